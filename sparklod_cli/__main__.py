@@ -1,0 +1,5 @@
+"""`python -m sparklod_cli`."""
+
+from .cli import main
+
+main()

@@ -1,0 +1,113 @@
+"""Baking: from a splat file to a Level-of-Detail file. What `sparklod build-lod` calls, and a program can call."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from .codecs import spz
+from .errors import FormatError
+from .io import read_scene
+from .limits import DEFAULT_BASE, MAX_SH_DEGREE
+from .lod import quick
+from .progress import Progress, silent
+from .scene import Scene
+from .selection import Selection
+
+#: Writes the pieces of an output and returns how many bytes it wrote.
+Sink = Callable[[Iterable[bytes]], int]
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How to bake.
+
+    Attributes:
+        base: growth of the cells from level to level, 1.1 to 2.0.
+        max_sh: SH degrees above this are left out.
+        selection: which splats to keep.
+        spz: how to write.
+    """
+
+    base: float = DEFAULT_BASE
+    max_sh: int = MAX_SH_DEGREE
+    selection: Selection = field(default_factory=Selection)
+    spz: spz.Options = field(default_factory=spz.Options)
+
+
+@dataclass(frozen=True)
+class Baked:
+    """What came of it.
+
+    Attributes:
+        format: of the input, for people.
+        splats, sh_degree: of the input as far as it was kept; `read` counts what was in the file.
+        dropped: how many splats were left out, by reason (`selection.REASONS`).
+        nodes, levels: of the tree; a tree of one node has one level.
+        bytes, version, fractional_bits: of the output.
+        clamped_scales: nodes with a scale that the output cannot hold.
+        notes: what the reader had to leave out, for people.
+        seconds: by stage (read, build, write).
+    """
+
+    format: str
+    read: int
+    splats: int
+    sh_degree: int
+    dropped: dict[str, int]
+    nodes: int
+    levels: int
+    bytes: int
+    version: int
+    fractional_bits: int
+    clamped_scales: int
+    notes: tuple[str, ...]
+    seconds: dict[str, float]
+
+
+def bake(source: Path, write: Sink, recipe: Recipe, *, progress: Progress = silent) -> Baked:
+    """Reads `source`, builds its tree and hands the LoD file to `write`.
+
+    Raises:
+        FormatError, InvalidSplatsError, OutputError: see `io.read_scene`, `Selection.apply` and `write`.
+    """
+    threads = recipe.spz.threads
+    start = time.perf_counter()
+    scene = read_scene(source, threads=threads, progress=progress)
+    if scene.tree is not None:
+        raise FormatError("it is a Level-of-Detail file already")
+    total = len(scene.splats)
+    leaves, dropped = recipe.selection.apply(scene.splats.with_max_sh(recipe.max_sh))
+    read_done = time.perf_counter()
+    antialiased, name, notes = scene.antialiased, scene.format, scene.notes
+    del scene  # the memory of what was left out
+    nodes, tree = quick.build(leaves, recipe.base, threads=threads, progress=progress)
+    kept, degree = len(leaves), leaves.sh_degree
+    del leaves
+    build_done = time.perf_counter()
+    output = Scene(nodes, tree, antialiased)
+    options = spz.resolve(nodes, recipe.spz)
+    size = write(spz.encode(output, options, progress=progress))
+    assert options.fractional_bits is not None
+    seconds = {
+        "read": read_done - start,
+        "build": build_done - read_done,
+        "write": time.perf_counter() - build_done,
+    }
+    return Baked(
+        format=name,
+        read=total,
+        splats=kept,
+        sh_degree=degree,
+        dropped=dropped,
+        nodes=len(nodes),
+        levels=int(tree.depths().max()) + 1,
+        bytes=size,
+        version=options.version,
+        fractional_bits=options.fractional_bits,
+        clamped_scales=spz.scales_out_of_range(nodes),
+        notes=notes,
+        seconds={stage: round(value, 4) for stage, value in seconds.items()},
+    )

@@ -1,0 +1,73 @@
+"""The command `sparklod`: its sub-commands, and the one place where errors become exit codes."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from importlib import import_module
+from typing import NoReturn
+
+import click
+
+from . import __version__
+from .errors import SparklodError
+
+#: Sub-commands, each a module of `commands` with a function of its name; imported when it is called for.
+COMMANDS = {"build-lod": "build_lod"}
+
+EPILOG = """
+\b
+Exit status: 0 done, 1 something failed, 2 wrong usage, 130 interrupted.
+Shell completion: eval "$(_SPARKLOD_COMPLETE=bash_source sparklod)", or zsh_source, fish_source.
+"""
+
+
+class LazyGroup(click.Group):
+    """A group that imports a command when it is asked for."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name not in COMMANDS:
+            return None
+        module = import_module(f".commands.{COMMANDS[cmd_name]}", __package__)
+        command: click.Command = getattr(module, COMMANDS[cmd_name])
+        return command
+
+
+@click.group(cls=LazyGroup, epilog=EPILOG)
+@click.version_option(__version__, package_name="sparklod")
+def cli() -> None:
+    """Bake Level-of-Detail trees for 3D Gaussian splat scenes."""
+
+
+def run(arguments: list[str] | None = None) -> int:
+    """Runs the command line and returns its exit code; arguments are those of the process unless given."""
+    try:
+        code = cli.main(arguments, prog_name="sparklod", standalone_mode=False)
+    except click.ClickException as error:
+        error.show()
+        return error.exit_code
+    except SparklodError as error:
+        click.echo(f"error: {error}", err=True)
+        return 1
+    except (click.Abort, KeyboardInterrupt):
+        click.echo("interrupted", err=True)
+        return 130
+    except BrokenPipeError:
+        # Whoever read standard output has gone; pointing it elsewhere keeps the interpreter's last flush quiet.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    return code if isinstance(code, int) else 0
+
+
+def _terminate(signum: int, frame: object) -> NoReturn:
+    raise KeyboardInterrupt
+
+
+def main() -> NoReturn:
+    """Entry point of the script; a polite kill cleans up as Ctrl-C does."""
+    signal.signal(signal.SIGTERM, _terminate)
+    sys.exit(run())

@@ -1,0 +1,1 @@
+"""One module a file format. None imports another; `io` chooses among them by the table in `formats`."""

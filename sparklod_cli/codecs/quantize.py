@@ -1,0 +1,145 @@
+"""Number codings as encode/decode pairs over whole arrays; each decode names its largest error.
+
+Encoders expect finite numbers and clamp to what the code can hold.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..gaussian import normalized_quat
+from ..sh import SH_C0
+from ..splats import FloatArray
+
+Bytes = NDArray[np.uint8]
+
+SCALE_STEPS, SCALE_OFFSET = 16, 10  # log scale bytes: steps to a factor of e, and minus the smallest logarithm
+COLOR_GAIN = 0.15  # colour bytes: SH DC coefficients times this, around one half
+SH_BITS = (5, 4, 4)  # bits that are kept of each degree's SH bytes, as Niantic's library writes them
+FIXED24_MAX = 2**23 - 1
+
+_SQRT_HALF = np.float32(np.sqrt(0.5))
+_OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
+
+
+def _to_byte(values: NDArray[Any]) -> Bytes:
+    return np.clip(np.rint(values), 0, 255).astype(np.uint8)
+
+
+def encode_fixed24(values: FloatArray, fractional_bits: int) -> Bytes:
+    """(..., n) to (..., n, 3): little-endian 24-bit fixed point."""
+    fixed = np.rint(np.ldexp(values.astype(np.float64), fractional_bits))
+    clamped = np.clip(fixed, -FIXED24_MAX - 1, FIXED24_MAX).astype("<i4")
+    return clamped.view(np.uint8).reshape(*values.shape, 4)[..., :3]
+
+
+def decode_fixed24(codes: Bytes, fractional_bits: int) -> FloatArray:
+    """(..., n, 3) to (..., n). Largest error: half of 2 ** -fractional_bits."""
+    wide = np.zeros((*codes.shape[:-1], 4), np.uint8)
+    wide[..., 1:] = codes
+    signed = wide.view("<i4")[..., 0] >> 8
+    return np.ldexp(signed.astype(np.float32), -fractional_bits)
+
+
+def encode_log_scale(scale: FloatArray) -> Bytes:
+    """Linear scales to a byte each; e ** -10 to e ** 5.94 is what it holds."""
+    with np.errstate(divide="ignore"):
+        return _to_byte((np.log(scale) + SCALE_OFFSET) * SCALE_STEPS)
+
+
+def decode_log_scale(codes: Bytes) -> FloatArray:
+    """Largest error: a factor of e ** (1 / 32), 3.2 %."""
+    return np.exp(codes.astype(np.float32) / SCALE_STEPS - SCALE_OFFSET)
+
+
+def encode_opacity(opacity: FloatArray) -> Bytes:
+    """0..1 to a byte."""
+    return _to_byte(opacity * 255)
+
+
+def decode_opacity(codes: Bytes) -> FloatArray:
+    """Largest error: 1 / 510."""
+    return codes.astype(np.float32) / 255
+
+
+def encode_lod_opacity(lod_opacity: FloatArray) -> Bytes:
+    """Spark's D, 0..5, to a byte: the lower half for 0..1, the upper half for 1..5.
+
+    A tie rounds down, so that D = 1, half-way between two codes, stays an opacity (code 127, 0.996) and does not become
+    a merged splat's (code 128, D = 1.016).
+    """
+    half = np.where(lod_opacity <= 1, lod_opacity, (lod_opacity + 3) / 4) / 2
+    return _to_byte(np.ceil(half * 255 - 0.5))
+
+
+def decode_lod_opacity(codes: Bytes) -> FloatArray:
+    """Largest error: 1 / 255 up to 1, 4 / 255 above."""
+    value = codes.astype(np.float32) * np.float32(2 / 255)
+    return np.where(value <= 1, value, 4 * value - 3)
+
+
+def encode_color(rgb: FloatArray) -> Bytes:
+    """Display-referred colours to bytes of their SH DC coefficients; holds -0.44 .. 1.44."""
+    return _to_byte((rgb - np.float32(0.5)) * np.float32(COLOR_GAIN * 255 / SH_C0) + np.float32(127.5))
+
+
+def decode_color(codes: Bytes) -> FloatArray:
+    """Largest error: SH_C0 / (2 * 0.15 * 255) = 0.0037."""
+    return (codes.astype(np.float32) / 255 - np.float32(0.5)) * np.float32(SH_C0 / COLOR_GAIN) + np.float32(0.5)
+
+
+def encode_sh(sh: FloatArray) -> Bytes:
+    """(N, K, 3) coefficients to bytes; the value is rounded to the middle of its bucket of 8 or 16 codes; -1..0.99."""
+    degree = np.repeat([0, 1, 2], [3, 5, 7])[: sh.shape[1]]
+    bucket = (2.0 ** (8 - np.array(SH_BITS)))[degree].astype(np.float32)[:, None]
+    codes = np.rint(sh * 128) + 128
+    return _to_byte(np.floor((codes + bucket / 2) / bucket) * bucket)
+
+
+def decode_sh(codes: Bytes) -> FloatArray:
+    """Largest error inside the range: 1 / 32 + 1 / 256 for degree 1, 1 / 16 + 1 / 256 above."""
+    return (codes.astype(np.float32) - 128) / 128
+
+
+def encode_quat_first_three(quat_xyzw: FloatArray) -> Bytes:
+    """(N, 4) unit quaternions to (N, 3) bytes of x y z, turned so that w is not negative."""
+    sign = np.where(quat_xyzw[:, 3:] < 0, np.float32(-127.5), np.float32(127.5))
+    return _to_byte(quat_xyzw[:, :3] * sign + np.float32(127.5))
+
+
+def decode_quat_first_three(codes: Bytes) -> FloatArray:
+    """(N, 3) bytes to (N, 4) unit quaternions. Largest error: 7 degrees of rotation, where w is near 0."""
+    xyz = codes.astype(np.float32) / np.float32(127.5) - 1
+    w = np.sqrt(np.maximum(0, 1 - np.einsum("ij,ij->i", xyz, xyz)))
+    return normalized_quat(np.concatenate([xyz, w[:, None]], axis=1))
+
+
+def encode_quat_smallest_three(quat_xyzw: FloatArray) -> Bytes:
+    """(N, 4) unit quaternions to (N, 4) bytes, a little-endian uint32: 2 bits index of the largest component, then of
+    the others in order a sign and 9 bits of magnitude, each over sqrt(1 / 2)."""
+    largest = np.abs(quat_xyzw).argmax(axis=1)[:, None]
+    others = np.take_along_axis(quat_xyzw, _OTHERS[largest[:, 0]], axis=1)
+    flip = np.take_along_axis(quat_xyzw, largest, axis=1) < 0
+    sign = ((others < 0) ^ flip).astype(np.uint32)
+    magnitude = np.minimum(np.abs(others) * (511 / _SQRT_HALF) + np.float32(0.5), 511).astype(np.uint32)
+    part = (sign << np.uint32(9)) | magnitude
+    shift = np.array([20, 10, 0], np.uint32)
+    code = (largest[:, 0].astype(np.uint32) << np.uint32(30)) | np.bitwise_or.reduce(part << shift, axis=1)
+    return code.astype("<u4").view(np.uint8).reshape(-1, 4)
+
+
+def decode_quat_smallest_three(codes: Bytes) -> FloatArray:
+    """(N, 4) bytes to (N, 4) unit quaternions. Largest error: 0.35 degrees of rotation."""
+    code = np.ascontiguousarray(codes).view("<u4")
+    part = code >> np.array([20, 10, 0], np.uint32)
+    magnitude = (part & np.uint32(511)).astype(np.float32) * (_SQRT_HALF / 511)
+    others = np.where(part & np.uint32(512), -magnitude, magnitude)
+    largest = (code[:, 0] >> np.uint32(30)).astype(np.intp)
+    quat = np.empty((len(codes), 4), np.float32)
+    np.put_along_axis(quat, _OTHERS[largest], others, axis=1)
+    rest = np.sqrt(np.maximum(0, 1 - np.einsum("ij,ij->i", others, others)))
+    np.put_along_axis(quat, largest[:, None], rest[:, None], axis=1)
+    return normalized_quat(quat)

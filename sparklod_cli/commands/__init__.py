@@ -1,0 +1,1 @@
+"""One module a sub-command: parse, one library call, report."""

@@ -1,0 +1,59 @@
+"""What commands say to a person, on standard error: lines and progress bars."""
+
+from __future__ import annotations
+
+import sys
+from types import TracebackType
+from typing import Any
+
+import click
+
+
+class Console:
+    """Says lines on standard error, and shows a bar for each stage of work where that is a terminal.
+
+    Used as a context manager, which clears the bar. Its `progress` is a `sparklod_cli.progress.Progress`.
+    """
+
+    def __init__(self, *, quiet: bool, verbose: bool) -> None:
+        self._quiet, self._verbose = quiet, verbose
+        self._bars = not quiet and sys.stderr.isatty()
+        self._bar: Any = None
+
+    def __enter__(self) -> Console:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.clear()
+
+    def clear(self) -> None:
+        """Takes the bar away."""
+        if self._bar is not None:
+            self._bar.close()
+            self._bar = None
+
+    def error(self, text: str) -> None:
+        self.clear()
+        click.echo(f"{click.style('error:', fg='red', bold=True)} {text}", err=True)
+
+    def say(self, text: str) -> None:
+        if not self._quiet:
+            self.clear()
+            click.echo(text, err=True)
+
+    def detail(self, text: str) -> None:
+        """Something only `--verbose` wants to know."""
+        if self._verbose:
+            self.say(text)
+
+    def progress(self, stage: str, done: int, total: int, unit: str) -> None:
+        if not self._bars:
+            return
+        if self._bar is None or self._bar.desc != stage:
+            from tqdm import tqdm
+
+            self.clear()
+            scaled = {"unit_scale": True, "unit": unit if unit == "B" else f" {unit}s"}
+            self._bar = tqdm(total=total, desc=stage, leave=False, file=sys.stderr, dynamic_ncols=True, **scaled)
+            self._bar.desc = stage
+        self._bar.update(done - self._bar.n)

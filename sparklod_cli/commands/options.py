@@ -1,0 +1,69 @@
+"""Options and parameter types that commands share."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import click
+
+from .. import __version__
+
+Command = TypeVar("Command", bound=Callable[..., Any])
+
+
+class Numbers(click.ParamType):
+    """`count` finite numbers with commas between, as a tuple of floats."""
+
+    def __init__(self, *names: str) -> None:
+        self.name = ",".join(names)
+        self._count = len(names)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, ...]:
+        if isinstance(value, tuple):
+            return value
+        try:
+            numbers = tuple(float(part) for part in value.split(","))
+        except ValueError:
+            numbers = ()
+        if len(numbers) != self._count or not all(map(math.isfinite, numbers)):
+            self.fail(f"{value!r} is not {self.name}, {self._count} numbers with commas between", param, ctx)
+        return numbers
+
+    def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:
+        return self.name
+
+
+class AutoOr(click.IntRange):
+    """An integer of a range, or the word auto, which becomes None."""
+
+    name = "auto|N"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        return None if value == "auto" else super().convert(value, param, ctx)
+
+    def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:
+        return "auto|N"
+
+
+def processors() -> int:
+    """How many processors this process may use."""
+    affinity = getattr(os, "sched_getaffinity", None)
+    return len(affinity(0)) if affinity else os.cpu_count() or 1
+
+
+def common_options(command: Command) -> Command:
+    """`--threads`, `--json`, `-q`, `-v`, `--version`."""
+    for option in (
+        click.version_option(__version__, package_name="sparklod"),
+        click.option("-v", "--verbose", is_flag=True, help="Say how long each stage took, and what was chosen."),
+        click.option("-q", "--quiet", is_flag=True, help="Say nothing but errors."),
+        click.option("--json", "as_json", is_flag=True, help="Print one JSON object a file on standard output."),
+        click.option(
+            "--threads", type=click.IntRange(1, 256), default=processors, show_default="all", help="Threads to work on."
+        ),
+    ):
+        command = option(command)
+    return command

@@ -1,0 +1,101 @@
+"""The only module that opens paths: what a file is, scenes in, files out whole or not at all."""
+
+from __future__ import annotations
+
+import os
+import secrets
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+
+from .codecs.formats import FORMATS, sniff
+from .errors import FormatError, OutputError
+from .progress import Progress, silent
+from .scene import Scene
+
+
+def read_scene(path: Path, *, threads: int = 1, progress: Progress = silent) -> Scene:
+    """Reads a splat file of any known format, told by its content.
+
+    Raises:
+        FormatError: it is not a file, empty, of no known format, or broken.
+    """
+    try:
+        with path.open("rb") as file:
+            head = file.read(16)
+            file.seek(0)
+            if not head:
+                raise FormatError("the file is empty")
+            form = sniff(head)
+            if form is None:
+                names = ", ".join(form.name for form in FORMATS)
+                raise FormatError(f"not a splat file that sparklod reads ({names})")
+            scene: Scene = form.codec().decode(file, threads=threads, progress=progress)
+            return scene
+    except OSError as error:
+        raise FormatError(f"cannot be read: {_reason(error)}") from None
+    except MemoryError:
+        raise FormatError("does not fit into memory") from None
+
+
+def check_writable(path: Path, *, overwrite: bool, make_parent: bool = False) -> None:
+    """Raises `OutputError` where an output cannot be written, before work goes into it.
+
+    Args:
+        path: of the output.
+        overwrite: an existing file may be replaced.
+        make_parent: make its directory if there is none.
+    """
+    if make_parent:
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OutputError(f"cannot make {path.parent}: {_reason(error)}") from None
+    if path.is_dir():
+        raise OutputError(f"{path} is a directory")
+    if path.is_file() and not overwrite:
+        raise OutputError(f"{path} exists, add --overwrite to replace it")
+    if not path.parent.is_dir():
+        raise OutputError(f"the directory {path.parent} does not exist")
+
+
+def write_whole(path: Path, pieces: Iterable[bytes], *, overwrite: bool) -> int:
+    """Writes a file so that it appears complete or not at all, and returns its size.
+
+    A temporary file beside it is filled, synced and renamed; an interruption leaves nothing behind.
+
+    Raises:
+        OutputError: it exists and `overwrite` is not set, or the file system refused something.
+    """
+    check_writable(path, overwrite=overwrite)
+    target = Path(os.path.realpath(path))
+    special = target.exists() and not target.is_file()  # a pipe or a device is written to, never replaced
+    temporary = target if special else target.with_name(f".{target.name}.{secrets.token_hex(4)}.part")
+    try:
+        with temporary.open("wb" if special else "xb") as file:
+            size = sum(file.write(piece) for piece in pieces)
+            file.flush()
+            if not special:
+                os.fsync(file.fileno())
+        if not special:
+            temporary.replace(target)
+    except OSError as error:
+        raise OutputError(f"cannot write {path}: {_reason(error)}") from None
+    finally:
+        if not special:
+            temporary.unlink(missing_ok=True)
+    return size
+
+
+def write_stdout(pieces: Iterable[bytes]) -> int:
+    """Writes to standard output and returns how many bytes; raises `OutputError` where nobody reads them."""
+    try:
+        size = sum(sys.stdout.buffer.write(piece) for piece in pieces)
+        sys.stdout.buffer.flush()
+    except OSError as error:
+        raise OutputError(f"cannot write standard output: {_reason(error)}") from None
+    return size
+
+
+def _reason(error: OSError) -> str:
+    return (error.strerror or str(error)).lower()

@@ -1,0 +1,1 @@
+"""Builders and traversal of Level-of-Detail trees."""

@@ -1,0 +1,82 @@
+"""Levels and cells: which splats belong where, and which share a cell."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import prange
+
+from ...jit import kernel
+from .sort import morton_code
+
+
+@kernel(parallel=True)
+def level_keys(center, scale, steps, first_level, grid, low, cell_bits):
+    """Sort keys that order splats by natural level and, inside a level, along a Morton curve.
+
+    Args:
+        center, scale: (n, 3) float32.
+        steps: (L,) float64 ascending, a geometric series; the last is not below the largest size.
+        first_level: the lowest index into `steps` that a splat is put in.
+        grid: edge of the cells of the curve, float64.
+        low: (3,) int64 lowest cell of `grid`.
+        cell_bits: bits of the curve, below the level's bits.
+
+    Returns:
+        keys (n,) uint64, and levels (n,) int32 into `steps`.
+    """
+    n = len(scale)
+    keys = np.empty(n, np.uint64)
+    levels = np.empty(n, np.int32)
+    start = math.log(steps[0])
+    per_level = (len(steps) - 1) / (math.log(steps[-1]) - start)
+    for i in prange(n):
+        size = 2 * np.float64(max(scale[i, 0], scale[i, 1], scale[i, 2]))
+        level = min(max(np.int64(math.ceil((math.log(size) - start) * per_level)), 0), len(steps) - 1)
+        # The logarithm rounds; the table of steps is what the level is defined by.
+        while level > 0 and size <= steps[level - 1]:
+            level -= 1
+        while size > steps[level]:
+            level += 1
+        levels[i] = max(level, first_level)
+        x, y, z = np.float64(center[i, 0]), np.float64(center[i, 1]), np.float64(center[i, 2])
+        keys[i] = morton_code(x, y, z, grid, low, np.uint64(0)) | (np.uint64(levels[i]) << np.uint64(cell_bits))
+    return keys, levels
+
+
+@kernel()
+def split_cells(nodes, is_first, next_node):
+    """Separates the cells that hold one node from those that hold more.
+
+    Args:
+        nodes: (n,) uint32, sorted by cell.
+        is_first: (n,) bool, true where a cell begins.
+        next_node: the node that will be made of the first cell with more than one, counted up from there.
+
+    Returns:
+        members (C,) uint32: the nodes of all cells with more than one; first (G + 1,) int64: where each such cell
+        starts in members; survivors (S,) uint32: the one node of each cell, in order.
+    """
+    n = len(nodes)
+    members = np.empty(n, np.uint32)
+    first = np.empty(n // 2 + 1, np.int64)
+    survivors = np.empty(n, np.uint32)
+    used = groups = cells = 0
+    first[0] = 0
+    i = 0
+    while i < n:
+        j = i + 1
+        while j < n and not is_first[j]:
+            j += 1
+        if j - i == 1:
+            survivors[cells] = nodes[i]
+        else:
+            survivors[cells] = next_node + groups
+            members[used : used + j - i] = nodes[i:j]
+            used += j - i
+            groups += 1
+            first[groups] = used
+        cells += 1
+        i = j
+    return members[:used], first[: groups + 1], survivors[:cells]

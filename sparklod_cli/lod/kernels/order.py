@@ -1,0 +1,62 @@
+"""Final order: copying leaves and merged nodes to their place, and merging colours there."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import prange
+
+from ...jit import kernel
+from .geometry import CENTER, OPACITY, QUAT, SCALE
+
+
+@kernel(parallel=True)
+def fill_columns(order, geometry, center, scale, quat, opacity):
+    """Columns of splats (arguments after `geometry`) in final order: row i from geometry[order[i]]."""
+    for i in prange(len(order)):
+        j = order[i]
+        for k in range(3):
+            center[i, k] = geometry[j, CENTER + k]
+            scale[i, k] = geometry[j, SCALE + k]
+        for k in range(4):
+            quat[i, k] = geometry[j, QUAT + k]
+        opacity[i] = geometry[j, OPACITY]
+
+
+@kernel(parallel=True)
+def fill_leaf_colors(order, index, rgb, sh, rgb_out, sh_out):
+    """Colours of the leaves in final order: row i from splat index[order[i]]; rows of merged nodes are left alone."""
+    for i in prange(len(order)):
+        if order[i] < len(index):
+            j = index[order[i]]
+            for k in range(3):
+                rgb_out[i, k] = rgb[j, k]
+            for k in range(sh.shape[1]):
+                sh_out[i, k] = sh[j, k]
+
+
+@kernel(parallel=True)
+def merge_colors(place, child_start, child_count, order, weight, color, chunks):
+    """Weighted mean colour of the children of nodes, whose children's colours are in place.
+
+    Args:
+        place: (G,) final indices of the nodes.
+        child_start, child_count: of the whole tree.
+        order, weight: node of each final index, and weight of each node, float64.
+        color: (M, J) float32 in final order, rows `place` are filled.
+        chunks: how many pieces to work in.
+    """
+    n, width = len(place), color.shape[1]
+    for c in prange(chunks):
+        total = np.empty(width, np.float64)
+        for g in range(n * c // chunks, n * (c + 1) // chunks):
+            node = place[g]
+            total[:] = 0.0
+            total_weight = 0.0
+            begin = np.int64(child_start[node])
+            for child in range(begin, begin + child_count[node]):
+                w = weight[order[child]]
+                total_weight += w
+                for k in range(width):
+                    total[k] += w * color[child, k]
+            for k in range(width):
+                color[node, k] = total[k] / total_weight

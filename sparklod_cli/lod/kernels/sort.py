@@ -1,0 +1,128 @@
+"""Voxel keys and a parallel, stable radix sort."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import prange
+from numpy.typing import NDArray
+
+from ...jit import kernel
+from ...splats import FloatArray
+from .geometry import CENTER
+
+Keys = NDArray[np.uint64]
+Nodes = NDArray[np.uint32]
+
+AXIS_BITS = 21  # bits of a cell coordinate that one 64-bit Morton word holds
+DIGIT_BITS = 11  # 2048 counters fit the first-level cache; measured against 8, 9 and 12
+
+
+@kernel()
+def spread_bits(x):
+    """The low 21 bits of a uint64 with two zero bits between each."""
+    x &= np.uint64(0x1FFFFF)
+    x = (x | (x << np.uint64(32))) & np.uint64(0x1F00000000FFFF)
+    x = (x | (x << np.uint64(16))) & np.uint64(0x1F0000FF0000FF)
+    x = (x | (x << np.uint64(8))) & np.uint64(0x100F00F00F00F00F)
+    x = (x | (x << np.uint64(4))) & np.uint64(0x10C30C30C30C30C3)
+    return (x | (x << np.uint64(2))) & np.uint64(0x1249249249249249)
+
+
+@kernel()
+def morton_code(x, y, z, step, low, shift):
+    """Interleaved bits shift .. shift + 20 of floor(centre / step) - low on each axis."""
+    i = np.uint64(np.int64(math.floor(x / step)) - low[0]) >> shift
+    j = np.uint64(np.int64(math.floor(y / step)) - low[1]) >> shift
+    k = np.uint64(np.int64(math.floor(z / step)) - low[2]) >> shift
+    return spread_bits(i) | (spread_bits(j) << np.uint64(1)) | (spread_bits(k) << np.uint64(2))
+
+
+@kernel(parallel=True)
+def cell_words(geometry, nodes, step, low, word):
+    """Morton words of the cells of nodes.
+
+    Args:
+        geometry: rows of `geometry.py`.
+        nodes: (n,) uint32 rows of it.
+        step: edge of a cell, float64.
+        low: (3,) int64, the lowest cell on each axis, so that offsets from it are not negative.
+        word: which 21 bits of the offsets.
+
+    Returns:
+        (n,) uint64.
+    """
+    out = np.empty(len(nodes), np.uint64)
+    shift = np.uint64(AXIS_BITS * word)
+    for i in prange(len(nodes)):
+        x, y, z = geometry[nodes[i], CENTER], geometry[nodes[i], CENTER + 1], geometry[nodes[i], CENTER + 2]
+        out[i] = morton_code(np.float64(x), np.float64(y), np.float64(z), step, low, shift)
+    return out
+
+
+@kernel(parallel=True)
+def sort_pass(keys, values, keys_out, values_out, shift, bits, chunks):
+    """One stable counting pass of a radix sort over `bits` bits at `shift`; the result is the same for any `chunks`."""
+    n = len(keys)
+    buckets = 1 << bits
+    mask = np.uint64(buckets - 1)
+    shift = np.uint64(shift)
+    count = np.zeros((chunks, buckets), np.int64)
+    for c in prange(chunks):
+        for i in range(n * c // chunks, n * (c + 1) // chunks):
+            count[c, (keys[i] >> shift) & mask] += 1
+    total = 0
+    for b in range(buckets):
+        for c in range(chunks):
+            here = count[c, b]
+            count[c, b] = total
+            total += here
+    for c in prange(chunks):
+        for i in range(n * c // chunks, n * (c + 1) // chunks):
+            b = (keys[i] >> shift) & mask
+            to = count[c, b]
+            count[c, b] = to + 1
+            keys_out[to] = keys[i]
+            values_out[to] = values[i]
+
+
+def sort_by_key(keys: Keys, values: Nodes, key_bits: int, chunks: int) -> tuple[Keys, Nodes]:
+    """Sorts (n,) uint64 keys below 2 ** key_bits, stable, carrying (n,) uint32 values along.
+
+    Works in `chunks` pieces and overwrites its inputs.
+    """
+    passes = max(1, -(-key_bits // DIGIT_BITS))
+    bits = max(1, -(-key_bits // passes))
+    other_keys, other_values = np.empty_like(keys), np.empty_like(values)
+    for k in range(passes):
+        sort_pass(keys, values, other_keys, other_values, k * bits, bits, chunks)
+        keys, other_keys = other_keys, keys
+        values, other_values = other_values, values
+    return keys, values
+
+
+def sort_by_cell(
+    geometry: FloatArray, nodes: Nodes, step: float, low: NDArray[np.int64], axis_bits: int, chunks: int
+) -> tuple[Nodes, NDArray[np.bool_]]:
+    """Nodes in the Morton order of their cells, and where a new cell begins.
+
+    Args:
+        geometry, nodes, step, low: as in `cell_words`.
+        axis_bits: bits that the largest cell offset needs; any number up to 63.
+        chunks: pieces to work in.
+
+    Returns:
+        the (n,) nodes sorted, and (n,) bool, true at the first node of each cell.
+    """
+    words = max(1, -(-axis_bits // AXIS_BITS))
+    is_first = np.zeros(len(nodes), np.bool_)
+    is_first[:1] = True
+    for word in range(words):
+        keys = cell_words(geometry, nodes, step, low, word)
+        keys, nodes = sort_by_key(keys, nodes.copy(), 3 * min(axis_bits - AXIS_BITS * word, AXIS_BITS), chunks)
+    for word in range(words):
+        if words > 1:  # the last word's order is not the order of the others
+            keys = cell_words(geometry, nodes, step, low, word)
+        is_first[1:] |= keys[1:] != keys[:-1]
+    return nodes, is_first

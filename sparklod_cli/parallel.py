@@ -1,0 +1,37 @@
+"""Working through rows in chunks, on several threads."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+#: Rows of a chunk: temporaries stay in the cache, and the interpreter's part stays small.
+CHUNK = 1 << 14
+
+
+def ordered_map(work: Callable[[Item], Result], items: list[Item], threads: int) -> Iterator[Result]:
+    """The results of `work` in the order of `items`, computed up to `threads` at a time."""
+    if threads == 1:
+        yield from map(work, items)
+        return
+    pool = ThreadPoolExecutor(threads)
+    try:
+        yield from pool.map(work, items)
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def for_chunks(work: Callable[[slice], None], rows: int, threads: int, done: Callable[[int], None]) -> None:
+    """Calls `work` with slices that cover `rows`, and `done` with the number of rows finished so far, in order."""
+    slices = [slice(start, min(start + CHUNK, rows)) for start in range(0, rows, CHUNK)]
+
+    def run(part: slice) -> int:
+        work(part)
+        return part.stop
+
+    for stop in ordered_map(run, slices, threads):
+        done(stop)

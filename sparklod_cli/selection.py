@@ -1,0 +1,100 @@
+"""Which splats go into a scene: what cannot be drawn is dropped, what is not wanted cropped, all of it counted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import InvalidSplatsError
+from .splats import COLUMNS, Splats
+
+Vector = tuple[float, float, float]
+
+#: Why a splat was left out, in the order in which the reasons are tried, and how a report says it.
+REASONS = {
+    "non_finite": "not finite",
+    "zero_opacity": "zero opacity",
+    "zero_scale": "zero scale",
+    "low_opacity": "below --min-opacity",
+    "cropped": "cropped",
+}
+
+
+@dataclass(frozen=True)
+class Selection:
+    """What to keep.
+
+    Attributes:
+        drop_invalid: drop splats with a number that is not finite or a rotation of length 0, instead of failing.
+        min_opacity: keep splats of at least this opacity, 0..1.
+        min_box, max_box: keep centres inside this box, borders included; world units.
+        within: keep centres in this ball, x y z and radius.
+    """
+
+    drop_invalid: bool = False
+    min_opacity: float = 0.0
+    min_box: Vector | None = None
+    max_box: Vector | None = None
+    within: tuple[Vector, float] | None = None
+
+    def apply(self, splats: Splats) -> tuple[Splats, dict[str, int]]:
+        """The splats that are kept, in order, and how many were dropped for each of `REASONS` that occurred.
+
+        Raises:
+            InvalidSplatsError: some are not finite and `drop_invalid` is not set, or none is left.
+        """
+        finite = _finite(splats)
+        if not (self.drop_invalid or finite.all()):
+            bad = np.flatnonzero(~finite)
+            raise InvalidSplatsError(
+                f"{bad.size:,} splats are not finite (NaN, infinite, or a rotation of length 0; the first is splat"
+                f" {bad[0]:,}), add --on-invalid drop to leave them out"
+            )
+        keeps = {
+            "non_finite": finite,
+            "zero_opacity": splats.opacity > 0,
+            "zero_scale": splats.scale.max(axis=1, initial=0) > 0,
+            "low_opacity": splats.opacity >= self.min_opacity,
+            "cropped": self._inside(splats.center),
+        }
+        keep = np.ones(len(splats), np.bool_)
+        dropped = {}
+        for reason in REASONS:
+            before = int(np.count_nonzero(keep))
+            keep &= keeps[reason]
+            dropped[reason] = before - int(np.count_nonzero(keep))
+        dropped = {reason: count for reason, count in dropped.items() if count}
+        if not keep.any():
+            why = f" ({describe(dropped)})" if dropped else ""
+            raise InvalidSplatsError(f"no splat is left of {len(splats):,}{why}" if len(splats) else "it has no splats")
+        return (splats if keep.all() else splats.take(keep)), dropped
+
+    def _inside(self, center: NDArray[np.float32]) -> NDArray[np.bool_]:
+        inside = np.ones(len(center), np.bool_)
+        if self.min_box is not None:
+            inside &= (center >= self.min_box).all(axis=1)
+        if self.max_box is not None:
+            inside &= (center <= self.max_box).all(axis=1)
+        if self.within is not None:
+            middle, radius = self.within
+            offset = center.astype(np.float64) - middle
+            inside &= np.einsum("ij,ij->i", offset, offset) <= radius * radius
+        return inside
+
+
+def _finite(splats: Splats) -> NDArray[np.bool_]:
+    finite = np.ones(len(splats), np.bool_)
+    for name in COLUMNS:
+        column = getattr(splats, name).reshape(len(splats), -1)
+        # A sum is finite only if all its terms are, unless huge ones overflow: those rows are looked at one by one.
+        with np.errstate(over="ignore", invalid="ignore"):
+            suspect = np.flatnonzero(~np.isfinite(column.sum(axis=1, dtype=np.float64)))
+        finite[suspect[~np.isfinite(column[suspect]).all(axis=1)]] = False
+    return finite
+
+
+def describe(dropped: dict[str, int]) -> str:
+    """ "12 not finite, 3 cropped", for people."""
+    return ", ".join(f"{count:,} {REASONS[reason]}" for reason, count in dropped.items())

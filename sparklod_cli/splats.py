@@ -1,0 +1,83 @@
+"""`Splats`, the one data model that every codec, builder and renderer shares."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .sh import COEFFICIENTS, degree_of
+
+FloatArray = NDArray[np.floating[Any]]
+
+
+@dataclass(frozen=True)
+class Splats:
+    """N Gaussian splats as C-contiguous float32 columns.
+
+    Attributes:
+        center: (N, 3) world units, in the axes of the file they came from.
+        scale: (N, 3) standard deviations along the local axes, linear, world units.
+        quat_xyzw: (N, 4) unit quaternions, local to world.
+        opacity: (N,) linear: 0..1 for an input splat, up to 1000 for a merged one (see `gaussian.lod_opacity`).
+        rgb: (N, 3) display-referred colour, SH_C0 * f_dc + 0.5; may lie outside 0..1.
+        sh: (N, K, 3) higher SH coefficients, K = 0, 3, 8 or 15, r g b innermost.
+    """
+
+    center: FloatArray
+    scale: FloatArray
+    quat_xyzw: FloatArray
+    opacity: FloatArray
+    rgb: FloatArray
+    sh: FloatArray
+
+    def __post_init__(self) -> None:
+        n = len(self.center)
+        shapes = {"center": (n, 3), "scale": (n, 3), "quat_xyzw": (n, 4), "opacity": (n,), "rgb": (n, 3)}
+        coefficients = self.sh.shape[1] if self.sh.ndim == 3 else -1
+        shapes["sh"] = (n, coefficients, 3)
+        for name, shape in shapes.items():
+            column = getattr(self, name)
+            if column.shape != shape or column.dtype != np.float32 or not column.flags.c_contiguous:
+                raise ValueError(
+                    f"{name} is {column.dtype}{list(column.shape)}, expected C-contiguous float32{list(shape)}"
+                )
+        if coefficients not in COEFFICIENTS[:4]:
+            raise ValueError(f"sh has {coefficients} coefficients, expected one of {COEFFICIENTS[:4]}")
+
+    def __len__(self) -> int:
+        return len(self.center)
+
+    @property
+    def sh_degree(self) -> int:
+        """SH degree, 0 to 3."""
+        return degree_of(self.sh.shape[1])
+
+    @classmethod
+    def empty(cls, count: int, sh_degree: int) -> Splats:
+        """Uninitialised columns for `count` splats, for a decoder or a kernel to fill."""
+        shapes = {"opacity": (count,), "quat_xyzw": (count, 4), "sh": (count, COEFFICIENTS[sh_degree], 3)}
+        return cls(**{name: np.empty(shapes.get(name, (count, 3)), np.float32) for name in COLUMNS})
+
+    @classmethod
+    def concat(cls, parts: Sequence[Splats]) -> Splats:
+        """All the parts in order; they must have the same SH degree."""
+        return cls(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in COLUMNS})
+
+    def take(self, index: NDArray[Any] | slice) -> Splats:
+        """The splats at an index array, a boolean mask or a slice: the one way to filter, permute and truncate."""
+        return Splats(**{name: np.ascontiguousarray(getattr(self, name)[index]) for name in COLUMNS})
+
+    def with_max_sh(self, degree: int) -> Splats:
+        """These splats with the SH coefficients above `degree` left out."""
+        keep = COEFFICIENTS[degree]
+        if keep >= self.sh.shape[1]:
+            return self
+        return dataclasses.replace(self, sh=np.ascontiguousarray(self.sh[:, :keep]))
+
+
+COLUMNS = tuple(field.name for field in dataclasses.fields(Splats))
