@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import zstandard
@@ -24,7 +25,7 @@ WINDOW = 1 << 15  # bytes before a block that it may refer to
 #: a ratio of 3, a scene of equal splats 1000, which is also deflate's limit.
 TRUSTED_SIZE, MAX_RATIO = 1 << 26, 200
 
-_ZlibError: type[Exception] = zlib_ng.error
+_ZlibError: Any = zlib_ng.error  # the stubs take the class for an instance
 _RAW, _GZIP = -zlib_ng.MAX_WBITS, zlib_ng.MAX_WBITS + 16
 
 

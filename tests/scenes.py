@@ -1,0 +1,24 @@
+"""Random and hand-made splats to test with."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sparklod_cli.gaussian import normalized_quat
+from sparklod_cli.sh import COEFFICIENTS
+from sparklod_cli.splats import Splats
+
+
+def random_splats(count: int, *, sh_degree: int = 0, seed: int = 0, extent: float = 1.0) -> Splats:
+    """Plausible splats: scales over two decades, clustered centres, mostly opaque."""
+    rng = np.random.default_rng(seed)
+    f32 = np.float32
+    clusters = rng.normal(size=(8, 3)) * extent
+    return Splats(
+        center=(clusters[rng.integers(8, size=count)] + rng.normal(size=(count, 3)) * 0.2 * extent).astype(f32),
+        scale=np.exp(rng.normal(-4, 0.8, size=(count, 3)) + np.log(extent)).astype(f32),
+        quat_xyzw=np.ascontiguousarray(normalized_quat(rng.normal(size=(count, 4)).astype(f32))),
+        opacity=rng.uniform(0.05, 1, size=count).astype(f32),
+        rgb=rng.uniform(0, 1, size=(count, 3)).astype(f32),
+        sh=np.clip(rng.normal(0, 0.15, size=(count, COEFFICIENTS[sh_degree], 3)), -0.9, 0.9).astype(f32),
+    )
