@@ -25,7 +25,7 @@ from ..tree import MAX_CHILDREN, LodTree
 from .kernels.geometry import CENTER, WIDTH, extremes, fill_leaves
 from .kernels.group import level_keys, split_cells
 from .kernels.merge import merge_groups
-from .kernels.order import fill_columns, fill_leaf_colors, merge_colors
+from .kernels.order import fill_columns, fill_leaf_colors, merge_colors, places_of_merged
 from .kernels.sort import Nodes, sort_by_cell, sort_by_key
 
 #: Cells count in int64; the finest level is the first at which the scene's coordinates stay below this.
@@ -186,9 +186,7 @@ def _in_final_order(forest: _Forest, index: Nodes, splats: Splats, threads: int)
     for _, members, _ in forest.batches:
         order[end - len(members) : end] = members
         end -= len(members)
-    place = np.empty(total, np.uint32)
-    place[order] = np.arange(total, dtype=np.uint32)
-
+    place = places_of_merged(order, forest.leaves)
     tree = LodTree(np.zeros(total, np.uint16), np.zeros(total, np.uint32))
     out = Splats.empty(total, splats.sh_degree)
     fill_columns(order, forest.geometry, out.center, out.scale, out.quat_xyzw, out.opacity)
@@ -196,7 +194,7 @@ def _in_final_order(forest: _Forest, index: Nodes, splats: Splats, threads: int)
     fill_leaf_colors(order, index, splats.rgb, sh_in, out.rgb, sh)
     end = total
     for row, members, first in forest.batches:
-        parents = place[row : row + len(first) - 1]
+        parents = place[row - forest.leaves :][: len(first) - 1]
         end -= len(members)
         tree.child_start[parents] = end + first[:-1]
         tree.child_count[parents] = np.diff(first)

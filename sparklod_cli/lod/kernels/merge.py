@@ -1,4 +1,4 @@
-"""Merging Gaussians: moment matching with a symmetric 3x3 eigen-solver.
+"""Merging Gaussians: moment matching.
 
 Weights, moments and the eigen-decomposition are in float64: a mean of float32 centres 1e7 units from the origin, or
 squares of scales near 1e-30, would not survive float32.
@@ -13,12 +13,11 @@ from numba import prange
 
 from ...gaussian import MAX_OPACITY, MIN_OPACITY
 from ...jit import kernel
+from .eigen import ROWS, decompose
 from .geometry import CENTER, OPACITY, QUAT, SCALE, WIDTH, ellipsoid_area
 
 SCALE_FLOOR = 1e-30
-MAX_SWEEPS = 16
-BLOCK = 64  # groups that are gathered before they are merged
-OFF_DIAGONAL = 1e-18  # square of an off-diagonal element, relative to the largest diagonal, that counts as zero
+BLOCK = 64  # groups that are merged together: gathered, summed, then decomposed side by side
 
 
 @kernel()
@@ -39,52 +38,50 @@ def covariance(a, b, c, x, y, z, w):
 
 
 @kernel()
-def jacobi_rotation(p, q, off):
-    """The rotation that clears the off-diagonal element between diagonals p and q: tan, cos, sin, and of its half."""
-    theta = (q - p) / (2 * off)
-    t = 1 / (abs(theta) + math.sqrt(theta * theta + 1))
-    if theta < 0:
-        t = -t
-    c = 1 / math.sqrt(t * t + 1)
-    s = t * c
-    half_c = math.sqrt((1 + c) / 2)
-    return t, c, s, half_c, s / (2 * half_c)
+def sum_moments(row, weight, begin, end, merged, moments, column):
+    """Weighted mean and covariance of rows begin to end.
 
-
-@kernel()
-def eigen_symmetric(a, b, c, d, e, f):
-    """Eigenvalues and eigenvectors of a symmetric matrix xx, yy, zz, xy, xz, yz by cyclic Jacobi rotations.
-
-    Unlike the closed form, it keeps the eigenvectors of flat, needle-like and spherical matrices. The vectors come as
-    the quaternion of the product of its rotations, so they are right-handed by construction.
+    Args:
+        row, weight: rows of `geometry.py` and their weights.
+        begin, end: which of them.
+        merged: a row of geometry, whose centre is set to the mean.
+        moments: (6 or more, columns) float64, whose `column` is set to xx, yy, zz, xy, xz, yz.
+        column: which.
 
     Returns:
-        the three eigenvalues, and x, y, z, w of the rotation from their axes to the world's.
+        the sum of the weights.
     """
-    largest = max(a, b, c)
-    x = y = z = 0.0
-    w = 1.0
-    if not largest > 0:
-        return 0.0, 0.0, 0.0, x, y, z, w
-    unit = 1 / largest
-    a, b, c, d, e, f = a * unit, b * unit, c * unit, d * unit, e * unit, f * unit
-    for _ in range(MAX_SWEEPS):
-        if max(d * d, e * e, f * f) <= OFF_DIAGONAL:
-            break
-        if d * d > OFF_DIAGONAL:  # in the xy plane: about -z
-            t, cs, sn, hc, hs = jacobi_rotation(a, b, d)
-            a, b, d, e, f = a - t * d, b + t * d, 0.0, cs * e - sn * f, sn * e + cs * f
-            x, y, z, w = x * hc - y * hs, y * hc + x * hs, z * hc - w * hs, w * hc + z * hs
-        if e * e > OFF_DIAGONAL:  # in the xz plane: about y
-            t, cs, sn, hc, hs = jacobi_rotation(a, c, e)
-            a, c, e, d, f = a - t * e, c + t * e, 0.0, cs * d - sn * f, sn * d + cs * f
-            x, y, z, w = x * hc - z * hs, y * hc + w * hs, z * hc + x * hs, w * hc - y * hs
-        if f * f > OFF_DIAGONAL:  # in the yz plane: about -x
-            t, cs, sn, hc, hs = jacobi_rotation(b, c, f)
-            b, c, f, d, e = b - t * f, c + t * f, 0.0, cs * d - sn * e, sn * d + cs * e
-            x, y, z, w = x * hc - w * hs, y * hc - z * hs, z * hc + y * hs, w * hc + x * hs
-    norm = 1 / math.sqrt(x * x + y * y + z * z + w * w)
-    return a * largest, b * largest, c * largest, x * norm, y * norm, z * norm, w * norm
+    total = x = y = z = 0.0
+    for k in range(begin, end):
+        w = weight[k]
+        total += w
+        x += w * row[k, CENTER]
+        y += w * row[k, CENTER + 1]
+        z += w * row[k, CENTER + 2]
+    x, y, z = x / total, y / total, z / total
+    xx = yy = zz = xy = xz = yz = 0.0
+    for k in range(begin, end):
+        cxx, cyy, czz, cxy, cxz, cyz = covariance(
+            np.float64(row[k, SCALE]),
+            np.float64(row[k, SCALE + 1]),
+            np.float64(row[k, SCALE + 2]),
+            np.float64(row[k, QUAT]),
+            np.float64(row[k, QUAT + 1]),
+            np.float64(row[k, QUAT + 2]),
+            np.float64(row[k, QUAT + 3]),
+        )
+        w = weight[k] / total
+        dx, dy, dz = row[k, CENTER] - x, row[k, CENTER + 1] - y, row[k, CENTER + 2] - z
+        xx += w * (cxx + dx * dx)
+        yy += w * (cyy + dy * dy)
+        zz += w * (czz + dz * dz)
+        xy += w * (cxy + dx * dy)
+        xz += w * (cxz + dx * dz)
+        yz += w * (cyz + dy * dz)
+    merged[CENTER], merged[CENTER + 1], merged[CENTER + 2] = x, y, z
+    moments[0, column], moments[1, column], moments[2, column] = xx, yy, zz
+    moments[3, column], moments[4, column], moments[5, column] = xy, xz, yz
+    return total
 
 
 @kernel(parallel=True)
@@ -110,45 +107,22 @@ def merge_groups(nodes, first, geometry, weight, base):
                 row[k, column] = geometry[nodes[offset + k], column]
         for k in range(len(row)):
             row_weight[k] = weight[nodes[offset + k]]
+        moments = np.empty((ROWS, BLOCK), np.float64)
+        total_weight = np.empty(BLOCK, np.float64)
         for g in range(block_begin, block_end):
-            begin, end = first[g] - offset, first[g + 1] - offset
-            total = x = y = z = 0.0
-            for k in range(begin, end):
-                w = row_weight[k]
-                total += w
-                x += w * row[k, CENTER]
-                y += w * row[k, CENTER + 1]
-                z += w * row[k, CENTER + 2]
-            x, y, z = x / total, y / total, z / total
-            xx = yy = zz = xy = xz = yz = 0.0
-            for k in range(begin, end):
-                cxx, cyy, czz, cxy, cxz, cyz = covariance(
-                    np.float64(row[k, SCALE]),
-                    np.float64(row[k, SCALE + 1]),
-                    np.float64(row[k, SCALE + 2]),
-                    np.float64(row[k, QUAT]),
-                    np.float64(row[k, QUAT + 1]),
-                    np.float64(row[k, QUAT + 2]),
-                    np.float64(row[k, QUAT + 3]),
-                )
-                w = row_weight[k] / total
-                dx, dy, dz = row[k, CENTER] - x, row[k, CENTER + 1] - y, row[k, CENTER + 2] - z
-                xx += w * (cxx + dx * dx)
-                yy += w * (cyy + dy * dy)
-                zz += w * (czz + dz * dz)
-                xy += w * (cxy + dx * dy)
-                xz += w * (cxz + dx * dz)
-                yz += w * (cyz + dy * dz)
-            a, b, c, qx, qy, qz, qw = eigen_symmetric(xx, yy, zz, xy, xz, yz)
-            a = max(math.sqrt(max(a, 0.0)), SCALE_FLOOR)
-            b = max(math.sqrt(max(b, 0.0)), SCALE_FLOOR)
-            c = max(math.sqrt(max(c, 0.0)), SCALE_FLOOR)
-            area = ellipsoid_area(a, b, c)
-            opacity = min(max(total / area, MIN_OPACITY), MAX_OPACITY)
-            made = base + g
-            geometry[made, CENTER], geometry[made, CENTER + 1], geometry[made, CENTER + 2] = x, y, z
+            total_weight[g - block_begin] = sum_moments(
+                row, row_weight, first[g] - offset, first[g + 1] - offset, geometry[base + g], moments, g - block_begin
+            )
+        decompose(moments, block_end - block_begin)
+        for k in range(block_end - block_begin):
+            made = base + block_begin + k
+            a = max(math.sqrt(max(moments[0, k], 0.0)), SCALE_FLOOR)
+            b = max(math.sqrt(max(moments[1, k], 0.0)), SCALE_FLOOR)
+            c = max(math.sqrt(max(moments[2, k], 0.0)), SCALE_FLOOR)
             geometry[made, SCALE], geometry[made, SCALE + 1], geometry[made, SCALE + 2] = a, b, c
-            geometry[made, QUAT], geometry[made, QUAT + 1] = qx, qy
-            geometry[made, QUAT + 2], geometry[made, QUAT + 3] = qz, qw
+            for i in range(4):
+                geometry[made, QUAT + i] = moments[6 + i, k]
+            area = ellipsoid_area(a, b, c)
+            opacity = min(max(total_weight[k] / area, MIN_OPACITY), MAX_OPACITY)
             geometry[made, OPACITY] = opacity
             weight[made] = opacity * area

@@ -10,6 +10,16 @@ from .geometry import CENTER, OPACITY, QUAT, SCALE
 
 
 @kernel(parallel=True)
+def places_of_merged(order, leaves):
+    """(M - leaves,) uint32: the final index of each merged node, by (M,) `order`, the node of each final index."""
+    place = np.empty(len(order) - leaves, np.uint32)
+    for i in prange(len(order)):
+        if order[i] >= leaves:
+            place[order[i] - leaves] = i
+    return place
+
+
+@kernel(parallel=True)
 def fill_columns(order, geometry, center, scale, quat, opacity):
     """Columns of splats (arguments after `geometry`) in final order: row i from geometry[order[i]]."""
     for i in prange(len(order)):
