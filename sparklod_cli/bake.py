@@ -79,13 +79,14 @@ def bake(source: Path, write: Sink, recipe: Recipe, *, progress: Progress = sile
     if scene.tree is not None:
         raise FormatError("it is a Level-of-Detail file already")
     total = len(scene.splats)
-    leaves, dropped = recipe.selection.apply(scene.splats.with_max_sh(recipe.max_sh))
+    kept, dropped = recipe.selection.apply(scene.splats.with_max_sh(recipe.max_sh))
     read_done = time.perf_counter()
     antialiased, name, notes = scene.antialiased, scene.format, scene.notes
-    del scene  # the memory of what was left out
-    nodes, tree = quick.build(leaves, recipe.base, threads=threads, progress=progress)
-    kept, degree = len(leaves), leaves.sh_degree
-    del leaves
+    count, degree = len(kept), kept.sh_degree
+    # The builder frees its input as it goes, if nobody else holds it: a third of the peak.
+    handed_over = [kept]
+    del scene, kept
+    nodes, tree = quick.build(handed_over.pop(), recipe.base, progress=progress)
     build_done = time.perf_counter()
     output = Scene(nodes, tree, antialiased)
     options = spz.resolve(nodes, recipe.spz)
@@ -99,7 +100,7 @@ def bake(source: Path, write: Sink, recipe: Recipe, *, progress: Progress = sile
     return Baked(
         format=name,
         read=total,
-        splats=kept,
+        splats=count,
         sh_degree=degree,
         dropped=dropped,
         nodes=len(nodes),

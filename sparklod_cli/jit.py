@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numba
 from numba.core import event
+
+SMALL = 4096  # rows that one thread works through before another would have woken up
 
 
 def kernel(*, parallel: bool = False) -> Callable[[Callable[..., Any]], Any]:
@@ -29,6 +31,21 @@ def kernel(*, parallel: bool = False) -> Callable[[Callable[..., Any]], Any]:
 def use_threads(count: int) -> None:
     """Runs kernels on `count` threads, or as many as there are if that is fewer."""
     numba.set_num_threads(min(count, numba.config.NUMBA_NUM_THREADS))
+
+
+@contextlib.contextmanager
+def threads_for(rows: int) -> Iterator[int]:
+    """Runs kernels on one thread inside where there is little to do, and tells how many threads that leaves.
+
+    Waking the other threads costs more than a few thousand rows, and on a busy machine, where they are not awake to be
+    waited for, a thousand times more.
+    """
+    threads = numba.get_num_threads()
+    use_threads(1 if rows < SMALL else threads)
+    try:
+        yield numba.get_num_threads()
+    finally:
+        use_threads(threads)
 
 
 class _OnCompile(event.Listener):

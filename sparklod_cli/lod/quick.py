@@ -18,8 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InvalidSplatsError
+from ..jit import threads_for
 from ..limits import DEFAULT_BASE, MAX_BASE, MIN_BASE
 from ..progress import Progress, silent
+from ..sh import degree_of
 from ..splats import FloatArray, Splats
 from ..tree import MAX_CHILDREN, LodTree
 from .kernels.geometry import CENTER, WIDTH, extremes, fill_leaves
@@ -87,19 +89,16 @@ class _Forest:
         return np.concatenate([*kept, members[at:]]), np.concatenate([[0], np.cumsum(count)])
 
 
-def build(
-    splats: Splats, base: float = DEFAULT_BASE, *, threads: int = 1, progress: Progress = silent
-) -> tuple[Splats, LodTree]:
+def build(splats: Splats, base: float = DEFAULT_BASE, *, progress: Progress = silent) -> tuple[Splats, LodTree]:
     """Builds a Level-of-Detail tree.
 
-    The result does not depend on `threads`. Every input splat is one leaf, bit for bit. Nodes come in an order in which
-    the root is 0, children are consecutive and after their parent, and a prefix is a coarser scene: nodes whose parents
-    were made at a coarser level come first, along a Morton curve inside a level.
+    The result does not depend on the number of threads (`jit.use_threads`). Every input splat is one leaf, bit for bit.
+    Nodes come in an order in which the root is 0, children are consecutive and after their parent, and a prefix is a
+    coarser scene: nodes whose parents were made at a coarser level come first, along a Morton curve inside a level.
 
     Args:
         splats: N splats, finite, with positive opacity and at least one positive scale each.
         base: growth of the cells from level to level, 1.1 to 2.0.
-        threads: pieces that the passes which keep a table a piece are cut into.
         progress: told how many splats have joined the tree.
 
     Returns:
@@ -114,17 +113,20 @@ def build(
     n = len(splats)
     if n == 0:
         raise InvalidSplatsError("no splat is left to build a tree of")
-    low, high, smallest, largest = extremes(splats.center, splats.scale, threads)
-    finest = math.floor(math.log(smallest, base)) - 1
-    steps = base ** np.arange(finest, math.ceil(math.log(largest, base)) + 2, dtype=np.float64)
-    finest_usable = int(np.searchsorted(steps, max(np.abs(low).max(), np.abs(high).max()) / MAX_CELL))
-    finest_usable = min(finest_usable, len(steps) - 1)
-
-    index, joins = _sort_leaves(splats, steps, finest_usable, low, high, threads)
-    forest = _Forest(np.empty((2 * n, WIDTH), np.float32), np.empty(2 * n, np.float64), n, n, [])
-    fill_leaves(index, splats.center, splats.scale, splats.quat_xyzw, splats.opacity, forest.geometry, forest.weight)
-    _grow(forest, joins, base, finest, low, high, threads, progress)
-    return _in_final_order(forest, index, splats, threads)
+    with threads_for(n) as threads:
+        low, high, smallest, largest = extremes(splats.center, splats.scale, threads)
+        finest = math.floor(math.log(smallest, base)) - 1
+        steps = base ** np.arange(finest, math.ceil(math.log(largest, base)) + 2, dtype=np.float64)
+        usable = int(np.searchsorted(steps, max(np.abs(low).max(), np.abs(high).max()) / MAX_CELL))
+        index, joins = _sort_leaves(splats, steps, min(usable, len(steps) - 1), low, high, threads)
+        rows, weight = np.empty((2 * n, WIDTH), np.float32), np.empty(2 * n, np.float64)
+        fill_leaves(index, splats.center, splats.scale, splats.quat_xyzw, splats.opacity, rows, weight)
+        rgb, sh = splats.rgb, splats.sh
+        del splats  # from here on the rows have the rest; frees it where the caller has let go of it too
+        forest = _Forest(rows, weight, n, n, [])
+        del rows
+        _grow(forest, joins, base, finest, low, high, progress)
+        return _in_final_order(forest, index, rgb, sh)
 
 
 def _sort_leaves(
@@ -147,7 +149,6 @@ def _grow(
     finest: int,
     low: NDArray[np.float64],
     high: NDArray[np.float64],
-    threads: int,
     progress: Progress,
 ) -> None:
     """Merges cells level by level, up to one root."""
@@ -163,7 +164,9 @@ def _grow(
             # A mean stays in the box of what it is a mean of, so the scene's own box bounds the cells of all levels.
             low_cell = np.floor(low / step).astype(np.int64)
             axis_bits = int((np.floor(high / step).astype(np.int64) - low_cell).max()).bit_length()
-            active = forest.merge_cells(*sort_by_cell(forest.geometry, active, step, low_cell, axis_bits, threads))
+            with threads_for(len(active)) as threads:
+                cells = sort_by_cell(forest.geometry, active, step, low_cell, axis_bits, threads)
+                active = forest.merge_cells(*cells)
         if joined == forest.leaves and len(active) <= 8:  # a block of 2 x 2 x 2 cells with one survivor each
             cell = np.floor(forest.geometry[active, CENTER : CENTER + 3] / step)
             if np.ptp(cell, axis=0).max() <= 1:
@@ -173,11 +176,12 @@ def _grow(
         forest.merge(active, np.array([0, len(active)]))
 
 
-def _in_final_order(forest: _Forest, index: Nodes, splats: Splats, threads: int) -> tuple[Splats, LodTree]:
+def _in_final_order(forest: _Forest, index: Nodes, rgb: FloatArray, sh: FloatArray) -> tuple[Splats, LodTree]:
     """The root, then the members of the batches, last batch first; colours are merged here, where children are close.
 
     Args:
         index: (N,) splat of each leaf row.
+        rgb, sh: of the splats.
     """
     total = forest.used
     order = np.empty(total, np.uint32)
@@ -188,16 +192,18 @@ def _in_final_order(forest: _Forest, index: Nodes, splats: Splats, threads: int)
         end -= len(members)
     place = places_of_merged(order, forest.leaves)
     tree = LodTree(np.zeros(total, np.uint16), np.zeros(total, np.uint32))
-    out = Splats.empty(total, splats.sh_degree)
+    out = Splats.empty(total, degree_of(sh.shape[1]))
     fill_columns(order, forest.geometry, out.center, out.scale, out.quat_xyzw, out.opacity)
-    sh_in, sh = splats.sh.reshape(len(splats), -1), out.sh.reshape(total, -1)
-    fill_leaf_colors(order, index, splats.rgb, sh_in, out.rgb, sh)
+    forest.geometry = np.empty((0, WIDTH), np.float32)  # the colours want its memory
+    flat_sh = out.sh.reshape(total, -1)
+    fill_leaf_colors(order, index, rgb, sh.reshape(len(sh), -1), out.rgb, flat_sh)
     end = total
     for row, members, first in forest.batches:
         parents = place[row - forest.leaves :][: len(first) - 1]
         end -= len(members)
         tree.child_start[parents] = end + first[:-1]
         tree.child_count[parents] = np.diff(first)
-        for color in (out.rgb, sh):
-            merge_colors(parents, tree.child_start, tree.child_count, order, forest.weight, color, threads)
+        with threads_for(len(members)) as threads:
+            for color in (out.rgb, flat_sh):
+                merge_colors(parents, tree.child_start, tree.child_count, order, forest.weight, color, threads)
     return out, tree

@@ -48,8 +48,9 @@ def extremes(center, scale, chunks):
         low[c, 0], low[c, 1], low[c, 2], low[c, 3] = x0, y0, z0, s0
         high[c, 0], high[c, 1], high[c, 2], high[c, 3] = x1, y1, z1, s1
     for c in range(1, chunks):
-        low[0] = np.minimum(low[0], low[c])
-        high[0] = np.maximum(high[0], high[c])
+        for k in range(4):
+            low[0, k] = min(low[0, k], low[c, k])
+            high[0, k] = max(high[0, k], high[c, k])
     return low[0, :3], high[0, :3], 2 * low[0, 3], 2 * high[0, 3]
 
 

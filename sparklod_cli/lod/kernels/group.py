@@ -73,8 +73,9 @@ def split_cells(nodes, is_first, next_node):
             survivors[cells] = nodes[i]
         else:
             survivors[cells] = next_node + groups
-            members[used : used + j - i] = nodes[i:j]
-            used += j - i
+            for k in range(i, j):
+                members[used] = nodes[k]
+                used += 1
             groups += 1
             first[groups] = used
         cells += 1

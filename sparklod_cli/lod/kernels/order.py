@@ -60,8 +60,9 @@ def merge_colors(place, child_start, child_count, order, weight, color, chunks):
         total = np.empty(width, np.float64)
         for g in range(n * c // chunks, n * (c + 1) // chunks):
             node = place[g]
-            total[:] = 0.0
             total_weight = 0.0
+            for k in range(width):
+                total[k] = 0.0
             begin = np.int64(child_start[node])
             for child in range(begin, begin + child_count[node]):
                 w = weight[order[child]]

@@ -1,0 +1,155 @@
+"""Baking, stage by stage, beside Spark's own builder in the same run: `python benchmarks/bench_build.py --help`."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+from scenes import load, tiled, write_ply
+
+from sparklod_cli import jit
+from sparklod_cli.codecs import spz
+from sparklod_cli.commands.options import processors
+from sparklod_cli.lod import quick
+from sparklod_cli.scene import Scene
+
+HERE = Path(__file__).resolve().parent
+
+HEADINGS = (
+    *("scene", "splats", "nodes", "read s", "build s", "write s", "process s", "peak MB", "peak / input", "LoD MB"),
+    *("LoD / plain", "warm build s", "million splats/s (min to max)", "Spark's build s", "ratio"),
+)
+
+
+#: The command, and then its peak memory in kB as the kernel saw it: what the parent is told counts the parent's too.
+MEASURED = """
+import re, sys
+from pathlib import Path
+from sparklod_cli.cli import run
+code = run(sys.argv[1:])
+print(re.search(r"VmHWM:\\s+(\\d+)", Path("/proc/self/status").read_text())[1])
+sys.exit(code)
+"""
+
+
+def machine() -> str:
+    """A name for this machine, for tables."""
+    info = Path("/proc/cpuinfo")
+    models = [line.split(":")[1].strip() for line in info.read_text().splitlines() if line.startswith("model name")]
+    return (
+        f"{models[0] if models else platform.processor()}, {processors()} threads, Python {platform.python_version()}"
+    )
+
+
+def warm_build(path: Path, runs: int) -> list[float]:
+    """Seconds of each run of the builder alone, decoded splats to final order, after one that is not counted."""
+    splats = load(path)
+    jit.use_threads(processors())
+    seconds = []
+    for run in range(runs + 1):
+        start = time.perf_counter()
+        quick.build(splats)
+        if run:
+            seconds.append(time.perf_counter() - start)
+    return seconds
+
+
+def whole_command(path: Path, output: Path) -> dict[str, float]:
+    """One run of the command: its stages, wall time and peak memory of the process."""
+    command = [sys.executable, "-c", MEASURED, "build-lod", str(path), "-o", str(output), "--overwrite", "--json"]
+    start = time.perf_counter()
+    result = subprocess.run(command, capture_output=True, text=True, check=True)
+    wall = time.perf_counter() - start
+    record, peak = map(json.loads, result.stdout.splitlines())
+    return {
+        **record["seconds"],
+        "wall": wall,
+        "peak": peak * 1024,
+        "nodes": record["nodes"],
+        "bytes": record["bytes"],
+        "bits": record["fractional_bits"],
+    }
+
+
+def plain_bytes(path: Path, bits: int) -> int:
+    """Size of the plain SPZ of the same splats, of the same version, level and fractional bits, in their own order."""
+    options = spz.Options(fractional_bits=bits, threads=processors())
+    return sum(len(piece) for piece in spz.encode(Scene(load(path)), options))
+
+
+def spark(path: Path, runs: int) -> list[float]:
+    """Seconds of Spark's builder alone; empty where it cannot be run."""
+    if "SPARK_DIR" not in os.environ:
+        return []
+    command = ["node", str(HERE / "spark_build.mjs"), str(path), str(runs)]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    if result.returncode:
+        print(f"Spark failed on {path.name}: {result.stderr.strip().splitlines()[-1:]}", file=sys.stderr)
+        return []
+    return [json.loads(line)["build"] for line in result.stdout.splitlines()]
+
+
+def main() -> None:
+    """Prints Markdown tables."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("scenes", nargs="+", type=Path, help="splat files; the last is also tiled")
+    parser.add_argument("--millions", type=float, nargs="*", default=[0.1, 0.5, 1, 2, 5], help="sizes to tile to")
+    parser.add_argument("--runs", type=int, default=5, help="runs of each; medians are printed")
+    parser.add_argument("--spark-up-to", type=float, default=2, help="millions of splats that Spark is tried on")
+    arguments = parser.parse_args()
+    # The first touch of a page is slow on a virtual machine; a program that runs for long has its pages.
+    np.zeros(1 << 29, np.float64)[::512] = 1
+    print(f"Machine: {machine()}. Medians of {arguments.runs} runs.\n")
+    print("| " + " | ".join(HEADINGS) + " |")
+    print("|---" * len(HEADINGS) + "|")
+    with tempfile.TemporaryDirectory() as folder:
+        paths = list(arguments.scenes)
+        source = load(paths[-1])
+        for millions in arguments.millions:
+            path = Path(folder) / f"tiled-{millions:g}M.ply"
+            if not path.exists():
+                write_ply(path, tiled(source, int(millions * 1e6)))
+            paths.append(path)
+        del source
+        for path in paths:
+            row(path, Path(folder) / "out.spz", arguments)
+
+
+def row(path: Path, output: Path, arguments: argparse.Namespace) -> None:
+    """Measures one scene and prints its row."""
+    whole_command(path, output)  # fills caches, the operating system's and numba's
+    commands = [whole_command(path, output) for _ in range(arguments.runs)]
+    median = {key: statistics.median(run[key] for run in commands) for key in commands[0]}
+    warm = warm_build(path, arguments.runs)
+    splats = len(load(path))
+    theirs = spark(path, 3) if splats <= arguments.spark_up_to * 1e6 else []
+    ratio = median["bytes"] / plain_bytes(path, int(median["bits"]))
+    rates = [splats / seconds / 1e6 for seconds in warm]
+    cells = [
+        path.name,
+        f"{splats:,}",
+        f"{median['nodes']:,.0f}",
+        *(f"{median[stage]:.2f}" for stage in ("read", "build", "write", "wall")),
+        f"{median['peak'] / 1e6:.0f}",
+        f"{median['peak'] / path.stat().st_size:.1f}",
+        f"{median['bytes'] / 1e6:.1f}",
+        f"{ratio:.2f}",
+        f"{statistics.median(warm):.3f}",
+        f"{statistics.median(rates):.2f} ({min(rates):.2f} to {max(rates):.2f})",
+        f"{statistics.median(theirs):.2f}" if theirs else "",
+        f"{statistics.median(theirs) / statistics.median(warm):.1f}x" if theirs else "",
+    ]
+    print("| " + " | ".join(cells) + " |", flush=True)
+
+
+if __name__ == "__main__":
+    main()

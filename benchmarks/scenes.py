@@ -1,0 +1,60 @@
+"""Scenes to measure with: real ones, and larger ones tiled from them."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+
+import numpy as np
+
+from sparklod_cli.io import read_scene
+from sparklod_cli.sh import SH_C0
+from sparklod_cli.splats import Splats
+
+
+def tiled(splats: Splats, count: int, seed: int = 0) -> Splats:
+    """`count` splats: copies of a scene side by side on the ground, each centre jittered, in random order.
+
+    The jitter, half the largest scale of each splat, keeps copies from sharing the cells of the first; the order is as
+    random as training leaves it, which is harder on memory than a sorted scene.
+    """
+    rng = np.random.default_rng(seed)
+    copies = math.ceil(count / len(splats))
+    side = math.ceil(math.sqrt(copies))
+    low, high = np.percentile(splats.center, [1, 99], axis=0)
+    parts = []
+    for copy in range(copies):
+        offset = np.array([copy % side, 0, copy // side]) * (high - low)
+        jitter = rng.normal(0, 0.5, splats.center.shape) * splats.scale.max(axis=1, keepdims=True)
+        parts.append(dataclasses.replace(splats, center=(splats.center + offset + jitter).astype(np.float32)))
+    return Splats.concat(parts).take(rng.permutation(copies * len(splats))[:count])
+
+
+def write_ply(path: Path, splats: Splats) -> None:
+    """An Inria-style binary PLY, without normals."""
+    rest = splats.sh.transpose(0, 2, 1).reshape(len(splats), -1)
+    names = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", *(f"f_rest_{i}" for i in range(rest.shape[1]))]
+    names += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+    opacity = np.clip(splats.opacity, 1e-6, 1 - 1e-6)
+    columns = [
+        splats.center,
+        (splats.rgb - 0.5) / SH_C0,
+        rest,
+        np.log(opacity / (1 - opacity))[:, None],
+        np.log(splats.scale),
+        splats.quat_xyzw[:, [3, 0, 1, 2]],
+    ]
+    header = "\n".join(["ply", "format binary_little_endian 1.0", f"element vertex {len(splats)}"])
+    header += "".join(f"\nproperty float {name}" for name in names) + "\nend_header\n"
+    with path.open("wb") as file:
+        file.write(header.encode())
+        for start in range(0, len(splats), 1 << 18):
+            part = np.concatenate([column[start : start + (1 << 18)] for column in columns], axis=1)
+            file.write(part.astype("<f4").tobytes())
+
+
+def load(path: Path) -> Splats:
+    """The splats of a file that can be drawn."""
+    splats = read_scene(path, threads=2).splats
+    return splats.take((splats.opacity > 0) & (splats.scale.max(axis=1) > 0))

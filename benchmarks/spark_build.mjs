@@ -1,0 +1,46 @@
+// node spark_build.mjs FILE RUNS: seconds that Spark's own builder (its wasm, in Node) takes for a splat file.
+// SPARK_DIR names a folder whose node_modules holds @sparkjsdev/spark. Prints one JSON object a run.
+import fs from 'node:fs';
+import path from 'node:path';
+import vm from 'node:vm';
+
+const [file, runs = '3'] = process.argv.slice(2);
+const bundle = path.join(process.env.SPARK_DIR ?? '.', 'node_modules/@sparkjsdev/spark/dist/spark.module.js');
+const source = fs.readFileSync(bundle, 'utf8');
+const wasm = Buffer.from(source.match(/const WASM = decode64\("([^"]+)"\)/)[1], 'base64');
+const worker = vm.runInThisContext(source.match(/^const jsContent = (.*?);?$/m)[1]);
+
+// The worker talks through self.postMessage and tells the build's time in a line of its log.
+const log = [];
+const handlers = [];
+const answers = new Map();
+globalThis.self = {
+  addEventListener: (kind, handler) => handlers.push(handler),
+  removeEventListener: () => {},
+  postMessage: ({ id, result, error }) => {
+    if (result === undefined && error === undefined) return;
+    answers.get(id)?.(error === undefined ? { result } : { error });
+  },
+  performance,
+};
+const print = console.log;
+console.log = (...words) => log.push(words.join(' '));
+vm.runInThisContext(worker);
+const send = (data) => handlers.forEach((handler) => handler({ data }));
+send({ name: 'init-wasm', module: await WebAssembly.compile(wasm) });
+await new Promise((resolve) => setTimeout(resolve, 300));
+
+for (let run = 1; run <= Number(runs); run++) {
+  const fileBytes = new Uint8Array(fs.readFileSync(file));
+  const start = performance.now();
+  const { result, error } = await new Promise((resolve) => {
+    answers.set(run, resolve);
+    send({ id: run, name: 'loadExtSplats', args: { fileBytes, pathName: file, lod: true } });
+  });
+  if (error !== undefined) throw error;
+  const seconds = (performance.now() - start) / 1000;
+  const build = /Tiny LoD: (\d+) -> (\d+) \(([\d.]+) ms\)/.exec(log.join('\n'));
+  log.length = 0;
+  print(JSON.stringify({ nodes: result.lodSplats.numSplats, build: build && Number(build[3]) / 1000, all: seconds }));
+}
+process.exit(0);
