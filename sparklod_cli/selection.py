@@ -45,6 +45,8 @@ class Selection:
         Raises:
             InvalidSplatsError: some are not finite and `drop_invalid` is not set, or none is left.
         """
+        if len(splats) == 0:
+            raise InvalidSplatsError("it has no splats")
         finite = _finite(splats)
         if not (self.drop_invalid or finite.all()):
             bad = np.flatnonzero(~finite)
@@ -67,8 +69,7 @@ class Selection:
             dropped[reason] = before - int(np.count_nonzero(keep))
         dropped = {reason: count for reason, count in dropped.items() if count}
         if not keep.any():
-            why = f" ({describe(dropped)})" if dropped else ""
-            raise InvalidSplatsError(f"no splat is left of {len(splats):,}{why}" if len(splats) else "it has no splats")
+            raise InvalidSplatsError(f"no splat is left of {len(splats):,} ({describe(dropped)})")
         return (splats if keep.all() else splats.take(keep)), dropped
 
     def _inside(self, center: NDArray[np.float32]) -> NDArray[np.bool_]:

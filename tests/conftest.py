@@ -5,6 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
+
+# Machines differ by a factor of a hundred in speed, and the first example of a kernel compiles it.
+settings.register_profile("sparklod", deadline=None)
+settings.load_profile("sparklod")
 
 ROOT = Path(__file__).resolve().parents[1]
 FIXTURES = ROOT / "fixtures"

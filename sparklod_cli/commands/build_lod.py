@@ -14,7 +14,7 @@ import click
 
 from .. import limits
 from .console import Console
-from .options import AutoOr, Numbers, common_options
+from .options import AutoOr, Ball, Numbers, Real, common_options
 
 if TYPE_CHECKING:
     from ..bake import Baked, Recipe
@@ -52,7 +52,7 @@ Examples:
 @click.option("--overwrite", is_flag=True, help="Replace outputs that exist.")
 @click.option(
     "--base",
-    type=click.FloatRange(limits.MIN_BASE, limits.MAX_BASE),
+    type=Real(limits.MIN_BASE, limits.MAX_BASE),
     default=limits.DEFAULT_BASE,
     help="Growth of the voxel grid from level to level: nearer 1, smoother transitions and more nodes.",
 )
@@ -62,12 +62,10 @@ Examples:
     default=limits.MAX_SH_DEGREE,
     help="Leave out spherical harmonics above this degree.",
 )
-@click.option("--min-opacity", type=click.FloatRange(0, 1), default=0.0, help="Leave out splats of lower opacity.")
+@click.option("--min-opacity", type=Real(0, 1), default=0.0, help="Leave out splats of lower opacity.")
 @click.option("--min-box", type=Numbers("x", "y", "z"), help="Leave out splats whose centre is below this on any axis.")
 @click.option("--max-box", type=Numbers("x", "y", "z"), help="Leave out splats whose centre is above this on any axis.")
-@click.option(
-    "--within", type=Numbers("x", "y", "z", "radius"), help="Leave out splats whose centre is outside this ball."
-)
+@click.option("--within", type=Ball(), help="Leave out splats whose centre is outside this ball.")
 @click.option(
     "--on-invalid",
     type=click.Choice(["error", "drop"]),
@@ -106,7 +104,7 @@ def build_lod(
     verbose: bool,
     **settings: Any,
 ) -> None:
-    """Bake splat scenes into Level-of-Detail files that Spark streams.
+    """Bake splat scenes into Level-of-Detail files for Spark.
 
     Reads 3D Gaussian Splatting PLY and SPZ, merges splats into a tree, and writes it as SPZ with Spark's extension. The
     axes of the input are kept as they are.
@@ -172,7 +170,6 @@ def _prepare(settings: dict[str, Any], console: Console) -> Recipe:
 
     jit.use_threads(settings["threads"])
     jit.on_first_compile(lambda: console.say("Compiling for this machine; this happens once and takes a while ..."))
-    within = settings["within"]
     return Recipe(
         base=settings["base"],
         max_sh=settings["max_sh"],
@@ -181,7 +178,7 @@ def _prepare(settings: dict[str, Any], console: Console) -> Recipe:
             min_opacity=settings["min_opacity"],
             min_box=settings["min_box"],
             max_box=settings["max_box"],
-            within=within and (within[:3], within[3]),
+            within=settings["within"],
         ),
         spz=spz.Options(
             version=int(settings["spz_version"]),

@@ -36,6 +36,29 @@ class Numbers(click.ParamType):
         return self.name
 
 
+class Ball(Numbers):
+    """x, y, z and a positive radius, as ((x, y, z), radius)."""
+
+    def __init__(self) -> None:
+        super().__init__("x", "y", "z", "radius")
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        *center, radius = super().convert(value, param, ctx)
+        if radius <= 0:
+            self.fail(f"radius {radius:g} is not positive", param, ctx)
+        return tuple(center), radius
+
+
+class Real(click.FloatRange):
+    """A number of a range; unlike its base it knows that NaN is in none."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        number: float = super().convert(value, param, ctx)
+        if math.isnan(number):
+            self.fail(f"{value!r} is not a number", param, ctx)
+        return number
+
+
 class AutoOr(click.IntRange):
     """An integer of a range, or the word auto, which becomes None."""
 

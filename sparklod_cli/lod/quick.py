@@ -33,8 +33,8 @@ from .kernels.sort import Nodes, sort_by_cell, sort_by_key
 #: Cells count in int64; the finest level is the first at which the scene's coordinates stay below this.
 MAX_CELL = 2.0**61
 
-#: Bits an axis of the curve that the leaves are sorted along; with 10 bits of level they fill a 64-bit key.
-CURVE_BITS = 18
+#: Bits an axis of the curve that the leaves are sorted along; float32 sizes span 11 bits of levels, all fit a uint64.
+CURVE_BITS = 17
 
 Offsets = NDArray[np.int64]
 
@@ -115,10 +115,10 @@ def build(splats: Splats, base: float = DEFAULT_BASE, *, progress: Progress = si
         raise InvalidSplatsError("no splat is left to build a tree of")
     with threads_for(n) as threads:
         low, high, smallest, largest = extremes(splats.center, splats.scale, threads)
-        finest = math.floor(math.log(smallest, base)) - 1
-        steps = base ** np.arange(finest, math.ceil(math.log(largest, base)) + 2, dtype=np.float64)
-        usable = int(np.searchsorted(steps, max(np.abs(low).max(), np.abs(high).max()) / MAX_CELL))
-        index, joins = _sort_leaves(splats, steps, min(usable, len(steps) - 1), low, high, threads)
+        finest = math.floor(math.log(max(smallest, np.abs([low, high]).max() / MAX_CELL), base))
+        coarsest = max(finest + 1, math.ceil(math.log(largest, base)) + 1)
+        steps = base ** np.arange(finest, coarsest + 1, dtype=np.float64)
+        index, joins = _sort_leaves(splats, steps, low, high, threads)
         rows, weight = np.empty((2 * n, WIDTH), np.float32), np.empty(2 * n, np.float64)
         fill_leaves(index, splats.center, splats.scale, splats.quat_xyzw, splats.opacity, rows, weight)
         rgb, sh = splats.rgb, splats.sh
@@ -130,13 +130,13 @@ def build(splats: Splats, base: float = DEFAULT_BASE, *, progress: Progress = si
 
 
 def _sort_leaves(
-    splats: Splats, steps: NDArray[np.float64], finest_usable: int, low: Offsets, high: Offsets, threads: int
+    splats: Splats, steps: NDArray[np.float64], low: Offsets, high: Offsets, threads: int
 ) -> tuple[Nodes, Offsets]:
     """The order of the leaves, by natural level and then along a curve, and where each level ends in it."""
-    grid = max(float((high - low).max()) / (2**CURVE_BITS - 2), float(steps[finest_usable]))
+    grid = max(float((high - low).max()) / (2**CURVE_BITS - 2), float(steps[0]))
     low_cell = np.floor(low / grid).astype(np.int64)
     level_bits = len(steps).bit_length()
-    keys, levels = level_keys(splats.center, splats.scale, steps, finest_usable, grid, low_cell, 3 * CURVE_BITS)
+    keys, levels = level_keys(splats.center, splats.scale, steps, grid, low_cell, 3 * CURVE_BITS)
     index = np.arange(len(splats), dtype=np.uint32)
     _, index = sort_by_key(keys, index, 3 * CURVE_BITS + level_bits, threads)
     return index, np.cumsum(np.bincount(levels, minlength=len(steps)))
@@ -155,7 +155,7 @@ def _grow(
     active = np.empty(0, np.uint32)
     joined, level = 0, 0
     while True:
-        step = base ** float(finest + level)
+        step = np.float64(base) ** (finest + level)
         if joined < forest.leaves:
             new = np.arange(joined, joins[level], dtype=np.uint32)
             active, joined = np.concatenate([active, new]), int(joins[level])

@@ -17,17 +17,23 @@ from ...jit import kernel
 CENTER, SCALE, QUAT, OPACITY, WIDTH = 0, 3, 6, 10, 11  # first column of each, and the number of columns
 
 BLOCK = 256  # rows that are gathered before they are computed with, so that their cache misses overlap
+AXIS_FLOOR = np.float32(1e-20)
 THOMSEN_P32, THOMSEN_ROOT, THIRD = np.float32(THOMSEN_P), np.float32(1 / THOMSEN_P), np.float32(1 / 3)
 
 
 @kernel()
 def ellipsoid_area(a, b, c):
-    """Surface of an ellipsoid with semi-axes a, b, c (Knud Thomsen's formula); any of them may be 0, but not all."""
+    """Surface of an ellipsoid with semi-axes a, b, c (Knud Thomsen's formula).
+
+    Any of them may be 0, but not all: an axis counts as at least AXIS_FLOOR of the longest, so that a needle weighs
+    something.
+    """
     largest = max(a, b, c)
     smallest = min(a, b, c)
     middle = max(min(a, b), min(max(a, b), c))
     # Powers of ratios at most 1 stay in range, and in float32, where a power of a product of scales would not.
-    y, z = np.float32(middle / largest) ** THOMSEN_P32, np.float32(smallest / largest) ** THOMSEN_P32
+    y = max(np.float32(middle / largest), AXIS_FLOOR) ** THOMSEN_P32
+    z = max(np.float32(smallest / largest), AXIS_FLOOR) ** THOMSEN_P32
     mean = ((y + z + y * z) * THIRD) ** THOMSEN_ROOT
     return 4 * math.pi * np.float64(largest) * np.float64(largest) * np.float64(mean)
 

@@ -12,13 +12,13 @@ from .sort import morton_code
 
 
 @kernel(parallel=True)
-def level_keys(center, scale, steps, first_level, grid, low, cell_bits):
+def level_keys(center, scale, steps, grid, low, cell_bits):
     """Sort keys that order splats by natural level and, inside a level, along a Morton curve.
 
     Args:
         center, scale: (n, 3) float32.
-        steps: (L,) float64 ascending, a geometric series; the last is not below the largest size.
-        first_level: the lowest index into `steps` that a splat is put in.
+        steps: (L,) float64 ascending, a geometric series; the last is not below the largest size; what is smaller than
+            the first belongs to it.
         grid: edge of the cells of the curve, float64.
         low: (3,) int64 lowest cell of `grid`.
         cell_bits: bits of the curve, below the level's bits.
@@ -39,7 +39,7 @@ def level_keys(center, scale, steps, first_level, grid, low, cell_bits):
             level -= 1
         while size > steps[level]:
             level += 1
-        levels[i] = max(level, first_level)
+        levels[i] = level
         x, y, z = np.float64(center[i, 0]), np.float64(center[i, 1]), np.float64(center[i, 2])
         keys[i] = morton_code(x, y, z, grid, low, np.uint64(0)) | (np.uint64(levels[i]) << np.uint64(cell_bits))
     return keys, levels

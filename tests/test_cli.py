@@ -1,0 +1,219 @@
+"""The command line: arguments, messages, exit codes."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import click
+import pytest
+
+from sparklod_cli import __version__
+from sparklod_cli.cli import cli, run
+from sparklod_cli.io import read_scene
+
+from .conftest import FIXTURES, ROOT
+
+ONE, SMALL = FIXTURES / "one.ply", FIXTURES / "sh2.ply"
+
+
+def build(*arguments: object) -> int:
+    return run(["build-lod", *map(str, arguments)])
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    path = tmp_path / "scene.ply"
+    path.write_bytes(SMALL.read_bytes())
+    return path
+
+
+def test_an_input_is_baked_beside_itself(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert build(scene) == 0
+    out, err = capsys.readouterr()
+    assert out == ""
+    output = scene.with_name("scene-lod.spz")
+    baked = read_scene(output)
+    assert baked.tree is not None
+    assert f"{baked.tree.is_leaf.sum():,} splats, SH 2  ->  {output}  {len(baked.splats):,} nodes" in err
+
+
+def test_several_inputs_go_into_a_directory_that_is_made(tmp_path: Path) -> None:
+    assert build(ONE, SMALL, "--output-dir", tmp_path / "new" / "web") == 0
+    assert sorted(path.name for path in (tmp_path / "new" / "web").iterdir()) == ["one-lod.spz", "sh2-lod.spz"]
+
+
+def test_a_failure_does_not_stop_the_others(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    missing, broken = tmp_path / "missing.ply", tmp_path / "broken.ply"
+    broken.write_bytes(b"ply\nnonsense\nend_header\n")
+    assert build(missing, ONE, broken, SMALL, "--output-dir", tmp_path) == 1
+    err = capsys.readouterr().err
+    assert f"error: {missing}: cannot be read: no such file or directory\n" in err
+    assert f"error: {broken}: bad PLY header" in err
+    assert err.count("error:") == 2
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["broken.ply", "one-lod.spz", "sh2-lod.spz"]
+
+
+def test_an_existing_output_is_refused_without_overwrite(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    output = scene.with_name("scene-lod.spz")
+    output.write_bytes(b"precious")
+    assert build(scene) == 1
+    assert "exists, add --overwrite" in capsys.readouterr().err
+    assert output.read_bytes() == b"precious"
+    assert build(scene, "--overwrite") == 0
+    assert read_scene(output).tree is not None
+
+
+def test_json_is_an_object_a_file(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert build(scene, tmp_path / "missing.ply", "--json", "-q", "--base", 2, "--max-sh", 1) == 1
+    good, bad = map(json.loads, capsys.readouterr().out.splitlines())
+    output = scene.with_name("scene-lod.spz")
+    assert good["output"] == str(output)
+    assert good["bytes"] == output.stat().st_size
+    assert good["nodes"] == len(read_scene(output).splats)
+    assert (good["splats"], good["sh_degree"], good["dropped"]) == (len(read_scene(scene).splats), 1, {})
+    assert set(good["seconds"]) == {"read", "build", "write"}
+    assert bad == {"input": str(tmp_path / "missing.ply"), "error": "cannot be read: no such file or directory"}
+
+
+def test_options_reach_the_file(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert build(scene, "-o", tmp_path / "a.spz", "--json", "--spz-version", 2, "--fractional-bits", 9) == 0
+    record = json.loads(capsys.readouterr().out)
+    assert (record["version"], record["fractional_bits"]) == (2, 9)
+    assert read_scene(tmp_path / "a.spz").format == "SPZ 2 LoD"
+    sizes = {}
+    for base in (1.1, 2.0):
+        assert build(scene, "-o", tmp_path / f"{base}.spz", "--base", base) == 0
+        sizes[base] = len(read_scene(tmp_path / f"{base}.spz").splats)
+    assert sizes[1.1] > sizes[2.0]
+
+
+def test_what_is_dropped_is_said(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    splats = read_scene(scene).splats
+    x = float(sorted(splats.center[:, 0])[len(splats) // 2])
+    assert build(scene, "--max-box", f"{x},1e9,1e9", "--json") == 0
+    out, err = capsys.readouterr()
+    record = json.loads(out)
+    cropped = int((splats.center[:, 0] > x).sum())
+    assert record["dropped"] == {"cropped": cropped}
+    assert record["splats"] + cropped == record["read"] == len(splats)
+    assert f"dropped {cropped} cropped" in err
+
+
+def test_quiet_says_nothing_and_verbose_more(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert build(scene, "-q") == 0
+    assert capsys.readouterr() == ("", "")
+    assert build(scene, "-v", "--overwrite") == 0
+    assert "fractional bits; read" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "Missing argument"),
+        (["a.ply", "--base", "1.05"], "--base"),
+        (["a.ply", "--base", "nan"], "--base"),
+        (["a.ply", "--spz-version", "4"], "--spz-version"),
+        (["a.ply", "--fractional-bits", "25"], "--fractional-bits"),
+        (["a.ply", "--fractional-bits", "many"], "--fractional-bits"),
+        (["a.ply", "--min-box", "1,2"], "x,y,z"),
+        (["a.ply", "--max-box", "1,2,nan"], "x,y,z"),
+        (["a.ply", "--within", "1,2,3"], "x,y,z,radius"),
+        (["a.ply", "--within", "1,2,3,-1"], "radius"),
+        (["a.ply", "b.ply", "-o", "c.spz"], "-o takes one input"),
+        (["a.ply", "-o", "c.spz", "--output-dir", "d"], "exclude each other"),
+        (["x/a.ply", "y/a.ply", "--output-dir", "d"], "would both be written to"),
+        (["a.ply", "-o", "-", "--json"], "standard output"),
+        (["a.ply", "--threads", "0"], "--threads"),
+    ],
+)
+def test_wrong_usage_is_exit_code_2(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert build(*arguments) == 2
+    assert message in capsys.readouterr().err
+
+
+def sparklod(*arguments: object, **how: object) -> subprocess.CompletedProcess[bytes]:
+    command = [sys.executable, "-m", "sparklod_cli", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, check=False, cwd=ROOT, **how)
+
+
+def test_standard_output_takes_the_file(tmp_path: Path) -> None:
+    result = sparklod("build-lod", SMALL, "-o", "-")
+    assert result.returncode == 0
+    (tmp_path / "out.spz").write_bytes(result.stdout)
+    assert read_scene(tmp_path / "out.spz").tree is not None
+
+
+def test_a_reader_that_goes_away_is_a_failure_without_a_traceback() -> None:
+    command = f"{sys.executable} -m sparklod_cli build-lod {FIXTURES / 'demo.ply'} -o - | head -c 10 > {os.devnull}"
+    result = subprocess.run(["bash", "-c", f"set -o pipefail; {command}"], capture_output=True, check=False, cwd=ROOT)
+    assert result.returncode == 1
+    assert b"Traceback" not in result.stderr
+    assert b"broken pipe" in result.stderr
+
+
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
+def test_an_interruption_leaves_nothing_behind(tmp_path: Path, how: signal.Signals) -> None:
+    source = FIXTURES / "demo.ply"
+    command = [sys.executable, "-m", "sparklod_cli", "build-lod", str(source), "--output-dir", str(tmp_path), "-q"]
+    # Wherever it is caught: while it imports, reads, compiles, builds or writes.
+    for delay in (0.4, 0.7, 1.0):
+        process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE)
+        time.sleep(delay)
+        process.send_signal(how)
+        _, err = process.communicate()
+        left = [path.name for path in tmp_path.iterdir()]
+        if process.returncode == 0:  # it was done before
+            assert left == ["demo-lod.spz"]
+            (tmp_path / "demo-lod.spz").unlink()
+        else:
+            assert left == []
+            assert b"Exception ignored" not in err
+
+
+def test_version_and_help_everywhere() -> None:
+    for arguments in (["--version"], ["build-lod", "--version"]):
+        assert sparklod(*arguments).stdout.decode() == f"sparklod, version {__version__}\n"
+    for arguments in (["--help"], ["build-lod", "--help"]):
+        assert b"Usage: sparklod" in sparklod(*arguments).stdout
+    assert b"Examples:" in sparklod("build-lod", "--help").stdout
+
+
+def test_help_imports_nothing_heavy() -> None:
+    code = "import sys; from sparklod_cli.cli import run; run(sys.argv[1:]); print(*sys.modules, file=sys.stderr)"
+    for arguments in (["--help"], ["build-lod", "--help"]):
+        result = subprocess.run(
+            [sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=True, cwd=ROOT
+        )
+        modules = set(result.stderr.split())
+        assert not modules & {"numpy", "numba", "plyfile", "zstandard", "tqdm", "open3d", "pyvista"}
+
+
+def test_completion_knows_the_options() -> None:
+    words = {"COMP_WORDS": "sparklod build-lod --over", "COMP_CWORD": "2", "_SPARKLOD_COMPLETE": "bash_complete"}
+    code = "from sparklod_cli.cli import cli; cli(prog_name='sparklod')"
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=ROOT, env={**os.environ, **words}
+    )
+    assert "--overwrite" in result.stdout
+
+
+def test_the_readme_quotes_the_help() -> None:
+    """Made by `python -m tests.test_cli`."""
+    assert help_text() in (ROOT / "README.md").read_text()
+
+
+def help_text() -> str:
+    command = cli.get_command(click.Context(cli), "build-lod")
+    assert command is not None
+    context = click.Context(command, info_name="sparklod build-lod", terminal_width=100, max_content_width=100)
+    return command.get_help(context)
+
+
+if __name__ == "__main__":
+    print(help_text())
