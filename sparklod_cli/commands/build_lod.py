@@ -52,17 +52,19 @@ Examples:
 @click.option("--overwrite", is_flag=True, help="Replace outputs that exist.")
 @click.option(
     "--base",
+    metavar="N",
     type=Real(limits.MIN_BASE, limits.MAX_BASE),
     default=limits.DEFAULT_BASE,
     help="Growth of the voxel grid from level to level: nearer 1, smoother transitions and more nodes.",
 )
 @click.option(
     "--max-sh",
+    metavar="N",
     type=click.IntRange(0, limits.MAX_SH_DEGREE),
     default=limits.MAX_SH_DEGREE,
     help="Leave out spherical harmonics above this degree.",
 )
-@click.option("--min-opacity", type=Real(0, 1), default=0.0, help="Leave out splats of lower opacity.")
+@click.option("--min-opacity", metavar="N", type=Real(0, 1), default=0.0, help="Leave out splats of lower opacity.")
 @click.option("--min-box", type=Numbers("x", "y", "z"), help="Leave out splats whose centre is below this on any axis.")
 @click.option("--max-box", type=Numbers("x", "y", "z"), help="Leave out splats whose centre is above this on any axis.")
 @click.option("--within", type=Ball(), help="Leave out splats whose centre is outside this ball.")
@@ -86,6 +88,7 @@ Examples:
 )
 @click.option(
     "--compression-level",
+    metavar="N",
     type=click.IntRange(limits.MIN_COMPRESSION, limits.MAX_COMPRESSION),
     default=limits.DEFAULT_COMPRESSION,
     help="1 is fast, 9 small.",

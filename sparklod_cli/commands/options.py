@@ -85,7 +85,12 @@ def common_options(command: Command) -> Command:
         click.option("-q", "--quiet", is_flag=True, help="Say nothing but errors."),
         click.option("--json", "as_json", is_flag=True, help="Print one JSON object a file on standard output."),
         click.option(
-            "--threads", type=click.IntRange(1, 256), default=processors, show_default="all", help="Threads to work on."
+            "--threads",
+            metavar="N",
+            type=click.IntRange(1, 256),
+            default=processors,
+            show_default="all",
+            help="Threads to work on.",
         ),
     ):
         command = option(command)
