@@ -6,6 +6,7 @@ import os
 import signal
 import sys
 from importlib import import_module
+from types import FrameType
 from typing import NoReturn
 
 import click
@@ -63,11 +64,30 @@ def run(arguments: list[str] | None = None) -> int:
     return code if isinstance(code, int) else 0
 
 
-def _terminate(signum: int, frame: object) -> NoReturn:
+def _interrupt(signum: int, frame: FrameType | None) -> None:
+    """Raises `KeyboardInterrupt`, but not inside numba.
+
+    LLVM calls back into Python there; an exception in such a call is lost, and what LLVM gets instead of an answer can
+    crash the process. So the signal is tried again a moment later.
+    """
+    at = frame if hasattr(signal, "setitimer") else None
+    while at is not None:
+        if at.f_globals.get("__name__", "").partition(".")[0] in ("numba", "llvmlite"):
+            signal.signal(signal.SIGALRM, _interrupt)
+            signal.setitimer(signal.ITIMER_REAL, 0.005)
+            return
+        at = at.f_back
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_DFL)  # a second one does not wait for the cleaning up
     raise KeyboardInterrupt
 
 
 def main() -> NoReturn:
     """Entry point of the script; a polite kill cleans up as Ctrl-C does."""
-    signal.signal(signal.SIGTERM, _terminate)
-    sys.exit(run())
+    signal.signal(signal.SIGINT, _interrupt)
+    signal.signal(signal.SIGTERM, _interrupt)
+    code = run()
+    for name in ("SIGINT", "SIGTERM", "SIGALRM"):
+        if hasattr(signal, name):
+            signal.signal(getattr(signal, name), signal.SIG_IGN)  # what there was to do is done
+    sys.exit(code)

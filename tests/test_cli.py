@@ -211,7 +211,8 @@ def test_the_readme_quotes_the_help() -> None:
 def help_text() -> str:
     command = cli.get_command(click.Context(cli), "build-lod")
     assert command is not None
-    context = click.Context(command, info_name="sparklod build-lod", terminal_width=100, max_content_width=100)
+    width = {"terminal_width": 100, "max_content_width": 100}
+    context = click.Context(command, info_name="sparklod build-lod", **width, **command.context_settings)
     return command.get_help(context)
 
 
