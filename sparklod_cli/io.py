@@ -51,12 +51,15 @@ def check_writable(path: Path, *, overwrite: bool, make_parent: bool = False) ->
             path.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise OutputError(f"cannot make {path.parent}: {_reason(error)}") from None
-    if path.is_dir():
-        raise OutputError(f"{path} is a directory")
-    if path.is_file() and not overwrite:
-        raise OutputError(f"{path} exists, add --overwrite to replace it")
-    if not path.parent.is_dir():
-        raise OutputError(f"the directory {path.parent} does not exist")
+    try:
+        if path.is_dir():
+            raise OutputError(f"{path} is a directory")
+        if path.is_file() and not overwrite:
+            raise OutputError(f"{path} exists, add --overwrite to replace it")
+        if not path.parent.is_dir():
+            raise OutputError(f"the directory {path.parent} does not exist")
+    except OSError as error:
+        raise OutputError(f"cannot write {path}: {_reason(error)}") from None
 
 
 def write_whole(path: Path, pieces: Iterable[bytes], *, overwrite: bool) -> int:
@@ -68,9 +71,9 @@ def write_whole(path: Path, pieces: Iterable[bytes], *, overwrite: bool) -> int:
         OutputError: it exists and `overwrite` is not set, or the file system refused something.
     """
     check_writable(path, overwrite=overwrite)
-    target = Path(os.path.realpath(path))
-    special = target.exists() and not target.is_file()  # a pipe or a device is written to, never replaced
-    temporary = target if special else target.with_name(f".{target.name}.{secrets.token_hex(4)}.part")
+    special = path.exists() and not path.is_file()  # a pipe or a device is written to, never replaced
+    target = path if special else Path(os.path.realpath(path))
+    temporary = target if special else target.with_name(f".sparklod-{secrets.token_hex(8)}.part")
     try:
         with temporary.open("wb" if special else "xb") as file:
             size = sum(file.write(piece) for piece in pieces)

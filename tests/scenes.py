@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from fixtures import by_hand
 from sparklod_cli.gaussian import normalized_quat
-from sparklod_cli.sh import COEFFICIENTS
+from sparklod_cli.sh import COEFFICIENTS, SH_C0
 from sparklod_cli.splats import Splats
 
 
@@ -22,3 +23,17 @@ def random_splats(count: int, *, sh_degree: int = 0, seed: int = 0, extent: floa
         rgb=rng.uniform(0, 1, size=(count, 3)).astype(f32),
         sh=np.clip(rng.normal(0, 0.15, size=(count, COEFFICIENTS[sh_degree], 3)), -0.9, 0.9).astype(f32),
     )
+
+
+def splat_columns(count: int, *, sh_degree: int = 0, seed: int = 0) -> dict[str, np.ndarray]:
+    """The vertex properties of plausible splats as a 3DGS PLY stores them, for `fixtures.by_hand.ply`; float32."""
+    splats = random_splats(count, sh_degree=sh_degree, seed=seed)
+    columns = by_hand.ply_columns(
+        center=splats.center,
+        log_scale=np.log(splats.scale),
+        quat_wxyz=splats.quat_xyzw[:, [3, 0, 1, 2]],
+        logit=np.log(splats.opacity / (1.001 - splats.opacity)),
+        dc=(splats.rgb - 0.5) / SH_C0,
+        sh=splats.sh,
+    )
+    return {name: np.array(column, np.float32) for name, column in columns.items()}

@@ -77,6 +77,7 @@ def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> 
     """
     header = _read_header(file)
     coefficients = _checked_coefficients(header)
+    _check_size(header, file.seek(0, io.SEEK_END) - header.size)
     degree, count = degree_of(coefficients), header.vertices
     splats = Splats.empty(count, min(degree, MAX_SH_DEGREE))
 
@@ -97,7 +98,7 @@ def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> 
 def _decode_rows(rows: NDArray[Any], out: Splats, part: slice, channel_stride: int) -> None:
     """Fills rows `part` of the columns from structured rows; f_rest holds all red coefficients first."""
     # Infinite logits and logarithms are what converters write for an opacity of 0 or 1 and a scale of 0.
-    with np.errstate(over="ignore"):
+    with np.errstate(over="ignore", invalid="ignore"):
         for column, names, decoder in COLUMNS:
             raw = np.stack([rows[name] for name in names], axis=1).astype(np.float32, copy=False)
             getattr(out, column)[part] = decoder(raw).reshape(getattr(out, column)[part].shape)
@@ -148,13 +149,21 @@ def _checked_coefficients(header: Header) -> int:
     return rest // 3
 
 
-def _binary_rows(file: BinaryIO, header: Header) -> NDArray[Any]:
-    size = file.seek(0, io.SEEK_END) - header.size
-    for name, (_, count) in header.elements.items():
+def _check_size(header: Header, size: int) -> None:
+    """Raises `FormatError` where `size` bytes cannot hold what the header promises, before memory is asked for."""
+    need = 0
+    for name, (element, count) in header.elements.items():
         row_type = header.row_type(name)
-        size -= count * row_type.itemsize if row_type else 0
-    if size < 0:
-        raise FormatError(f"cut short: {-size:,} bytes are missing of what the header promises")
+        if header.text:
+            need += count * 2 * max(1, len(element.properties))  # a digit and a separator a value
+        else:
+            need += count * (row_type.itemsize if row_type else 1)
+    missing = need - size - (1 if header.text else 0)  # the last separator may be missing
+    if missing > 0:
+        raise FormatError(f"cut short: {missing:,} bytes are missing of what the header promises")
+
+
+def _binary_rows(file: BinaryIO, header: Header) -> NDArray[Any]:
     file.seek(0)
     try:
         rows: NDArray[Any] = PlyData.read(file, mmap="r")["vertex"].data
@@ -165,11 +174,7 @@ def _binary_rows(file: BinaryIO, header: Header) -> NDArray[Any]:
 
 def _text_rows(file: BinaryIO, header: Header) -> Iterator[tuple[slice, NDArray[Any]]]:
     """The vertices of an ascii file in chunks; plyfile's own reader goes value by value in Python."""
-    size = file.seek(0, io.SEEK_END) - header.size
     row_type = header.row_type("vertex")
-    assert row_type is not None
-    if header.vertices * 2 * len(row_type.names or ()) > size + 1:  # a digit and a separator a value
-        raise FormatError(f"cut short: {size:,} bytes cannot hold {header.vertices:,} vertices")
     file.seek(header.size)
     for name, (_, count) in header.elements.items():
         if name == "vertex":
@@ -177,10 +182,13 @@ def _text_rows(file: BinaryIO, header: Header) -> Iterator[tuple[slice, NDArray[
         deque(islice(file, count), maxlen=0)
     for start in range(0, header.vertices, CHUNK):
         wanted = min(CHUNK, header.vertices - start)
+        lines = list(islice(file, wanted))
+        if len(lines) < wanted:
+            raise FormatError(f"cut short after {start + len(lines):,} of {header.vertices:,} vertices")
         try:
-            rows = np.loadtxt(list(islice(file, wanted)), dtype=row_type, ndmin=1, comments=None)
+            rows = np.loadtxt(lines, dtype=row_type, ndmin=1, comments=None)
         except ValueError as error:
             raise FormatError(f"bad PLY data after vertex {start:,}: {error}") from None
         if len(rows) < wanted:
-            raise FormatError(f"cut short after {start + len(rows):,} of {header.vertices:,} vertices")
+            raise FormatError(f"empty lines among the vertices after {start:,}")
         yield slice(start, start + wanted), rows

@@ -1,0 +1,258 @@
+"""PLY in all the shapes that writers give it."""
+
+from __future__ import annotations
+
+import io
+import math
+import re
+import tracemalloc
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from plyfile import PlyElement
+
+from fixtures import by_hand
+from sparklod_cli.codecs import ply
+from sparklod_cli.errors import FormatError
+from sparklod_cli.scene import Scene
+from sparklod_cli.splats import COLUMNS
+
+from ..conftest import FIXTURES
+
+SH_C0 = 0.28209479177387814
+
+
+def columns(count: int = 5, sh_degree: int = 0) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(7)
+    sh = rng.normal(size=(count, by_hand.SH_COEFFICIENTS[sh_degree], 3))
+    values = [rng.normal(size=(count, width)) for width in (3, 3, 4, 1, 3)]
+    return by_hand.ply_columns(values[0], values[1], values[2], values[3][:, 0], values[4], sh)
+
+
+def decode(data: bytes) -> Scene:
+    return ply.decode(io.BytesIO(data))
+
+
+def assert_same(one: Scene, other: Scene) -> None:
+    for column in COLUMNS:
+        np.testing.assert_array_equal(getattr(one.splats, column), getattr(other.splats, column), column)
+
+
+def test_every_column_by_hand() -> None:
+    center = [[1.5, -2.25, 1e6], [0, 0, 0]]
+    rest = np.arange(2 * 9).reshape(2, 9) / 16
+    data = by_hand.ply(
+        by_hand.ply_columns(
+            center,
+            [[0, 1, -1]] * 2,
+            [[2, 0, 0, 0], [0, 0, -3, 4]],
+            [0, math.log(3)],
+            [[0, 1, -1]] * 2,
+            rest.reshape(2, 3, 3),
+        )
+    )
+    scene = decode(data)
+    splats = scene.splats
+    assert (scene.format, scene.tree, scene.antialiased, scene.notes) == ("PLY", None, False, ())
+    np.testing.assert_array_equal(splats.center, center)
+    np.testing.assert_allclose(splats.scale, [[1, math.e, 1 / math.e]] * 2, rtol=1e-6)
+    np.testing.assert_allclose(splats.quat_xyzw, [[0, 0, 0, 1], [0, -0.6, 0.8, 0]], atol=1e-7)
+    np.testing.assert_allclose(splats.opacity, [0.5, 0.75], rtol=1e-6)
+    np.testing.assert_allclose(splats.rgb, [[0.5, 0.5 + SH_C0, 0.5 - SH_C0]] * 2, rtol=1e-6)
+    np.testing.assert_array_equal(splats.sh, rest.reshape(2, 3, 3))
+
+
+@pytest.mark.parametrize("sh_degree", [0, 1, 2, 3, 4])
+def test_f_rest_has_all_of_red_first(sh_degree: int) -> None:
+    coefficients = by_hand.SH_COEFFICIENTS[sh_degree]
+    given = columns()
+    given |= {f"f_rest_{index}": np.full(5, index) for index in range(3 * coefficients)}
+    scene = decode(by_hand.ply(given))
+    kept = min(coefficients, 15)
+    assert scene.splats.sh.shape == (5, kept, 3)
+    expected = np.arange(3 * coefficients).reshape(3, coefficients).T[:kept]
+    np.testing.assert_array_equal(scene.splats.sh, np.broadcast_to(expected, (5, kept, 3)))
+    assert scene.notes == (("SH degree 4 is cut to 3",) if sh_degree == 4 else ())
+
+
+@pytest.mark.parametrize("variant", ["sh1-ascii", "sh1-big-endian"])
+def test_fixture_variants_hold_the_same(variant: str) -> None:
+    both = [decode((FIXTURES / f"{name}.ply").read_bytes()) for name in ("sh1", variant)]
+    assert_same(*both)
+
+
+def some_faces(count: int = 3) -> PlyElement:
+    faces = np.empty(count, [("vertex_indices", "O"), ("flag", "u1")])
+    faces["vertex_indices"] = [list(range(index)) for index in range(count)]
+    return PlyElement.describe(faces, "face", len_types={"vertex_indices": "u1"}, val_types={"vertex_indices": "i4"})
+
+
+def some_cameras(count: int = 4) -> PlyElement:
+    return PlyElement.describe(np.ones(count, [("view", "f8"), ("id", "u1")]), "camera")
+
+
+def shuffled(given: dict[str, Any]) -> dict[str, Any]:
+    names = np.random.default_rng(8).permutation(sorted(given))
+    return {name: given[name] for name in names}
+
+
+LAYOUTS: dict[str, Callable[[dict[str, Any], bool], bytes]] = {
+    "shuffled": lambda c, text: by_hand.ply(shuffled(c), text=text),
+    "no normals": lambda c, text: by_hand.ply({k: v for k, v in c.items() if k[0] != "n"}, text=text),
+    "extra properties": lambda c, text: by_hand.ply(
+        {"red": [255] * 5, **c, "label": [-7] * 5}, text=text, types={"red": "u1", "label": "i2"}
+    ),
+    "mixed types": lambda c, text: by_hand.ply(c, text=text, types={"x": "f8", "f_rest_3": "f8", "opacity": "f8"}),
+    "scalars before": lambda c, text: by_hand.ply(c, text=text, before=[some_cameras()]),
+    "scalars after": lambda c, text: by_hand.ply(c, text=text, after=[some_cameras()]),
+    "lists before": lambda c, text: by_hand.ply(c, text=text, before=[some_faces()]),
+    "lists after": lambda c, text: by_hand.ply(c, text=text, after=[some_faces()]),
+    "all around": lambda c, text: by_hand.ply(
+        c, text=text, before=[some_cameras(), some_faces()], after=[PlyElement.describe(np.ones(2, [("a", "i4")]), "b")]
+    ),
+    "comments": lambda c, text: by_hand.ply(c, text=text).replace(
+        b"element vertex", b"comment element vertex 99\nobj_info made by hand\ncomment\nelement vertex"
+    ),
+    "CRLF header": lambda c, text: crlf_header(by_hand.ply(c, text=text)),
+}
+
+
+def crlf_header(data: bytes) -> bytes:
+    at = data.index(b"end_header\n") + len(b"end_header\n")
+    return data[:at].replace(b"\n", b"\r\n") + data[at:]
+
+
+@pytest.mark.parametrize("text", [False, True], ids=["binary", "ascii"])
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_layout_makes_no_difference(layout: str, text: bool) -> None:
+    given = columns(sh_degree=1)
+    given = {name: np.asarray(values, np.float32) for name, values in given.items()}  # so that doubles are no better
+    assert_same(decode(LAYOUTS[layout](given, text)), decode(by_hand.ply(given)))
+
+
+@pytest.mark.parametrize("text", [False, True], ids=["binary", "ascii"])
+def test_doubles_are_rounded_to_float32(text: bool) -> None:
+    given = columns(sh_degree=3)
+    scene = decode(by_hand.ply(given, text=text, types="f8"))
+    np.testing.assert_array_equal(scene.splats.center[:, 1], given["y"].astype(np.float32))
+    assert_same(scene, decode(by_hand.ply(given, text=text, types="f4")))
+
+
+def test_crlf_throughout_an_ascii_file() -> None:
+    data = by_hand.ply(columns(), text=True)
+    assert_same(decode(data.replace(b"\n", b"\r\n")), decode(data))
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("text", [False, True], ids=["binary", "ascii"])
+def test_infinite_logits_and_logarithms_are_what_they_mean(text: bool) -> None:
+    given = columns()
+    given["opacity"][:] = [np.inf, -np.inf, 1000, -1000, 0]
+    given["scale_1"][:] = [-np.inf, -1000, 0, 0, 0]
+    splats = decode(by_hand.ply(given, text=text)).splats
+    assert splats.opacity.tolist() == [1, 0, 1, 0, 0.5]
+    assert splats.scale[:, 1].tolist() == [0, 0, 1, 1, 1]
+
+
+@pytest.mark.filterwarnings("error")
+def test_what_is_not_finite_is_passed_on_quietly() -> None:
+    """Whether it is an error is for `selection` to say; a reader that warned would print on standard error."""
+    given = columns()
+    rows = bytearray(by_hand.ply(given))
+    signalling = (0x7FA00000).to_bytes(4, "little")  # a NaN that raises a flag when it is used
+    rows[-4 * len(given) :] = signalling * len(given)
+    splats = decode(bytes(rows)).splats
+    for column in ("center", "scale", "quat_xyzw", "opacity", "rgb"):
+        assert np.isnan(getattr(splats, column)[-1]).all(), column
+        assert np.isfinite(getattr(splats, column)[:-1]).all(), column
+
+
+def test_rotations_of_any_length_become_unit() -> None:
+    given = columns()
+    for length, name in enumerate(["rot_0", "rot_1", "rot_2", "rot_3"]):
+        given[name][:] = np.array([1e-30, 1e-3, 1, 1e3, 1e30]) * (length + 1)
+    quats = decode(by_hand.ply(given)).splats.quat_xyzw
+    np.testing.assert_allclose(quats, np.tile([2, 3, 4, 1], (5, 1)) / 30**0.5, rtol=1e-6)
+
+
+def test_a_rotation_of_no_length_is_not_a_number() -> None:
+    given = columns()
+    for name in ("rot_0", "rot_1", "rot_2", "rot_3"):
+        given[name][2] = 0
+    quats = decode(by_hand.ply(given)).splats.quat_xyzw
+    assert np.isnan(quats).any(axis=1).tolist() == [False, False, True, False, False]
+
+
+def test_the_table_names_what_is_required() -> None:
+    for name in ply.REQUIRED:
+        given = columns()
+        del given[name]
+        with pytest.raises(FormatError, match=rf"not Gaussian splats: its vertices have no {name}$"):
+            decode(by_hand.ply(given))
+
+
+def edited(old: str, new: str, data: bytes | None = None) -> bytes:
+    data = by_hand.ply(columns()) if data is None else data
+    assert old.encode() in data
+    return data.replace(old.encode(), new.encode(), 1)
+
+
+NO_VERTEX = b"ply\nformat ascii 1.0\nelement face 1\nproperty int a\nend_header\n1\n"
+TEXT = by_hand.ply(columns(), text=True)
+REFUSED: dict[str, tuple[Callable[[], bytes], str]] = {
+    "list property": (lambda: edited("property float nx", "property list uchar float nx"), "list properties"),
+    "negative count": (lambda: edited("vertex 5", "vertex -5"), "bad PLY header"),
+    "count of no number": (lambda: edited("vertex 5", "vertex five"), "bad PLY header"),
+    "no count": (lambda: edited("vertex 5", "vertex"), "bad PLY header"),
+    "two of a property": (lambda: edited("property float ny", "property float nx"), "bad PLY header"),
+    "two of an element": (
+        lambda: edited("end_header", "element vertex 0\nproperty int a\nend_header"),
+        "bad PLY header",
+    ),
+    "unknown type": (lambda: edited("property float ny", "property half ny"), "bad PLY header"),
+    "unknown format": (lambda: edited("binary_little_endian", "binary_middle_endian"), "bad PLY header"),
+    "no end of the header": (lambda: edited("end_header", "end_heading"), "does not end"),
+    "not ascii": (lambda: edited("property float nx", "property float ü"), "bad PLY header"),
+    "not PLY": (lambda: b"plain text\nthat goes on\n", "not a PLY file"),
+    "no vertex": (lambda: NO_VERTEX, "no vertex element"),
+    "point cloud": (lambda: (FIXTURES / "points.ply").read_bytes(), "a point cloud or mesh, not Gaussian splats"),
+    "compressed": (
+        lambda: (
+            b"ply\nformat ascii 1.0\nelement chunk 0\nproperty float min_x\nelement vertex 0\n"
+            b"property uint packed_position\nend_header\n"
+        ),
+        "compressed PLY",
+    ),
+    "five f_rest": (lambda: by_hand.ply(columns() | {f"f_rest_{i}": [0] * 5 for i in range(5)}), "5 f_rest properties"),
+    "six f_rest": (lambda: by_hand.ply(columns() | {f"f_rest_{i}": [0] * 5 for i in range(6)}), "2 SH coefficients"),
+    "f_rest from 1": (lambda: by_hand.ply(columns() | {f"f_rest_{i}": [0] * 5 for i in range(1, 10)}), "f_rest_0 on"),
+    "cut short": (lambda: by_hand.ply(columns())[:-1], "cut short: 1 bytes are missing"),
+    "ascii cut short": (lambda: TEXT[: TEXT.rindex(b"\n", 0, -1) + 1], "cut short after 4 of 5 vertices"),
+    "a short row": (lambda: TEXT[:-3].rsplit(b" ", 2)[0], "bad PLY data"),
+    "a word": (lambda: TEXT[:-5] + b" nul\n", "bad PLY data"),
+}
+
+
+@pytest.mark.parametrize("what", REFUSED)
+def test_refused_with_a_reason(what: str) -> None:
+    make, reason = REFUSED[what]
+    with pytest.raises(FormatError, match=reason):
+        decode(make())
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("count", ["4000000000", "18446744073709551615", "1" + "0" * 30])
+@pytest.mark.parametrize("element", ["vertex", "camera", "face"])
+@pytest.mark.parametrize("text", [False, True], ids=["binary", "ascii"])
+def test_a_count_that_cannot_be_is_refused_before_memory_is_asked_for(text: bool, element: str, count: str) -> None:
+    data = by_hand.ply(columns(), text=text, before=[some_cameras(), some_faces()])
+    data = re.sub(rf"element {element} \d+".encode(), f"element {element} {count}".encode(), data)
+    tracemalloc.start()
+    try:
+        with pytest.raises(FormatError):
+            decode(data)
+        assert tracemalloc.get_traced_memory()[1] < 1e7
+    finally:
+        tracemalloc.stop()

@@ -1,0 +1,266 @@
+"""SPZ against files that were put together by hand, and how the fractional bits are chosen."""
+
+from __future__ import annotations
+
+import gzip
+import io
+import math
+import struct
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fixtures import by_hand
+from sparklod_cli.codecs import spz
+from sparklod_cli.errors import FormatError
+from sparklod_cli.scene import Scene
+from sparklod_cli.splats import COLUMNS, Splats
+
+from ..conftest import FIXTURES
+from ..scenes import random_splats
+
+GOLDEN = FIXTURES / "golden"
+
+# --- Reading: every field of the three splats of fixtures/by_hand.py --------------------------------------------------
+
+STEP = 0.28209479177387814 / 0.15  # of a colour, for the whole range of a byte
+RGB = [[code / 255 * STEP - STEP / 2 + 0.5 for code in row] for row in ((0, 51, 102), (153, 204, 255), (127, 128, 0))]
+SCALE = [[1, 1 / math.e, math.e], [math.exp(-10), math.exp(5.9375), math.exp(-5)], [1.0644945, 0.9394131, 1]]
+THIRD = 3**-0.5
+FIRST_THREE = [
+    [0.6, -0.6, -1 / 255, 0.5291359],  # w is what is left of 1
+    [0.9999846, -0.0039215, 0.0039215, 0],
+    [-THIRD, -THIRD, -THIRD, 0],
+]
+PART = 0.5**0.5 / 511
+REST = (1 - (256**2 + 100**2) * PART**2) ** 0.5
+SMALLEST_THREE = [[0, 0, 0, 1], [511 * PART, 0, 0, 0.5**0.5], [-256 * PART, REST, 0, 100 * PART]]
+
+
+def golden(name: str) -> Scene:
+    with (GOLDEN / f"{name}.spz").open("rb") as file:
+        return spz.decode(file)
+
+
+@pytest.mark.parametrize(
+    ("name", "format_name", "sh_degree", "antialiased", "quats"),
+    [
+        ("hand-v1", "SPZ 1", 1, False, FIRST_THREE),
+        ("hand-v2", "SPZ 2", 2, False, FIRST_THREE),
+        ("hand-v3", "SPZ 3", 3, True, SMALLEST_THREE),
+        ("hand-v4", "SPZ 4", 3, True, SMALLEST_THREE),
+        ("hand-v4-sh4", "SPZ 4", 3, False, SMALLEST_THREE),  # its table of streams comes after 16 other bytes
+    ],
+)
+def test_every_field_of_a_file_made_by_hand(
+    name: str, format_name: str, sh_degree: int, antialiased: bool, quats: list[list[float]]
+) -> None:
+    scene = golden(name)
+    splats = scene.splats
+    assert (scene.format, scene.antialiased, scene.tree) == (format_name, antialiased, None)
+    assert scene.notes == (("SH degree 4 is cut to 3",) if name.endswith("sh4") else ())
+    np.testing.assert_array_equal(splats.center, [[1.5, -2.25, 0.125], [0, -100, 2047], [-0.5, 0.25, -2048]])
+    np.testing.assert_allclose(splats.opacity, [1, 0, 0.2], atol=1e-7)
+    np.testing.assert_allclose(splats.rgb, RGB, atol=1e-6)
+    np.testing.assert_allclose(splats.scale, SCALE, rtol=1e-6)
+    np.testing.assert_allclose(splats.quat_xyzw, quats, atol=1e-6)
+    assert splats.sh_degree == sh_degree
+    k, channel = np.mgrid[: splats.sh.shape[1], :3]
+    np.testing.assert_array_equal(splats.sh, np.broadcast_to((8 * k + channel - 128) / 128, splats.sh.shape))
+
+
+# --- Writing: every byte of a small tree ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_every_stream_of_a_tree(version: int) -> None:
+    data = gzip.decompress((GOLDEN / f"tree-v{version}.spz").read_bytes())
+    bits, count = 8, 8  # the smallest scale is e ** -1.5 (its largest axis: e ** -2.5), 16 steps of 1 / 256 and more
+    assert struct.unpack("<IIIBBBB", data[:16]) == (0x5053474E, version, count, 1, bits, 0x80, 0)
+    rotation = 4 if version == 3 else 3
+    ends = 16 + np.cumsum([9 * count, count, 3 * count, 3 * count, rotation * count, 9 * count, 2 * count, 4 * count])
+    position, alpha, color, scale, quat, sh, counts, starts = (
+        data[start:end] for start, end in zip([16, *ends], ends, strict=False)
+    )
+    assert len(data) == ends[-1]
+    assert position == by_hand.fixed24([[i, -0.5 * i, 0.25] for i in range(count)], bits)
+    assert list(alpha) == [237, 163, 115, 127, 32, 0, 127, 89]  # D of 1000 is 4.447, of 3.5 it is 2.099
+    rgb = np.linspace(-0.2, 1.2, 3 * count)
+    assert list(color) == [round((value - 0.5) / 0.28209479177387814 * 0.15 * 255 + 127.5) for value in rgb]
+    logs = [max(0, round((-0.5 * i + axis + 10) * 16)) for i in range(count) for axis in (1, 0, -1)]
+    assert list(scale) == logs
+    assert list(sh) == [math.floor((round(v * 128) + 132) / 8) * 8 for v in np.linspace(-0.9, 0.9, 9 * count)]
+    assert struct.unpack("<8H", counts) == (3, 2, 0, 2, 0, 0, 0, 0)
+    assert struct.unpack("<8I", starts) == (1, 4, 0, 6, 0, 0, 0, 0)
+    x, w = np.sin(np.arange(count) * 0.7), np.cos(np.arange(count) * 0.7)
+    if version == 2:
+        first = [round(abs(a) * math.copysign(1, a * b) * 127.5 + 127.5) for a, b in zip(x, w, strict=True)]
+        assert list(quat[::3]) == first
+        assert set(quat[1::3] + quat[2::3]) == {128}  # 127.5, to even
+    else:
+        codes = struct.unpack("<8I", quat)
+        assert [code >> 30 for code in codes] == [0 if abs(a) > abs(b) else 3 for a, b in zip(x, w, strict=True)]
+
+
+def test_a_tree_is_read() -> None:
+    scene = golden("tree-v3")
+    assert scene.format == "SPZ 3 LoD"
+    assert scene.tree is not None
+    assert scene.tree.child_count.tolist() == [3, 2, 0, 2, 0, 0, 0, 0]
+    assert scene.tree.child_start.tolist() == [1, 4, 0, 6, 0, 0, 0, 0]
+    d_root = 4 * (237 * 2 / 255) - 3
+    np.testing.assert_allclose(scene.splats.opacity[0], math.exp((d_root**2 - 1) / math.e), rtol=1e-5)
+    np.testing.assert_allclose(scene.splats.opacity[[3, 5]], [127 * 2 / 255, 0], rtol=1e-6)
+
+
+@pytest.mark.parametrize("version", [2, 3])
+@pytest.mark.parametrize("threads", [2, 5])
+def test_threads_do_not_change_a_file(version: int, threads: int) -> None:
+    scene = Scene(random_splats(40_000, sh_degree=1))  # more than two chunks of rows and five gzip blocks
+    one, many = (b"".join(spz.encode(scene, spz.Options(version=version, threads=count))) for count in (1, threads))
+    assert one == many
+    decoded = [spz.decode(io.BytesIO(one), threads=count).splats for count in (1, threads)]
+    for column in COLUMNS:
+        np.testing.assert_array_equal(getattr(decoded[0], column), getattr(decoded[1], column), column)
+
+
+# --- Fractional bits --------------------------------------------------------------------------------------------------
+
+
+def splats_with(*, reach: float = 1.0, scale: float = 0.01, count: int = 200) -> Splats:
+    splats = random_splats(count)
+    splats.center[:] = np.linspace(-reach, reach, count)[:, None]
+    splats.scale[:] = scale
+    return splats
+
+
+def bits_of(splats: Splats, fractional_bits: int | None = None) -> int | None:
+    return spz.resolve(splats, spz.Options(fractional_bits=fractional_bits)).fractional_bits
+
+
+@given(reach=st.floats(2.0**-10, 8_388_607, width=32))
+def test_the_most_bits_are_the_most_that_fit(reach: float) -> None:
+    splats = splats_with(reach=reach, count=2)
+    bits = spz.largest_fractional_bits(splats.center)
+    assert round(reach * 2.0**bits) <= 2**23 - 1
+    assert bits == 24 or round(reach * 2.0 ** (bits + 1)) > 2**23 - 1
+    back = spz.decode(io.BytesIO(b"".join(spz.encode(Scene(splats), spz.Options(fractional_bits=bits)))))
+    assert np.abs(back.splats.center.astype(np.float64) - splats.center).max() <= 0.5 * 2.0**-bits
+
+
+@given(log_scale=st.floats(-12, 6))
+def test_auto_is_the_fewest_bits_with_16_steps_in_a_small_splat(log_scale: float) -> None:
+    splats = splats_with(reach=1e-3, scale=math.exp(log_scale))  # so small that the extent sets no limit before 24
+    bits = bits_of(splats)
+    assert bits is not None
+    assert bits in (0, 24) or 16 * 2.0**-bits <= math.exp(log_scale) * 1.0001 < 16 * 2.0 ** (1 - bits) * 1.0002
+    assert bits > 0 or math.exp(log_scale) >= 16 * 0.9999
+    assert bits < 24 or math.exp(log_scale) <= 32 * 2.0**-24 * 1.0001
+
+
+def test_auto_looks_at_the_largest_scale_and_not_at_the_smallest_percent() -> None:
+    flat = splats_with(scale=0.25)
+    flat.scale[:, 2] = 1e-9
+    assert bits_of(flat) == 6
+    flat.scale[0] = 1e-9  # one of 200 is less than a percent
+    assert bits_of(flat) == 6
+    flat.scale[:5] = 1e-9
+    assert bits_of(flat) == 22  # as many as coordinates of 1 allow
+
+
+@pytest.mark.parametrize(("reach", "most"), [(0.4, 24), (1, 22), (100, 16), (2047, 12), (2049, 11), (8e6, 0)])
+def test_extent_limits_auto_and_refuses_more_by_name(reach: float, most: int) -> None:
+    splats = splats_with(reach=reach, scale=1e-12)
+    assert bits_of(splats) == most
+    assert bits_of(splats, most) == most
+    assert bits_of(splats, 0) == 0
+    if most < 24:
+        with pytest.raises(FormatError, match=rf"does not fit {most + 1} fractional bits, at most {most} would do"):
+            bits_of(splats, most + 1)
+
+
+def test_what_no_bits_hold_is_refused() -> None:
+    for bits in (None, 0):
+        with pytest.raises(FormatError, match=r"coordinates reach 1e\+07, SPZ holds at most 8388607"):
+            bits_of(splats_with(reach=1e7), bits)
+
+
+def test_only_versions_2_and_3_are_written() -> None:
+    for version in (1, 4):
+        with pytest.raises(ValueError, match="is not one of"):
+            spz.resolve(random_splats(1), spz.Options(version=version))
+
+
+def test_scales_out_of_range_counts_splats() -> None:
+    splats = random_splats(8)
+    splats.scale[:] = 1
+    low, high = math.exp(-10 - 1 / 32), math.exp(255.5 / 16 - 10)
+    assert spz.scales_out_of_range(splats) == 0
+    splats.scale[0] = low * 1.001  # rounds to the last code that is in
+    splats.scale[1] = high * 0.999
+    assert spz.scales_out_of_range(splats) == 0
+    splats.scale[2, 1] = low * 0.999
+    splats.scale[3, 2] = high * 1.001
+    splats.scale[4] = 0  # a splat counts once, however many of its axes are out
+    assert spz.scales_out_of_range(splats) == 3
+
+
+# --- What is refused --------------------------------------------------------------------------------------------------
+
+
+def gzipped(
+    version: int = 2, count: int = 3, degree: int = 0, bits: int = 12, flags: int = 0, more: bytes = b""
+) -> bytes:
+    return by_hand.spz_gzip(version, count, degree, bits, flags, [*by_hand.hand_streams(version, degree), more])
+
+
+def zstd(**changed: object) -> bytes:
+    settings = {"count": 3, "sh_degree": 0, "fractional_bits": 12, "flags": 0, "streams": by_hand.hand_streams(4, 0)}
+    return by_hand.spz_zstd(**(settings | changed))  # type: ignore[arg-type]
+
+
+def with_byte(data: bytes, at: int, value: int) -> bytes:
+    return data[:at] + bytes([value]) + data[at + 1 :]
+
+
+REFUSED: dict[str, tuple[Callable[[], bytes], str]] = {
+    "version 0": (lambda: gzipped(0), "SPZ version 0 is not known"),
+    "version 5": (lambda: gzipped(5), "SPZ version 5 is not known"),
+    "version 3 without gzip": (lambda: zstd(version=3), "version 3 is not gzipped"),
+    "SH degree 4 before version 4": (lambda: gzipped(3, degree=4), "SH degree 4 is not one that SPZ version 3 has"),
+    "SH degree 5": (lambda: with_byte(zstd(), 12, 5), "SH degree 5 is not one"),
+    "32 fractional bits": (lambda: gzipped(bits=32), "32 fractional bits"),
+    "more splats than data": (lambda: gzipped(count=4), "cut short: the header promises 4 splats"),
+    "more data than splats": (lambda: gzipped(more=b"!"), "more data than its header promises"),
+    "gzip of something else": (lambda: gzip.compress(b"something else that is long"), "not of an SPZ file"),
+    "gzip of little": (lambda: gzip.compress(b"NGSP"), "inside the SPZ header"),
+    "wrong checksum": (lambda: with_byte(gzipped(), len(gzipped()) - 8, gzipped()[-8] ^ 1), "corrupt gzip data"),
+    "no checksum": (lambda: gzipped()[:-8], "checksum is missing"),
+    "a table past the end": (lambda: with_byte(zstd(), 18, 1), "inside the table of streams"),
+    "too few streams": (lambda: with_byte(zstd(), 15, 4), "4 streams where"),
+    "a wrong size in the table": (lambda: zstd(sizes=[27, 4, 9, 9, 12]), "stream alphas has 4 bytes"),
+    "a frame of another size": (
+        lambda: zstd(streams=[b"", *by_hand.hand_streams(4, 0)[1:]], sizes=[27, 3, 9, 9, 12]),
+        "table says",
+    ),
+    "no tree in an LoD file": (lambda: gzipped(flags=0x80, more=struct.pack("<3H3I", *[0] * 6)), "LoD tree is broken"),
+    "an LoD file without splats": (lambda: by_hand.spz_gzip(2, 0, 0, 12, 0x80, []), "LoD tree is broken"),
+}
+
+
+@pytest.mark.parametrize("what", REFUSED)
+def test_refused_with_a_reason(what: str) -> None:
+    make, reason = REFUSED[what]
+    with pytest.raises(FormatError, match=reason):
+        spz.decode(io.BytesIO(make()))
+
+
+def test_what_follows_is_allowed_where_extensions_are_announced() -> None:
+    assert len(spz.decode(io.BytesIO(gzipped(flags=0x02, more=b"an extension"))).splats) == 3
+
+
+def test_more_streams_than_are_known_are_allowed() -> None:
+    assert len(spz.decode(io.BytesIO(zstd(streams=[*by_hand.hand_streams(4, 0), b"more"]))).splats) == 3

@@ -1,0 +1,171 @@
+"""The real Spark in a Node process, and its in-memory layouts as numpy columns."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from threading import Timer
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+PROGRAM = Path(__file__).with_name("spark_load.mjs")
+#: Far above what any file here takes; only there so that a hanging wasm fails the test and not the day.
+SECONDS = 120
+
+#: ExtSplats, one row for each of its two arrays of 16 bytes a splat.
+EXT0 = np.dtype([("center", "<f4", 3), ("alpha", "<f2"), ("padding", "<u2")])
+EXT1 = np.dtype([("rgb", "<f2", 3), ("log_scale", "<f2", 3), ("quat", "<u4")])
+#: A node of the LodTree. The count has a whole word, so that one that does not fit its uint16 shows up.
+NODE = np.dtype([("center", "<f2", 3), ("size", "<f2"), ("child_count", "<u4"), ("child_start", "<u4")])
+assert EXT0.itemsize == EXT1.itemsize == NODE.itemsize == 16
+
+#: Bits a coefficient of the SH arrays of PackedSplats.
+PACKED_SH_BITS = (7, 8, 6)
+
+
+@dataclass(frozen=True)
+class Reply:
+    """What Spark made of one file: its arrays of uint32, as they lie in memory."""
+
+    count: int
+    lod: bool
+    words: Mapping[str, NDArray[np.uint32]]
+
+    def rows(self, name: str, dtype: np.dtype[Any]) -> NDArray[Any]:
+        """(count,) structs of an array; Spark allocates whole rows of a texture, more than there are splats."""
+        return self.words[name].view(dtype)[: self.count]
+
+
+@dataclass(frozen=True)
+class ExtSplats:
+    """Decoded ExtSplats of N splats.
+
+    Attributes:
+        alpha: (N,) as stored: the opacity, and in an LoD file D = 1..5 as 1..2.
+        lod_opacity: (N,) D.
+        sh: (N, K, 3), K = 0, 3, 8 or 15.
+        nodes: (N,) `NODE` rows if Spark took the file for an LoD tree.
+    """
+
+    center: NDArray[np.float32]
+    alpha: NDArray[np.float64]
+    rgb: NDArray[np.float64]
+    log_scale: NDArray[np.float64]
+    quat_xyzw: NDArray[np.float64]
+    sh: NDArray[np.float64]
+    nodes: NDArray[Any] | None
+
+    @property
+    def lod_opacity(self) -> NDArray[np.float64]:
+        return self.alpha if self.nodes is None else np.where(self.alpha > 1, 4 * self.alpha - 3, self.alpha)
+
+
+class Spark:
+    """One Node process with Spark's worker in it; loads files one after the other."""
+
+    def __init__(self, package_dir: Path, scratch: Path) -> None:
+        self._scratch = scratch
+        self._asked = 0
+        self._stderr = scratch / "stderr.txt"
+        with self._stderr.open("wb") as stderr:
+            command = ["node", str(PROGRAM), str(package_dir)]
+            self._node = subprocess.Popen(
+                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=stderr, encoding="utf-8"
+            )
+
+    def close(self) -> None:
+        assert self._node.stdin and self._node.stdout
+        self._node.stdin.close()
+        self._node.stdout.close()
+        self._node.wait(SECONDS)
+
+    def _ask(self, method: str, source: bytes | Path, options: Mapping[str, Any]) -> Reply:
+        assert self._node.stdin and self._node.stdout
+        self._asked += 1
+        out = self._scratch / str(self._asked)
+        path = source if isinstance(source, Path) else out.with_suffix(".spz")
+        if isinstance(source, bytes):
+            path.write_bytes(source)
+        request = {"method": method, "path": str(path), "name": path.name, "options": options, "out": str(out)}
+        watchdog = Timer(SECONDS, self._node.kill)
+        watchdog.start()
+        try:
+            self._node.stdin.write(json.dumps(request) + "\n")
+            self._node.stdin.flush()
+            answer = json.loads(self._node.stdout.readline() or '{"error": "the Node process ended"}')
+        except BrokenPipeError:
+            answer = {"error": "the Node process ended"}
+        finally:
+            watchdog.cancel()
+        if "error" in answer:
+            raise AssertionError(f"Spark cannot load it: {answer['error']}\n{self._stderr.read_text()[-2000:]}")
+        words = {name: np.fromfile(file, "<u4") for name, file in answer["arrays"].items()}
+        for file in answer["arrays"].values():
+            Path(file).unlink()
+        return Reply(answer["numSplats"], answer["lod"], words)
+
+    def load(self, source: bytes | Path, *, lod: bool = False) -> ExtSplats:
+        """Loads the bytes of an SPZ file, or a file, as ExtSplats; `lod` builds a tree where it has none."""
+        reply = self._ask("loadExtSplats", source, {"lod": lod})
+        ext0, ext1 = reply.rows("ext0", EXT0), reply.rows("ext1", EXT1)
+        nodes = reply.words["lodTree"].view(NODE) if reply.lod else None
+        assert reply.lod == ("lodTree" in reply.words)
+        return ExtSplats(
+            center=ext0["center"],
+            alpha=ext0["alpha"].astype(np.float64),
+            rgb=ext1["rgb"].astype(np.float64),
+            log_scale=ext1["log_scale"].astype(np.float64),
+            quat_xyzw=_decode_quat(ext1["quat"]),
+            sh=_decode_ext_sh(reply),
+            nodes=nodes,
+        )
+
+    def load_packed_sh(self, source: bytes) -> NDArray[np.float64]:
+        """(N, K, 3) SH coefficients of a file as Spark's other layout, PackedSplats, holds them."""
+        reply = self._ask("loadPackedSplats", source, {})
+        parts = [np.zeros((reply.count, 0))]
+        for degree, bits in enumerate(PACKED_SH_BITS, 1):
+            if f"sh{degree}" not in reply.words:
+                break
+            size = 3 * (2 * degree + 1)
+            words = reply.words[f"sh{degree}"].reshape(-1, 2 if degree == 1 else 4)[: reply.count]
+            # Numbers of two's complement lie bit after bit, across words.
+            stream = np.unpackbits(words.view(np.uint8), axis=1, bitorder="little")[:, : size * bits]
+            weight = 2.0 ** np.arange(bits)
+            weight[-1] *= -1
+            parts.append(stream.reshape(reply.count, size, bits) @ weight / (2 ** (bits - 1) - 1))
+        return np.concatenate(parts, axis=1).reshape(reply.count, -1, 3)
+
+
+def _decode_quat(code: NDArray[np.uint32]) -> NDArray[np.float64]:
+    """The axis as 10 + 10 bits of an octahedral map, and 12 bits of the angle, 0..pi."""
+    xy = np.stack([code & 1023, code >> 10 & 1023], axis=1) / 1023 * 2 - 1
+    z = 1 - np.abs(xy).sum(axis=1, keepdims=True)
+    xy -= np.copysign(np.maximum(-z, 0), xy)  # unfolds the lower half
+    axis = np.concatenate([xy, z], axis=1)
+    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
+    half = ((code >> 20) / 4095 * np.pi / 2)[:, None]
+    return np.concatenate([axis * np.sin(half), np.cos(half)], axis=1)
+
+
+def _decode_ext_sh(reply: Reply) -> NDArray[np.float64]:
+    """A word a coefficient: a byte each of r, g and b, their signs, and the exponent that they share.
+
+    sh1 holds the three of degree 1 and the first of degree 2, sh2 the other four; sh3a and sh3b hold degree 3.
+    """
+    arrays = [
+        reply.words[name].reshape(-1, 4)[: reply.count]
+        for name in ("sh1", "sh2", "sh3a", "sh3b")
+        if name in reply.words
+    ]
+    coefficients = (0, 3, 8, 0, 15)[len(arrays)]
+    words = np.concatenate([np.zeros((reply.count, 0), np.uint32), *arrays], axis=1)[:, :coefficients, None]
+    channel = np.arange(3, dtype=np.uint32)
+    magnitude = words >> 8 * channel & 255
+    sign = 1 - 2.0 * (words >> (24 + channel) & 1)
+    return sign * magnitude / 255 * 2.0 ** ((words >> 27).astype(np.float64) - 15)

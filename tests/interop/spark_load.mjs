@@ -1,0 +1,61 @@
+// Loads splat files with the real Spark: node spark_load.mjs FOLDER, whose node_modules holds @sparkjsdev/spark.
+//
+// A request a line on stdin, {method, path, name, options, out}: calls the worker's `method` (loadExtSplats or
+// loadPackedSplats) with the bytes at `path`, as if they had come from `name`. An answer a line on stdout:
+// {numSplats, lod, arrays}, or {error}. Each array is a raw file of uint32, `arrays` has its path by name.
+//
+// In a page Spark starts a Web Worker from the source that its module holds as a string, and posts it the wasm that
+// the module holds in base64. Here an EventTarget stands in for the worker's global scope.
+import { readFileSync, writeFileSync } from 'node:fs';
+import { join } from 'node:path';
+import { createInterface } from 'node:readline';
+import { runInThisContext } from 'node:vm';
+
+console.log = console.error; // Spark says how it is getting on; stdout is for the answers
+const lines = readFileSync(join(process.argv[2], 'node_modules/@sparkjsdev/spark/dist/spark.module.js'), 'utf8').split('\n');
+
+function literal(start, end) {
+  const line = lines.find((candidate) => candidate.startsWith(start));
+  if (!line) throw new Error(`this version of Spark has no line that starts with ${start}`);
+  return runInThisContext(line.slice(start.length, line.lastIndexOf(end)));
+}
+
+const scope = new EventTarget();
+const post = (data) => scope.dispatchEvent(new MessageEvent('message', { data }));
+const waiting = new Map();
+scope.postMessage = ({ id, status, error, result }) => {
+  if (status !== undefined) return;
+  const { resolve, reject } = waiting.get(id);
+  waiting.delete(id);
+  if (error === undefined) resolve(result);
+  else reject(error);
+};
+new Function('self', literal('const jsContent = ', ';'))(scope);
+post({ name: 'init-wasm', module: await WebAssembly.compile(Buffer.from(literal('const WASM = decode64(', ')'), 'base64')) });
+
+let calls = 0;
+function call(name, args) {
+  const id = ++calls;
+  return new Promise((resolve, reject) => {
+    waiting.set(id, { resolve, reject });
+    post({ id, name, args });
+  });
+}
+
+async function answer({ method, path, name, options, out }) {
+  const result = await call(method, { ...options, fileBytes: new Uint8Array(readFileSync(path)), pathName: name });
+  const splats = result.lodSplats ?? result;
+  const found = { ext0: splats.extArrays?.[0], ext1: splats.extArrays?.[1], packed: splats.packedArray, ...splats.extra };
+  const arrays = {};
+  for (const [key, values] of Object.entries(found)) {
+    if (!(values instanceof Uint32Array)) continue;
+    arrays[key] = `${out}.${key}`;
+    writeFileSync(arrays[key], new Uint8Array(values.buffer, values.byteOffset, values.byteLength));
+  }
+  return { numSplats: splats.numSplats, lod: result.lodSplats !== undefined, arrays };
+}
+
+for await (const line of createInterface({ input: process.stdin })) {
+  const reply = await answer(JSON.parse(line)).catch((error) => ({ error: String(error?.message ?? error) }));
+  process.stdout.write(JSON.stringify(reply) + '\n');
+}

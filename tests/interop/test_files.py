@@ -1,0 +1,93 @@
+"""Spark reads what `spz.encode` writes of made-up scenes."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from sparklod_cli.codecs import spz
+from sparklod_cli.lod import quick
+from sparklod_cli.scene import Scene
+from sparklod_cli.splats import Splats
+from sparklod_cli.tree import MAX_CHILDREN
+from tests.scenes import random_splats
+
+from . import laws
+from .spark import Spark
+
+
+def baked(splats: Splats) -> Scene:
+    return Scene(*quick.build(splats))
+
+
+def encoded(scene: Scene) -> bytes:
+    return b"".join(spz.encode(scene, spz.Options()))
+
+
+@pytest.mark.parametrize("sh_degree", range(4))
+@pytest.mark.parametrize("version", [2, 3])
+def test_tree(spark: Spark, version: int, sh_degree: int) -> None:
+    scene = baked(random_splats(2000, sh_degree=sh_degree))
+    got = laws.check(spark, scene, spz.Options(version=version))
+    assert got.sh.shape == scene.splats.sh.shape
+    assert got.lod_opacity.max() > 1  # merged splats that are more than opaque were among them
+
+
+@pytest.mark.parametrize("sh_degree", range(4))
+@pytest.mark.parametrize("version", [2, 3])
+def test_plain(spark: Spark, version: int, sh_degree: int) -> None:
+    laws.check(spark, Scene(random_splats(2000, sh_degree=sh_degree)), spz.Options(version=version))
+
+
+@pytest.mark.parametrize("extent, bits", [(5e3, 0), (1, 12), (0.05, 24), (0.05, None), (1, None), (5e3, None)])
+def test_fractional_bits(spark: Spark, extent: float, bits: int | None) -> None:
+    scene = baked(random_splats(2000, extent=extent))
+    laws.check(spark, scene, spz.Options(fractional_bits=bits))
+
+
+def test_coordinates_at_the_limit(spark: Spark) -> None:
+    splats = random_splats(2)
+    limit = 2**23 - 1
+    splats.center[:] = [[limit, -limit, 0.4], [-limit, limit, -0.6]]
+    laws.check(spark, Scene(splats), spz.Options(fractional_bits=0))
+
+
+def test_one_splat(spark: Spark) -> None:
+    got = laws.check(spark, baked(random_splats(1, sh_degree=3)), spz.Options())
+    assert len(got.center) == 1
+
+
+def test_more_children_in_one_place_than_a_node_may_have(spark: Spark) -> None:
+    count = MAX_CHILDREN + 5000
+    scene = baked(random_splats(1).take(np.zeros(count, np.intp)))
+    got = laws.check(spark, scene, spz.Options())
+    assert got.nodes is not None
+    assert np.count_nonzero(got.nodes["child_count"] == 0) == count
+    assert got.nodes["child_count"].sum() == len(got.nodes) - 1
+
+
+def test_antialiased_changes_only_the_flag(spark: Spark) -> None:
+    scene = baked(random_splats(500))
+    flagged = dataclasses.replace(scene, antialiased=True)
+    assert encoded(flagged) != encoded(scene)
+    a, b = laws.check(spark, flagged, spz.Options()), laws.check(spark, scene, spz.Options())
+    np.testing.assert_array_equal(a.nodes, b.nodes)
+    np.testing.assert_array_equal(a.center, b.center)
+    np.testing.assert_array_equal(a.alpha, b.alpha)
+
+
+def test_a_page_that_asks_for_lod_gets_our_tree(spark: Spark) -> None:
+    """`SplatMesh({lod: true})` decodes by another way, into what Spark would build a tree from if there were none."""
+    scene = baked(random_splats(2000, sh_degree=3))
+    got = spark.load(encoded(scene), lod=True)
+    assert scene.tree is not None
+    laws.check_tree(got, scene.tree)
+
+
+def test_a_truncated_file_is_an_error(spark: Spark) -> None:
+    """So that the tests above would notice if Spark could not read a file."""
+    data = encoded(baked(random_splats(500)))
+    with pytest.raises(AssertionError, match="Spark cannot load it"):
+        spark.load(data[: len(data) // 2])
