@@ -47,7 +47,7 @@ class Baked:
         dropped: how many splats were left out, by reason (`selection.REASONS`).
         nodes, levels: of the tree; a tree of one node has one level.
         bytes, version, fractional_bits: of the output.
-        clamped_scales: nodes with a scale that the output cannot hold.
+        clamped: nodes with a value that the output cannot hold, by the column of `Splats` where there are any.
         notes: what the reader had to leave out, for people.
         seconds: by stage (read, build, write).
     """
@@ -62,7 +62,7 @@ class Baked:
     bytes: int
     version: int
     fractional_bits: int
-    clamped_scales: int
+    clamped: dict[str, int]
     notes: tuple[str, ...]
     seconds: dict[str, float]
 
@@ -108,7 +108,7 @@ def bake(source: Path, write: Sink, recipe: Recipe, *, progress: Progress = sile
         bytes=size,
         version=options.version,
         fractional_bits=options.fractional_bits,
-        clamped_scales=spz.scales_out_of_range(nodes),
+        clamped=spz.clamped(nodes, threads),
         notes=notes,
         seconds={stage: round(value, 4) for stage, value in seconds.items()},
     )

@@ -21,6 +21,16 @@ COLOR_GAIN = 0.15  # colour bytes: SH DC coefficients times this, around one hal
 SH_BITS = (5, 4, 4)  # bits that are kept of each degree's SH bytes, as Niantic's library writes them
 FIXED24_MAX = 2**23 - 1
 
+#: Columns of `Splats` whose codes clamp, and the least and the greatest value that they hold, half a step included.
+CLAMPS = {
+    "scale": (
+        float(np.exp(-0.5 / SCALE_STEPS - SCALE_OFFSET)),
+        float(np.exp(255.5 / SCALE_STEPS - SCALE_OFFSET)),
+    ),
+    "rgb": (0.5 - 128 * SH_C0 / (255 * COLOR_GAIN), 0.5 + 128 * SH_C0 / (255 * COLOR_GAIN)),
+    "sh": (-128.5 / 128, 127.5 / 128),
+}
+
 _SQRT_HALF = np.float32(np.sqrt(0.5))
 _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 

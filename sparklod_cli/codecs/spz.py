@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 from ..errors import FormatError, SparklodError
 from ..gaussian import linear_opacity, lod_opacity
 from ..limits import DEFAULT_COMPRESSION, DEFAULT_SPZ_VERSION, MAX_FRACTIONAL_BITS, MAX_SH_DEGREE, SPZ_VERSIONS
-from ..parallel import for_chunks
+from ..parallel import CHUNK, for_chunks, ordered_map
 from ..progress import Progress, silent
 from ..scene import Scene
 from ..sh import COEFFICIENTS
-from ..splats import Splats
+from ..splats import FloatArray, Splats
 from ..tree import LodTree
 from . import compression, quantize
 
@@ -128,11 +128,19 @@ def _enough_bits(splats: Splats, most: int) -> int:
     return max(0, min(most, math.ceil(math.log2(STEPS_A_SPLAT / small))))
 
 
-def scales_out_of_range(splats: Splats) -> int:
-    """How many splats have a scale that a byte of log scale cannot hold, e ** -10 .. e ** 5.94."""
-    low = math.exp(-quantize.SCALE_OFFSET - 0.5 / quantize.SCALE_STEPS)
-    high = math.exp(255.5 / quantize.SCALE_STEPS - quantize.SCALE_OFFSET)
-    return int(np.count_nonzero(((splats.scale < low) | (splats.scale > high)).any(axis=1)))
+def clamped(splats: Splats, threads: int = 1) -> dict[str, int]:
+    """How many splats have a value that its code cannot hold, by the column (scale, rgb, sh) where there are any."""
+    slices = [slice(start, start + CHUNK) for start in range(0, len(splats), CHUNK)]
+    counts = {}
+    for name, (low, high) in quantize.CLAMPS.items():
+        column = getattr(splats, name).reshape(len(splats), -1)
+
+        def outside(part: slice, column: FloatArray = column, low: float = low, high: float = high) -> int:
+            values = column[part]
+            return int(np.count_nonzero(((values < low) | (values > high)).any(axis=1)))
+
+        counts[name] = sum(ordered_map(outside, slices, threads))
+    return {name: count for name, count in counts.items() if count}
 
 
 def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> Scene:

@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 
 STDOUT = Path("-")
 
+#: What SPZ clamps, for people; see `spz.clamped`.
+CLAMPED = {"scale": "scales (4.5e-5 to 380 units)", "rgb": "colours (-0.44 to 1.44)", "sh": "SH (-1 to 0.99)"}
+
 EXAMPLES = """
 \b
 Examples:
@@ -204,7 +207,8 @@ def _report(console: Console, source: Path, target: Path, baked: Baked) -> None:
         console.say(f"  dropped {describe(baked.dropped)}")
     for note in baked.notes:
         console.say(f"  {note}")
-    if baked.clamped_scales:
-        console.say(f"  {baked.clamped_scales:,} nodes have scales that SPZ clamps to 0.000045 .. 380 units")
+    if baked.clamped:
+        counts = ", ".join(f"{CLAMPED[name]} of {count:,} nodes" for name, count in baked.clamped.items())
+        console.say(f"  clamped to what SPZ holds: {counts}")
     stages = ", ".join(f"{stage} {value:.2f} s" for stage, value in baked.seconds.items())
     console.detail(f"  {baked.format} -> SPZ {baked.version} LoD, {baked.fractional_bits} fractional bits; {stages}")

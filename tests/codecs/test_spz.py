@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fixtures import by_hand
-from sparklod_cli.codecs import spz
+from sparklod_cli.codecs import quantize, spz
 from sparklod_cli.errors import FormatError
 from sparklod_cli.scene import Scene
 from sparklod_cli.splats import COLUMNS, Splats
@@ -194,18 +194,28 @@ def test_only_versions_2_and_3_are_written() -> None:
             spz.resolve(random_splats(1), spz.Options(version=version))
 
 
-def test_scales_out_of_range_counts_splats() -> None:
-    splats = random_splats(8)
+def test_what_is_clamped_is_counted_by_splat() -> None:
+    splats = random_splats(8, sh_degree=1)
     splats.scale[:] = 1
     low, high = math.exp(-10 - 1 / 32), math.exp(255.5 / 16 - 10)
-    assert spz.scales_out_of_range(splats) == 0
     splats.scale[0] = low * 1.001  # rounds to the last code that is in
     splats.scale[1] = high * 0.999
-    assert spz.scales_out_of_range(splats) == 0
+    assert spz.clamped(splats) == {}
     splats.scale[2, 1] = low * 0.999
     splats.scale[3, 2] = high * 1.001
     splats.scale[4] = 0  # a splat counts once, however many of its axes are out
-    assert spz.scales_out_of_range(splats) == 3
+    splats.rgb[5] = -0.5
+    splats.sh[6:, 2] = 1.1
+    assert spz.clamped(splats, threads=2) == {"scale": 3, "rgb": 1, "sh": 2}
+
+
+@pytest.mark.parametrize(("name", "decode"), [("scale", quantize.decode_log_scale), ("rgb", quantize.decode_color)])
+def test_the_ends_that_are_counted_are_the_ends_of_the_codes(name: str, decode: Callable) -> None:
+    low, high = quantize.CLAMPS[name]
+    first, second, before, last = decode(np.array([0, 1, 254, 255], np.uint8))
+    middle = np.log if name == "scale" else np.copy  # half a step is half a factor for logarithms
+    assert middle(first) - middle(low) == pytest.approx((middle(second) - middle(first)) / 2, rel=1e-4)
+    assert middle(high) - middle(last) == pytest.approx((middle(last) - middle(before)) / 2, rel=1e-4)
 
 
 # --- What is refused --------------------------------------------------------------------------------------------------
