@@ -203,7 +203,7 @@ def test_a_pipe_is_written_to_and_not_replaced(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(not Path("/dev/fd").exists(), reason="there is no /dev/fd here")
 def test_a_pipe_by_its_number_is_written_to() -> None:
-    """What a shell makes of `-o >(upload)`, and what /dev/stdout is in a pipeline: a link to nothing that has a path."""
+    """What a shell makes of `-o >(upload)`, and /dev/stdout in a pipeline: a link to nothing that has a path."""
     reader, writer = os.pipe()
     try:
         assert write_whole(Path(f"/dev/fd/{writer}"), [b"through"], overwrite=False) == 7
