@@ -107,7 +107,7 @@ def main() -> None:
     parser.add_argument("--spark-up-to", type=float, default=2, help="millions of splats that Spark is tried on")
     arguments = parser.parse_args()
     # The first touch of a page is slow on a virtual machine; a program that runs for long has its pages.
-    np.zeros(1 << 29, np.float64)[::512] = 1
+    np.zeros(1 << 30, np.float64)[::512] = 1
     print(f"Machine: {machine()}. Medians of {arguments.runs} runs.\n")
     print("| " + " | ".join(HEADINGS) + " |")
     print("|---" * len(HEADINGS) + "|")

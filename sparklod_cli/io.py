@@ -21,6 +21,8 @@ def read_scene(path: Path, *, threads: int = 1, progress: Progress = silent) -> 
         FormatError: it is not a file, empty, of no known format, or broken.
     """
     try:
+        if path.exists() and not (path.is_file() or path.is_dir()):
+            raise FormatError("it is a pipe or a device; save it to a file first")
         with path.open("rb") as file:
             head = file.read(16)
             file.seek(0)

@@ -51,8 +51,8 @@ class Selection:
         if not (self.drop_invalid or finite.all()):
             bad = np.flatnonzero(~finite)
             raise InvalidSplatsError(
-                f"{bad.size:,} splats are not finite (NaN, infinite, or a rotation of length 0; the first is splat"
-                f" {bad[0]:,}), add --on-invalid drop to leave them out"
+                f"{bad.size:,} of {len(splats):,} splats are not finite (NaN, infinite, or a rotation of length 0; the"
+                f" first is splat {bad[0]:,}), add --on-invalid drop to leave them out"
             )
         keeps = {
             "non_finite": finite,

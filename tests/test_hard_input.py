@@ -104,7 +104,7 @@ def test_a_number_that_is_not_finite(name: str, value: float, bake: Bake) -> Non
         assert "20 splats, SH 1" in result
         assert "dropped" not in result + dropped
     else:
-        assert result.startswith("error: : 1 splats are not finite")
+        assert result.startswith("error: : 1 of 20 splats are not finite")
         assert "--on-invalid drop" in result
         assert "19 splats, SH 1" in dropped
         assert "  dropped 1 not finite" in dropped
@@ -119,7 +119,7 @@ def each(names: Iterable[str], *values: Any) -> Columns:
 
 #: What is done to the splats, options, and what must be said.
 NUMBERS: dict[str, tuple[Columns, list[str], str]] = {
-    "rotation of no length": (each(ALL_ROTATIONS, 0), [], r"^error: : 1 splats are not finite .*length 0"),
+    "rotation of no length": (each(ALL_ROTATIONS, 0), [], r"^error: : 1 of 20 splats are not finite .*length 0"),
     "rotation of no length, dropped": (each(ALL_ROTATIONS, 0), ["--on-invalid", "drop"], "dropped 1 not finite"),
     "all rotations of no length": (each(ALL_ROTATIONS, (0,)), ["--on-invalid", "drop"], "error: : no splat is left"),
     "tiny rotations": (each(ALL_ROTATIONS, (1e-38,)), [], "20 splats"),
@@ -135,7 +135,7 @@ NUMBERS: dict[str, tuple[Columns, list[str], str]] = {
     "scales of every size": ({"scale_0": tuple(np.linspace(-100, 40, 20))}, ["--base", "1.1"], "20 splats.*clamped"),
     "scales whose squares overflow": (each(ALL_SCALES, (60,)), [], "20 splats.*clamped"),
     "scales that almost overflow": (each(ALL_SCALES, (88.5,)), [], "splats|^error"),
-    "scales that overflow": (each(ALL_SCALES, (89,)), [], "^error: : 20 splats are not finite"),
+    "scales that overflow": (each(ALL_SCALES, (89,)), [], "^error: : 20 of 20 splats are not finite"),
     "certain and impossible logits": ({"opacity": tuple(1000 * (-1) ** np.arange(20))}, [], "dropped 10 zero opacity"),
     "opacities of nothing": ({"opacity": (-1000,)}, [], "error: : no splat is left of 20 .20 zero opacity"),
     "opacities near nothing": ({"opacity": (-85,)}, [], "20 splats"),

@@ -185,10 +185,10 @@ def _text_rows(file: BinaryIO, header: Header) -> Iterator[tuple[slice, NDArray[
         lines = list(islice(file, wanted))
         if len(lines) < wanted:
             raise FormatError(f"cut short after {start + len(lines):,} of {header.vertices:,} vertices")
+        if not all(map(bytes.strip, lines)):  # numpy would skip them
+            raise FormatError(f"empty lines among the vertices after {start:,}")
         try:
             rows = np.loadtxt(lines, dtype=row_type, ndmin=1, comments=None)
         except ValueError as error:
             raise FormatError(f"bad PLY data after vertex {start:,}: {error}") from None
-        if len(rows) < wanted:
-            raise FormatError(f"empty lines among the vertices after {start:,}")
         yield slice(start, start + wanted), rows

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from .. import limits
-from .console import Console
+from .console import Console, count_of
 from .options import AutoOr, Ball, Numbers, Real, common_options
 
 if TYPE_CHECKING:
@@ -199,16 +199,17 @@ def _report(console: Console, source: Path, target: Path, baked: Baked) -> None:
     from ..selection import describe
 
     seconds = sum(baked.seconds.values())
+    size = f"{baked.bytes / 1e6:.1f} MB" if baked.bytes >= 1e5 else f"{baked.bytes / 1e3:.1f} kB"
     console.say(
-        f"{source}  {baked.splats:,} splats, SH {baked.sh_degree}  ->  {target}  {baked.nodes:,} nodes,"
-        f" {baked.levels} levels, {baked.bytes / 1e6:.1f} MB, {seconds:.1f} s"
+        f"{source}  {count_of(baked.splats, 'splat')}, SH {baked.sh_degree}  ->  {target} "
+        f" {count_of(baked.nodes, 'node')}, {count_of(baked.levels, 'level')}, {size}, {seconds:.1f} s"
     )
     if baked.dropped:
         console.say(f"  dropped {describe(baked.dropped)}")
     for note in baked.notes:
         console.say(f"  {note}")
     if baked.clamped:
-        counts = ", ".join(f"{CLAMPED[name]} of {count:,} nodes" for name, count in baked.clamped.items())
+        counts = ", ".join(f"{CLAMPED[name]} of {count_of(count, 'node')}" for name, count in baked.clamped.items())
         console.say(f"  clamped to what SPZ holds: {counts}")
     stages = ", ".join(f"{stage} {value:.2f} s" for stage, value in baked.seconds.items())
     console.detail(f"  {baked.format} -> SPZ {baked.version} LoD, {baked.fractional_bits} fractional bits; {stages}")

@@ -9,6 +9,11 @@ from typing import Any
 import click
 
 
+def count_of(count: int, noun: str) -> str:
+    """ "1 node", "1,234 nodes"."""
+    return f"{count:,} {noun}" + ("" if count == 1 else "s")
+
+
 class Console:
     """Says lines on standard error, and shows a bar for each stage of work where that is a terminal.
 

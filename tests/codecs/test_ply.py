@@ -231,10 +231,12 @@ REFUSED: dict[str, tuple[Callable[[], bytes], str]] = {
     "cut short": (lambda: by_hand.ply(columns())[:-1], "cut short: 1 bytes are missing"),
     "ascii cut short": (lambda: TEXT[: TEXT.rindex(b"\n", 0, -1) + 1], "cut short after 4 of 5 vertices"),
     "a short row": (lambda: TEXT[:-3].rsplit(b" ", 2)[0], "bad PLY data"),
+    "rows of spaces": (lambda: TEXT[: TEXT.index(b"end_header") + 11] + (b" " * 60 + b"\n") * 5, "empty lines"),
     "a word": (lambda: TEXT[:-5] + b" nul\n", "bad PLY data"),
 }
 
 
+@pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("what", REFUSED)
 def test_refused_with_a_reason(what: str) -> None:
     make, reason = REFUSED[what]
