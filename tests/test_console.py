@@ -1,0 +1,40 @@
+"""Progress bars appear where a person sits at a terminal, and nowhere else."""
+
+from __future__ import annotations
+
+import io
+
+import pytest
+
+from sparklod_cli.commands.console import Console, count_of
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def shown_on(stream: io.StringIO, monkeypatch: pytest.MonkeyPatch, *, quiet: bool = False) -> str:
+    monkeypatch.setattr("sys.stderr", stream)
+    with Console(quiet=quiet, verbose=False) as console:
+        for done in (0, 5, 10):
+            console.progress("reading", done, 10, "splat")
+        console.progress("writing", 1, 4, "B")
+    return stream.getvalue()
+
+
+def test_a_terminal_gets_a_bar_a_stage(monkeypatch: pytest.MonkeyPatch) -> None:
+    text = shown_on(Terminal(), monkeypatch)
+    assert "reading:" in text
+    assert "splats" in text
+    assert "writing:" in text
+    assert text.endswith("\r")  # and takes it away
+
+
+def test_a_file_or_a_quiet_terminal_gets_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert shown_on(io.StringIO(), monkeypatch) == ""
+    assert shown_on(Terminal(), monkeypatch, quiet=True) == ""
+
+
+def test_counts_are_said_properly() -> None:
+    assert [count_of(n, "node") for n in (0, 1, 1234)] == ["0 nodes", "1 node", "1,234 nodes"]
