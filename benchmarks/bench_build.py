@@ -18,8 +18,8 @@ from scenes import load, tiled, write_ply
 
 from sparklod_cli import jit
 from sparklod_cli.codecs import spz
-from sparklod_cli.commands.options import processors
 from sparklod_cli.lod import quick
+from sparklod_cli.parallel import processors
 from sparklod_cli.scene import Scene
 
 HERE = Path(__file__).resolve().parent

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from .codecs import spz
-from .errors import FormatError
+from .errors import FormatError, SparklodError
 from .io import read_scene
 from .limits import DEFAULT_BASE, MAX_SH_DEGREE
 from .lod import quick
@@ -72,7 +73,15 @@ def bake(source: Path, write: Sink, recipe: Recipe, *, progress: Progress = sile
 
     Raises:
         FormatError, InvalidSplatsError, OutputError: see `io.read_scene`, `Selection.apply` and `write`.
+        SparklodError: it does not fit into memory.
     """
+    try:
+        return _bake(source, write, recipe, progress)
+    except MemoryError:
+        raise SparklodError("it does not fit into memory") from None
+
+
+def _bake(source: Path, write: Sink, recipe: Recipe, progress: Progress) -> Baked:
     threads = recipe.spz.threads
     start = time.perf_counter()
     scene = read_scene(source, threads=threads, progress=progress)
@@ -83,15 +92,16 @@ def bake(source: Path, write: Sink, recipe: Recipe, *, progress: Progress = sile
     read_done = time.perf_counter()
     antialiased, name, notes = scene.antialiased, scene.format, scene.notes
     count, degree = len(kept), kept.sh_degree
+    # Merged centres stay in the box of the splats, so what fits these fits all nodes, and is known before building.
+    bits = spz.fractional_bits(kept, recipe.spz)
+    options = dataclasses.replace(recipe.spz, fractional_bits=bits)
     # The builder frees its input as it goes, if nobody else holds it: a third of the peak.
     handed_over = [kept]
     del scene, kept
     nodes, tree = quick.build(handed_over.pop(), recipe.base, progress=progress)
     build_done = time.perf_counter()
     output = Scene(nodes, tree, antialiased)
-    options = spz.resolve(nodes, recipe.spz)
     size = write(spz.encode(output, options, progress=progress))
-    assert options.fractional_bits is not None
     seconds = {
         "read": read_done - start,
         "build": build_done - read_done,
@@ -107,7 +117,7 @@ def bake(source: Path, write: Sink, recipe: Recipe, *, progress: Progress = sile
         levels=int(tree.depths().max()) + 1,
         bytes=size,
         version=options.version,
-        fractional_bits=options.fractional_bits,
+        fractional_bits=bits,
         clamped=spz.clamped(nodes, threads),
         notes=notes,
         seconds={stage: round(value, 4) for stage, value in seconds.items()},

@@ -12,10 +12,14 @@ from typing import NoReturn
 import click
 
 from . import __version__
+from .commands.console import say_error
 from .errors import SparklodError
 
 #: Sub-commands, each a module of `commands` with a function of its name; imported when it is called for.
 COMMANDS = {"build-lod": "build_lod"}
+
+#: Signals that end a run: Ctrl-C, a polite kill, a terminal that is closed.
+ENDING = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 
 EPILOG = """
 \b
@@ -38,7 +42,7 @@ class LazyGroup(click.Group):
         return command
 
 
-@click.group(cls=LazyGroup, epilog=EPILOG)
+@click.group(cls=LazyGroup, epilog=EPILOG, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, package_name="sparklod")
 def cli() -> None:
     """Bake Level-of-Detail trees for 3D Gaussian splat scenes."""
@@ -52,7 +56,7 @@ def run(arguments: list[str] | None = None) -> int:
         error.show()
         return error.exit_code
     except SparklodError as error:
-        click.echo(f"error: {error}", err=True)
+        say_error(str(error))
         return 1
     except (click.Abort, KeyboardInterrupt):
         click.echo("interrupted", err=True)
@@ -77,17 +81,19 @@ def _interrupt(signum: int, frame: FrameType | None) -> None:
             signal.setitimer(signal.ITIMER_REAL, 0.005)
             return
         at = at.f_back
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in ENDING:
         signal.signal(number, signal.SIG_DFL)  # a second one does not wait for the cleaning up
     raise KeyboardInterrupt
 
 
 def main() -> NoReturn:
-    """Entry point of the script; a polite kill cleans up as Ctrl-C does."""
-    signal.signal(signal.SIGINT, _interrupt)
-    signal.signal(signal.SIGTERM, _interrupt)
+    """Entry point of the script; cleans up on a polite kill as on Ctrl-C."""
+    for number in ENDING:
+        if signal.getsignal(number) != signal.SIG_IGN:  # nohup and the like stay in force
+            signal.signal(number, _interrupt)
     code = run()
-    for name in ("SIGINT", "SIGTERM", "SIGALRM"):
-        if hasattr(signal, name):
-            signal.signal(getattr(signal, name), signal.SIG_IGN)  # what there was to do is done
+    for number in ENDING:
+        signal.signal(number, signal.SIG_IGN)  # what there was to do is done
+    if hasattr(signal, "setitimer"):
+        signal.setitimer(signal.ITIMER_REAL, 0)
     sys.exit(code)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import secrets
+import stat
 import sys
 from collections.abc import Iterable
 from pathlib import Path
@@ -21,6 +23,8 @@ def read_scene(path: Path, *, threads: int = 1, progress: Progress = silent) -> 
         FormatError: it is not a file, empty, of no known format, or broken.
     """
     try:
+        if str(path) == "-":
+            raise FormatError("standard input is not read; save it to a file first")
         if path.exists() and not (path.is_file() or path.is_dir()):
             raise FormatError("it is a pipe or a device; save it to a file first")
         with path.open("rb") as file:
@@ -36,8 +40,6 @@ def read_scene(path: Path, *, threads: int = 1, progress: Progress = silent) -> 
             return scene
     except OSError as error:
         raise FormatError(f"cannot be read: {_reason(error)}") from None
-    except MemoryError:
-        raise FormatError("does not fit into memory") from None
 
 
 def check_writable(path: Path, *, overwrite: bool, make_parent: bool = False) -> None:
@@ -83,7 +85,9 @@ def write_whole(path: Path, pieces: Iterable[bytes], *, overwrite: bool) -> int:
             if not special:
                 os.fsync(file.fileno())
         if not special:
-            temporary.replace(target)
+            _publish(temporary, target, overwrite)
+    except FileExistsError:
+        raise OutputError(f"{path} exists, add --overwrite to replace it") from None
     except OSError as error:
         raise OutputError(f"cannot write {path}: {_reason(error)}") from None
     finally:
@@ -92,8 +96,27 @@ def write_whole(path: Path, pieces: Iterable[bytes], *, overwrite: bool) -> int:
     return size
 
 
+def _publish(temporary: Path, target: Path, overwrite: bool) -> None:
+    """Gives a complete file its name; `FileExistsError` where somebody took that meanwhile."""
+    if overwrite:
+        with contextlib.suppress(FileNotFoundError):
+            temporary.chmod(stat.S_IMODE(target.stat().st_mode))  # what was private stays private
+        temporary.replace(target)
+        return
+    try:
+        os.link(temporary, target)  # fails where the name is taken; a rename would replace it
+    except FileExistsError:
+        raise
+    except OSError:  # a file system without links
+        if target.exists():
+            raise FileExistsError from None
+        temporary.replace(target)
+
+
 def write_stdout(pieces: Iterable[bytes]) -> int:
     """Writes to standard output and returns how many bytes; raises `OutputError` where nobody reads them."""
+    if sys.stdout is None:
+        raise OutputError("standard output is closed")
     try:
         size = sum(sys.stdout.buffer.write(piece) for piece in pieces)
         sys.stdout.buffer.flush()

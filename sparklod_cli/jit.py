@@ -3,13 +3,43 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
+import os
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import numba
 from numba.core import event
 
 SMALL = 4096  # rows that one thread works through before another would have woken up
+
+
+def _cache_folder() -> Path | None:
+    """Where compiled code is kept, or None where nothing can be written.
+
+    numba looks at the file of a kernel alone to tell whether what it has is of the same source; a kernel also consists
+    of those that it calls and of constants that it uses. So the folder's name is of all the source there is.
+    """
+    package = Path(__file__).parent
+    sources = [package / "gaussian.py", package / "jit.py", *sorted(package.glob("*/kernels/*.py"))]
+    digest = hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()[:16]
+    given = os.environ.get("NUMBA_CACHE_DIR")
+    places = [Path(given)] if given else [package / "__pycache__"]
+    if not given:
+        with contextlib.suppress(RuntimeError):  # nobody's home
+            places.append(Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sparklod")
+    for place in places:
+        folder = place / f"kernels-{digest}"
+        with contextlib.suppress(OSError):
+            folder.mkdir(parents=True, exist_ok=True)
+            if os.access(folder, os.W_OK):
+                return folder
+    return None
+
+
+#: None: kernels are compiled in every process.
+CACHE_FOLDER = _cache_folder()
 
 
 def kernel(*, parallel: bool = False) -> Callable[[Callable[..., Any]], Any]:
@@ -21,8 +51,13 @@ def kernel(*, parallel: bool = False) -> Callable[[Callable[..., Any]], Any]:
 
     def decorate(function: Callable[..., Any]) -> Any:
         compiled: Any = numba.njit(error_model="numpy", parallel=parallel)(function)
-        with contextlib.suppress(RuntimeError):  # "no locator available": nowhere to put a cache
-            compiled.enable_caching()
+        if CACHE_FOLDER is not None and hasattr(compiled, "enable_caching"):  # not with NUMBA_DISABLE_JIT
+            theirs = numba.config.CACHE_DIR
+            numba.config.CACHE_DIR = str(CACHE_FOLDER)
+            try:
+                compiled.enable_caching()
+            finally:
+                numba.config.CACHE_DIR = theirs
         return compiled
 
     return decorate

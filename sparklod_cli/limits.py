@@ -6,6 +6,9 @@ MIN_BASE, MAX_BASE, DEFAULT_BASE = 1.1, 2.0, 1.5
 #: Highest degree of spherical harmonics that is kept.
 MAX_SH_DEGREE = 3
 
+#: Threads to work on.
+MAX_THREADS = 256
+
 #: SPZ versions that can be written, and the one that is; docs/decisions has the measurement.
 SPZ_VERSIONS, DEFAULT_SPZ_VERSION = (2, 3), 3
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
@@ -11,6 +12,12 @@ Result = TypeVar("Result")
 
 #: Rows of a chunk: temporaries stay in the cache, and the interpreter's part stays small.
 CHUNK = 1 << 14
+
+
+def processors() -> int:
+    """How many processors this process may use."""
+    affinity = getattr(os, "sched_getaffinity", None)
+    return len(affinity(0)) if affinity else os.cpu_count() or 1
 
 
 def ordered_map(work: Callable[[Item], Result], items: list[Item], threads: int) -> Iterator[Result]:

@@ -29,7 +29,7 @@ class Selection:
     Attributes:
         drop_invalid: drop splats with a number that is not finite or a rotation of length 0, instead of failing.
         min_opacity: keep splats of at least this opacity, 0..1.
-        min_box, max_box: keep centres inside this box, borders included; world units.
+        min_box, max_box: keep centres inside this box, borders (as float32) included; world units.
         within: keep centres in this ball, x y z and radius.
     """
 
@@ -75,9 +75,9 @@ class Selection:
     def _inside(self, center: NDArray[np.float32]) -> NDArray[np.bool_]:
         inside = np.ones(len(center), np.bool_)
         if self.min_box is not None:
-            inside &= (center >= self.min_box).all(axis=1)
+            inside &= (center >= np.asarray(self.min_box, np.float32)).all(axis=1)
         if self.max_box is not None:
-            inside &= (center <= self.max_box).all(axis=1)
+            inside &= (center <= np.asarray(self.max_box, np.float32)).all(axis=1)
         if self.within is not None:
             middle, radius = self.within
             offset = center.astype(np.float64) - middle

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
@@ -13,13 +14,13 @@ settings.load_profile("sparklod")
 
 ROOT = Path(__file__).resolve().parents[1]
 FIXTURES = ROOT / "fixtures"
-#: Real scenes, which are not part of the repository.
-SCENES = ROOT.parent / "shared" / "scenes"
+#: Real scenes, which are not part of the repository: where SPARKLOD_SCENES says, or beside the checkout.
+SCENES = Path(os.environ.get("SPARKLOD_SCENES") or ROOT.parent / "shared" / "scenes")
 
 
 def real_scene(name: str) -> Path:
     """A real scene's path; skips the test where the folder is absent."""
     path = SCENES / name
     if not path.is_file():
-        pytest.skip(f"the real scene {name} is not beside this checkout")
+        pytest.skip(f"no real scene {name}; SPARKLOD_SCENES names the folder of real scenes")
     return path

@@ -11,11 +11,13 @@ import time
 from pathlib import Path
 
 import click
+import numpy as np
 import pytest
 
 from sparklod_cli import __version__
 from sparklod_cli.cli import cli, run
 from sparklod_cli.io import read_scene
+from sparklod_cli.lod import quick
 
 from .conftest import FIXTURES, ROOT
 
@@ -112,6 +114,81 @@ def test_quiet_says_nothing_and_verbose_more(scene: Path, capsys: pytest.Capture
     assert "fractional bits; read" in capsys.readouterr().err
 
 
+def test_options_reach_the_tree(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    splats = read_scene(scene).splats
+    x, y, z = splats.center[0].tolist()
+    distance = np.sqrt(((splats.center - splats.center[0]) ** 2).sum(axis=1, dtype=np.float64))
+    radius = float(np.median(distance))
+    opacity = float(np.median(splats.opacity))
+    left = {
+        ("--within", f"{x},{y},{z},{radius}"): int((distance <= radius).sum()),
+        ("--min-opacity", str(opacity)): int((splats.opacity >= opacity).sum()),
+        ("--min-box", f"{x},{y},{z}"): int((splats.center >= splats.center[0]).all(axis=1).sum()),
+        ("--max-sh", "0"): len(splats),
+    }
+    for arguments, count in left.items():
+        assert build(scene, "-o", tmp_path / "out.spz", "--overwrite", "--json", "-q", *arguments) == 0
+        assert json.loads(capsys.readouterr().out)["splats"] == count
+    assert read_scene(tmp_path / "out.spz").splats.sh_degree == 0
+    sizes = []
+    for level in (1, 9):
+        assert build(FIXTURES / "demo.ply", "-o", tmp_path / f"{level}.spz", "--compression-level", level) == 0
+        sizes.append((tmp_path / f"{level}.spz").stat().st_size)
+    assert sizes[1] < sizes[0]
+
+
+def test_what_belongs_to_the_file_is_kept_or_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    golden = FIXTURES / "golden"
+    assert build(golden / "hand-v4.spz", golden / "hand-v4-sh4.spz", "--output-dir", tmp_path) == 0
+    assert "SH degree 4 is cut to 3" in capsys.readouterr().err
+    for name in ("hand-v4", "hand-v4-sh4"):
+        before, after = read_scene(golden / f"{name}.spz"), read_scene(tmp_path / f"{name}-lod.spz")
+        assert after.antialiased == before.antialiased
+    assert read_scene(golden / "hand-v4.spz").antialiased
+
+
+def test_a_tree_is_not_baked_again(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert build(scene) == 0
+    assert build(scene.with_name("scene-lod.spz")) == 1
+    assert "it is a Level-of-Detail file already" in capsys.readouterr().err
+
+
+def test_what_does_not_fit_into_memory_does_not_stop_the_others(
+    scene: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(*args: object, **kwargs: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr(quick, "build", full)
+    assert build(scene, ONE, "--output-dir", scene.parent) == 1
+    err = capsys.readouterr().err
+    assert err.count("it does not fit into memory") == 2
+
+
+def test_an_input_is_never_an_output(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = scene.read_bytes()
+    assert build(scene, "-o", scene, "--overwrite") == 2
+    assert "is an input" in capsys.readouterr().err
+    link = scene.with_name("link.ply")
+    link.symlink_to(scene)
+    assert build(link, "-o", scene, "--overwrite") == 2
+    assert scene.read_bytes() == before
+
+
+def test_more_processors_than_threads_that_are_taken(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sparklod_cli.commands.options.processors", lambda: 5000)
+    assert build(scene) == 0
+
+
+def test_closed_streams(tmp_path: Path) -> None:
+    command = f"{sys.executable} -m sparklod_cli build-lod {SMALL}"
+    done = subprocess.run(["bash", "-c", f"{command} -o - >&-"], capture_output=True, text=True, check=False, cwd=ROOT)
+    assert (done.returncode, done.stderr) == (1, f"error: {SMALL}: standard output is closed\n")
+    done = subprocess.run(["bash", "-c", f"{command} -o {tmp_path}/out.spz 2>&-"], check=False, cwd=ROOT)
+    assert done.returncode == 0
+    assert read_scene(tmp_path / "out.spz").tree is not None
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -157,7 +234,7 @@ def test_a_reader_that_goes_away_is_a_failure_without_a_traceback() -> None:
     assert b"broken pipe" in result.stderr
 
 
-@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_an_interruption_leaves_nothing_behind(tmp_path: Path, how: signal.Signals) -> None:
     source = FIXTURES / "demo.ply"
     command = [sys.executable, "-m", "sparklod_cli", "build-lod", str(source), "--output-dir", str(tmp_path), "-q"]
@@ -167,13 +244,15 @@ def test_an_interruption_leaves_nothing_behind(tmp_path: Path, how: signal.Signa
         time.sleep(delay)
         process.send_signal(how)
         _, err = process.communicate()
-        left = [path.name for path in tmp_path.iterdir()]
-        if process.returncode == 0:  # it was done before
-            assert left == ["demo-lod.spz"]
-            (tmp_path / "demo-lod.spz").unlink()
+        assert process.returncode in (0, 130, -how)  # -how: before Python came to us, or while it left
+        left = list(tmp_path.iterdir())
+        if left:  # it was done before, or all but done
+            assert [path.name for path in left] == ["demo-lod.spz"]
+            assert read_scene(left[0]).tree is not None
+            left[0].unlink()
         else:
-            assert left == []
-            assert b"Exception ignored" not in err
+            assert process.returncode != 0
+        assert b"Exception ignored" not in err
 
 
 def test_version_and_help_everywhere() -> None:
@@ -212,7 +291,8 @@ def help_text() -> str:
     command = cli.get_command(click.Context(cli), "build-lod")
     assert command is not None
     width = {"terminal_width": 100, "max_content_width": 100}
-    context = click.Context(command, info_name="sparklod build-lod", **width, **command.context_settings)
+    parent = click.Context(cli, info_name="sparklod", **cli.context_settings)
+    context = click.Context(command, info_name="build-lod", parent=parent, **width, **command.context_settings)
     return command.get_help(context)
 
 

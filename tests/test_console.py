@@ -6,7 +6,7 @@ import io
 
 import pytest
 
-from sparklod_cli.commands.console import Console, count_of
+from sparklod_cli.commands.console import Console, count_of, say_error
 
 
 class Terminal(io.StringIO):
@@ -34,6 +34,17 @@ def test_a_terminal_gets_a_bar_a_stage(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_file_or_a_quiet_terminal_gets_none(monkeypatch: pytest.MonkeyPatch) -> None:
     assert shown_on(io.StringIO(), monkeypatch) == ""
     assert shown_on(Terminal(), monkeypatch, quiet=True) == ""
+
+
+def test_colour_is_for_terminals_that_want_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value, colour in (("NO_COLOR", "", True), ("NO_COLOR", "1", False), ("TERM", "dumb", False)):
+        with monkeypatch.context() as patch:
+            patch.delenv("NO_COLOR", raising=False)
+            patch.setenv("TERM", "xterm")
+            patch.setenv(name, value)
+            patch.setattr("sys.stderr", stream := Terminal())
+            say_error("no")
+            assert ("\x1b[31m" in stream.getvalue()) == colour
 
 
 def test_counts_are_said_properly() -> None:

@@ -11,7 +11,6 @@ from pathlib import Path
 
 import pytest
 
-from sparklod_cli.codecs import ply
 from sparklod_cli.codecs.formats import FORMATS
 from sparklod_cli.errors import FormatError, OutputError
 from sparklod_cli.io import check_writable, read_scene, write_stdout, write_whole
@@ -72,15 +71,6 @@ def test_what_may_not_be_read(tmp_path: Path) -> None:
     path.chmod(0)
     with pytest.raises(FormatError, match="cannot be read: permission denied"):
         read_scene(path)
-
-
-def test_what_is_too_large_for_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    def decode(*args: object, **kwargs: object) -> None:
-        raise MemoryError
-
-    monkeypatch.setattr(ply, "decode", decode)
-    with pytest.raises(FormatError, match="does not fit into memory"):
-        read_scene(FIXTURES / "one.ply")
 
 
 def test_a_scene_outlives_its_file(tmp_path: Path) -> None:

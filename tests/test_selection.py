@@ -61,6 +61,8 @@ def test_cropping_keeps_borders() -> None:
 
     assert left(min_box=(1, 0, 0)) == [[1, 0, 0], [3, 0, 4]]
     assert left(max_box=(1, 2, 0)) == [[0, 0, 0], [1, 0, 0], [0, 2, 0]]
+    tenth = dataclasses.replace(random_splats(1), center=np.full((1, 3), 0.1, np.float32))
+    assert Selection(min_box=(0.1,) * 3, max_box=(0.1,) * 3).apply(tenth)[1] == {}
     assert left(min_box=(0, 0, 0), max_box=(0, 2, 0)) == [[0, 0, 0], [0, 2, 0]]
     assert left(within=((0, 0, 0), 5)) == center.tolist()
     assert left(within=((0, 0, 0), 1)) == [[0, 0, 0], [1, 0, 0]]

@@ -6,6 +6,7 @@ One vertex a splat, of scalar properties in any order; properties that are not i
 from __future__ import annotations
 
 import io
+import mmap
 import re
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -56,6 +57,7 @@ class Header:
 
     elements: dict[str, tuple[PlyElement, int]]
     text: bool
+    byte_order: str
     size: int
 
     @property
@@ -63,10 +65,10 @@ class Header:
         return self.elements["vertex"][1]
 
     def row_type(self, name: str) -> np.dtype[Any] | None:
-        """Type of a row in native byte order, or None where rows have lists and so no fixed size."""
+        """Type of a row, or None where rows have lists and so no fixed size."""
         element = self.elements[name][0]
         has_list = any(isinstance(prop, PlyListProperty) for prop in element.properties)
-        return None if has_list else np.dtype(element.dtype())
+        return None if has_list else np.dtype(element.dtype(self.byte_order))
 
 
 def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> Scene:
@@ -117,15 +119,23 @@ def _read_header(file: BinaryIO) -> Header:
             raise FormatError("not a PLY file")
         if not line or len(text) > MAX_HEADER:
             raise FormatError("the PLY header does not end")
+    # plyfile gets what it must parse: no comments, which may be in any encoding, and counts of 0, as it would read all
+    # data otherwise, and text value by value.
+    lines, counts = [], []
+    for words in map(bytes.split, text.splitlines()):
+        if words[:1] == [b"element"]:
+            if len(words) != 3 or not words[2].isdigit():
+                raise FormatError("bad PLY header: expected element, a name and a count")
+            counts.append(int(words[2]))
+            words[2] = b"0"
+        if words and words[0] not in (b"comment", b"obj_info"):
+            lines.append(b" ".join(words))
     try:
-        # With its counts at 0 plyfile parses the header alone; else it would read all data, and text value by value.
-        empty = re.sub(rb"^(element\s+\S+\s+)\d+", rb"\g<1>0", text, flags=re.MULTILINE)
-        parsed = PlyData.read(io.BytesIO(empty))
-        counts = [int(count) for count in re.findall(rb"^element\s+\S+\s+(\d+)", text, re.MULTILINE)]
-        elements = {element.name: (element, count) for element, count in zip(parsed, counts, strict=True)}
+        parsed = PlyData.read(io.BytesIO(b"\n".join(lines) + b"\n"))
     except (PlyParseError, ValueError) as error:
         raise FormatError(f"bad PLY header: {error}") from None
-    return Header(elements, parsed.text, len(text))
+    elements = {element.name: (element, count) for element, count in zip(parsed, counts, strict=True)}
+    return Header(elements, parsed.text, parsed.byte_order, len(text))
 
 
 def _checked_coefficients(header: Header) -> int:
@@ -164,9 +174,28 @@ def _check_size(header: Header, size: int) -> None:
 
 
 def _binary_rows(file: BinaryIO, header: Header) -> NDArray[Any]:
+    """The vertices, memory-mapped where `file` is a real one."""
+    offset = header.size
+    for name, (_, count) in header.elements.items():
+        row_type = header.row_type(name)
+        if row_type is None:  # rows of unknown sizes come before the vertices
+            return _rows_by_plyfile(file)
+        if name == "vertex":
+            break
+        offset += count * row_type.itemsize
+    data: mmap.mmap | bytes
+    try:
+        data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+    except (OSError, ValueError):  # not a file of the system's, or one that cannot be mapped
+        file.seek(0)
+        data = file.read()
+    return np.frombuffer(data, row_type, header.vertices, offset)
+
+
+def _rows_by_plyfile(file: BinaryIO) -> NDArray[Any]:
     file.seek(0)
     try:
-        rows: NDArray[Any] = PlyData.read(file, mmap="r")["vertex"].data
+        rows: NDArray[Any] = PlyData.read(file)["vertex"].data
     except (PlyParseError, ValueError) as error:
         raise FormatError(f"bad PLY data: {error}") from None
     return rows

@@ -6,7 +6,6 @@ versions 2 and 3. `docs/format.md` lays the extension out byte by byte.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import struct
 from collections.abc import Iterator
@@ -35,7 +34,7 @@ STREAM_SIZES = struct.Struct("<QQ")  # of a version 4 stream: compressed, uncomp
 ANTIALIASED, EXTENSIONS, LOD = 0x01, 0x02, 0x80
 READABLE = (1, 2, 3, 4)
 
-#: What "far below the smallest splats" means for the step of a position: see `resolve`.
+#: What "far below the smallest splats" means for the step of a position: see `fractional_bits`.
 STEPS_A_SPLAT, SMALL_QUANTILE = 16, 0.01
 
 
@@ -75,7 +74,7 @@ class Options:
 
     Attributes:
         version: 2 (rotations in 3 bytes) or 3 (in 4, ten times as exact).
-        fractional_bits: of positions, 0 to 24; None takes what suits the scene, see `resolve`.
+        fractional_bits: of positions, 0 to 24; None takes what suits the scene, see `fractional_bits`.
         compression_level: 1 (fast) to 9 (small).
         threads: to encode and compress with.
     """
@@ -101,8 +100,8 @@ def largest_fractional_bits(center: NDArray[np.float32]) -> int:
     return bits
 
 
-def resolve(splats: Splats, options: Options) -> Options:
-    """The options with the fractional bits that these splats get.
+def fractional_bits(splats: Splats, options: Options) -> int:
+    """The fractional bits that these splats get with these options.
 
     Raises:
         FormatError: a coordinate does not fit the fractional bits; the text names the most that would.
@@ -111,12 +110,12 @@ def resolve(splats: Splats, options: Options) -> Options:
         raise ValueError(f"SPZ version {options.version} is not one of {SPZ_VERSIONS}")
     most = largest_fractional_bits(splats.center)
     if options.fractional_bits is None:
-        return dataclasses.replace(options, fractional_bits=_enough_bits(splats, most))
+        return _enough_bits(splats, most)
     if options.fractional_bits > most:
         raise FormatError(
             f"a coordinate does not fit {options.fractional_bits} fractional bits, at most {most} would do"
         )
-    return options
+    return options.fractional_bits
 
 
 def _enough_bits(splats: Splats, most: int) -> int:
@@ -204,8 +203,7 @@ def encode(scene: Scene, options: Options, *, progress: Progress = silent) -> It
         FormatError: a coordinate does not fit the fractional bits; the text names the most that would.
     """
     splats, tree = scene.splats, scene.tree
-    bits = resolve(splats, options).fractional_bits
-    assert bits is not None
+    bits = fractional_bits(splats, options)
     flags = (ANTIALIASED if scene.antialiased else 0) | (LOD if tree else 0)
     layout = Layout(options.version, len(splats), splats.sh_degree, bits, flags)
     data = np.empty(HEADER.size + layout.total, np.uint8)

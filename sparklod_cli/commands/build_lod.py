@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import json
+import os
 import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -13,13 +14,16 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from .. import limits
-from .console import Console, count_of
+from .console import Console, count_of, is_terminal
 from .options import AutoOr, Ball, Numbers, Real, common_options
 
 if TYPE_CHECKING:
     from ..bake import Baked, Recipe
 
 STDOUT = Path("-")
+
+#: Said when kernels are compiled; {} is how often that happens.
+COMPILING = "Compiling for this machine, which takes some 10 seconds; this happens {} ..."
 
 #: What SPZ clamps, for people; see `spz.clamped`.
 CLAMPED = {"scale": "scales (4.5e-5 to 380 units)", "rgb": "colours (-0.44 to 1.44)", "sh": "SH (-1 to 0.99)"}
@@ -81,7 +85,7 @@ Examples:
     "--spz-version",
     type=click.Choice([str(version) for version in limits.SPZ_VERSIONS]),
     default=str(limits.DEFAULT_SPZ_VERSION),
-    help="2 is 8 % smaller, 3 keeps rotations ten times as exact.",
+    help="2 is 4 to 8 % smaller, 3 keeps rotations ten times as exact.",
 )
 @click.option(
     "--fractional-bits",
@@ -120,7 +124,7 @@ def build_lod(
     outputs = _outputs(inputs, output, output_dir)
     if output == STDOUT and as_json:
         raise click.UsageError("--json and -o - both want standard output")
-    if output == STDOUT and sys.stdout.isatty():
+    if output == STDOUT and is_terminal(sys.stdout):
         raise click.UsageError("-o - writes binary data; redirect it to a file or a pipe")
     failed = False
     with Console(quiet=quiet, verbose=verbose) as console:
@@ -157,13 +161,18 @@ def _outputs(inputs: tuple[Path, ...], output: Path | None, output_dir: Path | N
             raise click.UsageError("-o and --output-dir exclude each other")
         if len(inputs) > 1:
             raise click.UsageError(f"-o takes one input, not {len(inputs)}; use --output-dir")
-        return [output]
-    outputs = [(output_dir or source.parent) / f"{source.stem}-lod.spz" for source in inputs]
-    first: dict[Path, Path] = {}
+        outputs = [output]
+    else:
+        outputs = [(output_dir or source.parent) / f"{source.stem}-lod.spz" for source in inputs]
+    sources = {os.path.realpath(source): source for source in inputs}
+    first: dict[str, Path] = {}
     for source, target in zip(inputs, outputs, strict=True):
-        if target in first:
-            raise click.UsageError(f"{first[target]} and {source} would both be written to {target}")
-        first[target] = source
+        place = os.path.realpath(target)
+        if place in sources and target != STDOUT:
+            raise click.UsageError(f"{target} is an input; write elsewhere")
+        if place in first:
+            raise click.UsageError(f"{first[place]} and {source} would both be written to {target}")
+        first[place] = source
     return outputs
 
 
@@ -175,7 +184,9 @@ def _prepare(settings: dict[str, Any], console: Console) -> Recipe:
     from ..selection import Selection
 
     jit.use_threads(settings["threads"])
-    jit.on_first_compile(lambda: console.say("Compiling for this machine; this happens once and takes a while ..."))
+    jit.on_first_compile(
+        lambda: console.say(COMPILING.format("once" if jit.CACHE_FOLDER else "every time, as no cache can be written"))
+    )
     return Recipe(
         base=settings["base"],
         max_sh=settings["max_sh"],

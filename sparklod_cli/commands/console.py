@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from types import TracebackType
-from typing import Any
+from typing import Any, TextIO
 
 import click
 
@@ -12,6 +13,18 @@ import click
 def count_of(count: int, noun: str) -> str:
     """ "1 node", "1,234 nodes"."""
     return f"{count:,} {noun}" + ("" if count == 1 else "s")
+
+
+def is_terminal(stream: TextIO | None) -> bool:
+    """Whether a person sits at a stream; one that is closed is None."""
+    return stream is not None and stream.isatty()
+
+
+def say_error(text: str) -> None:
+    """One line on standard error, in colour where that is a terminal that wants it (no-color.org)."""
+    plain = os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb"
+    prefix = "error:" if plain else click.style("error:", fg="red", bold=True)
+    click.echo(f"{prefix} {text}", err=True)
 
 
 class Console:
@@ -22,7 +35,7 @@ class Console:
 
     def __init__(self, *, quiet: bool, verbose: bool) -> None:
         self._quiet, self._verbose = quiet, verbose
-        self._bars = not quiet and sys.stderr.isatty()
+        self._bars = not quiet and is_terminal(sys.stderr)
         self._bar: Any = None
 
     def __enter__(self) -> Console:
@@ -39,7 +52,7 @@ class Console:
 
     def error(self, text: str) -> None:
         self.clear()
-        click.echo(f"{click.style('error:', fg='red', bold=True)} {text}", err=True)
+        say_error(text)
 
     def say(self, text: str) -> None:
         if not self._quiet:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable
 from typing import Any, TypeVar
 
 import click
 
 from .. import __version__
+from ..limits import MAX_THREADS
+from ..parallel import processors
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 
@@ -71,12 +72,6 @@ class AutoOr(click.IntRange):
         return "auto|N"
 
 
-def processors() -> int:
-    """How many processors this process may use."""
-    affinity = getattr(os, "sched_getaffinity", None)
-    return len(affinity(0)) if affinity else os.cpu_count() or 1
-
-
 def common_options(command: Command) -> Command:
     """`--threads`, `--json`, `-q`, `-v`, `--version`."""
     for option in (
@@ -87,8 +82,8 @@ def common_options(command: Command) -> Command:
         click.option(
             "--threads",
             metavar="N",
-            type=click.IntRange(1, 256),
-            default=processors,
+            type=click.IntRange(1, MAX_THREADS),
+            default=lambda: min(processors(), MAX_THREADS),
             show_default="all",
             help="Threads to work on.",
         ),

@@ -105,7 +105,7 @@ def build(splats: Splats, base: float = DEFAULT_BASE, *, progress: Progress = si
         M >= N splats and their tree; merged ones have linear opacities up to 1000.
 
     Raises:
-        InvalidSplatsError: there is no splat.
+        InvalidSplatsError: there is no splat, or one that cannot be drawn.
         ValueError: the base is out of range.
     """
     if not MIN_BASE <= base <= MAX_BASE:
@@ -115,6 +115,8 @@ def build(splats: Splats, base: float = DEFAULT_BASE, *, progress: Progress = si
         raise InvalidSplatsError("no splat is left to build a tree of")
     with threads_for(n) as threads:
         low, high, smallest, largest = extremes(splats.center, splats.scale, threads)
+        if not (smallest > 0 and splats.opacity.min() > 0 and np.isfinite([*low, *high, largest]).all()):
+            raise InvalidSplatsError("a splat is not finite, or without opacity or scale: see Selection.apply")
         finest = math.floor(math.log(max(smallest, np.abs([low, high]).max() / MAX_CELL), base))
         coarsest = max(finest + 1, math.ceil(math.log(largest, base)) + 1)
         steps = base ** np.arange(finest, coarsest + 1, dtype=np.float64)

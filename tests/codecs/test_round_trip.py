@@ -79,7 +79,7 @@ def as_spz(source: Scene, version: int) -> bytes:
 
 
 def spz_precision(version: int, source: Scene) -> Precision:
-    bits = spz.resolve(source.splats, spz.Options(version=version)).fractional_bits
+    bits = spz.fractional_bits(source.splats, spz.Options(version=version))
     assert bits is not None
     coding = spz.quantize.decode_quat_smallest_three if version == 3 else spz.quantize.decode_quat_first_three
     return Precision(
@@ -169,7 +169,7 @@ def assert_close(back: Splats, source: Splats, allowed: Precision) -> None:
 @pytest.mark.parametrize("lod", [False, True])
 def test_writing_again_changes_nothing(name: str, version: int, lod: bool) -> None:
     """SPZ of SPZ: whatever was rounded once stays where it is (rotations beyond half a turn excepted)."""
-    bits = spz.resolve(scene(name).splats, spz.Options()).fractional_bits
+    bits = spz.fractional_bits(scene(name).splats, spz.Options())
     options = spz.Options(version=version, fractional_bits=bits)
     once = spz.decode(io.BytesIO(b"".join(spz.encode(scene(name, lod=lod), options))))
     twice = spz.decode(io.BytesIO(b"".join(spz.encode(once, options))))

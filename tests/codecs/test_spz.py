@@ -138,7 +138,7 @@ def splats_with(*, reach: float = 1.0, scale: float = 0.01, count: int = 200) ->
 
 
 def bits_of(splats: Splats, fractional_bits: int | None = None) -> int | None:
-    return spz.resolve(splats, spz.Options(fractional_bits=fractional_bits)).fractional_bits
+    return spz.fractional_bits(splats, spz.Options(fractional_bits=fractional_bits))
 
 
 @given(reach=st.floats(2.0**-10, 8_388_607, width=32))
@@ -191,7 +191,7 @@ def test_what_no_bits_hold_is_refused() -> None:
 def test_only_versions_2_and_3_are_written() -> None:
     for version in (1, 4):
         with pytest.raises(ValueError, match="is not one of"):
-            spz.resolve(random_splats(1), spz.Options(version=version))
+            spz.fractional_bits(random_splats(1), spz.Options(version=version))
 
 
 def test_what_is_clamped_is_counted_by_splat() -> None:
