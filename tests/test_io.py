@@ -305,3 +305,26 @@ def test_standard_output_that_is_full_is_one_line() -> None:
     assert done.returncode == 1
     assert len(lines) == 1, done.stderr
     assert "cannot write standard output: no space left on device" in lines[0]
+
+
+def test_a_name_that_is_taken_meanwhile_is_not_replaced(tmp_path: Path) -> None:
+    target = tmp_path / "out.spz"
+
+    def pieces() -> Iterator[bytes]:
+        target.write_bytes(b"another's")
+        yield b"ours"
+
+    with pytest.raises(OutputError, match="exists, add --overwrite"):
+        write_whole(target, pieces(), overwrite=False)
+    assert target.read_bytes() == b"another's"
+    assert names(tmp_path) == ["out.spz"]
+
+
+def test_what_was_private_stays_private(tmp_path: Path) -> None:
+    target = tmp_path / "out.spz"
+    target.write_bytes(b"old")
+    target.chmod(0o600)
+    before = target.stat().st_ino
+    write_whole(target, [b"new"], overwrite=True)
+    assert target.stat().st_mode & 0o777 == 0o600
+    assert target.stat().st_ino != before  # renamed to, not written into
