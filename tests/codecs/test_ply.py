@@ -244,6 +244,23 @@ def test_refused_with_a_reason(what: str) -> None:
         decode(make())
 
 
+def test_comments_may_be_in_any_encoding() -> None:
+    plain = by_hand.ply(columns())
+    comments = b"\ncomment by J\xfcrgen, element vertex 3\nobj_info \xff\xfe\nelement vertex"
+    assert_same(decode(plain.replace(b"\nelement vertex", comments, 1)), decode(plain))
+
+
+@pytest.mark.parametrize("count", ["5_0", "+5", "-5", "0x5", "5.0", "five", "", "5 5"])
+def test_a_count_is_digits(count: str) -> None:
+    with pytest.raises(FormatError, match="a name and a count"):
+        decode(by_hand.ply(columns()).replace(b"element vertex 5", f"element vertex {count}".encode(), 1))
+
+
+def test_space_around_the_words_of_a_header_does_not_matter() -> None:
+    plain = by_hand.ply(columns())
+    assert_same(decode(plain.replace(b"element vertex 5", b"  element \t vertex  5 ", 1)), decode(plain))
+
+
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("count", ["4000000000", "18446744073709551615", "1" + "0" * 30])
 @pytest.mark.parametrize("element", ["vertex", "camera", "face"])
