@@ -12,7 +12,7 @@ from typing import NoReturn
 import click
 
 from . import __version__
-from .commands.console import say_error
+from .commands.console import say, say_error
 from .errors import SparklodError
 
 #: Sub-commands, each a module of `commands` with a function of its name; imported when it is called for.
@@ -59,7 +59,7 @@ def run(arguments: list[str] | None = None) -> int:
         say_error(str(error))
         return 1
     except (click.Abort, KeyboardInterrupt):
-        click.echo("interrupted", err=True)
+        say("interrupted")
         return 130
     except BrokenPipeError:
         # Whoever read standard output has gone; pointing it elsewhere keeps the interpreter's last flush quiet.

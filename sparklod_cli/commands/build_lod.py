@@ -164,7 +164,7 @@ def _outputs(inputs: tuple[Path, ...], output: Path | None, output_dir: Path | N
         outputs = [output]
     else:
         outputs = [(output_dir or source.parent) / f"{source.stem}-lod.spz" for source in inputs]
-    sources = {os.path.realpath(source): source for source in inputs}
+    sources = {os.path.realpath(source) for source in inputs}
     first: dict[str, Path] = {}
     for source, target in zip(inputs, outputs, strict=True):
         place = os.path.realpath(target)

@@ -20,11 +20,17 @@ def is_terminal(stream: TextIO | None) -> bool:
     return stream is not None and stream.isatty()
 
 
+def say(text: str) -> None:
+    """One line on standard error, if that is not closed."""
+    if sys.stderr is not None:
+        click.echo(text, err=True)
+
+
 def say_error(text: str) -> None:
     """One line on standard error, in colour where that is a terminal that wants it (no-color.org)."""
     plain = os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb"
     prefix = "error:" if plain else click.style("error:", fg="red", bold=True)
-    click.echo(f"{prefix} {text}", err=True)
+    say(f"{prefix} {text}")
 
 
 class Console:
@@ -57,7 +63,7 @@ class Console:
     def say(self, text: str) -> None:
         if not self._quiet:
             self.clear()
-            click.echo(text, err=True)
+            say(text)
 
     def detail(self, text: str) -> None:
         """Something only `--verbose` wants to know."""
