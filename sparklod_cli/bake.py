@@ -99,9 +99,11 @@ def _bake(source: Path, write: Sink, recipe: Recipe, progress: Progress) -> Bake
     handed_over = [kept]
     del scene, kept
     nodes, tree = quick.build(handed_over.pop(), recipe.base, progress=progress)
+    levels = int(tree.depths().max()) + 1
     build_done = time.perf_counter()
     output = Scene(nodes, tree, antialiased)
     size = write(spz.encode(output, options, progress=progress))
+    clamped = spz.clamped(nodes, threads)
     seconds = {
         "read": read_done - start,
         "build": build_done - read_done,
@@ -114,11 +116,11 @@ def _bake(source: Path, write: Sink, recipe: Recipe, progress: Progress) -> Bake
         sh_degree=degree,
         dropped=dropped,
         nodes=len(nodes),
-        levels=int(tree.depths().max()) + 1,
+        levels=levels,
         bytes=size,
         version=options.version,
         fractional_bits=bits,
-        clamped=spz.clamped(nodes, threads),
+        clamped=clamped,
         notes=notes,
         seconds={stage: round(value, 4) for stage, value in seconds.items()},
     )

@@ -1,4 +1,4 @@
-"""The mathematics of one splat: quaternions, opacity and feature size, over whole arrays."""
+"""The mathematics of one splat: quaternions and opacity, over whole arrays."""
 
 from __future__ import annotations
 

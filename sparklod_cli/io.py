@@ -75,24 +75,27 @@ def write_whole(path: Path, pieces: Iterable[bytes], *, overwrite: bool) -> int:
         OutputError: it exists and `overwrite` is not set, or the file system refused something.
     """
     check_writable(path, overwrite=overwrite)
-    special = path.exists() and not path.is_file()  # a pipe or a device is written to, never replaced
-    target = path if special else Path(os.path.realpath(path))
-    temporary = target if special else target.with_name(f".sparklod-{secrets.token_hex(8)}.part")
     try:
-        with temporary.open("wb" if special else "xb") as file:
-            size = sum(file.write(piece) for piece in pieces)
-            file.flush()
-            if not special:
-                os.fsync(file.fileno())
-        if not special:
-            _publish(temporary, target, overwrite)
+        if path.exists() and not path.is_file():  # a pipe or a device is written to, never replaced
+            with path.open("wb") as file:
+                return sum(map(file.write, pieces))
+        return _write_and_rename(Path(os.path.realpath(path)), pieces, overwrite)
     except FileExistsError:
         raise OutputError(f"{path} exists, add --overwrite to replace it") from None
     except OSError as error:
         raise OutputError(f"cannot write {path}: {_reason(error)}") from None
+
+
+def _write_and_rename(target: Path, pieces: Iterable[bytes], overwrite: bool) -> int:
+    temporary = target.with_name(f".sparklod-{secrets.token_hex(8)}.part")
+    try:
+        with temporary.open("xb") as file:
+            size = sum(map(file.write, pieces))
+            file.flush()
+            os.fsync(file.fileno())
+        _publish(temporary, target, overwrite)
     finally:
-        if not special:
-            temporary.unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
     return size
 
 
@@ -118,7 +121,7 @@ def write_stdout(pieces: Iterable[bytes]) -> int:
     if sys.stdout is None:
         raise OutputError("standard output is closed")
     try:
-        size = sum(sys.stdout.buffer.write(piece) for piece in pieces)
+        size = sum(map(sys.stdout.buffer.write, pieces))
         sys.stdout.buffer.flush()
     except OSError as error:
         raise OutputError(f"cannot write standard output: {_reason(error)}") from None

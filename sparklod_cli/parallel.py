@@ -32,13 +32,17 @@ def ordered_map(work: Callable[[Item], Result], items: list[Item], threads: int)
         pool.shutdown(wait=True, cancel_futures=True)
 
 
+def chunks_of(rows: int) -> list[slice]:
+    """Slices of `CHUNK` rows that cover `rows`; the last may be shorter."""
+    return [slice(start, min(start + CHUNK, rows)) for start in range(0, rows, CHUNK)]
+
+
 def for_chunks(work: Callable[[slice], None], rows: int, threads: int, done: Callable[[int], None]) -> None:
     """Calls `work` with slices that cover `rows`, and `done` with the number of rows finished so far, in order."""
-    slices = [slice(start, min(start + CHUNK, rows)) for start in range(0, rows, CHUNK)]
 
     def run(part: slice) -> int:
         work(part)
         return part.stop
 
-    for stop in ordered_map(run, slices, threads):
+    for stop in ordered_map(run, chunks_of(rows), threads):
         done(stop)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from .errors import FormatError
+from .limits import MAX_SH_DEGREE
 
 #: Y_00, the constant term of the real spherical harmonics: 1 / (2 * sqrt(pi)).
 SH_C0 = 0.28209479177387814
@@ -18,3 +19,8 @@ def degree_of(coefficients: int) -> int:
     except ValueError:
         known = ", ".join(map(str, COEFFICIENTS))
         raise FormatError(f"{coefficients} SH coefficients a channel, expected one of {known}") from None
+
+
+def notes_on_degree(degree: int) -> tuple[str, ...]:
+    """What a reader says of a file of this degree: that it is cut, where it is."""
+    return (f"SH degree {degree} is cut to {MAX_SH_DEGREE}",) if degree > MAX_SH_DEGREE else ()

@@ -21,10 +21,10 @@ from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
 from ..errors import FormatError
 from ..gaussian import normalized_quat
 from ..limits import MAX_SH_DEGREE
-from ..parallel import CHUNK, for_chunks
+from ..parallel import chunks_of, for_chunks
 from ..progress import Progress, silent
 from ..scene import Scene
-from ..sh import SH_C0, degree_of
+from ..sh import SH_C0, degree_of, notes_on_degree
 from ..splats import FloatArray, Splats
 
 Decoder = Callable[[FloatArray], FloatArray]
@@ -93,8 +93,7 @@ def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> 
     else:
         data = _binary_rows(file, header)
         for_chunks(lambda part: _decode_rows(data[part], splats, part, coefficients), count, threads, report)
-    notes = (f"SH degree {degree} is cut to {MAX_SH_DEGREE}",) if degree > MAX_SH_DEGREE else ()
-    return Scene(splats, format="PLY", notes=notes)
+    return Scene(splats, format="PLY", notes=notes_on_degree(degree))
 
 
 def _decode_rows(rows: NDArray[Any], out: Splats, part: slice, channel_stride: int) -> None:
@@ -209,15 +208,14 @@ def _text_rows(file: BinaryIO, header: Header) -> Iterator[tuple[slice, NDArray[
         if name == "vertex":
             break
         deque(islice(file, count), maxlen=0)
-    for start in range(0, header.vertices, CHUNK):
-        wanted = min(CHUNK, header.vertices - start)
-        lines = list(islice(file, wanted))
-        if len(lines) < wanted:
-            raise FormatError(f"cut short after {start + len(lines):,} of {header.vertices:,} vertices")
+    for part in chunks_of(header.vertices):
+        lines = list(islice(file, part.stop - part.start))
+        if part.start + len(lines) < part.stop:
+            raise FormatError(f"cut short after {part.start + len(lines):,} of {header.vertices:,} vertices")
         if not all(map(bytes.strip, lines)):  # numpy would skip them
-            raise FormatError(f"empty lines among the vertices after {start:,}")
+            raise FormatError(f"empty lines among the vertices after {part.start:,}")
         try:
             rows = np.loadtxt(lines, dtype=row_type, ndmin=1, comments=None)
         except ValueError as error:
-            raise FormatError(f"bad PLY data after vertex {start:,}: {error}") from None
-        yield slice(start, start + wanted), rows
+            raise FormatError(f"bad PLY data after vertex {part.start:,}: {error}") from None
+        yield part, rows

@@ -15,13 +15,13 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FormatError, SparklodError
+from ..errors import FormatError, TreeError
 from ..gaussian import linear_opacity, lod_opacity
 from ..limits import DEFAULT_COMPRESSION, DEFAULT_SPZ_VERSION, MAX_FRACTIONAL_BITS, MAX_SH_DEGREE, SPZ_VERSIONS
-from ..parallel import CHUNK, for_chunks, ordered_map
+from ..parallel import chunks_of, for_chunks, ordered_map
 from ..progress import Progress, silent
 from ..scene import Scene
-from ..sh import COEFFICIENTS
+from ..sh import COEFFICIENTS, notes_on_degree
 from ..splats import FloatArray, Splats
 from ..tree import LodTree
 from . import compression, quantize
@@ -129,7 +129,6 @@ def _enough_bits(splats: Splats, most: int) -> int:
 
 def clamped(splats: Splats, threads: int = 1) -> dict[str, int]:
     """How many splats have a value that its code cannot hold, by the column (scale, rgb, sh) where there are any."""
-    slices = [slice(start, start + CHUNK) for start in range(0, len(splats), CHUNK)]
     counts = {}
     for name, (low, high) in quantize.CLAMPS.items():
         column = getattr(splats, name).reshape(len(splats), -1)
@@ -138,7 +137,7 @@ def clamped(splats: Splats, threads: int = 1) -> dict[str, int]:
             values = column[part]
             return int(np.count_nonzero(((values < low) | (values > high)).any(axis=1)))
 
-        counts[name] = sum(ordered_map(outside, slices, threads))
+        counts[name] = sum(ordered_map(outside, chunks_of(len(splats)), threads))
     return {name: count for name, count in counts.items() if count}
 
 
@@ -150,8 +149,7 @@ def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> 
             than its size can hold; an LoD file whose tree is not one.
     """
     data = file.read()
-    layout, streams = _read_v4(data) if data[:4] == struct.pack("<I", MAGIC) else _read_gzip(data)
-    columns = {name: streams[name].reshape(layout.count, size) for name, size in layout.streams().items()}
+    layout, columns = _read_v4(data) if data[:4] == struct.pack("<I", MAGIC) else _read_gzip(data)
     splats = Splats.empty(layout.count, min(layout.sh_degree, MAX_SH_DEGREE))
     for_chunks(
         lambda part: _decode_chunk(layout, columns, splats, part),
@@ -164,12 +162,10 @@ def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> 
         tree = LodTree(columns["child_counts"].view("<u2")[:, 0], columns["child_starts"].view("<u4")[:, 0])
         try:
             tree.validate()
-        except SparklodError as error:
+        except TreeError as error:
             raise FormatError(f"its LoD tree is broken: {error}") from error
-    cut = layout.sh_degree > MAX_SH_DEGREE
-    notes = (f"SH degree {layout.sh_degree} is cut to {MAX_SH_DEGREE}",) if cut else ()
     name = f"SPZ {layout.version}" + (" LoD" if tree else "")
-    return Scene(splats, tree, bool(layout.flags & ANTIALIASED), name, notes)
+    return Scene(splats, tree, bool(layout.flags & ANTIALIASED), name, notes_on_degree(layout.sh_degree))
 
 
 def _decode_chunk(layout: Layout, columns: dict[str, quantize.Bytes], out: Splats, part: slice) -> None:
@@ -297,6 +293,7 @@ def _read_v4(data: bytes) -> tuple[Layout, dict[str, quantize.Bytes]]:
             raise FormatError(f"stream {name} has {unpacked:,} bytes, {count:,} splats need {size * count:,}")
         if at + packed > len(data):
             raise FormatError(f"cut short inside stream {name}")
-        columns[name] = np.frombuffer(compression.unzstd(data[at : at + packed], unpacked, name), np.uint8)
+        stream = compression.unzstd(data[at : at + packed], unpacked, name)
+        columns[name] = np.frombuffer(stream, np.uint8).reshape(count, size)
         at += packed
     return layout, columns

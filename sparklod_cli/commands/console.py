@@ -79,5 +79,4 @@ class Console:
             self.clear()
             scaled = {"unit_scale": True, "unit": unit if unit == "B" else f" {unit}s"}
             self._bar = tqdm(total=total, desc=stage, leave=False, file=sys.stderr, dynamic_ncols=True, **scaled)
-            self._bar.desc = stage
         self._bar.update(done - self._bar.n)
