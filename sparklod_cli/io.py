@@ -3,21 +3,35 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import secrets
 import stat
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import Any, BinaryIO
 
-from .codecs.formats import FORMATS, sniff
+import numpy as np
+from numpy.typing import NDArray
+
+from .codecs.formats import FORMATS, HEAD, sniff
 from .errors import FormatError, OutputError
 from .progress import Progress, silent
 from .scene import Scene
+from .splats import FloatArray
+
+#: Writes the pieces of an output and returns how many bytes it wrote.
+Sink = Callable[[Iterable[bytes]], int]
 
 
 def read_scene(path: Path, *, threads: int = 1, progress: Progress = silent) -> Scene:
-    """Reads a splat file of any known format, told by its content.
+    """Reads a splat file of any known format, told by its content, or else by its suffix.
+
+    Args:
+        path: of a file, or of a folder that holds an unpacked SOG.
+        threads: to decode with.
+        progress: is told how much is done.
 
     Raises:
         FormatError: it is not a file, empty, of no known format, or broken.
@@ -25,21 +39,76 @@ def read_scene(path: Path, *, threads: int = 1, progress: Progress = silent) -> 
     try:
         if str(path) == "-":
             raise FormatError("standard input is not read; save it to a file first")
-        if path.exists() and not (path.is_file() or path.is_dir()):
+        if path.is_dir():
+            path = _in_folder(path)
+        if path.exists() and not path.is_file():
             raise FormatError("it is a pipe or a device; save it to a file first")
         with path.open("rb") as file:
-            head = file.read(16)
+            head = file.read(HEAD)
             file.seek(0)
             if not head:
                 raise FormatError("the file is empty")
-            form = sniff(head)
+            form = sniff(head, path.suffix)
             if form is None:
                 names = ", ".join(form.name for form in FORMATS)
                 raise FormatError(f"not a splat file that sparklod reads ({names})")
-            scene: Scene = form.codec().decode(file, threads=threads, progress=progress)
+            more = {"beside": functools.partial(_open_beside, path.parent)} if form.companions else {}
+            scene: Scene = form.codec().decode(file, threads=threads, progress=progress, **more)
             return scene
     except OSError as error:
         raise FormatError(f"cannot be read: {_reason(error)}") from None
+
+
+def _in_folder(folder: Path) -> Path:
+    path = folder / "meta.json"
+    if not path.is_file():
+        raise FormatError("cannot be read: is a directory, without the meta.json of an unpacked SOG")
+    return path
+
+
+def _open_beside(folder: Path, name: str) -> BinaryIO:
+    """Opens a file that another one names; `FormatError` where the name could lead out of their folder."""
+    if name in ("", ".", "..") or any(mark in name for mark in "/\\:\0"):
+        raise FormatError(f"it names {name!r}, which is not a file beside it")
+    try:
+        return (folder / name).open("rb")
+    except OSError as error:
+        raise FormatError(f"{name}, which it names, cannot be read: {_reason(error)}") from None
+
+
+def read_rgba(path: Path, count: int) -> FloatArray:
+    """Colours and opacities for the `count` splats of a scene: (count, 4) float32, 0..1.
+
+    Reads .npy files of uint8 or floats, and raw files of uint8 or float32 (little-endian), told by their size.
+
+    Raises:
+        FormatError: it is neither, of another length, or has values that are not 0..1; names the file.
+    """
+    try:
+        with path.open("rb") as file:
+            npy = file.read(6) == b"\x93NUMPY"
+        values = np.load(path, mmap_mode="r", allow_pickle=False) if npy else _raw_rgba(path, count)
+    except OSError as error:
+        raise FormatError(f"{path} cannot be read: {_reason(error)}") from None
+    except (ValueError, EOFError, SyntaxError) as error:
+        raise FormatError(f"{path} is not a .npy file: {error}") from None
+    if values.ndim != 2 or values.shape[1] != 4 or (values.dtype != np.uint8 and values.dtype.kind != "f"):
+        raise FormatError(f"{path} has {values.dtype}{list(values.shape)}, expected uint8 or floats [{count}, 4]")
+    if len(values) != count:
+        raise FormatError(f"{path} has colours for {len(values):,} splats, the scene has {count:,}")
+    rgba = np.array(values, np.float32) / np.float32(255 if values.dtype == np.uint8 else 1)
+    if not ((rgba >= 0) & (rgba <= 1)).all():
+        raise FormatError(f"{path} has values that are not 0..1")
+    return rgba
+
+
+def _raw_rgba(path: Path, count: int) -> NDArray[Any]:
+    values: NDArray[Any] = np.fromfile(path, np.uint8)
+    if values.size == 16 * count:
+        values = values.view("<f4")
+    if values.size % 4:
+        raise FormatError(f"{path} has {values.size:,} bytes, which are not four a splat")
+    return values.reshape(-1, 4)
 
 
 def check_writable(path: Path, *, overwrite: bool, make_parent: bool = False) -> None:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeVar
 
 Item = TypeVar("Item")
@@ -20,14 +21,23 @@ def processors() -> int:
     return len(affinity(0)) if affinity else os.cpu_count() or 1
 
 
-def ordered_map(work: Callable[[Item], Result], items: list[Item], threads: int) -> Iterator[Result]:
-    """The results of `work` in the order of `items`, computed up to `threads` at a time."""
+def ordered_map(work: Callable[[Item], Result], items: Iterable[Item], threads: int) -> Iterator[Result]:
+    """The results of `work` in the order of `items`, computed up to `threads` at a time.
+
+    Items are taken as they are needed, a few ahead of the workers, so that what they hold need not fit into memory.
+    """
     if threads == 1:
         yield from map(work, items)
         return
     pool = ThreadPoolExecutor(threads)
+    pending: deque[Future[Result]] = deque()
     try:
-        yield from pool.map(work, items)
+        for item in items:
+            pending.append(pool.submit(work, item))
+            if len(pending) > 2 * threads:
+                yield pending.popleft().result()
+        while pending:
+            yield pending.popleft().result()
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 from .splats import Splats
 from .tree import LodTree
@@ -18,6 +19,7 @@ class Scene:
         antialiased: trained with the opacity compensation of Mip-Splatting.
         format: what it was read from, for people ("PLY", "SPZ 4").
         notes: what the reader had to leave out, for people.
+        header: numbers of the file's header that the splats do not tell, by name ("version", "fractional_bits").
     """
 
     splats: Splats
@@ -25,3 +27,4 @@ class Scene:
     antialiased: bool = False
     format: str = ""
     notes: tuple[str, ...] = ()
+    header: Mapping[str, int] = field(default_factory=dict)

@@ -37,14 +37,14 @@ def test_the_suffix_says_nothing(kind: str, suffix: str, tmp_path: Path) -> None
     ("content", "reason"),
     [
         (b"", "the file is empty"),
-        (b"x", r"not a splat file that sparklod reads \(PLY, SPZ\)"),
+        (b"x", r"not a splat file that sparklod reads \(.*PLY, SPZ, SOG, KSPLAT, SPLAT\)"),
         (b"plywood\n" * 99, "not a splat file"),
         (b"PLY\nformat ascii 1.0\n", "not a splat file"),
         (b"ply", "not a splat file"),
         (b"ply\n", "the PLY header does not end"),
         (b"\x1f", "not a splat file"),
         (b"\x1f\x8b", "cut short"),
-        (b"PK\x03\x04" + bytes(100), "not a splat file"),
+        (b"PK\x03\x04" + bytes(100), "not a whole zip archive"),
         (b"\x28\xb5\x2f\xfd" + bytes(100), "not a splat file"),  # bare zstd
     ],
 )

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import zstandard
@@ -20,6 +20,7 @@ from ..progress import Progress
 
 BLOCK = 1 << 18  # bytes that are deflated apart
 WINDOW = 1 << 15  # bytes before a block that it may refer to
+PIECE = 1 << 17  # bytes that are read at a time
 
 #: Up to this size a header's promise is not doubted; beyond, a file may expand by at most MAX_RATIO. Real scenes reach
 #: a ratio of 3, a scene of equal splats 1000, which is also deflate's limit.
@@ -60,10 +61,11 @@ def check_promise(total: int, file_size: int) -> None:
 
 
 class Inflate:
-    """Reads a gzip member without ever holding more than was asked for."""
+    """Reads a gzip member from a file without ever holding much more than was asked for."""
 
-    def __init__(self, data: bytes) -> None:
-        self._rest = data
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+        self._rest = b""
         self._unpacker = zlib_ng.decompressobj(_GZIP)
 
     def read(self, size: int) -> bytes:
@@ -72,14 +74,19 @@ class Inflate:
         Raises:
             FormatError: the data is corrupt.
         """
-        if size == 0:
-            return b""
-        try:
-            piece: bytes = self._unpacker.decompress(self._rest, size)
-        except _ZlibError as error:
-            raise FormatError(f"corrupt gzip data: {error}") from None
-        self._rest = self._unpacker.unconsumed_tail
-        return piece
+        pieces = []
+        while size > 0 and not self._unpacker.eof:
+            packed = self._rest or self._file.read(PIECE)
+            try:
+                piece: bytes = self._unpacker.decompress(packed, size)
+            except _ZlibError as error:
+                raise FormatError(f"corrupt gzip data: {error}") from None
+            self._rest = self._unpacker.unconsumed_tail
+            if not (packed or piece):
+                break
+            pieces.append(piece)
+            size -= len(piece)
+        return b"".join(pieces)
 
     def finish(self, *, allow_more: bool) -> None:
         """Checks that the member ends here and that its checksum holds.
@@ -98,14 +105,39 @@ class Inflate:
             raise FormatError("cut short: the gzip checksum is missing")
 
 
-def unzstd(data: bytes, size: int, name: str) -> bytes:
-    """The `size` bytes of one zstd frame; `FormatError`, naming the stream, where it is corrupt or of another size."""
-    try:
-        if zstandard.frame_content_size(data) not in (-1, size):
-            raise FormatError(f"stream {name} is not of the size that its table says")
-        piece: bytes = zstandard.ZstdDecompressor().decompress(data, max_output_size=max(size, 1))
-    except zstandard.ZstdError as error:
-        raise FormatError(f"corrupt zstd data in stream {name}: {error}") from None
-    if len(piece) != size:
-        raise FormatError(f"stream {name} is not of the size that its table says")
-    return piece
+class _Window:
+    """The next `size` bytes of a file, as a file."""
+
+    def __init__(self, file: BinaryIO, size: int) -> None:
+        self._file, self._left = file, size
+
+    def read(self, size: int) -> bytes:
+        data = self._file.read(min(size, self._left))
+        self._left -= len(data)
+        return data
+
+
+class Unzstd:
+    """Reads the zstd frame that the next `packed` bytes of a file are, without holding more than was asked for."""
+
+    def __init__(self, file: BinaryIO, packed: int, name: str) -> None:
+        self._name = name
+        window: Any = _Window(file, packed)
+        self._reader = zstandard.ZstdDecompressor().stream_reader(window, read_size=PIECE)
+
+    def read(self, size: int) -> bytes:
+        """The next `size` bytes, or fewer where the data ends.
+
+        Raises:
+            FormatError: the data is corrupt; names the stream.
+        """
+        try:
+            piece: bytes = self._reader.read(size)
+        except zstandard.ZstdError as error:
+            raise FormatError(f"corrupt zstd data in stream {self._name}: {error}") from None
+        return piece
+
+    def finish(self) -> None:
+        """Raises `FormatError` unless the stream ends here."""
+        if self.read(1):
+            raise FormatError(f"stream {self._name} is longer than its table says")

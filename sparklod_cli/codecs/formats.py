@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
+
+#: Bytes of a file that are looked at to tell its format.
+HEAD = 1 << 12
 
 
 @dataclass(frozen=True)
@@ -15,25 +19,42 @@ class Format:
         name: for people.
         module: in this package; has `decode(file, *, threads, progress) -> Scene`.
         suffixes: lower case, with the dot.
-        magics: what a file of it may begin with.
+        beginning: a regular expression that the first bytes of its files match; None where they can be anything, and
+            only the suffix tells.
+        companions: its files name others beside them; `decode` takes another argument, `beside`, which opens these.
     """
 
     name: str
     module: str
     suffixes: tuple[str, ...]
-    magics: tuple[bytes, ...]
+    beginning: bytes | None
+    companions: bool = False
 
     def codec(self) -> Any:
         """The module, imported when it is needed."""
         return import_module(f".{self.module}", __package__)
 
+    def begins(self, head: bytes) -> bool:
+        """Whether a file that begins with `head` is of this format, as far as one can see."""
+        return self.beginning is not None and re.match(self.beginning, head, re.DOTALL) is not None
 
+
+#: In the order in which they are tried: compressed PLY is PLY, too.
 FORMATS = (
-    Format("PLY", "ply", (".ply",), (b"ply\n", b"ply\r")),
-    Format("SPZ", "spz", (".spz",), (b"\x1f\x8b", b"NGSP")),  # versions 1 to 3 are gzipped, 4 is not
+    Format("compressed PLY", "compressed_ply", (".ply",), rb"ply\s(?:(?!end_header).)*\bpacked_position\b"),
+    Format("PLY", "ply", (".ply",), rb"ply[\r\n]"),
+    Format("SPZ", "spz", (".spz",), rb"\x1f\x8b|NGSP"),  # versions 1 to 3 are gzipped, 4 is not
+    Format("SOG", "sog", (".sog", ".json"), rb"PK\x03\x04|\s*\{", companions=True),  # a zip, or its meta.json unpacked
+    Format("KSPLAT", "ksplat", (".ksplat",), rb"\0[\x01-\xff]\0\0"),  # version 0.1 and up; a float would be denormal
+    Format("SPLAT", "splat", (".splat",), None),
 )
 
 
-def sniff(head: bytes) -> Format | None:
-    """The format of a file that begins with `head`, judged by content alone."""
-    return next((form for form in FORMATS if head.startswith(form.magics)), None)
+def sniff(head: bytes, suffix: str) -> Format | None:
+    """The format of a file that begins with `head`, its first HEAD bytes, judged by that.
+
+    The suffix is asked where the content can be anything.
+    """
+    by_content = (form for form in FORMATS if form.begins(head))
+    by_suffix = (form for form in FORMATS if form.beginning is None and suffix.lower() in form.suffixes)
+    return next(by_content, None) or next(by_suffix, None)

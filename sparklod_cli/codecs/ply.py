@@ -5,136 +5,68 @@ One vertex a splat, of scalar properties in any order; properties that are not i
 
 from __future__ import annotations
 
-import io
-import mmap
 import re
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from itertools import islice
 from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
-from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
+from plyfile import PlyData, PlyParseError
 
 from ..errors import FormatError
 from ..gaussian import normalized_quat
 from ..limits import MAX_SH_DEGREE
-from ..parallel import chunks_of, for_chunks
+from ..parallel import chunks_of, ordered_map
 from ..progress import Progress, silent
 from ..scene import Scene
-from ..sh import SH_C0, degree_of, notes_on_degree
+from ..sh import degree_of, notes_on_degree
 from ..splats import FloatArray, Splats
+from . import quantize
+from .ply_header import Header, read_header
+from .stream import Rows, decode_rows, rows_of, size_of
 
-Decoder = Callable[[FloatArray], FloatArray]
+Coding = Callable[[FloatArray], FloatArray]
 
-MAX_HEADER = 1 << 20
-
-
-def _sigmoid(logit: FloatArray) -> FloatArray:
-    return 1 / (1 + np.exp(-logit))
-
-
-def _display(dc: FloatArray) -> FloatArray:
-    return dc * np.float32(SH_C0) + np.float32(0.5)
-
-
-#: Column of `Splats`, the properties that it is made of, and how.
-COLUMNS: tuple[tuple[str, tuple[str, ...], Decoder], ...] = (
-    ("center", ("x", "y", "z"), np.copy),
-    ("scale", ("scale_0", "scale_1", "scale_2"), np.exp),  # logarithms
-    ("quat_xyzw", ("rot_1", "rot_2", "rot_3", "rot_0"), normalized_quat),  # w first in the file, of any length
-    ("opacity", ("opacity",), _sigmoid),  # logit
-    ("rgb", ("f_dc_0", "f_dc_1", "f_dc_2"), _display),  # constant SH term
+#: Column of `Splats`, the properties that it is made of, and how they are read and written.
+COLUMNS: tuple[tuple[str, tuple[str, ...], Coding, Coding], ...] = (
+    ("center", ("x", "y", "z"), np.copy, np.copy),
+    ("rgb", ("f_dc_0", "f_dc_1", "f_dc_2"), quantize.decode_dc, quantize.encode_dc),
+    ("opacity", ("opacity",), quantize.decode_logit, quantize.encode_logit),
+    ("scale", ("scale_0", "scale_1", "scale_2"), quantize.decode_log, quantize.encode_log),
+    ("quat_xyzw", ("rot_1", "rot_2", "rot_3", "rot_0"), normalized_quat, np.copy),  # w first; of any length
 )
-REQUIRED = tuple(name for _, names, _ in COLUMNS for name in names)
-
-
-@dataclass(frozen=True)
-class Header:
-    """What comes before the data: element descriptions without their data, and how many rows each has."""
-
-    elements: dict[str, tuple[PlyElement, int]]
-    text: bool
-    byte_order: str
-    size: int
-
-    @property
-    def vertices(self) -> int:
-        return self.elements["vertex"][1]
-
-    def row_type(self, name: str) -> np.dtype[Any] | None:
-        """Type of a row, or None where rows have lists and so no fixed size."""
-        element = self.elements[name][0]
-        has_list = any(isinstance(prop, PlyListProperty) for prop in element.properties)
-        return None if has_list else np.dtype(element.dtype(self.byte_order))
+REQUIRED = tuple(name for _, names, _, _ in COLUMNS for name in names)
 
 
 def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> Scene:
-    """Reads a PLY file; binary ones are memory-mapped.
+    """Reads a PLY file.
 
     Raises:
         FormatError: it is not PLY, cut short, or not of Gaussian splats.
     """
-    header = _read_header(file)
+    size = size_of(file)
+    header = read_header(file)
     coefficients = _checked_coefficients(header)
-    _check_size(header, file.seek(0, io.SEEK_END) - header.size)
-    degree, count = degree_of(coefficients), header.vertices
+    header.check_size(size)
+    degree, count = degree_of(coefficients), header.count("vertex")
     splats = Splats.empty(count, min(degree, MAX_SH_DEGREE))
-
-    def report(done: int) -> None:
-        progress("reading", done, count, "splat")
-
-    if header.text:
-        for part, rows in _text_rows(file, header):
-            _decode_rows(rows, splats, part, coefficients)
-            report(part.stop)
-    else:
-        data = _binary_rows(file, header)
-        for_chunks(lambda part: _decode_rows(data[part], splats, part, coefficients), count, threads, report)
+    rows = _text_rows(file, header) if header.text else _binary_rows(file, header)
+    decode_rows(rows, lambda part, some: _decode(some, splats, part, coefficients), count, threads, progress)
     return Scene(splats, format="PLY", notes=notes_on_degree(degree))
 
 
-def _decode_rows(rows: NDArray[Any], out: Splats, part: slice, channel_stride: int) -> None:
+def _decode(rows: NDArray[Any], out: Splats, part: slice, channel_stride: int) -> None:
     """Fills rows `part` of the columns from structured rows; f_rest holds all red coefficients first."""
     # Infinite logits and logarithms are what converters write for an opacity of 0 or 1 and a scale of 0.
     with np.errstate(over="ignore", invalid="ignore"):
-        for column, names, decoder in COLUMNS:
+        for column, names, decoder, _ in COLUMNS:
             raw = np.stack([rows[name] for name in names], axis=1).astype(np.float32, copy=False)
             getattr(out, column)[part] = decoder(raw).reshape(getattr(out, column)[part].shape)
         for coefficient in range(out.sh.shape[1]):
             for channel in range(3):
                 out.sh[part, coefficient, channel] = rows[f"f_rest_{channel * channel_stride + coefficient}"]
-
-
-def _read_header(file: BinaryIO) -> Header:
-    """Reads up to the line end_header, leaving the file behind it."""
-    text = line = b""
-    while line.strip() != b"end_header":
-        line = file.readline(MAX_HEADER)
-        text += line
-        if not text.startswith(b"ply"):
-            raise FormatError("not a PLY file")
-        if not line or len(text) > MAX_HEADER:
-            raise FormatError("the PLY header does not end")
-    # plyfile gets what it must parse: no comments, which may be in any encoding, and counts of 0, as it would read all
-    # data otherwise, and text value by value.
-    lines, counts = [], []
-    for words in map(bytes.split, text.splitlines()):
-        if words[:1] == [b"element"]:
-            if len(words) != 3 or not words[2].isdigit():
-                raise FormatError("bad PLY header: expected element, a name and a count")
-            counts.append(int(words[2]))
-            words[2] = b"0"
-        if words and words[0] not in (b"comment", b"obj_info"):
-            lines.append(b" ".join(words))
-    try:
-        parsed = PlyData.read(io.BytesIO(b"\n".join(lines) + b"\n"))
-    except (PlyParseError, ValueError) as error:
-        raise FormatError(f"bad PLY header: {error}") from None
-    elements = {element.name: (element, count) for element, count in zip(parsed, counts, strict=True)}
-    return Header(elements, parsed.text, parsed.byte_order, len(text))
 
 
 def _checked_coefficients(header: Header) -> int:
@@ -145,8 +77,6 @@ def _checked_coefficients(header: Header) -> int:
     if row_type is None:
         raise FormatError("the vertices have list properties, splats have none")
     have = row_type.names or ()
-    if "chunk" in header.elements and "packed_position" in have:
-        raise FormatError("a compressed PLY (PlayCanvas); write it as a plain PLY first, with splat-transform")
     missing = [name for name in REQUIRED if name not in have]
     if missing:
         what = "a point cloud or mesh, not Gaussian splats" if "x" in have else "not Gaussian splats"
@@ -158,60 +88,33 @@ def _checked_coefficients(header: Header) -> int:
     return rest // 3
 
 
-def _check_size(header: Header, size: int) -> None:
-    """Raises `FormatError` where `size` bytes cannot hold what the header promises, before memory is asked for."""
-    need = 0
-    for name, (element, count) in header.elements.items():
-        row_type = header.row_type(name)
-        if header.text:
-            need += count * 2 * max(1, len(element.properties))  # a digit and a separator a value
-        else:
-            need += count * (row_type.itemsize if row_type else 1)
-    missing = need - size - (1 if header.text else 0)  # the last separator may be missing
-    if missing > 0:
-        raise FormatError(f"cut short: {missing:,} bytes are missing of what the header promises")
-
-
-def _binary_rows(file: BinaryIO, header: Header) -> NDArray[Any]:
-    """The vertices, memory-mapped where `file` is a real one."""
-    offset = header.size
-    for name, (_, count) in header.elements.items():
-        row_type = header.row_type(name)
-        if row_type is None:  # rows of unknown sizes come before the vertices
-            return _rows_by_plyfile(file)
-        if name == "vertex":
-            break
-        offset += count * row_type.itemsize
-    data: mmap.mmap | bytes
+def _binary_rows(file: BinaryIO, header: Header) -> Iterator[Rows]:
+    offset, row_type = header.offset("vertex"), header.row_type("vertex")
+    if offset is not None and row_type is not None:
+        file.seek(offset)
+        yield from rows_of(file.read, row_type, header.count("vertex"), "vertices")
+        return
+    file.seek(0)  # rows of unknown sizes come before the vertices
     try:
-        data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-    except (OSError, ValueError):  # not a file of the system's, or one that cannot be mapped
-        file.seek(0)
-        data = file.read()
-    return np.frombuffer(data, row_type, header.vertices, offset)
-
-
-def _rows_by_plyfile(file: BinaryIO) -> NDArray[Any]:
-    file.seek(0)
-    try:
-        rows: NDArray[Any] = PlyData.read(file)["vertex"].data
+        data = PlyData.read(file)["vertex"].data
     except (PlyParseError, ValueError) as error:
         raise FormatError(f"bad PLY data: {error}") from None
-    return rows
+    for part in chunks_of(len(data)):
+        yield part, data[part]
 
 
-def _text_rows(file: BinaryIO, header: Header) -> Iterator[tuple[slice, NDArray[Any]]]:
+def _text_rows(file: BinaryIO, header: Header) -> Iterator[Rows]:
     """The vertices of an ascii file in chunks; plyfile's own reader goes value by value in Python."""
-    row_type = header.row_type("vertex")
+    row_type, vertices = header.row_type("vertex"), header.count("vertex")
     file.seek(header.size)
     for name, (_, count) in header.elements.items():
         if name == "vertex":
             break
         deque(islice(file, count), maxlen=0)
-    for part in chunks_of(header.vertices):
+    for part in chunks_of(vertices):
         lines = list(islice(file, part.stop - part.start))
         if part.start + len(lines) < part.stop:
-            raise FormatError(f"cut short after {part.start + len(lines):,} of {header.vertices:,} vertices")
+            raise FormatError(f"cut short after {part.start + len(lines):,} of {vertices:,} vertices")
         if not all(map(bytes.strip, lines)):  # numpy would skip them
             raise FormatError(f"empty lines among the vertices after {part.start:,}")
         try:
@@ -219,3 +122,43 @@ def _text_rows(file: BinaryIO, header: Header) -> Iterator[tuple[slice, NDArray[
         except ValueError as error:
             raise FormatError(f"bad PLY data after vertex {part.start:,}: {error}") from None
         yield part, rows
+
+
+def encode(scene: Scene, *, threads: int = 1, progress: Progress = silent) -> Iterator[bytes]:
+    """The bytes of a binary PLY file in the layout of Inria's trainer, piece by piece.
+
+    Numbers are finite: opacities 0 and 1 and scales 0, whose logarithms are not, get ones that read as them.
+
+    Raises:
+        FormatError: the scene is a tree, which PLY cannot hold.
+    """
+    if scene.tree is not None:
+        raise FormatError("PLY holds no Level-of-Detail tree")
+    splats = scene.splats
+    row_type = np.dtype([(name, "<f4") for name in _inria_properties(splats.sh.shape[1])])
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(splats)}"]
+    lines += [f"property float {name}" for name in row_type.names or ()]
+    yield "".join(f"{line}\n" for line in [*lines, "end_header"]).encode()
+    parts = chunks_of(len(splats))
+    for part, piece in zip(
+        parts, ordered_map(lambda part: _encode(splats, part, row_type), parts, threads), strict=True
+    ):
+        yield piece
+        progress("writing", part.stop, len(splats), "splat")
+
+
+def _inria_properties(coefficients: int) -> list[str]:
+    rest = [f"f_rest_{index}" for index in range(3 * coefficients)]
+    rotation = ["rot_0", "rot_1", "rot_2", "rot_3"]
+    return [*REQUIRED[:3], "nx", "ny", "nz", *REQUIRED[3:6], *rest, *REQUIRED[6:10], *rotation]
+
+
+def _encode(splats: Splats, part: slice, row_type: np.dtype[Any]) -> bytes:
+    rows = np.zeros(part.stop - part.start, row_type)  # normals, which nobody reads, are 0
+    for column, names, _, encoder in COLUMNS:
+        for name, values in zip(names, encoder(getattr(splats, column)[part]).reshape(len(rows), -1).T, strict=True):
+            rows[name] = values
+    sh = splats.sh[part].transpose(0, 2, 1).reshape(len(rows), -1)
+    for index in range(sh.shape[1]):
+        rows[f"f_rest_{index}"] = sh[:, index]
+    return rows.tobytes()

@@ -35,6 +35,44 @@ _SQRT_HALF = np.float32(np.sqrt(0.5))
 _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 
 
+#: Stands for infinity where a logarithm or a logit is written: its exponential and its sigmoid are exactly 0 and 1 in
+#: float32, and readers that refuse what is not finite take it.
+FAR = np.float32(110)
+
+
+def decode_log(values: FloatArray) -> FloatArray:
+    """Natural logarithms to what they are of. Exact up to float32 arithmetic, as are the next two."""
+    return np.exp(values)
+
+
+def encode_log(values: FloatArray) -> FloatArray:
+    """Natural logarithms, finite also of 0."""
+    with np.errstate(divide="ignore"):
+        return np.maximum(np.log(values), -FAR)
+
+
+def decode_logit(logit: FloatArray) -> FloatArray:
+    """Logits to 0..1."""
+    return 1 / (1 + np.exp(-logit))
+
+
+def encode_logit(values: FloatArray) -> FloatArray:
+    """Logits of 0..1, finite also at both ends."""
+    wide = values.astype(np.float64)
+    with np.errstate(divide="ignore"):
+        return np.clip(np.log(wide) - np.log1p(-wide), -FAR, FAR).astype(np.float32)
+
+
+def decode_dc(dc: FloatArray) -> FloatArray:
+    """SH DC coefficients to display-referred colours."""
+    return dc * np.float32(SH_C0) + np.float32(0.5)
+
+
+def encode_dc(rgb: FloatArray) -> FloatArray:
+    """Display-referred colours to SH DC coefficients."""
+    return (rgb - np.float32(0.5)) / np.float32(SH_C0)
+
+
 def _to_byte(values: NDArray[Any]) -> Bytes:
     return np.clip(np.rint(values), 0, 255).astype(np.uint8)
 
@@ -65,12 +103,12 @@ def decode_log_scale(codes: Bytes) -> FloatArray:
     return np.exp(codes.astype(np.float32) / SCALE_STEPS - SCALE_OFFSET)
 
 
-def encode_opacity(opacity: FloatArray) -> Bytes:
+def encode_unorm8(values: FloatArray) -> Bytes:
     """0..1 to a byte."""
-    return _to_byte(opacity * 255)
+    return _to_byte(values * 255)
 
 
-def decode_opacity(codes: Bytes) -> FloatArray:
+def decode_unorm8(codes: Bytes) -> FloatArray:
     """Largest error: 1 / 510."""
     return codes.astype(np.float32) / 255
 
@@ -155,3 +193,56 @@ def decode_quat_smallest_three(codes: Bytes) -> FloatArray:
     rest = np.sqrt(np.maximum(0, 1 - np.einsum("ij,ij->i", others, others)))
     np.put_along_axis(quat, largest[:, None], rest[:, None], axis=1)
     return normalized_quat(quat)
+
+
+def encode_quat_bytes(quat: FloatArray) -> Bytes:
+    """(N, 4) unit quaternions to a byte a component, 128 times it around 128."""
+    return _to_byte(quat * 128 + 128)
+
+
+def decode_quat_bytes(codes: Bytes) -> FloatArray:
+    """(N, 4) bytes to unit quaternions. Largest error: 1.8 degrees of rotation."""
+    return normalized_quat((codes.astype(np.float32) - 128) / 128)
+
+
+def _unorm(code: NDArray[np.uint32], low: int, bits: int) -> FloatArray:
+    """Bits `low` up of codes, all ones for 1."""
+    most = (1 << bits) - 1
+    return (code >> np.uint32(low) & np.uint32(most)).astype(np.float32) / np.float32(most)
+
+
+def decode_unorm_11_10_11(code: NDArray[np.uint32]) -> FloatArray:
+    """(N,) words to (N, 3) of 0..1, the first in the top bits. Largest error: half of 1 / 2047, 1 / 1023, 1 / 2047."""
+    return np.stack([_unorm(code, 21, 11), _unorm(code, 11, 10), _unorm(code, 0, 11)], axis=1)
+
+
+def decode_unorm_8888(code: NDArray[np.uint32]) -> FloatArray:
+    """(N,) words to (N, 4) of 0..1, the first in the top bits. Largest error: 1 / 510."""
+    return np.stack([_unorm(code, low, 8) for low in (24, 16, 8, 0)], axis=1)
+
+
+def quat_of_others(largest: NDArray[Any], others: FloatArray) -> FloatArray:
+    """(N, 4) unit quaternions of the index of the largest component, taken as positive, and the (N, 3) others."""
+    quat = np.empty((len(others), 4), np.float32)
+    rest = np.sqrt(np.maximum(0, 1 - np.einsum("ij,ij->i", others, others)))
+    for component in range(4):
+        ahead = others[:, component - 1] if component else rest
+        behind = others[:, component] if component < 3 else rest
+        quat[:, component] = np.where(largest == component, rest, np.where(component < largest, behind, ahead))
+    return normalized_quat(quat)
+
+
+def decode_quat_2_10_10_10(code: NDArray[np.uint32]) -> FloatArray:
+    """(N,) words to (N, 4) unit quaternions w x y z: 2 bits index of the largest component, then the others in order.
+
+    Each has 10 bits for -sqrt(1 / 2) .. sqrt(1 / 2). Largest error: 0.28 degrees of rotation.
+    """
+    others = np.stack([_unorm(code, low, 10) for low in (20, 10, 0)], axis=1)
+    return quat_of_others(code >> np.uint32(30), (others - np.float32(0.5)) * (2 * _SQRT_HALF))
+
+
+def decode_centred_8(codes: Bytes) -> FloatArray:
+    """Bytes to -4..4, most at the middles of 256 steps, the first and the last at the ends. Largest error: 1 / 32."""
+    unit = (np.arange(256) + 0.5) / 256
+    unit[0], unit[255] = 0, 1
+    return ((unit - 0.5) * 8).astype(np.float32)[codes]

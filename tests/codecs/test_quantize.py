@@ -55,7 +55,7 @@ def test_fixed24_clamps_and_rounds_ties_to_even() -> None:
 
 BYTE_CODINGS = {
     "log scale": (quantize.encode_log_scale, quantize.decode_log_scale),
-    "opacity": (quantize.encode_opacity, quantize.decode_opacity),
+    "opacity": (quantize.encode_unorm8, quantize.decode_unorm8),
     "lod opacity": (quantize.encode_lod_opacity, quantize.decode_lod_opacity),
     "color": (quantize.encode_color, quantize.decode_color),
 }

@@ -1,0 +1,128 @@
+"""PlayCanvas's compressed PLY: four packed words a splat, relative to the bounds of its chunk of 256."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import FormatError
+from ..limits import MAX_SH_DEGREE
+from ..progress import Progress, silent
+from ..scene import Scene
+from ..sh import degree_of, notes_on_degree
+from ..splats import FloatArray, Splats
+from . import quantize
+from .ply_header import Header, read_header
+from .stream import decode_rows, rows_of, size_of
+
+CHUNK_SPLATS = 256
+
+VERTEX = ("packed_position", "packed_rotation", "packed_scale", "packed_color")  # uint32 each
+
+#: The bounds of a chunk, by what they are of; old files have none of colours.
+BOUNDS = {
+    "position": ("min_x", "min_y", "min_z", "max_x", "max_y", "max_z"),
+    "scale": ("min_scale_x", "min_scale_y", "min_scale_z", "max_scale_x", "max_scale_y", "max_scale_z"),  # logarithms
+    "color": ("min_r", "min_g", "min_b", "max_r", "max_g", "max_b"),
+}
+
+
+def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> Scene:
+    """Reads a compressed PLY file, with or without bounds of colours and SH.
+
+    Raises:
+        FormatError: it is not compressed PLY, or cut short.
+    """
+    size = size_of(file)
+    header = read_header(file)
+    count, coefficients = _checked(header)
+    header.check_size(size)
+    degree = degree_of(coefficients)
+    splats = Splats.empty(count, min(degree, MAX_SH_DEGREE))
+    bounds = _read_bounds(file, header, -(-count // CHUNK_SPLATS))
+
+    def unpack(part: slice, rows: NDArray[Any]) -> None:
+        words = {name: rows[name].astype(np.uint32) for name in VERTEX}
+        splats.center[part] = _within(
+            bounds["position"], part, quantize.decode_unorm_11_10_11(words["packed_position"])
+        )
+        log_scale = _within(bounds["scale"], part, quantize.decode_unorm_11_10_11(words["packed_scale"]))
+        with np.errstate(over="ignore"):
+            splats.scale[part] = np.exp(log_scale)
+        splats.quat_xyzw[part] = quantize.decode_quat_2_10_10_10(words["packed_rotation"])[:, [1, 2, 3, 0]]
+        rgba = quantize.decode_unorm_8888(words["packed_color"])
+        splats.rgb[part] = _within(bounds["color"], part, rgba[:, :3])
+        splats.opacity[part] = rgba[:, 3]
+
+    def unpack_sh(part: slice, rows: NDArray[Any]) -> None:
+        for coefficient in range(splats.sh.shape[1]):
+            for channel in range(3):
+                codes = rows[f"f_rest_{channel * coefficients + coefficient}"]  # all of red's come first
+                splats.sh[part, coefficient, channel] = quantize.decode_centred_8(codes)
+
+    with np.errstate(invalid="ignore", over="ignore"):
+        decode_rows(_rows(file, header, "vertex"), unpack, count, threads, progress)
+        if coefficients:
+            decode_rows(_rows(file, header, "sh"), unpack_sh, count, threads, progress)
+    return Scene(splats, format="compressed PLY", notes=notes_on_degree(degree))
+
+
+def _within(bounds: FloatArray | None, part: slice, unit: FloatArray) -> FloatArray:
+    """0..1 of the splats in `part` to between the bounds of their chunks, (chunks, 6): x y z of the least, the most."""
+    if bounds is None:
+        return unit
+    of_chunks = bounds[part.start // CHUNK_SPLATS : -(-part.stop // CHUNK_SPLATS)]
+    low, high = np.split(np.repeat(of_chunks, CHUNK_SPLATS, axis=0)[: len(unit)], 2, axis=1)
+    return low * (1 - unit) + high * unit
+
+
+def _rows(file: BinaryIO, header: Header, name: str) -> Iterator[tuple[slice, NDArray[Any]]]:
+    offset, row_type = header.offset(name), header.row_type(name)
+    if offset is None or row_type is None:
+        raise FormatError("a compressed PLY has no list properties")
+    file.seek(offset)
+    return rows_of(file.read, row_type, header.count(name))
+
+
+def _read_bounds(file: BinaryIO, header: Header, chunks: int) -> dict[str, FloatArray | None]:
+    rows = np.concatenate([rows for _, rows in _rows(file, header, "chunk")] or [np.empty(0)])[:chunks]
+    have = rows.dtype.names or ()
+    return {
+        what: np.stack([rows[name] for name in names], axis=1).astype(np.float32) if names[0] in have else None
+        for what, names in BOUNDS.items()
+    }
+
+
+def _checked(header: Header) -> tuple[int, int]:
+    """Splats and SH coefficients a channel, if the elements are those of a compressed PLY."""
+    if header.text:
+        raise FormatError("an ascii compressed PLY; the format is binary")
+    count = header.count("vertex")
+    _check_types(header, "vertex", VERTEX, np.uint32)
+    chunk_names = {*BOUNDS["position"], *BOUNDS["scale"]}
+    have = set(_check_types(header, "chunk", tuple(chunk_names), np.float32))
+    if have & {*BOUNDS["color"]}:
+        _check_types(header, "chunk", BOUNDS["color"], np.float32)
+    if header.count("chunk") * CHUNK_SPLATS < count:
+        raise FormatError(f"{header.count('chunk'):,} chunks of {CHUNK_SPLATS} cannot hold {count:,} splats")
+    if "sh" not in header.elements:
+        return count, 0
+    row_type = header.row_type("sh")
+    values = len(row_type.names or ()) if row_type else 0
+    _check_types(header, "sh", tuple(f"f_rest_{index}" for index in range(values)), np.uint8)
+    if values % 3 or header.count("sh") != count:
+        raise FormatError(f"its element sh has {header.count('sh'):,} rows of {values} values for {count:,} splats")
+    return count, values // 3
+
+
+def _check_types(header: Header, element: str, names: tuple[str, ...], kind: type[np.generic]) -> tuple[str, ...]:
+    """The names of an element's properties, if these are among them, and of this type."""
+    row_type = header.row_type(element) if element in header.elements else None
+    have: tuple[str, ...] = (row_type.names or ()) if row_type else ()
+    bad = [name for name in names if row_type is None or name not in have or row_type[name].newbyteorder("=") != kind]
+    if bad:
+        raise FormatError(f"its element {element} has no {', '.join(sorted(bad))} of type {np.dtype(kind)}")
+    return have

@@ -1,0 +1,183 @@
+"""mkkellogg's .ksplat: sections of splats, each with a row of fixed size a splat, centres relative to buckets.
+
+Compression level 0 has floats; 1 has halves and 16-bit centres; 2 has bytes of SH besides.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import FormatError
+from ..gaussian import normalized_quat
+from ..progress import Progress, silent
+from ..scene import Scene
+from ..sh import COEFFICIENTS
+from ..splats import FloatArray, Splats
+from . import quantize
+from .stream import Rows, decode_rows, rows_of, size_of
+
+HEADER = np.dtype(
+    {
+        "itemsize": 4096,
+        "names": ["major", "minor", "sections", "splats", "level", "least_sh", "most_sh"],
+        "formats": ["u1", "u1", "<u4", "<u4", "<u2", "<f4", "<f4"],
+        "offsets": [0, 1, 4, 16, 20, 36, 40],  # between them: counts of what is loaded so far, and the scene's middle
+    }
+)
+SECTION = np.dtype(
+    {
+        "itemsize": 1024,
+        "names": [
+            *("splats", "room", "bucket_splats", "buckets", "bucket_width", "bucket_bytes"),
+            *("steps", "full_buckets", "partial_buckets", "sh_degree"),
+        ],
+        "formats": ["<u4", "<u4", "<u4", "<u4", "<f4", "<u2", "<u4", "<u4", "<u4", "<u2"],
+        "offsets": [0, 4, 8, 12, 16, 20, 24, 32, 36, 40],
+    }
+)
+
+#: By level: types of centres, of scales and rotations, and of SH; and steps from the middle of a bucket to its side.
+LEVELS = (("<f4", "<f4", "<f4", 1), ("<u2", "<f2", "<f2", 32767), ("<u2", "<f2", "u1", 32767))
+MAX_DEGREE = 2
+DEFAULT_SH = 1.5  # bytes of SH are for -1.5 .. 1.5 where the header does not say
+
+#: Where coefficient k of channel c stands among a splat's SH values: all of red's of a degree come first.
+SH_PLACES = np.array(
+    [c * 3 + k for k in range(3) for c in range(3)] + [9 + c * 5 + k for k in range(5) for c in range(3)]
+)
+
+
+def row_type(level: int, sh_degree: int) -> np.dtype[Any]:
+    """The row of a splat."""
+    center, real, sh, _ = LEVELS[level]
+    return np.dtype(
+        [
+            ("center", center, 3),  # level 0: as it is; above: steps from the bucket's low corner
+            ("scale", real, 3),  # linear
+            ("quat_wxyz", real, 4),
+            ("rgb", "u1", 3),  # display-referred, 0..255 for 0..1
+            ("opacity", "u1"),  # 0..255 for 0..1
+            ("sh", sh, 3 * COEFFICIENTS[sh_degree]),  # bytes: 0..255 from the header's least to its most
+        ]
+    )
+
+
+@dataclass(frozen=True)
+class Section:
+    """Where a section lies, and what decodes its centres.
+
+    Attributes:
+        first: index of its first splat in the scene.
+        count: of splats.
+        row_type: of a splat.
+        offset: of its first row in the file.
+        middles: (buckets, 3) of the buckets.
+        ends: (buckets,) splats up to the end of each bucket.
+        step, steps: width of a step, and how many lead from a bucket's low corner to its middle.
+    """
+
+    first: int
+    count: int
+    row_type: np.dtype[Any]
+    offset: int
+    middles: FloatArray
+    ends: NDArray[np.int64]
+    step: np.float32
+    steps: int
+
+
+def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> Scene:
+    """Reads a .ksplat file of any compression level.
+
+    Raises:
+        FormatError: it is not KSPLAT, not a version, level or SH degree that is known, or cut short.
+    """
+    size = size_of(file)
+    header = _read(file, HEADER, 1, "the header")[0]
+    level, count = int(header["level"]), int(header["splats"])
+    if header["major"] != 0 or header["minor"] < 1:
+        raise FormatError(f"KSPLAT version {header['major']}.{header['minor']} is not known, only 0.1 is")
+    if level >= len(LEVELS):
+        raise FormatError(f"KSPLAT compression level {level} is not known, only 0 to {len(LEVELS) - 1} are")
+    sections = list(_read_sections(file, size, int(header["sections"]), level))
+    found = sum(section.count for section in sections)
+    if found != count:
+        raise FormatError(f"the header promises {count:,} splats, its sections have {found:,}")
+    degrees = [COEFFICIENTS.index(section.row_type["sh"].shape[0] // 3) for section in sections]
+    splats = Splats.empty(count, max(degrees, default=0))
+    low, high = header["least_sh"] or np.float32(-DEFAULT_SH), header["most_sh"] or np.float32(DEFAULT_SH)
+
+    def rows() -> Iterator[Rows]:
+        for section in sections:
+            file.seek(section.offset)
+            for part, some in rows_of(file.read, section.row_type, section.count):
+                yield slice(section.first + part.start, section.first + part.stop), some
+
+    def fill(part: slice, some: NDArray[Any]) -> None:
+        section = next(section for section in sections if part.start < section.first + section.count)
+        splats.center[part] = _centers(section, part, some["center"]) if level else some["center"]
+        splats.scale[part] = some["scale"]
+        splats.quat_xyzw[part] = normalized_quat(some["quat_wxyz"].astype(np.float32))[:, [1, 2, 3, 0]]
+        splats.rgb[part] = quantize.decode_unorm8(some["rgb"])
+        splats.opacity[part] = quantize.decode_unorm8(some["opacity"])
+        values = some["sh"][:, SH_PLACES[: some["sh"].shape[1]]].astype(np.float32)
+        if level == 2:
+            values = low + values / np.float32(255) * (high - low)
+        coefficients = values.shape[1] // 3
+        splats.sh[part, :coefficients] = values.reshape(len(some), coefficients, 3)
+        splats.sh[part, coefficients:] = 0  # other sections have more
+
+    with np.errstate(over="ignore", invalid="ignore"):
+        decode_rows(rows(), fill, count, threads, progress)
+    return Scene(splats, format="KSPLAT")
+
+
+def _centers(section: Section, part: slice, codes: NDArray[np.uint16]) -> FloatArray:
+    of_section = np.arange(part.start - section.first, part.stop - section.first)
+    bucket = np.searchsorted(section.ends, of_section, side="right")
+    return (codes.astype(np.float32) - np.float32(section.steps)) * section.step + section.middles[bucket]
+
+
+def _read(file: BinaryIO, kind: np.dtype[Any], count: int, what: str) -> NDArray[Any]:
+    data = file.read(kind.itemsize * count)
+    if len(data) < kind.itemsize * count:
+        raise FormatError(f"cut short inside {what}")
+    return np.frombuffer(data, kind)
+
+
+def _read_sections(file: BinaryIO, size: int, count: int, level: int) -> Iterator[Section]:
+    at = HEADER.itemsize + count * SECTION.itemsize
+    if at > size:
+        raise FormatError(f"cut short: {count:,} sections are promised")
+    first = 0
+    for header in _read(file, SECTION, count, "the sections' headers"):
+        of = {name: header[name].item() for name in SECTION.names or ()}
+        if of["sh_degree"] > MAX_DEGREE:
+            raise FormatError(f"SH degree {of['sh_degree']} is not one that KSPLAT has")
+        rows = row_type(level, of["sh_degree"])
+        buckets, partial = of["buckets"], of["partial_buckets"]
+        offset = at + 4 * partial + of["bucket_bytes"] * buckets
+        end = offset + of["room"] * rows.itemsize
+        if end > size or of["splats"] > of["room"]:
+            raise FormatError(f"cut short: a section promises {of['splats']:,} splats")
+        middles, ends = np.empty((0, 3), np.float32), np.empty(0, np.int64)
+        steps = of["steps"] or LEVELS[level][3]
+        if level and of["splats"]:
+            if of["bucket_bytes"] != 12 or of["full_buckets"] + partial > buckets:
+                raise FormatError("a section's buckets are not those of KSPLAT")
+            file.seek(at)
+            part_sizes = _read(file, np.dtype("<u4"), partial, "the buckets")
+            middles = _read(file, np.dtype(("<f4", (3,))), buckets, "the buckets")
+            sizes = np.concatenate([np.full(of["full_buckets"], of["bucket_splats"], np.int64), part_sizes])
+            ends = np.cumsum(sizes)
+            if of["splats"] > (ends[-1] if len(ends) else 0):
+                raise FormatError(f"a section's buckets do not hold its {of['splats']:,} splats")
+        step = np.float32(of["bucket_width"] / 2 / steps)
+        yield Section(first, of["splats"], rows, offset, middles, ends, step, steps)
+        first += of["splats"]
+        at = end

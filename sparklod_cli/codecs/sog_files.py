@@ -1,0 +1,214 @@
+"""What a SOG scene lies in: its meta.json and its images, from a zip or a folder, bounded before they are decoded."""
+
+from __future__ import annotations
+
+import io
+import json
+import struct
+import zipfile
+import zlib
+from collections.abc import Callable
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from ..errors import FormatError
+from .compression import check_promise
+from .stream import size_of
+
+Texels = NDArray[np.uint8]
+
+META = "meta.json"
+MAX_META = 1 << 22  # bytes; codebooks take 15,000
+METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+ENCRYPTED = 1
+
+_ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, ValueError, struct.error)
+
+
+class Meta:
+    """A meta.json whose values are looked at before they are believed; each way to one is a sequence of keys."""
+
+    def __init__(self, data: bytes) -> None:
+        try:
+            self._root = json.loads(data)
+        except (ValueError, RecursionError) as error:
+            raise FormatError(f"{META} is not JSON: {error}") from None
+        if not isinstance(self._root, dict):
+            raise FormatError(f"{META} is not that of a SOG")
+
+    def has(self, key: str) -> bool:
+        """Whether there is such a key at the top, and not null."""
+        return self._root.get(key) is not None
+
+    def _get(self, *way: str | int) -> Any:
+        value = self._root
+        try:
+            for key in way:
+                value = value[key]
+        except (KeyError, IndexError, TypeError):
+            raise FormatError(f"{META} has no {_spell(way)}") from None
+        return value
+
+    def integer(self, *way: str | int) -> int:
+        """A whole number."""
+        value = self._get(*way)
+        if type(value) is not int:
+            raise FormatError(f"{_spell(way)} of {META} is not a whole number")
+        return value
+
+    def number(self, *way: str | int) -> float:
+        """A finite number."""
+        return _finite(self._get(*way), way)
+
+    def numbers(self, count: int, *way: str | int, first_may_be_null: bool = False) -> NDArray[np.float64]:
+        """(count,) finite numbers.
+
+        Args:
+            count: how many there must be.
+            way: to the list.
+            first_may_be_null: as an old writer left it in codebooks; the step to it is taken as the average one.
+        """
+        values = self._get(*way)
+        if not isinstance(values, list) or len(values) != count:
+            raise FormatError(f"{_spell(way)} of {META} is not {count} numbers")
+        if first_may_be_null and values[0] is None:
+            rest = [_finite(value, way) for value in values[1:]]
+            values = [rest[0] + (rest[0] - rest[-1]) / (count - 1), *rest]
+        return np.array([_finite(value, way) for value in values])
+
+    def flag(self, *way: str | int) -> bool:
+        """True or false."""
+        return self._get(*way) is True
+
+    def name(self, *way: str | int) -> str:
+        """A text."""
+        value = self._get(*way)
+        if not isinstance(value, str):
+            raise FormatError(f"{_spell(way)} of {META} is not a file's name")
+        return value
+
+
+def _spell(way: tuple[str | int, ...]) -> str:
+    return ".".join(map(str, way))
+
+
+def _finite(value: Any, way: tuple[str | int, ...]) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < 1e38:
+        raise FormatError(f"{_spell(way)} of {META} has {str(value)[:20]!r}, which is not a finite number")
+    return float(value)
+
+
+class Files:
+    """The files of a SOG scene.
+
+    Attributes:
+        meta: what meta.json says.
+        size: bytes of all there is, which is what promises are measured by.
+    """
+
+    def __init__(self, file: BinaryIO, beside: Callable[[str], BinaryIO] | None) -> None:
+        self.size = size_of(file)
+        zipped = file.read(2) == b"PK"
+        file.seek(0)
+        self._archive = _Archive(file, self.size) if zipped else None
+        self._beside = beside
+        data = self._archive.read(META) if self._archive else file.read(MAX_META + 1)
+        if len(data) > MAX_META:
+            raise FormatError(f"{META} is too large for one of a SOG")
+        self.meta = Meta(data)
+        if not self._archive:
+            self.size += sum(map(self._size_beside, self._names()))
+
+    def _names(self) -> list[str]:
+        textures = {"means": 2, "scales": 1, "quats": 1, "sh0": 1} | ({"shN": 2} if self.meta.has("shN") else {})
+        return [
+            self.meta.name(texture, "files", index) for texture, count in textures.items() for index in range(count)
+        ]
+
+    def _open_beside(self, name: str) -> BinaryIO:
+        if self._beside is None:
+            raise FormatError(f"{META} names {name}, which cannot be had here")
+        return self._beside(name)
+
+    def _size_beside(self, name: str) -> int:
+        with self._open_beside(name) as file:
+            return size_of(file)
+
+    def _read(self, name: str) -> bytes:
+        if self._archive:
+            return self._archive.read(name)
+        with self._open_beside(name) as file:
+            return file.read()
+
+    def image(self, texture: str, index: int, least: tuple[int, int]) -> Texels:
+        """(height, width, 4) texels of a file of a texture; `FormatError` if there are not so many rows and columns."""
+        name = self.meta.name(texture, "files", index)
+        data = self._read(name)
+        width, height = _webp_size(data, name)
+        if height < least[0] or width < least[1]:
+            raise FormatError(f"{name} has {width} x {height} texels, too few")
+        check_promise(4 * width * height, self.size)
+        return _decode_webp(data, name)
+
+    def texels(self, texture: str, index: int, count: int) -> Texels:
+        """(count, 4) texels of a file of a texture, row by row."""
+        texels = self.image(texture, index, (1, 1)).reshape(-1, 4)
+        if len(texels) < count:
+            name = self.meta.name(texture, "files", index)
+            raise FormatError(f"{name} has {len(texels):,} texels for {count:,} splats")
+        return texels[:count]
+
+
+class _Archive:
+    """A zip that has a meta.json, maybe in a folder, and files beside that."""
+
+    def __init__(self, file: BinaryIO, size: int) -> None:
+        self._size = size
+        try:
+            self._zip = zipfile.ZipFile(file)
+        except _ZIP_ERRORS as error:
+            raise FormatError(f"not a whole zip archive: {error}") from None
+        names = [name for name in self._zip.namelist() if name == META or name.endswith("/" + META)]
+        if not names:
+            raise FormatError(f"a zip archive without {META} is not a SOG")
+        self._folder = min(names, key=len).removesuffix(META)
+
+    def read(self, name: str) -> bytes:
+        try:
+            member = self._zip.getinfo(self._folder + name)
+        except KeyError:
+            raise FormatError(f"{META} names {name}, which is not in the archive") from None
+        if member.compress_type not in METHODS or member.flag_bits & ENCRYPTED:
+            raise FormatError(f"{name} is packed in a way that SOG has not")
+        check_promise(member.file_size, self._size)
+        try:
+            return self._zip.read(member)
+        except _ZIP_ERRORS as error:
+            raise FormatError(f"{name} cannot be unpacked: {error}") from None
+
+
+def _webp_size(data: bytes, name: str) -> tuple[int, int]:
+    """Width and height that the header of a WebP file tells: its first chunk, of whichever kind of the three."""
+    kind = data[12:16] if data[:4] == b"RIFF" and data[8:12] == b"WEBP" and len(data) >= 30 else b""
+    if kind == b"VP8X":  # 24 bits each, less one
+        return 1 + int.from_bytes(data[24:27], "little"), 1 + int.from_bytes(data[27:30], "little")
+    if kind == b"VP8L":  # 14 bits each, less one, behind a byte of signature
+        bits = int.from_bytes(data[21:25], "little")
+        return 1 + (bits & 0x3FFF), 1 + (bits >> 14 & 0x3FFF)
+    if kind == b"VP8 ":  # 14 bits each, behind a frame tag and a start code
+        width, height = struct.unpack_from("<HH", data, 26)
+        return width & 0x3FFF, height & 0x3FFF
+    raise FormatError(f"{name} is not a WebP image")
+
+
+def _decode_webp(data: bytes, name: str) -> Texels:
+    try:
+        with Image.open(io.BytesIO(data), formats=["WEBP"]) as image:
+            return np.asarray(image.convert("RGBA"))
+    except Image.DecompressionBombError:
+        raise FormatError(f"{name} has more texels than Pillow decodes") from None
+    except (OSError, ValueError, SyntaxError, EOFError) as error:
+        raise FormatError(f"{name} is a corrupt WebP image: {error}") from None

@@ -1,0 +1,83 @@
+"""antimatter15's .splat: 32 bytes a splat and nothing else, the most important ones first."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import FormatError
+from ..parallel import chunks_of, ordered_map
+from ..progress import Progress, silent
+from ..scene import Scene
+from ..splats import Splats
+from . import quantize
+from .stream import decode_rows, rows_of, size_of
+
+ROW = np.dtype(
+    [
+        ("center", "<f4", 3),  # 0
+        ("scale", "<f4", 3),  # 12: linear
+        ("rgb", "u1", 3),  # 24: display-referred, 0..255 for 0..1
+        ("opacity", "u1"),  # 27: 0..255 for 0..1
+        ("quat_wxyz", "u1", 4),  # 28: round(128 * q + 128)
+    ]
+)
+assert ROW.itemsize == 32
+
+
+def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> Scene:
+    """Reads a .splat file. It has no header: any file whose size is a multiple of 32 passes for one.
+
+    Raises:
+        FormatError: its size is not a multiple of 32.
+    """
+    size = size_of(file)
+    if size % ROW.itemsize:
+        raise FormatError(f"cut short, or not .splat: its {size:,} bytes are not a multiple of {ROW.itemsize}")
+    count = size // ROW.itemsize
+    splats = Splats.empty(count, 0)
+
+    def fill(part: slice, rows: NDArray[Any]) -> None:
+        splats.center[part] = rows["center"]
+        splats.scale[part] = rows["scale"]
+        splats.rgb[part] = quantize.decode_unorm8(rows["rgb"])
+        splats.opacity[part] = quantize.decode_unorm8(rows["opacity"])
+        splats.quat_xyzw[part] = quantize.decode_quat_bytes(rows["quat_wxyz"])[:, [1, 2, 3, 0]]
+
+    decode_rows(rows_of(file.read, ROW, count), fill, count, threads, progress)
+    return Scene(splats, format="SPLAT", notes=())
+
+
+def importance_order(splats: Splats) -> NDArray[np.intp]:
+    """(N,) indices, the most important splats first: by the product of scales and opacity, as antimatter15 sorts."""
+    importance = splats.scale.astype(np.float64).prod(axis=1) * splats.opacity
+    return np.argsort(-importance, kind="stable")
+
+
+def encode(scene: Scene, *, threads: int = 1, progress: Progress = silent) -> Iterator[bytes]:
+    """The bytes of a .splat file, piece by piece, in order of importance. It holds no SH above degree 0.
+
+    Raises:
+        FormatError: the scene is a tree, which .splat cannot hold.
+    """
+    if scene.tree is not None:
+        raise FormatError("SPLAT holds no Level-of-Detail tree")
+    order = importance_order(scene.splats)
+
+    def rows(part: slice) -> bytes:
+        splats = scene.splats.with_max_sh(0).take(order[part])
+        out = np.empty(len(splats), ROW)
+        out["center"] = splats.center
+        out["scale"] = splats.scale
+        out["rgb"] = quantize.encode_unorm8(splats.rgb)
+        out["opacity"] = quantize.encode_unorm8(splats.opacity)
+        out["quat_wxyz"] = quantize.encode_quat_bytes(splats.quat_xyzw[:, [3, 0, 1, 2]])
+        return out.tobytes()
+
+    parts = chunks_of(len(order))
+    for part, piece in zip(parts, ordered_map(rows, parts, threads), strict=True):
+        yield piece
+        progress("writing", part.stop, len(order), "splat")

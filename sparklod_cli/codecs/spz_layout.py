@@ -1,0 +1,100 @@
+"""What the streams of an SPZ file are, and how each is coded: one table for reading and for writing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..gaussian import linear_opacity, lod_opacity
+from ..limits import MAX_SH_DEGREE
+from ..sh import COEFFICIENTS
+from . import quantize
+
+#: Flags of the header.
+ANTIALIASED, EXTENSIONS, LOD = 0x01, 0x02, 0x80
+
+
+class Stream(NamedTuple):
+    """One stream of a file: a column of all splats, one after the other.
+
+    Attributes:
+        name: for people.
+        size: bytes a splat.
+        column: of `Splats` or `LodTree`.
+        decode: (n, size) bytes to n rows of the column, of any shape.
+        encode: the way back.
+    """
+
+    name: str
+    size: int
+    column: str
+    decode: Callable[[quantize.Bytes], NDArray[Any]]
+    encode: Callable[[NDArray[Any]], NDArray[Any]]
+
+
+#: Rows of a stream: which, and (n, size) bytes.
+StreamRows = tuple[Stream, slice, quantize.Bytes]
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What a header says that decides which streams follow it."""
+
+    version: int
+    count: int
+    sh_degree: int
+    fractional_bits: int
+    flags: int
+
+    def streams(self) -> list[Stream]:
+        """The streams in file order."""
+        q, bits, coefficients = quantize, self.fractional_bits, COEFFICIENTS[self.sh_degree]
+        table = [
+            Stream("positions", 6, "center", lambda codes: codes.view("<f2"), lambda center: center.astype("<f2"))
+            if self.version == 1
+            else Stream(
+                "positions",
+                9,
+                "center",
+                lambda codes: q.decode_fixed24(codes.reshape(-1, 3, 3), bits),
+                lambda center: q.encode_fixed24(center, bits),
+            ),
+            Stream(
+                "alphas",
+                1,
+                "opacity",
+                lambda codes: linear_opacity(q.decode_lod_opacity(codes)),  # D = 0..5
+                lambda opacity: q.encode_lod_opacity(lod_opacity(opacity)),
+            )
+            if self.flags & LOD
+            else Stream("alphas", 1, "opacity", q.decode_unorm8, q.encode_unorm8),
+            Stream("colors", 3, "rgb", q.decode_color, q.encode_color),
+            Stream("scales", 3, "scale", q.decode_log_scale, q.encode_log_scale),
+            Stream("rotations", 4, "quat_xyzw", q.decode_quat_smallest_three, q.encode_quat_smallest_three)
+            if self.version >= 3
+            else Stream("rotations", 3, "quat_xyzw", q.decode_quat_first_three, q.encode_quat_first_three),
+            Stream(
+                "sh",
+                3 * coefficients,  # coefficient-major, r g b innermost
+                "sh",
+                lambda codes: q.decode_sh(codes.reshape(-1, coefficients, 3)[:, : COEFFICIENTS[MAX_SH_DEGREE]]),
+                q.encode_sh,
+            ),
+        ]
+        if self.flags & LOD:
+            table += [_integers("child_counts", "child_count", "<u2"), _integers("child_starts", "child_start", "<u4")]
+        return [stream for stream in table if stream.size]
+
+    @property
+    def total(self) -> int:
+        """Bytes of all streams."""
+        return self.count * sum(stream.size for stream in self.streams())
+
+
+def _integers(name: str, column: str, code: str) -> Stream:
+    size = np.dtype(code).itemsize
+    return Stream(name, size, column, lambda codes: codes.view(code), lambda values: values.astype(code))
