@@ -4,21 +4,20 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from .codecs import spz
+import numpy as np
+
+from .codecs import dump, spz
 from .errors import FormatError, SparklodError
-from .io import read_scene
+from .io import Sink, read_rgba, read_scene
 from .limits import DEFAULT_BASE, MAX_SH_DEGREE
 from .lod import quick
 from .progress import Progress, silent
 from .scene import Scene
 from .selection import Selection
-
-#: Writes the pieces of an output and returns how many bytes it wrote.
-Sink = Callable[[Iterable[bytes]], int]
+from .splats import Splats
 
 
 @dataclass(frozen=True)
@@ -29,12 +28,18 @@ class Recipe:
         base: growth of the cells from level to level, 1.1 to 2.0.
         max_sh: SH degrees above this are left out.
         selection: which splats to keep.
-        spz: how to write.
+        rgba: a file of colours and opacities that take the place of the splats' own, see `io.read_rgba`.
+        encoding: one of `limits.ENCODINGS`, to write the arrays of that instead of SPZ.
+        raw: write their words alone, rather than as .npz.
+        spz: how to write SPZ, and on how many threads to work.
     """
 
     base: float = DEFAULT_BASE
     max_sh: int = MAX_SH_DEGREE
     selection: Selection = field(default_factory=Selection)
+    rgba: Path | None = None
+    encoding: str | None = None
+    raw: bool = False
     spz: spz.Options = field(default_factory=spz.Options)
 
 
@@ -47,7 +52,9 @@ class Baked:
         splats, sh_degree: of the input as far as it was kept; `read` counts what was in the file.
         dropped: how many splats were left out, by reason (`selection.REASONS`).
         nodes, levels: of the tree; a tree of one node has one level.
-        bytes, version, fractional_bits: of the output.
+        bytes: of the output.
+        version, fractional_bits: of an SPZ output, else None.
+        arrays: shapes of the arrays of another output, in its order.
         clamped: nodes with a value that the output cannot hold, by the column of `Splats` where there are any.
         notes: what the reader had to leave out, for people.
         seconds: by stage (read, build, write).
@@ -61,8 +68,9 @@ class Baked:
     nodes: int
     levels: int
     bytes: int
-    version: int
-    fractional_bits: int
+    version: int | None
+    fractional_bits: int | None
+    arrays: dict[str, tuple[int, ...]]
     clamped: dict[str, int]
     notes: tuple[str, ...]
     seconds: dict[str, float]
@@ -86,15 +94,14 @@ def _bake(source: Path, write: Sink, recipe: Recipe, progress: Progress) -> Bake
     start = time.perf_counter()
     scene = read_scene(source, threads=threads, progress=progress)
     if scene.tree is not None:
-        raise FormatError("it is a Level-of-Detail file already")
+        raise FormatError("it is a Level-of-Detail file already; --unlod writes its splats back out")
     total = len(scene.splats)
-    kept, dropped = recipe.selection.apply(scene.splats.with_max_sh(recipe.max_sh))
+    kept, dropped = recipe.selection.apply(_recolored(scene.splats, recipe.rgba).with_max_sh(recipe.max_sh))
     read_done = time.perf_counter()
     antialiased, name, notes = scene.antialiased, scene.format, scene.notes
     count, degree = len(kept), kept.sh_degree
     # Merged centres stay in the box of the splats, so what fits these fits all nodes, and is known before building.
-    bits = spz.fractional_bits(kept, recipe.spz)
-    options = dataclasses.replace(recipe.spz, fractional_bits=bits)
+    bits = None if recipe.encoding else spz.fractional_bits(kept, recipe.spz)
     # The builder frees its input as it goes, if nobody else holds it: a third of the peak.
     handed_over = [kept]
     del scene, kept
@@ -102,8 +109,12 @@ def _bake(source: Path, write: Sink, recipe: Recipe, progress: Progress) -> Bake
     levels = int(tree.depths().max()) + 1
     build_done = time.perf_counter()
     output = Scene(nodes, tree, antialiased)
-    size = write(spz.encode(output, options, progress=progress))
-    clamped = spz.clamped(nodes, threads)
+    arrays = dump.pack(output, recipe.encoding, threads) if recipe.encoding else {}
+    if arrays:
+        size = write(dump.encode_raw(arrays) if recipe.raw else dump.encode_npz(arrays))
+    else:
+        size = write(spz.encode(output, dataclasses.replace(recipe.spz, fractional_bits=bits), progress=progress))
+    clamped = {} if arrays else spz.clamped(nodes, threads)
     seconds = {
         "read": read_done - start,
         "build": build_done - read_done,
@@ -118,9 +129,18 @@ def _bake(source: Path, write: Sink, recipe: Recipe, progress: Progress) -> Bake
         nodes=len(nodes),
         levels=levels,
         bytes=size,
-        version=options.version,
+        version=None if arrays else recipe.spz.version,
         fractional_bits=bits,
+        arrays={array: words.shape for array, words in arrays.items()},
         clamped=clamped,
         notes=notes,
         seconds={stage: round(value, 4) for stage, value in seconds.items()},
     )
+
+
+def _recolored(splats: Splats, rgba: Path | None) -> Splats:
+    """The splats with the colours and opacities of a file; their SH stay, as where Spark is given new colours."""
+    if rgba is None:
+        return splats
+    values = read_rgba(rgba, len(splats))
+    return dataclasses.replace(splats, rgb=np.ascontiguousarray(values[:, :3]), opacity=values[:, 3].copy())

@@ -9,16 +9,25 @@ from .splats import FloatArray
 #: Linear opacity of a merged splat is clamped to this range; 1000 is D = 4.45 of the 5 that the format holds.
 MIN_OPACITY, MAX_OPACITY = 1e-6, 1e3
 
+#: Lengths of a quaternion between which the squares of its components are exact enough in float32.
+MIN_LENGTH, MAX_LENGTH = 1e-15, 1e15
+
 #: Exponent of Knud Thomsen's approximation of an ellipsoid's surface, within 1.061 % of the true area.
 THOMSEN_P = 1.6075
 
 
 def normalized_quat(quat: FloatArray) -> FloatArray:
     """Unit quaternions from (N, 4) of any length; one of length 0 or that is not finite becomes NaN."""
-    # Dividing by the largest component first keeps the squares of tiny and huge quaternions inside float32.
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        unit = quat / np.abs(quat).max(axis=1, keepdims=True)
-        unit /= np.sqrt(np.einsum("ij,ij->i", unit, unit))[:, None]
+        length = np.sqrt(np.einsum("ij,ij->i", quat, quat))
+        extreme = np.flatnonzero(~((length > MIN_LENGTH) & (length < MAX_LENGTH)))
+        if extreme.size:  # dividing by the largest component first keeps the squares inside float32
+            rows = quat[extreme]
+            rows = rows / np.abs(rows).max(axis=1, keepdims=True)
+            quat = quat.copy()
+            quat[extreme] = rows
+            length[extreme] = np.sqrt(np.einsum("ij,ij->i", rows, rows))
+        unit: FloatArray = quat / length[:, None]
     return unit
 
 

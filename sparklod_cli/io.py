@@ -70,10 +70,13 @@ def _open_beside(folder: Path, name: str) -> BinaryIO:
     """Opens a file that another one names; `FormatError` where the name could lead out of their folder."""
     if name in ("", ".", "..") or any(mark in name for mark in "/\\:\0"):
         raise FormatError(f"it names {name!r}, which is not a file beside it")
+    path = folder / name
     try:
-        return (folder / name).open("rb")
+        if path.exists() and not path.is_file():
+            raise FormatError(f"{name!r}, which it names, is not a file")
+        return path.open("rb")
     except OSError as error:
-        raise FormatError(f"{name}, which it names, cannot be read: {_reason(error)}") from None
+        raise FormatError(f"{name!r}, which it names, cannot be read: {_reason(error)}") from None
 
 
 def read_rgba(path: Path, count: int) -> FloatArray:

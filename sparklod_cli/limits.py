@@ -17,3 +17,9 @@ MAX_FRACTIONAL_BITS = 24
 
 #: Deflate levels, and the one that is used; docs/decisions has the measurement.
 MIN_COMPRESSION, MAX_COMPRESSION, DEFAULT_COMPRESSION = 1, 9, 5
+
+#: What files of plain splats can be written as, by suffix.
+PLAIN_SUFFIXES = (".spz", ".ply", ".splat")
+
+#: In-memory layouts of viewers that a tree can be dumped in.
+ENCODINGS = ("packed", "ext", "lodtree", "texture")

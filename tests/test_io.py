@@ -43,7 +43,7 @@ def test_the_suffix_says_nothing(kind: str, suffix: str, tmp_path: Path) -> None
         (b"ply", "not a splat file"),
         (b"ply\n", "the PLY header does not end"),
         (b"\x1f", "not a splat file"),
-        (b"\x1f\x8b", "cut short"),
+        (b"\x1f\x8b\x08\x00", "cut short"),
         (b"PK\x03\x04" + bytes(100), "not a whole zip archive"),
         (b"\x28\xb5\x2f\xfd" + bytes(100), "not a splat file"),  # bare zstd
     ],

@@ -44,29 +44,27 @@ def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> 
     splats = Splats.empty(count, min(degree, MAX_SH_DEGREE))
     bounds = _read_bounds(file, header, -(-count // CHUNK_SPLATS))
 
+    @np.errstate(invalid="ignore", over="ignore")  # of bounds that no scene has
     def unpack(part: slice, rows: NDArray[Any]) -> None:
         words = {name: rows[name].astype(np.uint32) for name in VERTEX}
         splats.center[part] = _within(
             bounds["position"], part, quantize.decode_unorm_11_10_11(words["packed_position"])
         )
-        log_scale = _within(bounds["scale"], part, quantize.decode_unorm_11_10_11(words["packed_scale"]))
-        with np.errstate(over="ignore"):
-            splats.scale[part] = np.exp(log_scale)
+        splats.scale[part] = np.exp(
+            _within(bounds["scale"], part, quantize.decode_unorm_11_10_11(words["packed_scale"]))
+        )
         splats.quat_xyzw[part] = quantize.decode_quat_2_10_10_10(words["packed_rotation"])[:, [1, 2, 3, 0]]
         rgba = quantize.decode_unorm_8888(words["packed_color"])
         splats.rgb[part] = _within(bounds["color"], part, rgba[:, :3])
         splats.opacity[part] = rgba[:, 3]
 
     def unpack_sh(part: slice, rows: NDArray[Any]) -> None:
-        for coefficient in range(splats.sh.shape[1]):
-            for channel in range(3):
-                codes = rows[f"f_rest_{channel * coefficients + coefficient}"]  # all of red's come first
-                splats.sh[part, coefficient, channel] = quantize.decode_centred_8(codes)
+        codes = rows.view(np.uint8).reshape(len(rows), 3, coefficients)  # all of red's come first
+        splats.sh[part] = quantize.decode_centred_8(codes[:, :, : splats.sh.shape[1]].transpose(0, 2, 1))
 
-    with np.errstate(invalid="ignore", over="ignore"):
-        decode_rows(_rows(file, header, "vertex"), unpack, count, threads, progress)
-        if coefficients:
-            decode_rows(_rows(file, header, "sh"), unpack_sh, count, threads, progress)
+    decode_rows(_rows(file, header, "vertex"), unpack, count, threads, progress)
+    if coefficients:
+        decode_rows(_rows(file, header, "sh"), unpack_sh, count, threads, progress)
     return Scene(splats, format="compressed PLY", notes=notes_on_degree(degree))
 
 
@@ -111,11 +109,12 @@ def _checked(header: Header) -> tuple[int, int]:
     if "sh" not in header.elements:
         return count, 0
     row_type = header.row_type("sh")
-    values = len(row_type.names or ()) if row_type else 0
-    _check_types(header, "sh", tuple(f"f_rest_{index}" for index in range(values)), np.uint8)
-    if values % 3 or header.count("sh") != count:
-        raise FormatError(f"its element sh has {header.count('sh'):,} rows of {values} values for {count:,} splats")
-    return count, values // 3
+    names = tuple(f"f_rest_{index}" for index in range(len(row_type.names or ()) if row_type else 1))
+    if _check_types(header, "sh", names, np.uint8) != names:
+        raise FormatError("the properties of its element sh are not f_rest_0 on, in order")
+    if len(names) % 3 or header.count("sh") != count:
+        raise FormatError(f"its element sh has {header.count('sh'):,} rows of {len(names)} values for {count:,} splats")
+    return count, len(names) // 3
 
 
 def _check_types(header: Header, element: str, names: tuple[str, ...], kind: type[np.generic]) -> tuple[str, ...]:

@@ -8,7 +8,7 @@ from importlib import import_module
 from typing import Any
 
 #: Bytes of a file that are looked at to tell its format.
-HEAD = 1 << 12
+HEAD = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -39,12 +39,20 @@ class Format:
         return self.beginning is not None and re.match(self.beginning, head, re.DOTALL) is not None
 
 
-#: In the order in which they are tried: compressed PLY is PLY, too.
+#: In the order in which they are tried: compressed PLY is PLY, too. A .splat begins with any float, so no beginning may
+#: be of two bytes or less.
 FORMATS = (
-    Format("compressed PLY", "compressed_ply", (".ply",), rb"ply\s(?:(?!end_header).)*\bpacked_position\b"),
+    Format(
+        "compressed PLY",
+        "compressed_ply",
+        (".ply",),
+        rb"ply\s(?:(?!end_header).)*[\r\n]\s*property\s+\w+\s+packed_position\s",
+    ),
     Format("PLY", "ply", (".ply",), rb"ply[\r\n]"),
-    Format("SPZ", "spz", (".spz",), rb"\x1f\x8b|NGSP"),  # versions 1 to 3 are gzipped, 4 is not
-    Format("SOG", "sog", (".sog", ".json"), rb"PK\x03\x04|\s*\{", companions=True),  # a zip, or its meta.json unpacked
+    Format("SPZ", "spz", (".spz",), rb"\x1f\x8b\x08[\0-\x1f]|NGSP"),  # versions 1 to 3 are gzipped, 4 is not
+    Format(
+        "SOG", "sog", (".sog", ".json"), rb"PK\x03\x04|\s*\{\s*\"\w+\"\s*:", companions=True
+    ),  # a zip, or its meta.json unpacked
     Format("KSPLAT", "ksplat", (".ksplat",), rb"\0[\x01-\xff]\0\0"),  # version 0.1 and up; a float would be denormal
     Format("SPLAT", "splat", (".splat",), None),
 )

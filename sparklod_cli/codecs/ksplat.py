@@ -118,6 +118,7 @@ def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> 
             for part, some in rows_of(file.read, section.row_type, section.count):
                 yield slice(section.first + part.start, section.first + part.stop), some
 
+    @np.errstate(invalid="ignore", over="ignore")  # of numbers that no scene has
     def fill(part: slice, some: NDArray[Any]) -> None:
         section = next(section for section in sections if part.start < section.first + section.count)
         splats.center[part] = _centers(section, part, some["center"]) if level else some["center"]
@@ -132,8 +133,7 @@ def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> 
         splats.sh[part, :coefficients] = values.reshape(len(some), coefficients, 3)
         splats.sh[part, coefficients:] = 0  # other sections have more
 
-    with np.errstate(over="ignore", invalid="ignore"):
-        decode_rows(rows(), fill, count, threads, progress)
+    decode_rows(rows(), fill, count, threads, progress)
     return Scene(splats, format="KSPLAT")
 
 

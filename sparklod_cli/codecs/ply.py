@@ -31,11 +31,11 @@ Coding = Callable[[FloatArray], FloatArray]
 
 #: Column of `Splats`, the properties that it is made of, and how they are read and written.
 COLUMNS: tuple[tuple[str, tuple[str, ...], Coding, Coding], ...] = (
-    ("center", ("x", "y", "z"), np.copy, np.copy),
+    ("center", ("x", "y", "z"), np.asarray, np.asarray),
     ("rgb", ("f_dc_0", "f_dc_1", "f_dc_2"), quantize.decode_dc, quantize.encode_dc),
     ("opacity", ("opacity",), quantize.decode_logit, quantize.encode_logit),
     ("scale", ("scale_0", "scale_1", "scale_2"), quantize.decode_log, quantize.encode_log),
-    ("quat_xyzw", ("rot_1", "rot_2", "rot_3", "rot_0"), normalized_quat, np.copy),  # w first; of any length
+    ("quat_xyzw", ("rot_1", "rot_2", "rot_3", "rot_0"), normalized_quat, np.asarray),  # w first; of any length
 )
 REQUIRED = tuple(name for _, names, _, _ in COLUMNS for name in names)
 
@@ -53,30 +53,47 @@ def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> 
     degree, count = degree_of(coefficients), header.count("vertex")
     splats = Splats.empty(count, min(degree, MAX_SH_DEGREE))
     rows = _text_rows(file, header) if header.text else _binary_rows(file, header)
-    decode_rows(rows, lambda part, some: _decode(some, splats, part, coefficients), count, threads, progress)
+    names = list(_row_type(header).names or ())
+    places = {column: _run([names.index(name) for name in parts]) for column, parts, _, _ in COLUMNS}
+    rest = _run([names.index(f"f_rest_{index}") for index in range(3 * coefficients)])  # all of red's come first
+    kept = splats.sh.shape[1]
+
+    # Infinite logits and logarithms are what converters write for an opacity of 0 or 1 and a scale of 0.
+    @np.errstate(over="ignore", invalid="ignore")
+    def fill(part: slice, some: NDArray[Any]) -> None:
+        matrix = _matrix(some)
+        for column, _, decoder, _ in COLUMNS:
+            out = getattr(splats, column)[part]
+            out[...] = decoder(matrix[:, places[column]]).reshape(out.shape)
+        splats.sh[part] = matrix[:, rest].reshape(len(some), 3, coefficients)[:, :, :kept].transpose(0, 2, 1)
+
+    decode_rows(rows, fill, count, threads, progress)
     return Scene(splats, format="PLY", notes=notes_on_degree(degree))
 
 
-def _decode(rows: NDArray[Any], out: Splats, part: slice, channel_stride: int) -> None:
-    """Fills rows `part` of the columns from structured rows; f_rest holds all red coefficients first."""
-    # Infinite logits and logarithms are what converters write for an opacity of 0 or 1 and a scale of 0.
-    with np.errstate(over="ignore", invalid="ignore"):
-        for column, names, decoder, _ in COLUMNS:
-            raw = np.stack([rows[name] for name in names], axis=1).astype(np.float32, copy=False)
-            getattr(out, column)[part] = decoder(raw).reshape(getattr(out, column)[part].shape)
-        for coefficient in range(out.sh.shape[1]):
-            for channel in range(3):
-                out.sh[part, coefficient, channel] = rows[f"f_rest_{channel * channel_stride + coefficient}"]
+def _matrix(rows: NDArray[Any]) -> FloatArray:
+    """(n, properties) float32 of structured rows, without a copy where they are that already."""
+    names = rows.dtype.names or ()
+    if rows.flags.c_contiguous and all(rows.dtype[name] == np.float32 for name in names):
+        return rows.view(np.float32).reshape(len(rows), len(names))
+    matrix = np.empty((len(rows), len(names)), np.float32)
+    for index, name in enumerate(names):
+        matrix[:, index] = rows[name]
+    return matrix
+
+
+def _run(places: list[int]) -> slice | list[int]:
+    """A slice for places that follow one another, as it makes a view and a list a copy."""
+    first = places[0] if places else 0
+    run = slice(first, first + len(places))
+    return run if places == list(range(run.start, run.stop)) else places
 
 
 def _checked_coefficients(header: Header) -> int:
     """SH coefficients a channel, if the vertices are splats."""
     if "vertex" not in header.elements:
         raise FormatError("no vertex element in the PLY header")
-    row_type = header.row_type("vertex")
-    if row_type is None:
-        raise FormatError("the vertices have list properties, splats have none")
-    have = row_type.names or ()
+    have = _row_type(header).names or ()
     missing = [name for name in REQUIRED if name not in have]
     if missing:
         what = "a point cloud or mesh, not Gaussian splats" if "x" in have else "not Gaussian splats"
@@ -88,11 +105,18 @@ def _checked_coefficients(header: Header) -> int:
     return rest // 3
 
 
+def _row_type(header: Header) -> np.dtype[Any]:
+    row_type = header.row_type("vertex")
+    if row_type is None:
+        raise FormatError("the vertices have list properties, splats have none")
+    return row_type
+
+
 def _binary_rows(file: BinaryIO, header: Header) -> Iterator[Rows]:
-    offset, row_type = header.offset("vertex"), header.row_type("vertex")
-    if offset is not None and row_type is not None:
+    offset = header.offset("vertex")
+    if offset is not None:
         file.seek(offset)
-        yield from rows_of(file.read, row_type, header.count("vertex"), "vertices")
+        yield from rows_of(file.read, _row_type(header), header.count("vertex"), "vertices")
         return
     file.seek(0)  # rows of unknown sizes come before the vertices
     try:
@@ -105,7 +129,7 @@ def _binary_rows(file: BinaryIO, header: Header) -> Iterator[Rows]:
 
 def _text_rows(file: BinaryIO, header: Header) -> Iterator[Rows]:
     """The vertices of an ascii file in chunks; plyfile's own reader goes value by value in Python."""
-    row_type, vertices = header.row_type("vertex"), header.count("vertex")
+    row_type, vertices = _row_type(header), header.count("vertex")
     file.seek(header.size)
     for name, (_, count) in header.elements.items():
         if name == "vertex":

@@ -183,16 +183,28 @@ def encode_quat_smallest_three(quat_xyzw: FloatArray) -> Bytes:
 
 def decode_quat_smallest_three(codes: Bytes) -> FloatArray:
     """(N, 4) bytes to (N, 4) unit quaternions. Largest error: 0.35 degrees of rotation."""
-    code = np.ascontiguousarray(codes).view("<u4")
-    part = code >> np.array([20, 10, 0], np.uint32)
-    magnitude = (part & np.uint32(511)).astype(np.float32) * (_SQRT_HALF / 511)
-    others = np.where(part & np.uint32(512), -magnitude, magnitude)
-    largest = (code[:, 0] >> np.uint32(30)).astype(np.intp)
-    quat = np.empty((len(codes), 4), np.float32)
-    np.put_along_axis(quat, _OTHERS[largest], others, axis=1)
-    rest = np.sqrt(np.maximum(0, 1 - np.einsum("ij,ij->i", others, others)))
-    np.put_along_axis(quat, largest[:, None], rest[:, None], axis=1)
-    return normalized_quat(quat)
+    code = np.ascontiguousarray(codes).view("<u4")[:, 0]
+    others = []
+    for low in (20, 10, 0):
+        magnitude = (code >> np.uint32(low) & np.uint32(511)).astype(np.float32) * (_SQRT_HALF / 511)
+        others.append(np.where(code & np.uint32(512 << low), -magnitude, magnitude))
+    return quat_of_others(code >> np.uint32(30), *others)
+
+
+def quat_of_others(largest: NDArray[Any], a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
+    """(N, 4) unit quaternions of which the component at `largest`, (N,), is missing, and the others in order are a b c.
+
+    It is taken as positive.
+    """
+    square = a * a + b * b + c * c
+    rest = np.sqrt(np.maximum(1 - square, 0))
+    over = 1 / np.sqrt(np.maximum(square, 1))  # the others may be longer than 1 together
+    quat = np.empty((len(a), 4), np.float32)
+    quat[:, 0] = np.where(largest == 0, rest, a) * over
+    quat[:, 1] = np.where(largest == 1, rest, np.where(largest < 1, a, b)) * over
+    quat[:, 2] = np.where(largest == 2, rest, np.where(largest < 2, b, c)) * over
+    quat[:, 3] = np.where(largest == 3, rest, c) * over
+    return quat
 
 
 def encode_quat_bytes(quat: FloatArray) -> Bytes:
@@ -221,24 +233,13 @@ def decode_unorm_8888(code: NDArray[np.uint32]) -> FloatArray:
     return np.stack([_unorm(code, low, 8) for low in (24, 16, 8, 0)], axis=1)
 
 
-def quat_of_others(largest: NDArray[Any], others: FloatArray) -> FloatArray:
-    """(N, 4) unit quaternions of the index of the largest component, taken as positive, and the (N, 3) others."""
-    quat = np.empty((len(others), 4), np.float32)
-    rest = np.sqrt(np.maximum(0, 1 - np.einsum("ij,ij->i", others, others)))
-    for component in range(4):
-        ahead = others[:, component - 1] if component else rest
-        behind = others[:, component] if component < 3 else rest
-        quat[:, component] = np.where(largest == component, rest, np.where(component < largest, behind, ahead))
-    return normalized_quat(quat)
-
-
 def decode_quat_2_10_10_10(code: NDArray[np.uint32]) -> FloatArray:
     """(N,) words to (N, 4) unit quaternions w x y z: 2 bits index of the largest component, then the others in order.
 
     Each has 10 bits for -sqrt(1 / 2) .. sqrt(1 / 2). Largest error: 0.28 degrees of rotation.
     """
-    others = np.stack([_unorm(code, low, 10) for low in (20, 10, 0)], axis=1)
-    return quat_of_others(code >> np.uint32(30), (others - np.float32(0.5)) * (2 * _SQRT_HALF))
+    others = [(_unorm(code, low, 10) - np.float32(0.5)) * (2 * _SQRT_HALF) for low in (20, 10, 0)]
+    return quat_of_others(code >> np.uint32(30), *others)
 
 
 def decode_centred_8(codes: Bytes) -> FloatArray:

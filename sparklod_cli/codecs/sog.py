@@ -54,6 +54,8 @@ def decode(
     version = meta.integer("version") if meta.has("version") else 1
     if version not in (1, 2):
         raise FormatError(f"SOG version {version} is not known, only 1 and 2 are")
+    if version == 1 and meta.has("opacities"):
+        raise FormatError("SOG from before version 1, with opacities apart; only versions 1 and 2 are known")
     count = meta.integer("count") if version == 2 else meta.integer("means", "shape", 0)
     if not 0 < count <= MAX_SPLATS:
         raise FormatError(f"{count:,} splats are not a number that SOG can hold")
@@ -123,9 +125,9 @@ def _centers(splats: Splats, low: Texels, high: Texels, meta: Meta) -> Pass:
 
 def _fill_quats(splats: Splats, texels: Texels, part: slice) -> None:
     """The three smaller components in r g b; those of a texel without a tag become NaN, which nobody will draw."""
-    others = (texels[part, :3].astype(np.float32) / np.float32(127.5) - 1) * np.float32(np.sqrt(0.5))
+    others = [(texels[part, k].astype(np.float32) / np.float32(127.5) - 1) * np.float32(np.sqrt(0.5)) for k in range(3)]
     tag = texels[part, 3]
-    quat = quantize.quat_of_others(tag.astype(np.int16) - FIRST_TAG, others)[:, [1, 2, 3, 0]]
+    quat = quantize.quat_of_others(tag.astype(np.int16) - FIRST_TAG, *others)[:, [1, 2, 3, 0]]
     quat[tag < FIRST_TAG] = np.nan
     splats.quat_xyzw[part] = quat
 

@@ -130,7 +130,7 @@ class Files:
 
     def _open_beside(self, name: str) -> BinaryIO:
         if self._beside is None:
-            raise FormatError(f"{META} names {name}, which cannot be had here")
+            raise FormatError(f"{META} names {name!r}, which cannot be had here")
         return self._beside(name)
 
     def _size_beside(self, name: str) -> int:
@@ -149,7 +149,7 @@ class Files:
         data = self._read(name)
         width, height = _webp_size(data, name)
         if height < least[0] or width < least[1]:
-            raise FormatError(f"{name} has {width} x {height} texels, too few")
+            raise FormatError(f"{name!r} has {width} x {height} texels, too few")
         check_promise(4 * width * height, self.size)
         return _decode_webp(data, name)
 
@@ -158,7 +158,7 @@ class Files:
         texels = self.image(texture, index, (1, 1)).reshape(-1, 4)
         if len(texels) < count:
             name = self.meta.name(texture, "files", index)
-            raise FormatError(f"{name} has {len(texels):,} texels for {count:,} splats")
+            raise FormatError(f"{name!r} has {len(texels):,} texels for {count:,} splats")
         return texels[:count]
 
 
@@ -180,14 +180,14 @@ class _Archive:
         try:
             member = self._zip.getinfo(self._folder + name)
         except KeyError:
-            raise FormatError(f"{META} names {name}, which is not in the archive") from None
+            raise FormatError(f"{META} names {name!r}, which is not in the archive") from None
         if member.compress_type not in METHODS or member.flag_bits & ENCRYPTED:
-            raise FormatError(f"{name} is packed in a way that SOG has not")
+            raise FormatError(f"{name!r} is packed in a way that SOG has not")
         check_promise(member.file_size, self._size)
         try:
             return self._zip.read(member)
         except _ZIP_ERRORS as error:
-            raise FormatError(f"{name} cannot be unpacked: {error}") from None
+            raise FormatError(f"{name!r} cannot be unpacked: {error}") from None
 
 
 def _webp_size(data: bytes, name: str) -> tuple[int, int]:
@@ -201,7 +201,7 @@ def _webp_size(data: bytes, name: str) -> tuple[int, int]:
     if kind == b"VP8 ":  # 14 bits each, behind a frame tag and a start code
         width, height = struct.unpack_from("<HH", data, 26)
         return width & 0x3FFF, height & 0x3FFF
-    raise FormatError(f"{name} is not a WebP image")
+    raise FormatError(f"{name!r} is not a WebP image")
 
 
 def _decode_webp(data: bytes, name: str) -> Texels:
@@ -209,6 +209,6 @@ def _decode_webp(data: bytes, name: str) -> Texels:
         with Image.open(io.BytesIO(data), formats=["WEBP"]) as image:
             return np.asarray(image.convert("RGBA"))
     except Image.DecompressionBombError:
-        raise FormatError(f"{name} has more texels than Pillow decodes") from None
+        raise FormatError(f"{name!r} has more texels than Pillow decodes") from None
     except (OSError, ValueError, SyntaxError, EOFError) as error:
-        raise FormatError(f"{name} is a corrupt WebP image: {error}") from None
+        raise FormatError(f"{name!r} is a corrupt WebP image: {error}") from None

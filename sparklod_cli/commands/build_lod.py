@@ -7,26 +7,36 @@ import functools
 import json
 import os
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from .. import limits
-from .console import Console, count_of, is_terminal
+from .console import Console, is_terminal
 from .options import AutoOr, Ball, Numbers, Real, common_options
+from .reports import report_baked, report_unbaked
 
 if TYPE_CHECKING:
-    from ..bake import Baked, Recipe
+    from ..bake import Baked
+    from ..io import Sink
+    from ..unlod import Unbaked
+
+    #: Makes the output of an input through a sink, and reports what came of it.
+    Work = Callable[[Path, Path, Sink], Baked | Unbaked]
 
 STDOUT = Path("-")
 
 #: Said when kernels are compiled; {} is how often that happens.
 COMPILING = "Compiling for this machine, which takes some 10 seconds; this happens {} ..."
 
-#: What SPZ clamps, for people; see `spz.clamped`.
-CLAMPED = {"scale": "scales (4.5e-5 to 380 units)", "rgb": "colours (-0.44 to 1.44)", "sh": "SH (-1 to 0.99)"}
+#: Options that only mean something for a tree that is built, and for SPZ.
+OF_BAKING = ("base", "max_sh", "min_opacity", "min_box", "max_box", "within", "on_invalid", "rgba", "encoding")
+OF_SPZ = ("spz_version", "fractional_bits", "compression_level")
+
+#: Names that promise what a tree is not written as.
+OTHER_SUFFIXES = {".ply", ".splat", ".ksplat", ".sog", ".json"}
 
 EXAMPLES = """
 \b
@@ -36,6 +46,8 @@ Examples:
   sparklod build-lod scene.ply -o - | aws s3 cp - s3://bucket/scene-lod.spz
   sparklod build-lod scene.ply --within 0,1,0,25 --min-opacity 0.02
   sparklod build-lod scene.ply --json | jq .nodes
+  sparklod build-lod scene.sog --encoding ext     # writes scene-lod.npz
+  sparklod build-lod scene-lod.spz --unlod -o scene.ply
 """
 
 
@@ -46,7 +58,8 @@ Examples:
     "--output",
     metavar="FILE",
     type=click.Path(path_type=Path),
-    help="Output of a single input; - is standard output.  [default: NAME-lod.spz beside the input]",
+    help="Output of a single input; - is standard output.  [default: NAME-lod.spz beside the input;"
+    " NAME-lod.npz with --encoding, NAME-unlod.spz with --unlod]",
     show_default=False,
 )
 @click.option(
@@ -80,6 +93,22 @@ Examples:
     type=click.Choice(["error", "drop"]),
     default="error",
     help="What to do about splats with numbers that are not finite.",
+)
+@click.option(
+    "--rgba",
+    metavar="FILE",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="Take colours and opacities from a .npy or raw file of (N, 4) bytes or floats 0..1; alpha 0 drops a splat.",
+)
+@click.option(
+    "--encoding",
+    type=click.Choice(limits.ENCODINGS),
+    help="Write the tree as arrays in a viewer's memory layout: .npz, or the words alone if FILE ends otherwise.",
+)
+@click.option(
+    "--unlod",
+    is_flag=True,
+    help="The way back: write the splats of Level-of-Detail files, as SPZ or, if FILE ends so, as .ply or .splat.",
 )
 @click.option(
     "--spz-version",
@@ -116,45 +145,72 @@ def build_lod(
 ) -> None:
     """Bake splat scenes into Level-of-Detail files for Spark.
 
-    Reads 3D Gaussian Splatting PLY and SPZ, merges splats into a tree, and writes it as SPZ with Spark's extension. The
-    axes of the input are kept as they are.
+    Reads PLY (3D Gaussian Splatting's and PlayCanvas's compressed one), SPZ, SOG (.sog, or a folder with a meta.json),
+    .splat and .ksplat, merges splats into a tree, and writes it as SPZ with Spark's extension. The axes of the input
+    are kept as they are.
 
     A file that fails does not stop the others; the exit status is 1 if any did.
     """
-    outputs = _outputs(inputs, output, output_dir)
+    outputs = _outputs(inputs, output, output_dir, settings)
+    _check_usage(ctx, inputs, output, settings)
     if output == STDOUT and as_json:
         raise click.UsageError("--json and -o - both want standard output")
     if output == STDOUT and is_terminal(sys.stdout):
         raise click.UsageError("-o - writes binary data; redirect it to a file or a pipe")
     failed = False
     with Console(quiet=quiet, verbose=verbose) as console:
-        recipe = _prepare(settings, console)
+        work = _unlod(ctx, settings, console) if settings["unlod"] else _bake(settings, output, console)
         from .. import io
-        from ..bake import bake
         from ..errors import SparklodError
 
         for source, target in zip(inputs, outputs, strict=True):
             try:
                 if target == STDOUT:
-                    write: Callable[[Iterable[bytes]], int] = io.write_stdout
+                    write: Sink = io.write_stdout
                 else:
                     io.check_writable(target, overwrite=overwrite, make_parent=output_dir is not None)
                     write = functools.partial(io.write_whole, target, overwrite=overwrite)
-                baked = bake(source, write, recipe, progress=console.progress)
+                result = work(source, target, write)
             except SparklodError as error:
                 failed = True
                 console.error(f"{source}: {error}")
                 record: dict[str, Any] = {"input": str(source), "error": str(error)}
             else:
-                _report(console, source, target, baked)
-                record = {"input": str(source), "output": str(target), **dataclasses.asdict(baked)}
+                record = {"input": str(source), "output": str(target), **dataclasses.asdict(result)}
             if as_json:
                 click.echo(json.dumps(record))
     if failed:
         ctx.exit(1)
 
 
-def _outputs(inputs: tuple[Path, ...], output: Path | None, output_dir: Path | None) -> list[Path]:
+def _check_usage(ctx: click.Context, inputs: tuple[Path, ...], output: Path | None, settings: dict[str, Any]) -> None:
+    """A usage error where options contradict each other or the name of the output."""
+
+    def refuse(names: tuple[str, ...], why: str) -> None:
+        for name in names:
+            if ctx.get_parameter_source(name) not in (None, click.core.ParameterSource.DEFAULT):
+                raise click.UsageError(f"--{name.replace('_', '-')} {why}")
+
+    suffix = output.suffix.lower() if output is not None and output != STDOUT else ""
+    if settings["unlod"]:
+        refuse(OF_BAKING, "is of no use with --unlod, which writes what there is")
+        if suffix and suffix not in limits.PLAIN_SUFFIXES:
+            raise click.UsageError(f"--unlod writes {', '.join(limits.PLAIN_SUFFIXES)}, not {suffix}")
+        if suffix not in ("", ".spz"):
+            refuse(OF_SPZ, f"is of SPZ, not of {suffix}")
+    elif settings["encoding"]:
+        refuse(OF_SPZ, "is of SPZ, not of --encoding")
+    elif suffix in OTHER_SUFFIXES:
+        raise click.UsageError(f"{suffix} holds no tree, which is written as SPZ; name the output .spz")
+    elif suffix == ".npz":
+        raise click.UsageError("a .npz output needs --encoding")
+    if settings["rgba"] is not None and len(inputs) > 1:
+        raise click.UsageError(f"--rgba takes one input, not {len(inputs)}")
+
+
+def _outputs(
+    inputs: tuple[Path, ...], output: Path | None, output_dir: Path | None, settings: dict[str, Any]
+) -> list[Path]:
     """Where each input goes; a usage error where two would go to one place."""
     if output is not None:
         if output_dir is not None:
@@ -163,7 +219,7 @@ def _outputs(inputs: tuple[Path, ...], output: Path | None, output_dir: Path | N
             raise click.UsageError(f"-o takes one input, not {len(inputs)}; use --output-dir")
         outputs = [output]
     else:
-        outputs = [(output_dir or source.parent) / f"{source.stem}-lod.spz" for source in inputs]
+        outputs = [(output_dir or source.parent) / _output_name(source, settings) for source in inputs]
     sources = {os.path.realpath(source) for source in inputs}
     first: dict[str, Path] = {}
     for source, target in zip(inputs, outputs, strict=True):
@@ -176,10 +232,18 @@ def _outputs(inputs: tuple[Path, ...], output: Path | None, output_dir: Path | N
     return outputs
 
 
-def _prepare(settings: dict[str, Any], console: Console) -> Recipe:
-    """The recipe that the options ask for; the point where numpy and numba are loaded."""
+def _output_name(source: Path, settings: dict[str, Any]) -> str:
+    # The meta.json of an unpacked SOG is called as its folder.
+    stem = source.absolute().parent.name if source.name == "meta.json" else source.stem
+    if settings["unlod"]:
+        return f"{stem.removesuffix('-lod')}-unlod.spz"
+    return f"{stem}-lod.npz" if settings["encoding"] else f"{stem}-lod.spz"
+
+
+def _bake(settings: dict[str, Any], output: Path | None, console: Console) -> Work:
+    """What bakes a file and reports it; the point where numpy and numba are loaded."""
     from .. import jit
-    from ..bake import Recipe
+    from ..bake import Recipe, bake
     from ..codecs import spz
     from ..selection import Selection
 
@@ -187,7 +251,7 @@ def _prepare(settings: dict[str, Any], console: Console) -> Recipe:
     jit.on_first_compile(
         lambda: console.say(COMPILING.format("once" if jit.CACHE_FOLDER else "every time, as no cache can be written"))
     )
-    return Recipe(
+    recipe = Recipe(
         base=settings["base"],
         max_sh=settings["max_sh"],
         selection=Selection(
@@ -197,6 +261,9 @@ def _prepare(settings: dict[str, Any], console: Console) -> Recipe:
             max_box=settings["max_box"],
             within=settings["within"],
         ),
+        rgba=settings["rgba"],
+        encoding=settings["encoding"],
+        raw=output is not None and output.suffix.lower() != ".npz",
         spz=spz.Options(
             version=int(settings["spz_version"]),
             fractional_bits=settings["fractional_bits"],
@@ -205,22 +272,30 @@ def _prepare(settings: dict[str, Any], console: Console) -> Recipe:
         ),
     )
 
+    def work(source: Path, target: Path, write: Sink) -> Baked:
+        baked = bake(source, write, recipe, progress=console.progress)
+        report_baked(console, source, target, baked)
+        return baked
 
-def _report(console: Console, source: Path, target: Path, baked: Baked) -> None:
-    from ..selection import describe
+    return work
 
-    seconds = sum(baked.seconds.values())
-    size = f"{baked.bytes / 1e6:.1f} MB" if baked.bytes >= 1e5 else f"{baked.bytes / 1e3:.1f} kB"
-    console.say(
-        f"{source}  {count_of(baked.splats, 'splat')}, SH {baked.sh_degree}  ->  {target} "
-        f" {count_of(baked.nodes, 'node')}, {count_of(baked.levels, 'level')}, {size}, {seconds:.1f} s"
-    )
-    if baked.dropped:
-        console.say(f"  dropped {describe(baked.dropped)}")
-    for note in baked.notes:
-        console.say(f"  {note}")
-    if baked.clamped:
-        counts = ", ".join(f"{CLAMPED[name]} of {count_of(count, 'node')}" for name, count in baked.clamped.items())
-        console.say(f"  clamped to what SPZ holds: {counts}")
-    stages = ", ".join(f"{stage} {value:.2f} s" for stage, value in baked.seconds.items())
-    console.detail(f"  {baked.format} -> SPZ {baked.version} LoD, {baked.fractional_bits} fractional bits; {stages}")
+
+def _unlod(ctx: click.Context, settings: dict[str, Any], console: Console) -> Work:
+    """What writes the leaves of a file and reports it."""
+    from ..unlod import Target, unlod
+
+    chosen = ctx.get_parameter_source("spz_version") != click.core.ParameterSource.DEFAULT
+
+    def work(source: Path, target: Path, write: Sink) -> Unbaked:
+        how = Target(
+            suffix=".spz" if target == STDOUT else target.suffix.lower() or ".spz",
+            version=int(settings["spz_version"]) if chosen else None,
+            fractional_bits=settings["fractional_bits"],
+            compression_level=settings["compression_level"],
+            threads=settings["threads"],
+        )
+        unbaked = unlod(source, write, how, progress=console.progress)
+        report_unbaked(console, source, target, unbaked)
+        return unbaked
+
+    return work

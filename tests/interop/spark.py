@@ -125,6 +125,15 @@ class Spark:
             nodes=nodes,
         )
 
+    def load_words(self, layout: str, source: bytes | Path, **options: Any) -> dict[str, NDArray[np.uint32]]:
+        """The arrays of a layout, "Packed" or "Ext", as (N, words) rows without what Spark allocates beyond its splats.
+
+        The worker takes `options`: `lod` to build a tree, `encoding` for the ranges of PackedSplats.
+        """
+        reply = self._ask(f"load{layout}Splats", source, options)
+        width = {"sh1": 2 if layout == "Packed" else 4}
+        return {name: words.reshape(-1, width.get(name, 4))[: reply.count] for name, words in reply.words.items()}
+
     def load_packed_sh(self, source: bytes) -> NDArray[np.float64]:
         """(N, K, 3) SH coefficients of a file as Spark's other layout, PackedSplats, holds them."""
         reply = self._ask("loadPackedSplats", source, {})

@@ -1,0 +1,176 @@
+"""Decoding, each format beside splat-transform's library in one run: `python benchmarks/bench_decode.py --help`."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import gc
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from bench_build import machine
+from scenes import load, tiled
+
+from sparklod_cli.codecs import ply, splat
+from sparklod_cli.io import read_scene, write_whole
+from sparklod_cli.parallel import processors
+from sparklod_cli.scene import Scene
+
+HERE = Path(__file__).resolve().parent
+
+HEADINGS = (
+    *("file", "format", "splats", "SH", "MB", "sparklod s", "million splats/s (min to max)", "splat-transform s"),
+    *("million splats/s", "ratio", "peak / decoded"),
+)
+
+#: Decodes a file and prints its peak memory in kB, as the kernel saw it, beyond that of the interpreter and the codecs.
+MEASURED = """
+import re, sys
+from pathlib import Path
+from sparklod_cli.codecs.formats import FORMATS
+from sparklod_cli.io import read_scene
+from sparklod_cli.parallel import processors
+def memory(what):
+    return int(re.search(what + r":\\s+(\\d+)", Path("/proc/self/status").read_text())[1])
+for form in FORMATS:
+    form.codec()
+threads, before = processors(), memory("VmRSS")
+scene = read_scene(Path(sys.argv[1]), threads=threads)
+print(memory("VmHWM") - before)
+"""
+
+
+class SplatTransform:
+    """Its library in a Node process; None of it where FOREIGN_DIR does not say where it is."""
+
+    def __init__(self) -> None:
+        self._process: subprocess.Popen[str] | None = None
+        if "FOREIGN_DIR" in os.environ:
+            command = ["node", "--expose-gc", "--max-old-space-size=8192", str(HERE / "transform_read.mjs")]
+            self._process = subprocess.Popen(
+                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+            )
+
+    def ask(self, **request: Any) -> dict[str, Any] | None:
+        """The answer to a request; None, and a word on stderr, where there is none."""
+        if self._process is None:
+            return None
+        assert self._process.stdin and self._process.stdout
+        self._process.stdin.write(json.dumps(request) + "\n")
+        self._process.stdin.flush()
+        answer = json.loads(self._process.stdout.readline() or '{"error": "the process ended"}')
+        if "error" in answer:
+            print(f"splat-transform failed on {request}: {answer['error']}", file=sys.stderr)
+            return None
+        return dict(answer)
+
+    def seconds(self, path: Path) -> float | None:
+        """Of one run of its reader."""
+        answer = self.ask(read=str(path))
+        return None if answer is None else float(answer["seconds"])
+
+    def close(self) -> None:
+        if self._process is not None:
+            self._process.communicate()
+
+
+def our_seconds(path: Path) -> float:
+    """Of one run of `read_scene`, from the file to the columns of `Splats`."""
+    gc.collect()
+    start = time.perf_counter()
+    read_scene(path, threads=processors())
+    return time.perf_counter() - start
+
+
+def peak(path: Path) -> int:
+    """Bytes that a process which decodes a file needs at most, beyond what it needs to begin with."""
+    result = subprocess.run([sys.executable, "-c", MEASURED, str(path)], capture_output=True, text=True, check=True)
+    return int(result.stdout) * 1024
+
+
+def made(source: Path, millions: float, folder: Path, transform: SplatTransform) -> Iterator[Path]:
+    """A scene tiled to a size, in every format that sparklod or splat-transform writes.
+
+    Without SH for SOG: on a processor splat-transform takes hours to cluster those of a million splats.
+    """
+    scene = Scene(tiled(load(source), int(millions * 1e6)))
+    stem = f"tiled-{millions:g}M"
+    plain, bare = folder / f"{stem}.ply", folder / f"{stem}-sh0.ply"
+    for path, codec, degree in ((plain, ply, 3), (bare, ply, 0), (folder / f"{stem}.splat", splat, 0)):
+        part = dataclasses.replace(scene, splats=scene.splats.with_max_sh(degree))
+        write_whole(path, codec.encode(part), overwrite=True)
+        if path != bare:
+            yield path
+    del scene, part
+    for name, origin, options in (
+        (f"{stem}.compressed.ply", plain, {}),
+        (f"{stem}-v3.spz", plain, {"spzVersion": 3}),
+        (f"{stem}-v4.spz", plain, {"spzVersion": 4}),
+        (f"{stem}-sh0.sog", bare, {}),
+    ):
+        if transform.ask(write=str(folder / name), source=str(origin), options=options) is not None:
+            yield folder / name
+
+
+def row(path: Path, transform: SplatTransform, runs: int) -> None:
+    """Measures one file and prints its row."""
+    scene = read_scene(path, threads=processors())
+    splats, degree, form = len(scene.splats), scene.splats.sh_degree, scene.format
+    decoded = sum(getattr(scene.splats, field.name).nbytes for field in dataclasses.fields(scene.splats))
+    del scene
+    transform.seconds(path)
+    ours, theirs = [], []
+    for _ in range(runs):
+        ours.append(our_seconds(path))
+        theirs.append(transform.seconds(path))
+    median = statistics.median(ours)
+    rates = [splats / seconds / 1e6 for seconds in ours]
+    known = [seconds for seconds in theirs if seconds is not None]
+    other = statistics.median(known) if known else None
+    size = sum(file.stat().st_size for file in path.parent.glob("*")) if path.suffix == ".json" else path.stat().st_size
+    cells = [
+        path.name,
+        form,
+        f"{splats:,}",
+        str(degree),
+        f"{size / 1e6:.1f}",
+        f"{median:.3f}",
+        f"{statistics.median(rates):.2f} ({min(rates):.2f} to {max(rates):.2f})",
+        f"{other:.3f}" if other else "",
+        f"{splats / other / 1e6:.2f}" if other else "",
+        f"{other / median:.1f}x" if other else "",
+        f"{peak(path) / decoded:.2f}",
+    ]
+    print("| " + " | ".join(cells) + " |", flush=True)
+
+
+def main() -> None:
+    """Prints a Markdown table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("scenes", nargs="+", type=Path, help="splat files; the last is also tiled, see --millions")
+    parser.add_argument("--millions", type=float, nargs="*", default=[], help="sizes to tile to, in every format")
+    parser.add_argument("--runs", type=int, default=5, help="runs of each, in turns; medians are printed")
+    arguments = parser.parse_args()
+    print(f"Machine: {machine()}. Medians of {arguments.runs} runs.\n")
+    print("| " + " | ".join(HEADINGS) + " |")
+    print("|---" * len(HEADINGS) + "|")
+    transform = SplatTransform()
+    for path in arguments.scenes:
+        row(path, transform, arguments.runs)
+    for millions in arguments.millions:
+        with tempfile.TemporaryDirectory() as folder:
+            for path in made(arguments.scenes[-1], millions, Path(folder), transform):
+                row(path, transform, arguments.runs)
+    transform.close()
+
+
+if __name__ == "__main__":
+    main()

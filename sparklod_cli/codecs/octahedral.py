@@ -1,0 +1,120 @@
+"""What Spark's in-memory layouts share: rotations as axis and angle, its rounding, its alpha, and checks of arrays.
+
+The formulas are those of Spark 2.2.0's encoders in Rust, in float32 and in the same order of operations, because a code
+that lies half-way between two numbers falls by the last bit. Only the functions that round differently from library to
+library (arc cosine, sine, logarithm, exponential) are taken in float64 and rounded once, so that every machine gives
+the same codes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import FormatError
+from ..gaussian import linear_opacity, lod_opacity
+from ..splats import FloatArray
+
+Words = NDArray[np.uint32]
+
+#: Steps of the two numbers of the axis and of the angle, in the two layouts.
+STEPS_8_8_8 = (255, 255)
+STEPS_10_10_12 = (1023, 4095)
+
+_PI = np.float32(np.pi)
+#: Below this the axis of a rotation is noise, and Spark takes the x axis.
+_NO_ROTATION = np.float32(1e-6)
+#: Added before cutting off, this rounds ties up, and unlike 1 / 2 itself it does not lift the float32 below 1 / 2.
+_ALMOST_HALF = np.nextafter(np.float32(0.5), np.float32(0))
+
+
+def round_half_away(values: FloatArray) -> FloatArray:
+    """Whole float32 numbers, ties away from zero, as Rust's `round` has them and numpy's has not."""
+    return np.trunc(values + np.copysign(_ALMOST_HALF, values))
+
+
+def to_code(values: FloatArray, most: int) -> NDArray[np.uint32]:
+    """float32 numbers in steps of a code to whole codes 0..most, ties up."""
+    return (np.clip(values, 0, np.float32(most)) + _ALMOST_HALF).astype(np.uint32)
+
+
+def encode_axis_angle(quat_xyzw: FloatArray, steps: tuple[int, int]) -> tuple[Words, Words, Words]:
+    """(N, 4) unit quaternions to three codes, (N,) each: u and v of the axis, 0..steps[0], and the angle, 0..steps[1].
+
+    The axis is that of the turn by 0..pi. It is projected onto the octahedron |x| + |y| + |z| = 1, whose lower half is
+    folded outward over the corners of the square that the upper half covers in x and y: u and v are x and y of that,
+    -1..1. No rotation has the x axis.
+    """
+    axis_steps, angle_steps = steps
+    x, y, z, w = np.ascontiguousarray(quat_xyzw.T)
+    angle = 2 * np.arccos(np.minimum(np.abs(w), 1).astype(np.float64)).astype(np.float32)
+    sine = np.sin((angle * np.float32(0.5)).astype(np.float64)).astype(np.float32)
+    still = sine < _NO_ROTATION
+    signed_sine = np.where(w < 0, -sine, sine)
+    signed_sine[still] = 1
+    x, y, z = x / signed_sine, y / signed_sine, z / signed_sine
+    x[still], y[still], z[still] = 1, 0, 0
+    length = np.abs(x) + np.abs(y) + np.abs(z)
+    u, v = x / length, y / length
+    below = z < 0
+    u, v = (
+        np.where(below, np.where(u >= 0, 1 - np.abs(v), np.abs(v) - 1), u),
+        np.where(below, np.where(v >= 0, 1 - np.abs(u), np.abs(u) - 1), v),
+    )
+    half, scale = np.float32(0.5), np.float32(axis_steps)
+    return (
+        to_code((u * half + half) * scale, axis_steps),
+        to_code((v * half + half) * scale, axis_steps),
+        to_code(angle / _PI * np.float32(angle_steps), angle_steps),
+    )
+
+
+def decode_axis_angle(u: NDArray[Any], v: NDArray[Any], angle: NDArray[Any], steps: tuple[int, int]) -> FloatArray:
+    """Three codes, (N,) each, to (N, 4) unit quaternions x y z w with w >= 0.
+
+    Largest error: 1.94 degrees of rotation for `STEPS_8_8_8`, 0.476 for `STEPS_10_10_12`. x and y of the axis lie
+    within 1 / steps[0], which is sqrt(6) / steps[0] along a face of the octahedron and sqrt(18) / steps[0] radians
+    seen from the middle, sqrt(1 / 3) away; a turn by pi has twice that. The angle lies within pi / 2 / steps[1], and
+    that error is about another axis, at a right angle.
+    """
+    axis_steps, angle_steps = steps
+    x, y = u * np.float64(2 / axis_steps) - 1, v * np.float64(2 / axis_steps) - 1
+    z = 1 - np.abs(x) - np.abs(y)
+    fold = np.maximum(-z, 0)
+    x, y = np.where(x >= 0, x - fold, x + fold), np.where(y >= 0, y - fold, y + fold)
+    half = angle * np.float64(np.pi / 2 / angle_steps)
+    scale = np.sin(half) / np.sqrt(x * x + y * y + z * z)
+    return np.stack([x * scale, y * scale, z * scale, np.cos(half)], axis=1).astype(np.float32)
+
+
+def encode_lod_alpha(opacity: FloatArray) -> FloatArray:
+    """Linear opacity to Spark's alpha: itself up to 1, above it (D + 3) / 4, so that D = 1..5 becomes 1..2."""
+    d = lod_opacity(opacity)
+    return np.where(d > 1, (d + 3) * np.float32(0.25), d)
+
+
+def decode_lod_alpha(alpha: FloatArray) -> FloatArray:
+    """Spark's alpha to linear opacity; D is 4 * alpha - 3 above 1. Largest error: that of float32."""
+    return linear_opacity(np.where(alpha > 1, 4 * alpha - 3, alpha))
+
+
+def checked_words(arrays: Mapping[str, NDArray[Any]], columns: Mapping[str, int]) -> dict[str, Words]:
+    """The arrays of these names, each (N, columns) uint32 with the same N, C-contiguous.
+
+    Raises:
+        FormatError: one is missing, or of another shape or type.
+    """
+    found = {}
+    rows = None
+    for name, width in columns.items():
+        array = arrays.get(name)
+        if array is None:
+            raise FormatError(f"no array {name}, only {', '.join(arrays) or 'none at all'}")
+        rows = len(array) if rows is None and array.ndim else rows
+        if array.dtype != np.uint32 or array.shape != (rows, width):
+            raise FormatError(f"{name} is {array.dtype}{list(array.shape)}, expected uint32[{rows}, {width}]")
+        found[name] = np.ascontiguousarray(array)
+    return found

@@ -1,0 +1,240 @@
+"""The in-memory encodings are word for word what Spark makes: its worker of files, its JavaScript of bare numbers.
+
+But for ties that last bits decide, in a stated share of all codes at most, which is two to three times what was seen.
+See `ties`.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from fixtures import by_hand
+from sparklod_cli.codecs import ext_splats, lod_tree, packed_splats, spz
+from sparklod_cli.codecs.packed_splats import Encoding
+from sparklod_cli.gaussian import lod_opacity
+from sparklod_cli.io import read_scene
+from sparklod_cli.lod import quick
+from sparklod_cli.scene import Scene
+from sparklod_cli.sh import SH_C0
+from sparklod_cli.splats import Splats
+from tests.conftest import real_scene
+from tests.scenes import random_splats
+
+from . import ties
+from .spark import Spark
+from .ties import Floats, Words, check, ext_codes, ext_steps, packed_codes, packed_steps
+
+WIDE = Encoding(rgb_min=-0.5, rgb_max=2, ln_scale_min=-8, ln_scale_max=1, sh1_max=0.5, sh2_max=2, sh3_max=0.25)
+PROGRAM = Path(__file__).with_name("spark_encode.mjs")
+
+
+def spark_encoding(encoding: Encoding) -> dict[str, Any]:
+    """Spark's own names."""
+    return {re.sub("_(.)", lambda match: match[1].upper(), name): value for name, value in asdict(encoding).items()}
+
+
+def check_file(spark: Spark, path: Path, share: float, encoding: Encoding = packed_splats.DEFAULT) -> None:
+    """Both layouts and the tree of a file, as Spark's worker and as ours of what `read_scene` reads of it."""
+    scene = read_scene(path)
+    splats, lod = scene.splats, scene.tree is not None
+    encoding = Encoding(**asdict(encoding) | {"lod_opacity": lod})
+
+    ours = packed_splats.pack(splats, encoding)
+    theirs = spark.load_words("Packed", path, encoding=spark_encoding(encoding))
+    check(packed_codes(ours), packed_codes(theirs), packed_steps(splats, encoding), share)
+    assert theirs.keys() - {"lodTree"} == ours.keys()
+    for name in ours.keys() - {"packed"}:
+        np.testing.assert_array_equal(ours[name], theirs[name])
+    if scene.tree:
+        held = packed_splats.unpack({"packed": theirs["packed"]}, encoding)
+        check_tree(lod_tree.pack(held, scene.tree)["lod_tree"], theirs["lodTree"], held, share)
+
+    ours, theirs = ext_splats.pack(splats), spark.load_words("Ext", path)
+    np.testing.assert_array_equal(ours["ext0"][:, :3], theirs["ext0"][:, :3])
+    check(ext_codes(ours), ext_codes(theirs), ext_steps(splats), share)
+    assert theirs.keys() - {"lodTree"} == ours.keys()
+    np.testing.assert_array_equal(ext_sh(ours), ext_sh(theirs))
+    if scene.tree:
+        held = ext_splats.unpack({name: theirs[name] for name in ("ext0", "ext1")})
+        check_tree(lod_tree.pack(held, scene.tree)["lod_tree"], theirs["lodTree"], held, share)
+
+
+def ext_sh(words: Words) -> NDArray[np.uint32]:
+    """The words of SH without those that hold nothing: Spark leaves in them what its buffer had before."""
+    names = [name for name in ("sh1", "sh2", "sh3a", "sh3b") if name in words]
+    everything = np.concatenate([words["ext0"][:, :0], *(words[name] for name in names)], axis=1)
+    return everything[:, : (0, 3, 8, 0, 15)[len(names)]]
+
+
+def check_tree(ours: NDArray[np.uint32], theirs: NDArray[np.uint32], held: Splats, share: float) -> None:
+    one, other = (words.view(lod_tree.NODE)[:, 0] for words in (ours, theirs))
+    for name in ("center", "child_count", "child_start"):
+        np.testing.assert_array_equal(one[name], other[name])
+    steps, error = ties.half(lod_tree.spark_size(held))
+    check({"size": one["size"]}, {"size": other["size"]}, {"size": (steps, 4 * error)}, share)
+
+
+# --- The worker -------------------------------------------------------------------------------------------------------
+
+
+def ply(path: Path, splats: Splats) -> Path:
+    with np.errstate(divide="ignore"):
+        opacity = splats.opacity.astype(np.float64)
+        columns = by_hand.ply_columns(
+            center=splats.center,
+            log_scale=np.log(splats.scale.astype(np.float64)),
+            quat_wxyz=splats.quat_xyzw[:, [3, 0, 1, 2]],
+            logit=np.log(opacity) - np.log1p(-opacity),
+            dc=(splats.rgb - 0.5) / SH_C0,
+            sh=splats.sh,
+        )
+    path.write_bytes(by_hand.ply({name: np.array(column, np.float32) for name, column in columns.items()}))
+    return path
+
+
+def baked(path: Path, splats: Splats, version: int) -> Path:
+    path.write_bytes(b"".join(spz.encode(Scene(*quick.build(splats)), spz.Options(version=version, threads=2))))
+    return path
+
+
+def edges() -> Splats:
+    """Every pair of a hard rotation and a hard rest, among them the ends of all ranges."""
+    half = 0.5**0.5
+    quats = [[0, 0, 0, 1], [0, 0, 0, -1], [1, 0, 0, 0], [-1, 0, 0, 0], [0, 1, 0, 0], [0, -1, 0, 0], [0, 0, 1, 0]]
+    quats += [[0, 0, -1, 0], [half, 0, 0, half], [0, 0, -half, -half], [0, half, -half, 0], [-half, -half, 0, 0]]
+    quats += [[0.5, 0.5, 0.5, 0.5], [-0.5, 0.5, -0.5, 0.5], [0.5, -0.5, -0.5, -0.5], [half, half, 1e-7, 1e-4]]
+    quats += [[1e-4, -1e-4, 1e-4, 1], [0, 0, -1e-7, 1], [3e-4, -5e-4, -1e-4, 1]]
+    scales = [0, np.exp(-12), np.exp(-11.95), 1e-3, 1, np.exp(9), np.exp(9.2), 1e6]
+    opacities = [0, 1e-6, 0.25, 0.5, 0.999999, 1]
+    colours = [-3, -0.1, 0, 0.5, 1, 1.1, 2.5]
+    count = len(quats) * 56
+    rest = np.arange(count)
+    splats = random_splats(count, sh_degree=3)
+    splats.quat_xyzw[:] = np.repeat(quats, 56, axis=0)
+    splats.scale[:] = np.stack([np.take(scales, rest // step, mode="wrap") for step in (1, 3, 8)], axis=1)
+    splats.opacity[:] = np.take(opacities, rest, mode="wrap")
+    splats.rgb[:] = np.stack([np.take(colours, rest // step, mode="wrap") for step in (1, 2, 7)], axis=1)
+    splats.center[:] = np.exp(np.linspace(-25, np.log(7e4), count))[:, None] * [1, -1, 0]
+    numbers = np.array([-2, -1, -0.5, -1e-9, 0, 0.125, 0.25, 0.5, 1, 3, 8, 1e5], np.float32)
+    numbers = np.concatenate([numbers, np.nextafter(numbers, np.float32(0))])  # below powers of two
+    splats.sh[:] = np.random.default_rng(0).choice(numbers, splats.sh.shape)
+    return splats
+
+
+@pytest.mark.parametrize("sh_degree", range(4))
+def test_random_ply(spark: Spark, tmp_path: Path, sh_degree: int) -> None:
+    path = ply(tmp_path / "random.ply", random_splats(50_000, sh_degree=sh_degree))
+    check_file(spark, path, share=2e-4)
+
+
+@pytest.mark.parametrize("encoding", [packed_splats.DEFAULT, WIDE])
+def test_edges_and_ranges(spark: Spark, tmp_path: Path, encoding: Encoding) -> None:
+    """Ranges of ours to PackedSplats, and all their ends; ties are many here, as the numbers are round."""
+    check_file(spark, ply(tmp_path / "edges.ply", edges()), 0.2, encoding)
+
+
+@pytest.mark.parametrize("sh_degree", range(4))
+@pytest.mark.parametrize("version", [2, 3])
+def test_tree(spark: Spark, tmp_path: Path, version: int, sh_degree: int) -> None:
+    """The few numbers that SPZ has make the same ties again and again."""
+    path = baked(tmp_path / "tree.spz", random_splats(20_000, sh_degree=sh_degree), version)
+    assert lod_opacity(read_scene(path).splats.opacity).max() > 1.5
+    check_file(spark, path, share=2e-3)
+
+
+@pytest.mark.parametrize("name", ["biker.ply", "playbot-125k.ply"])
+def test_real_scene(spark: Spark, name: str) -> None:
+    check_file(spark, real_scene(name), share=2e-3)
+
+
+def test_tree_of_a_real_scene(spark: Spark, tmp_path: Path) -> None:
+    check_file(spark, baked(tmp_path / "tree.spz", read_scene(real_scene("biker.ply")).splats, 3), share=2e-3)
+
+
+@pytest.mark.parametrize("layout", ["Packed", "Ext"])
+def test_tree_of_sparks_own_builder(spark: Spark, tmp_path: Path, layout: str) -> None:
+    """What it keeps of each merged splat, read and measured by us, gives its nodes back."""
+    path = ply(tmp_path / "random.ply", random_splats(20_000))
+    words = spark.load_words(layout, path, lod=True)
+    held = packed_splats.unpack(words, Encoding(lod_opacity=True)) if layout == "Packed" else ext_splats.unpack(words)
+    nodes = lod_tree.unpack({"lod_tree": words["lodTree"]})
+    nodes.tree.validate()
+    check_tree(lod_tree.pack(held, nodes.tree)["lod_tree"], words["lodTree"], held, share=1e-3)
+    differs = lod_tree.pack(held, nodes.tree, size=lod_tree.design_size)["lod_tree"] != words["lodTree"]
+    assert differs[:, 1].mean() > 0.9
+
+
+def test_worker_has_no_true_zero_but_zero(spark: Spark, tmp_path: Path) -> None:
+    """Its pages and its JavaScript say that scales below e ** -30 are 0, and so do we."""
+    splats = random_splats(1)
+    splats.scale[:] = [0, np.exp(-31), np.exp(-29)]
+    path = ply(tmp_path / "tiny.ply", splats)
+    theirs = spark.load_words("Packed", path)["packed"].view(packed_splats.SPLAT)
+    ours = packed_splats.pack(read_scene(path).splats)["packed"].view(packed_splats.SPLAT)
+    assert theirs["log_scale"].tolist() == [[[0, 1, 1]]]
+    assert ours["log_scale"].tolist() == [[[0, 0, 1]]]
+
+
+# --- The JavaScript ---------------------------------------------------------------------------------------------------
+
+
+def cut_off(values: Floats) -> NDArray[np.float16]:
+    """float16s toward zero."""
+    nearest = values.astype(np.float16)
+    return np.where(np.abs(nearest.astype(np.float64)) > np.abs(values), np.nextafter(nearest, np.float16(0)), nearest)
+
+
+@pytest.mark.parametrize("encoding", [packed_splats.DEFAULT, WIDE, Encoding(lod_opacity=True)])
+def test_javascript(spark_dir: Path, tmp_path: Path, encoding: Encoding) -> None:
+    """Its float64 against our float32; where the Node at hand has no Float16Array, it cuts float16s off."""
+    if shutil.which("node") is None:
+        pytest.skip("Node is not installed")
+    splats = random_splats(20_000, sh_degree=3, seed=1)
+    splats.scale[:100] = np.exp(np.linspace(-40, -20, 300)).reshape(-1, 3)
+    numbers = [splats.center, splats.scale, splats.quat_xyzw, splats.opacity[:, None], splats.rgb]
+    np.concatenate([*numbers, splats.sh.reshape(len(splats), -1)], axis=1).astype("<f4").tofile(tmp_path / "in")
+    command = ["node", str(PROGRAM), str(spark_dir), str(tmp_path / "in"), str(tmp_path / "out")]
+    command.append(json.dumps(spark_encoding(encoding)))
+    done = subprocess.run(command, capture_output=True, encoding="utf-8", timeout=120, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
+    to_half = cut_off if done.stdout.strip() == "cuts" else np.float16
+
+    def words(name: str, width: int, dtype: str = "<u4") -> NDArray[Any]:
+        return np.fromfile(tmp_path / f"out.{name}", dtype).reshape(-1, width)
+
+    ours = packed_splats.pack(splats, encoding)
+    codes, steps = packed_codes(ours), packed_steps(splats, encoding)
+    codes["center"] = to_half(splats.center)
+    check(codes, packed_codes({"packed": words("packed", 4)}), steps, share=2e-4)
+    for name in ("sh1", "sh2", "sh3"):
+        np.testing.assert_array_equal(ours[name], words(name, packed_splats.SH_WORDS[int(name[2])]))
+
+    ext = {name: words(name, 4) for name in ("ext0", "ext1")}
+    codes, steps = ext_codes(ext_splats.pack(splats)), ext_steps(splats)
+    codes |= {"alpha": to_half(splats.opacity), "rgb": to_half(splats.rgb), "log_scale": to_half(np.log(splats.scale))}
+    if to_half is cut_off:  # then float32 logarithms have their ties at whole steps
+        value, error = steps["log_scale"]
+        steps["log_scale"] = value + 0.5, error
+    check(codes, ext_codes(ext), steps, share=2e-4)
+    sh = ext_splats.encode_sh(splats.sh) != words("ext-sh", 15)
+    assert sh.mean() < 1e-4
+
+    for layout, held in (
+        ("packed", packed_splats.unpack({"packed": words("packed", 4)}, encoding)),
+        ("ext", ext_splats.unpack(ext)),
+    ):
+        d = lod_opacity(held.opacity)
+        alpha = np.where(d > 1, (d + 3) / 4, d)
+        back = np.split(words(f"{layout}-back", 14, "<f4"), [3, 6, 10, 11], axis=1)
+        for one, other in zip((held.center, held.scale, held.quat_xyzw, alpha[:, None], held.rgb), back, strict=True):
+            np.testing.assert_allclose(one, other, rtol=2e-6, atol=2e-7)

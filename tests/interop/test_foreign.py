@@ -1,0 +1,266 @@
+"""Other programs' files, and ours: sparklod, splat-transform and Spark see the same splats in them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sparklod_cli.cli import run
+from sparklod_cli.codecs import ply, splat
+from sparklod_cli.io import read_scene
+from sparklod_cli.splats import Splats
+from tests.conftest import FIXTURES, real_scene
+
+from .foreign import Foreign
+from .laws import EXT_DEGREES, HALF, TINY, Floats, degrees_between, held_by_ext_sh, within
+from .spark import Spark
+
+#: Makes a file in a folder of what is in a PLY file, and says where.
+Writer = Callable[[Foreign, Path, Path], Path]
+
+
+def by(action: str, name: str, **options: Any) -> Writer:
+    return lambda foreign, source, folder: foreign.write(action, source, folder / name, **options)
+
+
+def ours(codec: ModuleType, name: str) -> Writer:
+    def write(_: Foreign, source: Path, folder: Path) -> Path:
+        path = folder / name
+        path.write_bytes(b"".join(codec.encode(read_scene(source))))
+        return path
+
+    return write
+
+
+#: Few enough for several sections of the fixtures, with full buckets and others in each. Of them mkkellogg's own reader
+#: and splat-transform's read only those that begin at multiples of four bytes; 20 splats do.
+SECTIONS = {"section": 20, "block": 1.0, "bucket": 4}
+
+WRITERS: dict[str, Writer] = {
+    "compressed PLY": by("convert", "scene.compressed.ply"),
+    "SOG": by("convert", "scene.sog"),
+    "unpacked SOG": by("convert", "meta.json"),
+    "SPZ 3": by("convert", "scene.spz", spz=3),
+    "SPZ 4": by("convert", "scene.spz", spz=4),
+    "SPLAT": by("splat", "scene.splat"),
+    **{f"KSPLAT {level}": by("ksplat", "scene.ksplat", level=level) for level in range(3)},
+    **{f"KSPLAT {level} in sections": by("ksplat", "scene.ksplat", level=level, **SECTIONS) for level in range(3)},
+    "our PLY": ours(ply, "ours.ply"),
+    "our SPLAT": ours(splat, "ours.splat"),
+}
+#: Put together by fixtures/make_fixtures.py. No program that can be had writes version 1 of SOG, or the older chunks.
+BY_HAND = [
+    *("sh3-compressed.ply", "sh1-compressed-old.ply", "coincident-compressed.ply", "sh0.splat"),
+    *("sh2-level0.ksplat", "sh2-level1.ksplat", "sh2-level2.ksplat"),
+    *("sh2-v1.sog", "sh3-v2.sog", "sh1-sog/meta.json"),
+]
+SOURCES = [f"sh{degree}.ply" for degree in range(4)]
+WRITTEN = [pytest.param((writer, source), id=f"{writer}-{source}") for writer in WRITERS for source in SOURCES]
+FILES = [*WRITTEN, *(pytest.param((None, f"golden/{name}"), id=name) for name in BY_HAND)]
+#: Where all bounds of a chunk are alike, and where they are far apart.
+HARD = [
+    pytest.param((writer, source), id=f"{writer}-{source}")
+    for writer in WRITERS
+    for source in ("coincident.ply", "huge.ply")
+]
+REAL = [
+    *((None, "playbot.sog"), (None, "meadow.sog"), ("compressed PLY", "playbot-125k.ply")),
+    *(("KSPLAT 1", "biker.ply"), ("KSPLAT 2", "playbot-125k.ply"), ("SPLAT", "biker.ply")),
+]
+
+
+@dataclass(frozen=True)
+class File:
+    path: Path
+    source: Path
+    writer: str
+
+
+@pytest.fixture(scope="session")
+def make(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Callable[..., File]:
+    """Makes files, each but once."""
+
+    @cache
+    def make(writer: str | None, source: Path) -> File:
+        if writer is None:
+            return File(source, source, "")
+        foreign = request.getfixturevalue("foreign")
+        return File(WRITERS[writer](foreign, source, tmp_path_factory.mktemp("file")), source, writer)
+
+    return make
+
+
+@pytest.fixture
+def file(request: pytest.FixtureRequest, make: Callable[..., File]) -> File:
+    """The file of a row of `FILES`."""
+    writer, source = request.param
+    return make(writer, FIXTURES / source)
+
+
+def flipped(splats: Splats) -> Splats:
+    """Turned by 180 degrees about x, from the axes of PLY files to those that SPZ files have by its specification."""
+    signs = [-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1]  # of the SH that are odd in y and z together
+    return replace(
+        splats,
+        center=splats.center * np.float32([1, -1, -1]),
+        quat_xyzw=splats.quat_xyzw * np.float32([1, -1, -1, 1]),
+        sh=splats.sh * np.float32(signs)[None, : splats.sh.shape[1], None],
+    )
+
+
+def check_same(ours: Splats, theirs: Splats, degrees: float) -> None:
+    """The same numbers, but for float32 arithmetic."""
+    within(ours.center, theirs.center, 2.0**-22 * np.abs(theirs.center).max())
+    within(np.log(ours.scale), np.log(theirs.scale), 2e-6)
+    assert degrees_between(ours.quat_xyzw, theirs.quat_xyzw).max() <= degrees
+    within(ours.opacity, theirs.opacity, 1.2e-6)  # splat-transform makes it 1e-6 .. 1 - 1e-6, for its logarithm
+    within(ours.rgb, theirs.rgb, 1e-6 * (1 + np.abs(theirs.rgb)))
+    within(ours.sh, theirs.sh, 1e-6 * (1 + np.abs(theirs.sh)))
+
+
+def check_with_splat_transform(foreign: Foreign, file: File) -> None:
+    theirs = foreign.read(file.path)
+    # It takes the bytes of .splat for 255 * (q / 2 + 1 / 2), where their writers mean 128 * q + 128: all four
+    # components are off by up to 1 / 128, together by 1 / 64 of the length, which is at least 1 - 1 / 64.
+    degrees = np.degrees(2 / 63) if file.path.suffix == ".splat" else 1e-4
+    check_same(read_scene(file.path, threads=2).splats, flipped(theirs) if "SPZ" in file.writer else theirs, degrees)
+
+
+@pytest.mark.parametrize("file", [*FILES, *HARD], indirect=True)
+def test_splat_transform_reads_the_same(foreign: Foreign, file: File) -> None:
+    check_with_splat_transform(foreign, file)
+
+
+@pytest.mark.parametrize("writer, scene", REAL)
+def test_splat_transform_reads_the_same_of_real_scenes(
+    foreign: Foreign, make: Callable[..., File], writer: str | None, scene: str
+) -> None:
+    check_with_splat_transform(foreign, make(writer, real_scene(scene)))
+
+
+#: Changes to a header of KSPLAT: offset and type of a number, and what is added to it or, for 0, put there.
+HEADERS = {
+    "fewer splats than there is room for": [(16, "<u4", -5), (4096, "<u4", -5)],
+    "SH from -1.5 to 1.5 unless it says otherwise": [(36, "<f4", 0), (40, "<f4", 0)],
+    "32767 steps unless it says otherwise": [(4096 + 24, "<u4", 0), (4096 + 1024 + 24, "<u4", 0)],
+    "a newer minor version": [(1, "u1", 6)],
+}
+
+
+@pytest.mark.parametrize("changes", HEADERS.values(), ids=HEADERS.keys())
+@pytest.mark.parametrize("level", range(3))
+def test_headers_that_mkkelloggs_viewer_takes(
+    foreign: Foreign, make: Callable[..., File], tmp_path: Path, level: int, changes: list[tuple[int, str, int]]
+) -> None:
+    data = bytearray(make(f"KSPLAT {level} in sections", FIXTURES / "sh2.ply").path.read_bytes())
+    for offset, kind, change in changes:
+        number = np.frombuffer(data, kind, 1, offset)
+        number[0] = int(number[0]) + change if change else 0
+    path = tmp_path / "changed.ksplat"
+    path.write_bytes(data)
+    check_with_splat_transform(foreign, File(path, path, ""))
+
+
+def spark_degrees(file: File, quat: Floats) -> Floats:
+    """(N,) degrees by which Spark may be off; it does not give quaternions their length, and takes w as it is."""
+    length = {".splat": 1 / 64, ".ksplat": 2.0**-9}.get(file.path.suffix, 0)  # off by that, see `LOSSES`
+    w = np.abs(quat[:, 3].astype(np.float64)).clip(0, 1)
+    half_angles = [np.arccos((w * (1 + change)).clip(0, 1)) for change in (-length, 0, length)]
+    return EXT_DEGREES + np.degrees(2 * np.ptp(half_angles, axis=0))
+
+
+def seen_by_spark(file: File, splats: Splats) -> Floats:
+    """(N, K, 3) SH: Spark reads a byte of compressed PLY as 0..255 for -4..4, where its writer means 256 steps."""
+    if "compressed" not in file.path.name:
+        return splats.sh
+    codes = np.clip((splats.sh.astype(np.float64) / 8 + 0.5) * 256 - 0.5, 0, 255)
+    return codes / 255 * 8 - 4
+
+
+def spark_can_read(writer: str | None, source: str) -> bool:
+    """Spark 2.2 knows no SPZ 4, and here its worker gets one file."""
+    return writer not in ("SPZ 4", "unpacked SOG") and not source.endswith("meta.json")
+
+
+@pytest.mark.parametrize("file", [row for row in FILES if spark_can_read(*row.values[0])], indirect=True)
+def test_spark_reads_the_same(spark: Spark, file: File) -> None:
+    got, splats = spark.load(file.path), read_scene(file.path).splats
+    within(got.center, splats.center, 2.0**-21 * np.abs(splats.center).max())
+    within(got.rgb, splats.rgb, HALF * np.abs(splats.rgb) + TINY)
+    log_scale = np.log(splats.scale.astype(np.float64))
+    within(got.log_scale, log_scale, HALF * np.abs(log_scale) + TINY)
+    within(
+        degrees_between(got.quat_xyzw, splats.quat_xyzw), np.zeros(len(splats)), spark_degrees(file, splats.quat_xyzw)
+    )
+    within(got.alpha, splats.opacity, HALF * splats.opacity + TINY)
+    held, tolerance = held_by_ext_sh(seen_by_spark(file, splats))
+    within(got.sh, held, tolerance + TINY)
+
+
+@dataclass(frozen=True)
+class Loss:
+    """By how much a format may miss what was put into it.
+
+    Attributes:
+        center: in world units.
+        scale: relative.
+        degrees: of rotation.
+        color: of rgb, once within 0..1, and of opacity.
+        sh: (N, K, 3) of SH, from what they are.
+        sh_degree: the most that it holds.
+    """
+
+    center: float = 0
+    scale: float = 1e-6
+    degrees: float = 1e-4
+    color: float = 1e-6
+    sh: Callable[[Floats], Floats | float] = lambda sh: 1e-6
+    sh_degree: int = 3
+
+
+#: Rounding towards zero, as three.js makes a float16: its last of 11 bits, or the last of its smallest numbers.
+CUT, SMALL = 2.0**-10, 2.0**-24
+#: A byte a component, rounded, and 1 is 255 / 128 - 1: off by 1 / 256, one of them by 1 / 128.
+SPLAT = Loss(degrees=np.degrees(2 * (np.sqrt(3) / 256 + 1 / 128)), color=1 / 510 + 1e-6, sh_degree=0)
+#: Positions are rounded to 32767 steps of half a block, colours cut to bytes.
+KSPLAT = Loss(5 / 2 / 32767 / 2 + 1e-6, CUT + 1e-6, np.degrees(2 * CUT), 1 / 255 + 1e-6, sh_degree=2)
+LOSSES = {
+    "our PLY": Loss(),
+    "our SPLAT": SPLAT,
+    "SPLAT": SPLAT,
+    "KSPLAT 0": Loss(color=KSPLAT.color, sh_degree=2),
+    "KSPLAT 1": replace(KSPLAT, sh=lambda sh: CUT * np.abs(sh) + SMALL),
+    "KSPLAT 2": replace(KSPLAT, sh=lambda sh: np.ptp(sh) / 255 + 1e-6 if sh.size else 0),
+}
+
+
+@pytest.mark.parametrize(
+    "file", [row for row in WRITTEN if row.values[0][0].removesuffix(" in sections") in LOSSES], indirect=True
+)
+def test_near_the_source(file: File) -> None:
+    """What is read is what was written, to the steps of the format's codings."""
+    loss = LOSSES[file.writer.removesuffix(" in sections")]
+    got, source = read_scene(file.path).splats, read_scene(file.source).splats
+    assert got.sh_degree == min(source.sh_degree, loss.sh_degree)
+    order = np.linalg.norm(got.center[:, None] - source.center, axis=2).argmin(axis=1)
+    np.testing.assert_array_equal(np.sort(order), np.arange(len(source)))
+    source = source.take(order)
+    within(got.center, source.center, loss.center)
+    within(got.scale, source.scale, loss.scale * source.scale)
+    assert degrees_between(got.quat_xyzw, source.quat_xyzw).max() <= loss.degrees
+    within(got.rgb, source.rgb if loss.color < 1e-5 else source.rgb.clip(0, 1), loss.color)
+    within(got.opacity, source.opacity, loss.color)
+    sh = source.with_max_sh(got.sh_degree).sh
+    within(got.sh, sh, loss.sh(sh))
+
+
+@pytest.mark.parametrize("file", [*WRITTEN[3::4], *FILES[len(WRITTEN) :]], indirect=True)
+def test_bakes(file: File, tmp_path: Path) -> None:
+    assert run(["build-lod", str(file.path), "-o", str(tmp_path / "out.spz")]) == 0

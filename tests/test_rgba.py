@@ -1,0 +1,96 @@
+"""New colours and opacities for the splats of a scene."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sparklod_cli.cli import run
+from sparklod_cli.errors import FormatError
+from sparklod_cli.io import read_rgba, read_scene
+
+from .conftest import FIXTURES
+
+SCENE = FIXTURES / "sh2.ply"
+COUNT = len(read_scene(SCENE).splats)
+
+
+def bytes_of(seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).integers(1, 256, (COUNT, 4)).astype(np.uint8)
+
+
+def save(path: Path, values: np.ndarray) -> Path:
+    if path.suffix == ".npy":
+        np.save(path, values)
+    else:
+        path.write_bytes(values.tobytes())
+    return path
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".rgba"])
+@pytest.mark.parametrize("kind", [np.uint8, np.float32])
+def test_npy_and_raw_of_bytes_and_floats(suffix: str, kind: type, tmp_path: Path) -> None:
+    codes = bytes_of()
+    values = codes if kind is np.uint8 else (codes / 255).astype(kind)
+    got = read_rgba(save(tmp_path / f"colors{suffix}", values), COUNT)
+    assert got.dtype == np.float32
+    np.testing.assert_allclose(got, codes / 255, atol=1e-7)
+
+
+def test_they_take_the_place_of_the_splats_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """What is drawn of a leaf is its new colour; SH stay, and alpha 0 removes."""
+    codes = bytes_of()
+    codes[:7, 3] = 0
+    colors = save(tmp_path / "colors.npy", codes)
+    assert run(["build-lod", str(SCENE), "--rgba", str(colors), "-o", str(tmp_path / "a.spz"), "--json"]) == 0
+    record = json.loads(capsys.readouterr().out)
+    assert (record["read"], record["splats"], record["dropped"]) == (COUNT, COUNT - 7, {"zero_opacity": 7})
+    scene, source = read_scene(tmp_path / "a.spz"), read_scene(SCENE).splats
+    assert scene.tree is not None
+    leaves = scene.splats.take(scene.tree.is_leaf)
+    nearest = [int(np.argmin(((source.center - center) ** 2).sum(axis=1))) for center in leaves.center]
+    assert sorted(nearest) == list(range(7, COUNT))
+    expected = codes[nearest] / 255
+    np.testing.assert_allclose(leaves.rgb, expected[:, :3], atol=0.0038)
+    np.testing.assert_allclose(leaves.opacity, expected[:, 3], atol=1.001 / 255)
+    np.testing.assert_allclose(leaves.sh, source.sh[nearest], atol=0.07)
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "message"),
+    [
+        ("a.npy", np.zeros((5, 4), np.uint8), f"has colours for 5 splats, the scene has {COUNT}"),
+        ("a.rgba", np.zeros((5, 4), np.uint8), f"has colours for 5 splats, the scene has {COUNT}"),
+        ("a.rgba", np.zeros(7, np.uint8), "has 7 bytes, which are not four a splat"),
+        ("a.npy", np.zeros((COUNT, 3), np.uint8), r"uint8\[60, 3\], expected uint8 or floats \[60, 4\]"),
+        ("a.npy", np.zeros((COUNT, 4), np.int32), "int32"),
+        ("a.npy", np.full((COUNT, 4), 1.5), "values that are not 0..1"),
+        ("a.npy", np.full((COUNT, 4), np.nan), "values that are not 0..1"),
+        ("a.npy", np.array([{}] * COUNT), "is not a .npy file"),
+    ],
+)
+def test_what_does_not_fit_is_refused(name: str, values: np.ndarray, message: str, tmp_path: Path) -> None:
+    with pytest.raises(FormatError, match=message):
+        read_rgba(save(tmp_path / name, values), COUNT)
+
+
+@pytest.mark.parametrize("cut", [6, 8, 60, 130, 200])
+def test_a_npy_file_that_is_cut_is_refused(cut: int, tmp_path: Path) -> None:
+    path = save(tmp_path / "a.npy", bytes_of())
+    path.write_bytes(path.read_bytes()[:cut])
+    with pytest.raises(FormatError):
+        read_rgba(path, COUNT)
+
+
+def test_a_missing_file_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    missing = tmp_path / "missing.npy"
+    assert run(["build-lod", str(SCENE), "--rgba", str(missing), "-o", str(tmp_path / "a.spz")]) == 1
+    assert f"{missing} cannot be read: no such file" in capsys.readouterr().err
+
+
+def test_one_file_of_colours_is_for_one_scene(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["build-lod", str(SCENE), str(FIXTURES / "sh1.ply"), "--rgba", "a.npy"]) == 2
+    assert "--rgba takes one input, not 2" in capsys.readouterr().err
