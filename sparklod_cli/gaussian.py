@@ -1,16 +1,20 @@
-"""The mathematics of one splat: quaternions and opacity, over whole arrays."""
+"""The mathematics of one splat: quaternions, covariance, opacity and size, over whole arrays."""
 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
-from .splats import FloatArray
+from .splats import FloatArray, Splats
 
 #: Linear opacity of a merged splat is clamped to this range; 1000 is D = 4.45 of the 5 that the format holds.
 MIN_OPACITY, MAX_OPACITY = 1e-6, 1e3
 
 #: Lengths of a quaternion between which the squares of its components are exact enough in float32.
 MIN_LENGTH, MAX_LENGTH = 1e-15, 1e15
+
+#: Rows and columns of the six elements that tell a covariance: xx xy xz yy yz zz.
+_ROW, _COLUMN = np.array([0, 0, 0, 1, 1, 2]), np.array([0, 1, 2, 1, 2, 2])
 
 #: Exponent of Knud Thomsen's approximation of an ellipsoid's surface, within 1.061 % of the true area.
 THOMSEN_P = 1.6075
@@ -31,6 +35,20 @@ def normalized_quat(quat: FloatArray) -> FloatArray:
     return unit
 
 
+def covariance(scale: FloatArray, quat_xyzw: FloatArray) -> NDArray[np.float64]:
+    """(N, 3) scales and (N, 4) unit quaternions, local to world, to (N, 6) covariances A diag(scale ** 2) A^T.
+
+    In float64, because what is left of the elements of a thin splat are small differences of large numbers.
+    """
+    x, y, z, w = quat_xyzw.T.astype(np.float64)
+    axes = np.empty((3, 3, len(scale)))  # world axis, local axis
+    axes[0] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
+    axes[1] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
+    axes[2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
+    axes *= scale.T
+    return np.einsum("kin,kin->nk", axes[_ROW], axes[_COLUMN])
+
+
 def lod_opacity(opacity: FloatArray) -> FloatArray:
     """Spark's opacity parameter D from linear opacity A: A up to 1, sqrt(1 + e * ln A) above (Spark's LoD design)."""
     above = np.maximum(opacity, np.float32(1))
@@ -42,3 +60,18 @@ def linear_opacity(lod_opacity: FloatArray) -> FloatArray:
     above = np.maximum(lod_opacity, np.float32(1))
     linear = np.exp((above * above - 1) / np.float32(np.e))
     return np.where(lod_opacity > 1, linear, lod_opacity).astype(np.float32, copy=False)
+
+
+def spark_size(splats: Splats) -> FloatArray:
+    """(N,) 2 * mean(scale) * (1 + 0.7 * max(0, D - 1)): what Spark 2.2.0 writes into its nodes.
+
+    Found in its output, see docs/decisions/2026-11-20-what-spark-does.md; its `encode_lod_tree` has it so.
+    """
+    x, y, z = splats.scale.T
+    beyond = np.maximum(lod_opacity(splats.opacity) - 1, 0)
+    return 2 * (1 + np.float32(0.7) * beyond) * ((x + y + z) / np.float32(3))
+
+
+def design_size(splats: Splats) -> FloatArray:
+    """(N,) 2 * max(scale) * max(1, D): what the pages on Spark's LoD design say, and its quick builder sorts by."""
+    return 2 * splats.scale.max(axis=1) * np.maximum(lod_opacity(splats.opacity), 1)

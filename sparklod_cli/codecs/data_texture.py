@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FormatError
+from ..gaussian import covariance
 from ..parallel import for_chunks
 from ..splats import FloatArray, Splats
 from . import quantize
@@ -30,8 +31,6 @@ assert SPLAT.itemsize == 32
 
 #: What the covariance is multiplied by, and the largest number that a float16 holds of the product.
 GAIN, LARGEST = 4, 65504
-#: Rows and columns of the six stored elements of the covariance.
-_ROW, _COLUMN = np.array([0, 0, 0, 1, 1, 2]), np.array([0, 1, 2, 1, 2, 2])
 
 
 def pack(splats: Splats, *, threads: int = 1) -> dict[str, Words]:
@@ -99,20 +98,6 @@ def unpack(arrays: Mapping[str, NDArray[Any]], count: int) -> Texels:
         texels["covariance"].astype(np.float32) / np.float32(GAIN),
         quantize.decode_unorm8(texels["rgba"]),
     )
-
-
-def covariance(scale: FloatArray, quat_xyzw: FloatArray) -> NDArray[np.float64]:
-    """(N, 3) scales and (N, 4) unit quaternions, local to world, to (N, 6) covariances A diag(scale ** 2) A^T.
-
-    In float64, because what is left of the elements of a thin splat are small differences of large numbers.
-    """
-    x, y, z, w = quat_xyzw.T.astype(np.float64)
-    axes = np.empty((3, 3, len(scale)))  # world axis, local axis
-    axes[0] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
-    axes[1] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
-    axes[2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
-    axes *= scale.T
-    return np.einsum("kin,kin->nk", axes[_ROW], axes[_COLUMN])
 
 
 def _encode_covariance(values: NDArray[np.float64]) -> NDArray[np.float64]:

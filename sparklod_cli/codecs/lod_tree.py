@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FormatError
-from ..gaussian import lod_opacity
+from ..gaussian import spark_size
 from ..parallel import for_chunks
 from ..splats import FloatArray, Splats
 from ..tree import MAX_CHILDREN, LodTree
@@ -25,21 +25,6 @@ NODE = np.dtype(
     ]
 )
 assert NODE.itemsize == 16
-
-
-def spark_size(splats: Splats) -> FloatArray:
-    """(N,) 2 * mean(scale) * (1 + 0.7 * max(0, D - 1)): what Spark 2.2.0 writes into its nodes.
-
-    Found in its output, see docs/decisions/2026-11-20-what-spark-does.md; its `encode_lod_tree` has it so.
-    """
-    x, y, z = splats.scale.T
-    beyond = np.maximum(lod_opacity(splats.opacity) - 1, 0)
-    return 2 * (1 + np.float32(0.7) * beyond) * ((x + y + z) / np.float32(3))
-
-
-def design_size(splats: Splats) -> FloatArray:
-    """(N,) 2 * max(scale) * max(1, D): what the pages on Spark's LoD design say, and its quick builder sorts by."""
-    return 2 * splats.scale.max(axis=1) * np.maximum(lod_opacity(splats.opacity), 1)
 
 
 def pack(

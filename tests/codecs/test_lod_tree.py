@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from sparklod_cli import gaussian
 from sparklod_cli.codecs import lod_tree
 from sparklod_cli.errors import FormatError
 from sparklod_cli.gaussian import linear_opacity
@@ -51,10 +52,10 @@ def test_layout_by_hand() -> None:
 
 def test_both_sizes_by_hand() -> None:
     splats = splats_with(3, scale=[0.25, 0.5, 0.75], opacity=[0.3, 1, linear_opacity(np.float32(3))])
-    np.testing.assert_allclose(lod_tree.spark_size(splats), [1, 1, 2.4], rtol=1e-6)
-    np.testing.assert_allclose(lod_tree.design_size(splats), [1.5, 1.5, 4.5], rtol=1e-6)
+    np.testing.assert_allclose(gaussian.spark_size(splats), [1, 1, 2.4], rtol=1e-6)
+    np.testing.assert_allclose(gaussian.design_size(splats), [1.5, 1.5, 4.5], rtol=1e-6)
     leaves = links([0, 0, 0], [0, 0, 0])
-    sizes = lod_tree.unpack(lod_tree.pack(splats, leaves, size=lod_tree.design_size)).size
+    sizes = lod_tree.unpack(lod_tree.pack(splats, leaves, size=gaussian.design_size)).size
     np.testing.assert_array_equal(sizes, [1.5, 1.5, 4.5])
 
 
@@ -91,7 +92,7 @@ def test_a_whole_tree_comes_back(threads: int) -> None:
     np.testing.assert_array_equal(got.tree.child_count, tree.child_count)
     np.testing.assert_array_equal(got.tree.child_start, tree.child_start)
     np.testing.assert_array_equal(got.center, splats.center.astype(np.float16))
-    np.testing.assert_array_equal(got.size, lod_tree.spark_size(splats).astype(np.float16))
+    np.testing.assert_array_equal(got.size, gaussian.spark_size(splats).astype(np.float16))
     packed["lod_tree"][:] = 0
     got.tree.validate()  # a copy
 

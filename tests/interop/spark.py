@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import json
-import subprocess
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from threading import Timer
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .node import Node
+
 PROGRAM = Path(__file__).with_name("spark_load.mjs")
-#: Far above what any file here takes; only there so that a hanging wasm fails the test and not the day.
-SECONDS = 120
 
 #: ExtSplats, one row for each of its two arrays of 16 bytes a splat.
 EXT0 = np.dtype([("center", "<f4", 3), ("alpha", "<f2"), ("padding", "<u2")])
@@ -71,39 +68,17 @@ class Spark:
     def __init__(self, package_dir: Path, scratch: Path) -> None:
         self._scratch = scratch
         self._asked = 0
-        self._stderr = scratch / "stderr.txt"
-        with self._stderr.open("wb") as stderr:
-            command = ["node", str(PROGRAM), str(package_dir)]
-            self._node = subprocess.Popen(
-                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=stderr, encoding="utf-8"
-            )
-
-    def close(self) -> None:
-        assert self._node.stdin and self._node.stdout
-        self._node.stdin.close()
-        self._node.stdout.close()
-        self._node.wait(SECONDS)
+        self._node = Node([str(PROGRAM), str(package_dir)], scratch / "stderr.txt")
+        self.close = self._node.close
 
     def _ask(self, method: str, source: bytes | Path, options: Mapping[str, Any]) -> Reply:
-        assert self._node.stdin and self._node.stdout
         self._asked += 1
         out = self._scratch / str(self._asked)
         path = source if isinstance(source, Path) else out.with_suffix(".spz")
         if isinstance(source, bytes):
             path.write_bytes(source)
         request = {"method": method, "path": str(path), "name": path.name, "options": options, "out": str(out)}
-        watchdog = Timer(SECONDS, self._node.kill)
-        watchdog.start()
-        try:
-            self._node.stdin.write(json.dumps(request) + "\n")
-            self._node.stdin.flush()
-            answer = json.loads(self._node.stdout.readline() or '{"error": "the Node process ended"}')
-        except BrokenPipeError:
-            answer = {"error": "the Node process ended"}
-        finally:
-            watchdog.cancel()
-        if "error" in answer:
-            raise AssertionError(f"Spark cannot load it: {answer['error']}\n{self._stderr.read_text()[-2000:]}")
+        answer = self._node.ask(request)
         words = {name: np.fromfile(file, "<u4") for name, file in answer["arrays"].items()}
         for file in answer["arrays"].values():
             Path(file).unlink()

@@ -19,6 +19,7 @@ import pytest
 from numpy.typing import NDArray
 
 from fixtures import by_hand
+from sparklod_cli import gaussian
 from sparklod_cli.codecs import ext_splats, lod_tree, packed_splats, spz
 from sparklod_cli.codecs.packed_splats import Encoding
 from sparklod_cli.gaussian import lod_opacity
@@ -80,7 +81,7 @@ def check_tree(ours: NDArray[np.uint32], theirs: NDArray[np.uint32], held: Splat
     one, other = (words.view(lod_tree.NODE)[:, 0] for words in (ours, theirs))
     for name in ("center", "child_count", "child_start"):
         np.testing.assert_array_equal(one[name], other[name])
-    steps, error = ties.half(lod_tree.spark_size(held))
+    steps, error = ties.half(gaussian.spark_size(held))
     check({"size": one["size"]}, {"size": other["size"]}, {"size": (steps, 4 * error)}, share)
 
 
@@ -170,7 +171,7 @@ def test_tree_of_sparks_own_builder(spark: Spark, tmp_path: Path, layout: str) -
     nodes = lod_tree.unpack({"lod_tree": words["lodTree"]})
     nodes.tree.validate()
     check_tree(lod_tree.pack(held, nodes.tree)["lod_tree"], words["lodTree"], held, share=1e-3)
-    differs = lod_tree.pack(held, nodes.tree, size=lod_tree.design_size)["lod_tree"] != words["lodTree"]
+    differs = lod_tree.pack(held, nodes.tree, size=gaussian.design_size)["lod_tree"] != words["lodTree"]
     assert differs[:, 1].mean() > 0.9
 
 

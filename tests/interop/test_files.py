@@ -89,5 +89,5 @@ def test_a_page_that_asks_for_lod_gets_our_tree(spark: Spark) -> None:
 def test_a_truncated_file_is_an_error(spark: Spark) -> None:
     """So that the tests above would notice if Spark could not read a file."""
     data = encoded(baked(random_splats(500)))
-    with pytest.raises(AssertionError, match="Spark cannot load it"):
+    with pytest.raises(AssertionError, match="failed: "):
         spark.load(data[: len(data) // 2])
