@@ -50,7 +50,7 @@ def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> 
         splats.center[part] = _within(
             bounds["position"], part, quantize.decode_unorm_11_10_11(words["packed_position"])
         )
-        splats.scale[part] = np.exp(
+        splats.scale[part] = quantize.decode_log(
             _within(bounds["scale"], part, quantize.decode_unorm_11_10_11(words["packed_scale"]))
         )
         splats.quat_xyzw[part] = quantize.decode_quat_2_10_10_10(words["packed_rotation"])[:, [1, 2, 3, 0]]

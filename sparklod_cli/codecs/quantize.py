@@ -42,7 +42,8 @@ FAR = np.float32(110)
 
 def decode_log(values: FloatArray) -> FloatArray:
     """Natural logarithms to what they are of. Exact up to float32 arithmetic, as are the next two."""
-    return np.exp(values)
+    with np.errstate(over="ignore"):
+        return np.exp(values)
 
 
 def encode_log(values: FloatArray) -> FloatArray:
@@ -53,7 +54,8 @@ def encode_log(values: FloatArray) -> FloatArray:
 
 def decode_logit(logit: FloatArray) -> FloatArray:
     """Logits to 0..1."""
-    return 1 / (1 + np.exp(-logit))
+    with np.errstate(over="ignore"):
+        return 1 / (1 + np.exp(-logit))
 
 
 def encode_logit(values: FloatArray) -> FloatArray:

@@ -22,6 +22,7 @@ from .compression import check_promise
 from .sog_files import Files, Meta, Texels
 
 PALETTE_WIDTH = 64  # entries a row of the image of centroids
+MAX_PALETTE = 1 << 16  # a label has 16 bits
 MAX_SPLATS = 1 << 28  # the most texels of a WebP image
 
 #: The alpha of a rotation's texel is this and the index, in w x y z, of the largest component.
@@ -80,8 +81,7 @@ def _passes(files: Files, version: int, splats: Splats, palette: FloatArray | No
     count = len(splats)
     yield _centers(splats, files.texels("means", 0, count), files.texels("means", 1, count), files.meta)
     yield functools.partial(_fill_quats, splats, files.texels("quats", 0, count))
-    with np.errstate(over="ignore"):
-        scales = np.exp(_tables(files.meta, "scales", version, 3))
+    scales = quantize.decode_log(_tables(files.meta, "scales", version, 3))
     yield functools.partial(_look_up, list(splats.scale.T), files.texels("scales", 0, count), scales)
     colors = _tables(files.meta, "sh0", version, 4 if version == 1 else 3)
     byte = np.arange(256, dtype=np.uint8)
@@ -141,7 +141,7 @@ def _fill_sh(splats: Splats, texels: Texels, palette: FloatArray, part: slice) -
 
 def _read_palette(files: Files, version: int) -> FloatArray:
     """(entries, K, 3) SH coefficients that splats share."""
-    image = files.image("shN", 0, (1, PALETTE_WIDTH))
+    image = files.image("shN", 0, MAX_PALETTE * COEFFICIENTS[3])
     width = image.shape[1]
     coefficients = width // PALETTE_WIDTH
     if coefficients not in COEFFICIENTS[1:4] or width % PALETTE_WIDTH:

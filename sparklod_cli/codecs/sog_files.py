@@ -25,6 +25,9 @@ MAX_META = 1 << 22  # bytes; codebooks take 15,000
 METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 ENCRYPTED = 1
 
+#: Writers make images square, or of sides that are powers of two: so many more texels than splats are taken.
+SPARE_FACTOR, SPARE_TEXELS = 4, 1 << 16
+
 _ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, ValueError, struct.error)
 
 
@@ -143,19 +146,19 @@ class Files:
         with self._open_beside(name) as file:
             return file.read()
 
-    def image(self, texture: str, index: int, least: tuple[int, int]) -> Texels:
-        """(height, width, 4) texels of a file of a texture; `FormatError` if there are not so many rows and columns."""
+    def image(self, texture: str, index: int, most: int) -> Texels:
+        """(height, width, 4) texels of a file of a texture; `FormatError` if there are more than `most`."""
         name = self.meta.name(texture, "files", index)
         data = self._read(name)
         width, height = _webp_size(data, name)
-        if height < least[0] or width < least[1]:
-            raise FormatError(f"{name!r} has {width} x {height} texels, too few")
+        if width * height > most:
+            raise FormatError(f"{name!r} has {width} x {height} texels, far more than are needed")
         check_promise(4 * width * height, self.size)
         return _decode_webp(data, name)
 
     def texels(self, texture: str, index: int, count: int) -> Texels:
         """(count, 4) texels of a file of a texture, row by row."""
-        texels = self.image(texture, index, (1, 1)).reshape(-1, 4)
+        texels = self.image(texture, index, SPARE_FACTOR * count + SPARE_TEXELS).reshape(-1, 4)
         if len(texels) < count:
             name = self.meta.name(texture, "files", index)
             raise FormatError(f"{name!r} has {len(texels):,} texels for {count:,} splats")
@@ -185,7 +188,8 @@ class _Archive:
             raise FormatError(f"{name!r} is packed in a way that SOG has not")
         check_promise(member.file_size, self._size)
         try:
-            return self._zip.read(member)
+            with self._zip.open(member) as file:
+                return file.read(member.file_size)  # without a size it would unfold all there is before it counts
         except _ZIP_ERRORS as error:
             raise FormatError(f"{name!r} cannot be unpacked: {error}") from None
 
