@@ -224,7 +224,7 @@ FILES: dict[str, tuple[bytes, str]] = {
     "text": (b"a line of text\n" * 100, "not a splat file"),
     "random": (np.random.default_rng(14).bytes(1000), "not a splat file"),
     "random PLY": (b"ply\n" + np.random.default_rng(15).bytes(1000), ""),
-    "random gzip": (b"\x1f\x8b" + np.random.default_rng(16).bytes(1000), "corrupt gzip data"),
+    "random gzip": (b"\x1f\x8b\x08\0" + np.random.default_rng(16).bytes(1000), "corrupt gzip data"),
     "random SPZ": (b"NGSP" + np.random.default_rng(17).bytes(1000), "SPZ version"),
 }
 

@@ -5,6 +5,7 @@ Compression level 0 has floats; 1 has halves and 16-bit centres; 2 has bytes of 
 
 from __future__ import annotations
 
+from bisect import bisect
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, BinaryIO
@@ -104,7 +105,8 @@ def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> 
         raise FormatError(f"KSPLAT version {header['major']}.{header['minor']} is not known, only 0.1 is")
     if level >= len(LEVELS):
         raise FormatError(f"KSPLAT compression level {level} is not known, only 0 to {len(LEVELS) - 1} are")
-    sections = list(_read_sections(file, size, int(header["sections"]), level))
+    sections = [section for section in _read_sections(file, size, int(header["sections"]), level) if section.count]
+    firsts = [section.first for section in sections]
     found = sum(section.count for section in sections)
     if found != count:
         raise FormatError(f"the header promises {count:,} splats, its sections have {found:,}")
@@ -120,7 +122,7 @@ def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> 
 
     @np.errstate(invalid="ignore", over="ignore")  # of numbers that no scene has
     def fill(part: slice, some: NDArray[Any]) -> None:
-        section = next(section for section in sections if part.start < section.first + section.count)
+        section = sections[bisect(firsts, part.start) - 1]
         splats.center[part] = _centers(section, part, some["center"]) if level else some["center"]
         splats.scale[part] = some["scale"]
         splats.quat_xyzw[part] = normalized_quat(some["quat_wxyz"].astype(np.float32))[:, [1, 2, 3, 0]]

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import gzip
+import json
 import re
 import struct
 import subprocess
 import sys
 import time
 import zlib
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
-from fixtures import by_hand
+from fixtures import by_hand, by_hand_sog
 
+from ..conftest import FIXTURES
 from ..scenes import splat_columns
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="memory is limited and counted as Linux does")
@@ -25,12 +28,16 @@ GIGABYTES = 8
 BILLIONS = 4_000_000_000
 
 
-def gzip_bomb(beginning: bytes) -> bytes:
-    """A gzip member of a beginning and gigabytes of zeros: deflate blocks that refer to nothing can be repeated."""
+def deflate_bomb(beginning: bytes) -> bytes:
+    """A beginning and gigabytes of zeros: deflate blocks that refer to nothing can be repeated."""
     packer = zlib.compressobj(9, zlib.DEFLATED, -15)
     head = packer.compress(beginning) + packer.flush(zlib.Z_FULL_FLUSH)
     megabyte = packer.compress(bytes(1 << 20)) + packer.flush(zlib.Z_FULL_FLUSH)
-    return b"\x1f\x8b\x08\0\0\0\0\0\0\xff" + head + megabyte * (1024 * GIGABYTES)
+    return head + megabyte * (1024 * GIGABYTES)
+
+
+def gzip_bomb(beginning: bytes) -> bytes:
+    return b"\x1f\x8b\x08\0\0\0\0\0\0\xff" + deflate_bomb(beginning)
 
 
 def zstd_bomb() -> bytes:
@@ -54,7 +61,53 @@ def counted(element: str, count: int, data: bytes) -> bytes:
     return re.sub(rf"element {element} \d+".encode(), f"element {element} {count}".encode(), data)
 
 
+def ksplat(**fields: int) -> bytes:
+    """A fixture whose headers say something else; u4 at these places of the file."""
+    data = bytearray((FIXTURES / "golden" / "sh2-level1.ksplat").read_bytes())
+    for name, value in fields.items():
+        struct.pack_into("<I", data, KSPLAT[name], value)
+    return bytes(data)
+
+
+KSPLAT = {"sections": 4, "max_splats": 12, "splats": 16}
+KSPLAT |= {f"section_{name}": 4096 + at for name, at in (("splats", 0), ("room", 4), ("buckets", 12), ("partial", 36))}
+
+
+def raw_zip(members: Mapping[str, tuple[int, bytes, int]]) -> bytes:
+    """A zip of members as (method, packed bytes, the size that is said of them); the checksums are of the packed."""
+    files, directory = b"", b""
+    for name, (method, data, size) in members.items():
+        about = struct.pack("<HHHHHIIIHH", 20, 0, method, 0, 33, zlib.crc32(data), len(data), size, len(name), 0)
+        directory += b"PK\1\2" + struct.pack("<H", 20) + about + struct.pack("<HHHII", 0, 0, 0, 0, len(files))
+        directory += name.encode()
+        files += b"PK\3\4" + about + name.encode() + data
+    count = len(members)
+    return files + directory + b"PK\5\6" + struct.pack("<HHHHIIH", 0, 0, count, count, len(directory), len(files), 0)
+
+
+SOG = {path.name: path.read_bytes() for path in sorted((FIXTURES / "golden" / "sh1-sog").iterdir())}
+
+
+def sog(changes: Mapping[str, bytes | tuple[int, bytes, int]]) -> bytes:
+    """A good SOG but for these members."""
+    every = SOG | changes
+    return raw_zip({name: (0, data, len(data)) if isinstance(data, bytes) else data for name, data in every.items()})
+
+
+def meta(**changes: object) -> dict[str, bytes]:
+    return {"meta.json": json.dumps(json.loads(SOG["meta.json"]) | changes).encode()}
+
+
+def all_images(side: int, **changes: object) -> dict[str, bytes]:
+    """Images of so many rows and columns, and no SH."""
+    flat = by_hand_sog.flat_webp(side, side)
+    return {name: flat for name in SOG if name.endswith(".webp")} | meta(shN=None, **changes)
+
+
 ASCII = by_hand.ply(splat_columns(20), text=True)
+COMPRESSED = (FIXTURES / "golden" / "sh3-compressed.ply").read_bytes()
+ZIP_BOMB, META_BOMB = deflate_bomb(SOG["means_l.webp"]), deflate_bomb(b'{"version":2')
+FLAT = by_hand_sog.flat_webp(16383, 16383)
 FACES = b"element face 1\nproperty list uchar int v\n"
 BOMBS: dict[str, bytes] = {
     "PLY that promises billions": counted("vertex", BILLIONS, PLY),
@@ -68,6 +121,35 @@ BOMBS: dict[str, bytes] = {
     "gzip bomb of nothing": gzip_bomb(b""),
     "zstd bomb": spz_with_bomb(100),
     "zstd bomb that keeps its promise": spz_with_bomb(GIGABYTES * 2**30 // 9),
+    "compressed PLY that promises billions": counted("vertex", BILLIONS, COMPRESSED),
+    "compressed PLY that promises billions of chunks": counted("chunk", BILLIONS, COMPRESSED),
+    "compressed PLY that promises billions of SH": counted("sh", BILLIONS, COMPRESSED),
+    "compressed PLY that promises billions of all": counted(
+        "chunk", BILLIONS // 256, counted("vertex", BILLIONS, counted("sh", BILLIONS, COMPRESSED))
+    ),
+    "KSPLAT that promises billions": ksplat(splats=BILLIONS, max_splats=BILLIONS),
+    "KSPLAT that promises billions of sections": ksplat(sections=BILLIONS),
+    "KSPLAT section that promises billions": ksplat(section_splats=BILLIONS, section_room=BILLIONS),
+    "KSPLAT section with room for billions": ksplat(section_room=BILLIONS),
+    "KSPLAT section of billions of buckets": ksplat(section_buckets=BILLIONS),
+    "KSPLAT section of billions of small buckets": ksplat(section_partial=BILLIONS),
+    "zip bomb": sog({"means_l.webp": (8, ZIP_BOMB, 2**32 - 2)}),
+    "zip bomb that says it is small": sog({"means_l.webp": (8, ZIP_BOMB, 1000)}),
+    "zip bomb of meta": sog({"meta.json": (8, META_BOMB, 2**32 - 2)}),
+    "zip bomb of meta that says it is small": sog({"meta.json": (8, META_BOMB, 1000)}),
+    "zip that says it is large": sog({"means_l.webp": (0, SOG["means_l.webp"], 2**32 - 2)}),
+    "WebP bomb": sog(all_images(16383)),
+    "WebP bomb of as many splats": sog(all_images(16383, count=16383**2)),
+    "WebP bomb in a large file": sog(all_images(12000) | {"padding": bytes(6_000_000)}),
+    "WebP that says it is large": sog({"means_l.webp": FLAT[:25] + SOG["means_l.webp"][25:]}),
+    "SOG that promises billions": sog(meta(count=BILLIONS)),
+    "SOG that promises more than there is": sog(meta(count=10**30)),
+    "SOG with a palette of billions": sog(meta(shN=json.loads(SOG["meta.json"])["shN"] | {"count": BILLIONS})),
+    "meta.json of a deep nest": b'{"means":' + b"[" * 1_000_000,
+    "meta.json of a deep nest of objects": b'{"a":' * 500_000,
+    "meta.json of a long number": b'{"version":2,"count":' + b"9" * 1_000_000 + b"}",
+    "meta.json of a long text": b'{"version":2,"asset":"' + b"x" * 50_000_000 + b'"}',
+    "meta.json of many numbers": b'{"version":2,"count":1,"means":{"mins":[' + b"0," * 1_500_000 + b"0]}}",
 }
 
 LIMITED = """

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import gzip
+import io
 import struct
 import tracemalloc
 import zlib
@@ -82,7 +83,7 @@ def test_progress_ends_at_the_end() -> None:
 @pytest.mark.parametrize("sizes", [[10], [1, 2, 3], [0, 10_000, 0, 1], [20_000]])
 def test_inflating_gives_what_is_asked_for(sizes: list[int]) -> None:
     data = bytes(range(256)) * 100
-    inflate = compression.Inflate(gzip.compress(data))
+    inflate = compression.Inflate(io.BytesIO(gzip.compress(data)))
     at = 0
     for size in sizes:
         assert inflate.read(size) == data[at : at + size]
@@ -93,14 +94,14 @@ def test_inflating_gives_what_is_asked_for(sizes: list[int]) -> None:
 
 
 def test_inflating_beyond_the_end_gives_less() -> None:
-    inflate = compression.Inflate(gzip.compress(b"some"))
+    inflate = compression.Inflate(io.BytesIO(gzip.compress(b"some")))
     assert inflate.read(10) == b"some"
     inflate.finish(allow_more=False)
 
 
 @pytest.mark.parametrize("cut", range(1, 9))
 def test_a_checksum_that_is_cut_is_missed(cut: int) -> None:
-    inflate = compression.Inflate(gzip.compress(b"some")[:-cut])
+    inflate = compression.Inflate(io.BytesIO(gzip.compress(b"some")[:-cut]))
     inflate.read(4)
     with pytest.raises(FormatError, match="checksum is missing"):
         inflate.finish(allow_more=False)
@@ -110,7 +111,7 @@ def test_a_bomb_is_never_inflated_whole() -> None:
     bomb = gzip.compress(bytes(50_000_000), 9)
     tracemalloc.start()
     try:
-        inflate = compression.Inflate(bomb)
+        inflate = compression.Inflate(io.BytesIO(bomb))
         assert inflate.read(1000) == bytes(1000)
         with pytest.raises(FormatError, match="more data"):
             inflate.finish(allow_more=False)
@@ -143,13 +144,38 @@ def frame(data: bytes, *, with_size: bool = True) -> bytes:
     return zstandard.ZstdCompressor(write_content_size=with_size).compress(data)
 
 
+def unzstd(data: bytes, packed: int | None = None) -> compression.Unzstd:
+    return compression.Unzstd(io.BytesIO(data), len(data) if packed is None else packed, "sh")
+
+
 @pytest.mark.parametrize("with_size", [True, False])
-def test_a_zstd_frame_is_of_the_size_that_was_said(with_size: bool) -> None:
+def test_a_zstd_frame_gives_what_is_asked_for_and_must_end_there(with_size: bool) -> None:
     data = bytes(range(100))
-    assert compression.unzstd(frame(data, with_size=with_size), 100, "sh") == data
-    for size in (0, 99, 101, 1 << 20):
-        with pytest.raises(FormatError, match="stream sh"):
-            compression.unzstd(frame(data, with_size=with_size), size, "sh")
+    packed = frame(data, with_size=with_size)
+    for sizes in ([100], [1, 2, 97], [0, 100, 0], [100, 1], [1 << 20]):
+        reader, at = unzstd(packed), 0
+        for size in sizes:
+            assert reader.read(size) == data[at : at + size]
+            at += size
+        reader.finish()
+    for size in (0, 99):
+        reader = unzstd(packed)
+        reader.read(size)
+        with pytest.raises(FormatError, match="stream sh is longer than its table says"):
+            reader.finish()
+
+
+def test_a_zstd_frame_ends_where_its_bytes_do() -> None:
+    first, second = (frame(bytes([value]) * 1000) for value in (1, 2))
+    file = io.BytesIO(first + second)
+    for value, packed in ((1, first), (2, second)):
+        reader = compression.Unzstd(file, len(packed), "sh")
+        assert reader.read(1000) == bytes([value]) * 1000
+        reader.finish()
+    assert len(unzstd(first + second, len(first)).read(2000)) == 1000
+    assert len(unzstd(first, len(first) - 5).read(1000)) < 1000
+    with pytest.raises(FormatError, match="corrupt zstd data in stream sh"):
+        unzstd(b"something else that is long").read(10)
 
 
 @pytest.mark.parametrize("with_size", [True, False])
@@ -157,8 +183,10 @@ def test_a_zstd_bomb_is_never_inflated_whole(with_size: bool) -> None:
     bomb = frame(bytes(50_000_000), with_size=with_size)
     tracemalloc.start()
     try:
+        reader = unzstd(bomb)
+        assert reader.read(1000) == bytes(1000)
         with pytest.raises(FormatError):
-            compression.unzstd(bomb, 1000, "sh")
+            reader.finish()
         assert tracemalloc.get_traced_memory()[1] < 1_000_000
     finally:
         tracemalloc.stop()

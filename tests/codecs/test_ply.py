@@ -218,13 +218,6 @@ REFUSED: dict[str, tuple[Callable[[], bytes], str]] = {
     "not PLY": (lambda: b"plain text\nthat goes on\n", "not a PLY file"),
     "no vertex": (lambda: NO_VERTEX, "no vertex element"),
     "point cloud": (lambda: (FIXTURES / "points.ply").read_bytes(), "a point cloud or mesh, not Gaussian splats"),
-    "compressed": (
-        lambda: (
-            b"ply\nformat ascii 1.0\nelement chunk 0\nproperty float min_x\nelement vertex 0\n"
-            b"property uint packed_position\nend_header\n"
-        ),
-        "compressed PLY",
-    ),
     "five f_rest": (lambda: by_hand.ply(columns() | {f"f_rest_{i}": [0] * 5 for i in range(5)}), "5 f_rest properties"),
     "six f_rest": (lambda: by_hand.ply(columns() | {f"f_rest_{i}": [0] * 5 for i in range(6)}), "2 SH coefficients"),
     "f_rest from 1": (lambda: by_hand.ply(columns() | {f"f_rest_{i}": [0] * 5 for i in range(1, 10)}), "f_rest_0 on"),

@@ -243,7 +243,7 @@ REFUSED: dict[str, tuple[Callable[[], bytes], str]] = {
     "SH degree 4 before version 4": (lambda: gzipped(3, degree=4), "SH degree 4 is not one that SPZ version 3 has"),
     "SH degree 5": (lambda: with_byte(zstd(), 12, 5), "SH degree 5 is not one"),
     "32 fractional bits": (lambda: gzipped(bits=32), "32 fractional bits"),
-    "more splats than data": (lambda: gzipped(count=4), "cut short: the header promises 4 splats"),
+    "more splats than data": (lambda: gzipped(count=4), "cut short after 1 of 4 scales"),
     "more data than splats": (lambda: gzipped(more=b"!"), "more data than its header promises"),
     "gzip of something else": (lambda: gzip.compress(b"something else that is long"), "not of an SPZ file"),
     "gzip of little": (lambda: gzip.compress(b"NGSP"), "inside the SPZ header"),
@@ -252,9 +252,13 @@ REFUSED: dict[str, tuple[Callable[[], bytes], str]] = {
     "a table past the end": (lambda: with_byte(zstd(), 18, 1), "inside the table of streams"),
     "too few streams": (lambda: with_byte(zstd(), 15, 4), "4 streams where"),
     "a wrong size in the table": (lambda: zstd(sizes=[27, 4, 9, 9, 12]), "stream alphas has 4 bytes"),
-    "a frame of another size": (
+    "a frame that is too short": (
         lambda: zstd(streams=[b"", *by_hand.hand_streams(4, 0)[1:]], sizes=[27, 3, 9, 9, 12]),
-        "table says",
+        "cut short after 0 of 3 positions",
+    ),
+    "a frame that is too long": (
+        lambda: zstd(streams=[bytes(28), *by_hand.hand_streams(4, 0)[1:]], sizes=[27, 3, 9, 9, 12]),
+        "stream positions is longer than its table says",
     ),
     "no tree in an LoD file": (lambda: gzipped(flags=0x80, more=struct.pack("<3H3I", *[0] * 6)), "LoD tree is broken"),
     "an LoD file without splats": (lambda: by_hand.spz_gzip(2, 0, 0, 12, 0x80, []), "LoD tree is broken"),

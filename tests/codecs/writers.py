@@ -1,0 +1,322 @@
+"""Every way to write each format of the table, and what it keeps of a scene: what the shared laws run on."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fixtures import by_hand, by_hand_compressed_ply, by_hand_ksplat, by_hand_sog, by_hand_splat
+from sparklod_cli.codecs import ply, splat, spz
+from sparklod_cli.scene import Scene
+from sparklod_cli.sh import SH_C0
+from sparklod_cli.splats import Splats
+
+from .test_quantize import stated_degrees
+
+Array = NDArray[np.float64]
+Content = bytes | dict[str, bytes]
+
+
+@dataclass(frozen=True)
+class Precision:
+    """What a way to write may change, and the ranges that it clamps to."""
+
+    center: float | Array = 0.0
+    log_scale: float | Array = 2e-6
+    degrees: float = 1e-3
+    opacity: float = 1e-6
+    merged: float = 1e-6  # in D, above 1
+    rgb: float | Array = 1e-6
+    sh: tuple[float, float] = (0.0, 0.0)  # degree 1, degrees above
+    scale_range: tuple[float, float] = (0.0, np.inf)
+    rgb_range: tuple[float, float] = (-np.inf, np.inf)
+    sh_range: tuple[float, float] = (-np.inf, np.inf)
+
+
+def exact(source: Scene) -> Precision:
+    return Precision()
+
+
+def everything(splats: Splats) -> Splats:
+    return splats
+
+
+@dataclass(frozen=True)
+class Case:
+    """A way to write a format.
+
+    Attributes:
+        format: what the reader must say of it.
+        write: the file of a scene; or the files of a folder, by their names.
+        precision: what may change in a scene.
+        lod: the scene is to be a tree.
+        held: the splats that the file is to hold, in its order.
+    """
+
+    format: str
+    write: Callable[[Scene], Content]
+    precision: Callable[[Scene], Precision]
+    lod: bool = False
+    held: Callable[[Splats], Splats] = everything
+
+
+def put(content: Content, directory: Path, form: str) -> Path:
+    """Writes a scene under a name that tells as little as possible; its path."""
+    if isinstance(content, bytes):
+        path = directory / ("scene.splat" if form == "SPLAT" else "scene.bin")
+        path.write_bytes(content)
+        return path
+    folder = directory / "scene"
+    folder.mkdir()
+    for name, data in content.items():
+        (folder / name).write_bytes(data)
+    return folder
+
+
+def linear(source: Scene) -> dict[str, Array]:
+    """The splats as the writers by hand take them."""
+    splats = source.splats
+    columns = {name: getattr(splats, name).astype(np.float64) for name in ("center", "scale", "opacity", "rgb", "sh")}
+    return columns | {"quat_wxyz": splats.quat_xyzw[:, [3, 0, 1, 2]].astype(np.float64) * 7}
+
+
+def rounding(values: Array) -> float:
+    """What float32 may do to values like these in a calculation or two."""
+    return 4 * float(np.spacing(np.float32(np.abs(values).max())))
+
+
+def largest_dropped_degrees(steps: int) -> float:
+    """The most that a rotation is off where all but the largest component have so many steps for +-sqrt(1 / 2).
+
+    Each of the three is off by half a step; the largest, which follows from them, by up to sqrt(3) times all that.
+    """
+    return float(np.degrees(2 * 2 * 3**0.5 * (2**0.5 / steps / 2))) * 1.001
+
+
+# --- PLY --------------------------------------------------------------------------------------------------------------
+
+
+def as_ply(source: Scene, **layout: object) -> bytes:
+    splats = source.splats
+    with np.errstate(divide="ignore"):
+        columns = by_hand.ply_columns(
+            center=splats.center,
+            log_scale=np.log(splats.scale),
+            quat_wxyz=splats.quat_xyzw[:, [3, 0, 1, 2]] * 7,
+            logit=np.log(splats.opacity.astype(np.float64)) - np.log1p(-splats.opacity.astype(np.float64)),
+            dc=(splats.rgb - 0.5) / SH_C0,
+            sh=splats.sh,
+        )
+    return by_hand.ply(columns, **layout)  # type: ignore[arg-type]
+
+
+PLY = {
+    "sparklod": Case("PLY", lambda source: b"".join(ply.encode(source)), exact),
+    "binary": Case("PLY", as_ply, exact),
+    "big-endian": Case("PLY", functools.partial(as_ply, byte_order=">"), exact),
+    "ascii": Case("PLY", functools.partial(as_ply, text=True), exact),
+    "double": Case("PLY", functools.partial(as_ply, types="f8"), exact),
+}
+
+# --- Compressed PLY ---------------------------------------------------------------------------------------------------
+
+
+def half_steps(values: Array, steps: float | Array) -> Array:
+    """(N, 3) half a step of each value between the bounds of its 256."""
+    chunks = [values[start : start + 256] for start in range(0, len(values), 256)]
+    return np.concatenate([np.ones((len(chunk), 1)) * np.ptp(chunk, axis=0) / steps / 2 for chunk in chunks])
+
+
+def compressed_precision(source: Scene, *, color_bounds: bool) -> Precision:
+    values = linear(source)
+    log_scale, words = np.log(values["scale"]), np.array([2047, 1023, 2047])
+    return Precision(
+        center=half_steps(values["center"], words) * 1.001 + rounding(values["center"]),
+        log_scale=half_steps(log_scale, words) * 1.001 + rounding(log_scale),
+        degrees=largest_dropped_degrees(1023),
+        opacity=1.001 / 510,
+        rgb=half_steps(values["rgb"], 255) * 1.001 + 1e-6 if color_bounds else 1.001 / 510,
+        sh=(1 / 64, 1 / 64),
+    )
+
+
+COMPRESSED_PLY = {
+    way: Case(
+        "compressed PLY",
+        lambda source, bounds=bounds: by_hand_compressed_ply.compressed_ply(**linear(source), color_bounds=bounds),
+        functools.partial(compressed_precision, color_bounds=bounds),
+    )
+    for way, bounds in {"by hand": True, "old": False}.items()
+}
+
+# --- SPZ --------------------------------------------------------------------------------------------------------------
+
+
+def as_spz(source: Scene, version: int) -> bytes:
+    return b"".join(spz.encode(source, spz.Options(version=version)))
+
+
+def spz_precision(source: Scene, version: int) -> Precision:
+    bits = spz.fractional_bits(source.splats, spz.Options(version=version))
+    assert bits is not None
+    coding = spz.quantize.decode_quat_smallest_three if version == 3 else spz.quantize.decode_quat_first_three
+    return Precision(
+        center=0.5 * 2.0**-bits,
+        log_scale=1.001 / 32,
+        # The first three are worse near half a turn than the docstring says; test_quantize.py holds it to its word.
+        degrees=max(stated_degrees(coding), 13.4) if version == 2 else stated_degrees(coding),
+        opacity=1.001 / 255 if source.tree else 1.001 / 510,
+        merged=4.004 / 255,
+        rgb=0.00369,
+        sh=(1 / 32 + 1 / 256, 1 / 16 + 1 / 256),
+        scale_range=(np.exp(-10), np.exp(95 / 16)),
+        rgb_range=(-0.4403, 1.4403),
+        sh_range=(-1, 0.992),
+    )
+
+
+SPZ = {
+    f"{version}{' LoD' * lod}": Case(
+        f"SPZ {version}{' LoD' * lod}",
+        functools.partial(as_spz, version=version),
+        functools.partial(spz_precision, version=version),
+        lod,
+    )
+    for version in (2, 3)
+    for lod in (False, True)
+}
+
+# --- SOG --------------------------------------------------------------------------------------------------------------
+
+
+def sog_precision(source: Scene, version: int) -> Precision:
+    values = linear(source)
+    center, log_scale = values["center"], np.log(values["scale"])
+    half_log_step = np.ptp(np.sign(center) * np.log1p(np.abs(center)), axis=0) / 65535 / 2
+    logit = np.log(values["opacity"] / (1 - values["opacity"]))
+    book = 1.3 / 255 / 2 * 1.001  # the steps of the codebook are this much larger at its end
+    sh = np.ptp(values["sh"]) * (book if version == 2 else 1.001 / 510) + 1e-6 if values["sh"].size else 0.0
+    return Precision(
+        center=(1 + np.abs(center)) * np.expm1(half_log_step * 1.001 + 4e-6),
+        log_scale=np.ptp(log_scale) * book + 4e-6 if version == 2 else np.ptp(log_scale, axis=0) / 510 * 1.001 + 4e-6,
+        degrees=largest_dropped_degrees(255),
+        opacity=1.001 / 510 if version == 2 else float(np.ptp(logit)) / 510 / 4 * 1.001 + 1e-6,
+        rgb=np.ptp(values["rgb"]) * book + 1e-6 if version == 2 else np.ptp(values["rgb"], axis=0) / 510 * 1.001 + 1e-6,
+        sh=(sh, sh),
+    )
+
+
+def as_sog(source: Scene, version: int, *, folder: bool = False) -> Content:
+    files = by_hand_sog.sog_files(**linear(source), version=version)
+    return files if folder else by_hand_sog.zipped(files)
+
+
+SOG = {
+    f"{version}{' folder' * folder}": Case(
+        f"SOG {version}",
+        functools.partial(as_sog, version=version, folder=folder),
+        functools.partial(sog_precision, version=version),
+    )
+    for version in (1, 2)
+    for folder in (False, True)
+}
+
+# --- KSPLAT -----------------------------------------------------------------------------------------------------------
+
+#: Where sections end, and their SH degrees.
+SECTIONS: Mapping[str, tuple[tuple[float, int], ...]] = {"": ((1.0, 2),), " sections": ((0.3, 1), (0.6, 0), (1.0, 2))}
+SH_RANGE = (-0.9, 0.8)
+
+
+def block(splats: Splats) -> float:
+    """The side of a bucket that any of the splats would fit into, wherever its centre."""
+    return float(np.float32(2.1 * np.ptp(splats.center, axis=0).max() + 0.001))
+
+
+def as_ksplat(source: Scene, level: int, sections: str) -> bytes:
+    return by_hand_ksplat.ksplat(
+        **linear(source),
+        level=level,
+        sections=SECTIONS[sections],
+        bucket_size=7 if sections else 16,
+        block=block(source.splats),
+        sh_range=None if sections else SH_RANGE,
+    )
+
+
+def ksplat_precision(source: Scene, level: int, sections: str) -> Precision:
+    values = linear(source)
+    bytes_of_color = Precision(opacity=1.001 / 510, rgb=1.001 / 510, rgb_range=(0, 1))
+    if level == 0:
+        return bytes_of_color
+    low, high = (-1.5, 1.5) if sections else SH_RANGE
+    sh = (high - low) / 510 * 1.001 if level == 2 else 2.0**-11 * float(np.abs(values["sh"]).max(initial=0))
+    return dataclasses.replace(
+        bytes_of_color,
+        center=block(source.splats) / 65534 / 2 * 1.001 + rounding(values["center"]),
+        log_scale=np.spacing(values["scale"].astype(np.float16)) / values["scale"] * 0.51,
+        degrees=float(np.degrees(2 * 3**0.5 * 2.0**-12)),  # three components of up to 1 / sqrt(2), or fewer larger ones
+        sh=(sh, sh),
+    )
+
+
+def held_by_ksplat(splats: Splats, sections: str) -> Splats:
+    """Up to degree 2, and zeros where a section has less than others."""
+    cut = by_hand_ksplat.parts(len(splats), SECTIONS[sections])
+    held = splats.take(slice(None)).with_max_sh(max(degree for _, degree in cut))
+    for part, degree in cut:
+        held.sh[part, (0, 3, 8)[degree] :] = 0
+    return held
+
+
+KSPLAT = {
+    f"{level}{sections}": Case(
+        "KSPLAT",
+        functools.partial(as_ksplat, level=level, sections=sections),
+        functools.partial(ksplat_precision, level=level, sections=sections),
+        held=functools.partial(held_by_ksplat, sections=sections),
+    )
+    for level in (0, 1, 2)
+    for sections in SECTIONS
+}
+
+# --- SPLAT ------------------------------------------------------------------------------------------------------------
+
+
+def splat_precision(source: Scene) -> Precision:
+    """Four bytes a rotation: each is off by half a step of 1 / 128, which is twice as much in an angle."""
+    return Precision(degrees=float(np.degrees(2 * 2 / 256)), opacity=1.001 / 510, rgb=1.001 / 510, rgb_range=(0, 1))
+
+
+def most_important_first(splats: Splats) -> Splats:
+    importance = splats.scale.astype(np.float64).prod(axis=1) * splats.opacity
+    return splats.with_max_sh(0).take(np.argsort(-importance))
+
+
+SPLAT = {
+    "sparklod": Case(
+        "SPLAT", lambda source: b"".join(splat.encode(source)), splat_precision, held=most_important_first
+    ),
+    "by hand": Case(
+        "SPLAT",
+        lambda source: by_hand_splat.splat(**linear(source)),
+        splat_precision,
+        held=lambda splats: splats.with_max_sh(0),
+    ),
+}
+
+#: Every way to write each format of the table, by its name there.
+WRITERS: dict[str, dict[str, Case]] = {
+    "PLY": PLY,
+    "compressed PLY": COMPRESSED_PLY,
+    "SPZ": SPZ,
+    "SOG": SOG,
+    "KSPLAT": KSPLAT,
+    "SPLAT": SPLAT,
+}
