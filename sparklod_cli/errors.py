@@ -6,7 +6,63 @@ class SparklodError(Exception):
 
 
 class FormatError(SparklodError):
-    """A file is not what its format says: unknown, cut short, corrupt, or beyond the format's limits."""
+    """A file is not what its format says, or beyond the format's limits. Its subclasses tell a validator more."""
+
+    code = "container.corrupt"
+
+
+class UnreadableError(FormatError):
+    """A file cannot be opened, or is empty."""
+
+    code = "file.unreadable"
+
+
+class UnknownFormatError(FormatError):
+    """A file is of no known format."""
+
+    code = "file.format"
+
+
+class NotSplatsError(FormatError):
+    """A file is of a known format, but holds something else than splats."""
+
+    code = "file.not-splats"
+
+
+class TruncatedError(FormatError):
+    """A file ends before what it promises."""
+
+    code = "container.cut-short"
+
+
+class PromiseError(FormatError):
+    """A header promises more than a file of its size can hold."""
+
+    code = "container.promise"
+
+
+class VersionError(FormatError):
+    """A version, level or degree that the format does not have."""
+
+    code = "container.version"
+
+
+class ChecksumError(FormatError):
+    """A checksum does not match."""
+
+    code = "container.checksum"
+
+
+class MembersError(FormatError):
+    """Compressed data go on in a second gzip member, which not every reader looks at."""
+
+    code = "container.members"
+
+
+class TooLongError(FormatError):
+    """A stream is longer than the header promises."""
+
+    code = "container.too-long"
 
 
 class InvalidSplatsError(SparklodError):

@@ -8,18 +8,18 @@ import os
 import secrets
 import stat
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .codecs.formats import FORMATS, HEAD, sniff
-from .errors import FormatError, OutputError
+from .codecs.formats import FORMATS, HEAD, Format, sniff
+from .errors import FormatError, OutputError, UnknownFormatError, UnreadableError
 from .progress import Progress, silent
 from .scene import Scene
-from .splats import FloatArray
+from .splats import COLUMNS, FloatArray
 
 #: Writes the pieces of an output and returns how many bytes it wrote.
 Sink = Callable[[Iterable[bytes]], int]
@@ -36,33 +36,62 @@ def read_scene(path: Path, *, threads: int = 1, progress: Progress = silent) -> 
     Raises:
         FormatError: it is not a file, empty, of no known format, or broken.
     """
+    with _opened(path) as (file, form, more):
+        scene: Scene = form.codec().decode(file, threads=threads, progress=progress, **more)
+    return scene
+
+
+def examine_scene(
+    path: Path, *, columns: Collection[str] = COLUMNS, threads: int = 1, progress: Progress = silent
+) -> Scene:
+    """Reads a splat file to look at it: its tree may be broken, and columns that are not asked for may be 0.
+
+    Args:
+        path: as for `read_scene`.
+        columns: of `Splats`.
+        threads: to decode with.
+        progress: is told how much is done.
+
+    Raises:
+        FormatError: as `read_scene`, but for the tree.
+    """
+    with _opened(path) as (file, form, more):
+        codec = form.codec()
+        if form.selective:
+            scene: Scene = codec.examine(file, columns=columns, threads=threads, progress=progress, **more)
+        else:
+            scene = codec.decode(file, threads=threads, progress=progress, **more)
+    return scene
+
+
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator[tuple[BinaryIO, Format, dict[str, Any]]]:
+    """A splat file, its format, and what else its codec takes."""
     try:
         if str(path) == "-":
-            raise FormatError("standard input is not read; save it to a file first")
+            raise UnreadableError("standard input is not read; save it to a file first")
         if path.is_dir():
             path = _in_folder(path)
         if path.exists() and not path.is_file():
-            raise FormatError("it is a pipe or a device; save it to a file first")
+            raise UnreadableError("it is a pipe or a device; save it to a file first")
         with path.open("rb") as file:
             head = file.read(HEAD)
             file.seek(0)
             if not head:
-                raise FormatError("the file is empty")
+                raise UnreadableError("the file is empty")
             form = sniff(head, path.suffix)
             if form is None:
                 names = ", ".join(form.name for form in FORMATS)
-                raise FormatError(f"not a splat file that sparklod reads ({names})")
-            more = {"beside": functools.partial(_open_beside, path.parent)} if form.companions else {}
-            scene: Scene = form.codec().decode(file, threads=threads, progress=progress, **more)
-            return scene
+                raise UnknownFormatError(f"not a splat file that sparklod reads ({names})")
+            yield file, form, {"beside": functools.partial(_open_beside, path.parent)} if form.companions else {}
     except OSError as error:
-        raise FormatError(f"cannot be read: {_reason(error)}") from None
+        raise UnreadableError(f"cannot be read: {_reason(error)}") from None
 
 
 def _in_folder(folder: Path) -> Path:
     path = folder / "meta.json"
     if not path.is_file():
-        raise FormatError("cannot be read: is a directory, without the meta.json of an unpacked SOG")
+        raise UnreadableError("cannot be read: is a directory, without the meta.json of an unpacked SOG")
     return path
 
 

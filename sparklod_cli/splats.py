@@ -64,6 +64,12 @@ class Splats:
         return cls(**{name: np.empty(shapes.get(name, (count, 3)), np.float32) for name in COLUMNS})
 
     @classmethod
+    def zeros(cls, count: int, sh_degree: int) -> Splats:
+        """Columns of zeros, which take no memory until something else is written to them."""
+        columns = cls.empty(0, sh_degree)
+        return cls(**{name: np.zeros((count, *getattr(columns, name).shape[1:]), np.float32) for name in COLUMNS})
+
+    @classmethod
     def concat(cls, parts: Sequence[Splats]) -> Splats:
         """All the parts in order; they must have the same SH degree."""
         return cls(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in COLUMNS})

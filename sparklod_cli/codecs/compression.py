@@ -14,7 +14,7 @@ import zstandard
 from numpy.typing import NDArray
 from zlib_ng import zlib_ng
 
-from ..errors import FormatError
+from ..errors import ChecksumError, FormatError, PromiseError, TooLongError, TruncatedError
 from ..parallel import ordered_map
 from ..progress import Progress
 
@@ -27,6 +27,7 @@ PIECE = 1 << 17  # bytes that are read at a time
 TRUSTED_SIZE, MAX_RATIO = 1 << 26, 200
 
 _ZlibError: Any = zlib_ng.error  # the stubs take the class for an instance
+GZIP_MAGIC = b"\x1f\x8b"
 _RAW, _GZIP = -zlib_ng.MAX_WBITS, zlib_ng.MAX_WBITS + 16
 
 
@@ -57,7 +58,7 @@ def gzip_member(data: NDArray[np.uint8], level: int, threads: int, progress: Pro
 def check_promise(total: int, file_size: int) -> None:
     """Raises `FormatError` where a header promises more bytes than the file can honestly expand to."""
     if total > TRUSTED_SIZE and total > MAX_RATIO * file_size:
-        raise FormatError(f"its header promises {total:,} bytes, {file_size:,} bytes of file cannot hold that")
+        raise PromiseError(f"its header promises {total:,} bytes, {file_size:,} bytes of file cannot hold that")
 
 
 class Inflate:
@@ -80,7 +81,8 @@ class Inflate:
             try:
                 piece: bytes = self._unpacker.decompress(packed, size)
             except _ZlibError as error:
-                raise FormatError(f"corrupt gzip data: {error}") from None
+                kind = ChecksumError if "check" in str(error) else FormatError  # "incorrect data check"
+                raise kind(f"corrupt gzip data: {error}") from None
             self._rest = self._unpacker.unconsumed_tail
             if not (packed or piece):
                 break
@@ -92,7 +94,7 @@ class Inflate:
         """Checks that the member ends here and that its checksum holds.
 
         Args:
-            allow_more: bytes may follow that are of no interest; then nothing is checked.
+            allow_more: bytes may follow in it that are of no interest; then nothing is checked.
 
         Raises:
             FormatError: it does not.
@@ -100,9 +102,14 @@ class Inflate:
         if allow_more:
             return
         if self.read(1):
-            raise FormatError("more data than its header promises")
+            raise TooLongError("more data than its header promises")
         if not self._unpacker.eof:
-            raise FormatError("cut short: the gzip checksum is missing")
+            raise TruncatedError("cut short: the gzip checksum is missing")
+
+    def behind(self) -> bytes:
+        """What follows the member in the file, as far as it has been read; empty before the member's end."""
+        rest: bytes = self._unpacker.unused_data
+        return rest
 
 
 class _Window:
@@ -140,4 +147,4 @@ class Unzstd:
     def finish(self) -> None:
         """Raises `FormatError` unless the stream ends here."""
         if self.read(1):
-            raise FormatError(f"stream {self._name} is longer than its table says")
+            raise TooLongError(f"stream {self._name} is longer than its table says")

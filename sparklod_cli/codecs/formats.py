@@ -22,6 +22,8 @@ class Format:
         beginning: a regular expression that the first bytes of its files match; None where they can be anything, and
             only the suffix tells.
         companions: its files name others beside them; `decode` takes another argument, `beside`, which opens these.
+        selective: its module also has `examine(file, *, columns, threads, progress) -> Scene`, which decodes some columns
+            and passes a broken tree on.
     """
 
     name: str
@@ -29,6 +31,7 @@ class Format:
     suffixes: tuple[str, ...]
     beginning: bytes | None
     companions: bool = False
+    selective: bool = False
 
     def codec(self) -> Any:
         """The module, imported when it is needed."""
@@ -49,7 +52,7 @@ FORMATS = (
         rb"ply\s(?:(?!end_header).)*[\r\n]\s*property\s+\w+\s+packed_position\s",
     ),
     Format("PLY", "ply", (".ply",), rb"ply[\r\n]"),
-    Format("SPZ", "spz", (".spz",), rb"\x1f\x8b\x08[\0-\x1f]|NGSP"),  # versions 1 to 3 are gzipped, 4 is not
+    Format("SPZ", "spz", (".spz",), rb"\x1f\x8b\x08[\0-\x1f]|NGSP", selective=True),  # gzipped up to version 3
     Format(
         "SOG", "sog", (".sog", ".json"), rb"PK\x03\x04|\s*\{\s*\"\w+\"\s*:", companions=True
     ),  # a zip, or its meta.json unpacked

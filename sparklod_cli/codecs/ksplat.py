@@ -13,7 +13,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FormatError
+from ..errors import FormatError, TruncatedError, VersionError
 from ..gaussian import normalized_quat
 from ..progress import Progress, silent
 from ..scene import Scene
@@ -102,9 +102,9 @@ def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> 
     header = _read(file, HEADER, 1, "the header")[0]
     level, count = int(header["level"]), int(header["splats"])
     if header["major"] != 0 or header["minor"] < 1:
-        raise FormatError(f"KSPLAT version {header['major']}.{header['minor']} is not known, only 0.1 is")
+        raise VersionError(f"KSPLAT version {header['major']}.{header['minor']} is not known, only 0.1 is")
     if level >= len(LEVELS):
-        raise FormatError(f"KSPLAT compression level {level} is not known, only 0 to {len(LEVELS) - 1} are")
+        raise VersionError(f"KSPLAT compression level {level} is not known, only 0 to {len(LEVELS) - 1} are")
     sections = [section for section in _read_sections(file, size, int(header["sections"]), level) if section.count]
     firsts = [section.first for section in sections]
     found = sum(section.count for section in sections)
@@ -148,25 +148,25 @@ def _centers(section: Section, part: slice, codes: NDArray[np.uint16]) -> FloatA
 def _read(file: BinaryIO, kind: np.dtype[Any], count: int, what: str) -> NDArray[Any]:
     data = file.read(kind.itemsize * count)
     if len(data) < kind.itemsize * count:
-        raise FormatError(f"cut short inside {what}")
+        raise TruncatedError(f"cut short inside {what}")
     return np.frombuffer(data, kind)
 
 
 def _read_sections(file: BinaryIO, size: int, count: int, level: int) -> Iterator[Section]:
     at = HEADER.itemsize + count * SECTION.itemsize
     if at > size:
-        raise FormatError(f"cut short: {count:,} sections are promised")
+        raise TruncatedError(f"cut short: {count:,} sections are promised")
     first = 0
     for header in _read(file, SECTION, count, "the sections' headers"):
         of = {name: header[name].item() for name in SECTION.names or ()}
         if of["sh_degree"] > MAX_DEGREE:
-            raise FormatError(f"SH degree {of['sh_degree']} is not one that KSPLAT has")
+            raise VersionError(f"SH degree {of['sh_degree']} is not one that KSPLAT has")
         rows = row_type(level, of["sh_degree"])
         buckets, partial = of["buckets"], of["partial_buckets"]
         offset = at + 4 * partial + of["bucket_bytes"] * buckets
         end = offset + of["room"] * rows.itemsize
         if end > size or of["splats"] > of["room"]:
-            raise FormatError(f"cut short: a section promises {of['splats']:,} splats")
+            raise TruncatedError(f"cut short: a section promises {of['splats']:,} splats")
         middles, ends = np.empty((0, 3), np.float32), np.empty(0, np.int64)
         steps = of["steps"] or LEVELS[level][3]
         if level and of["splats"]:

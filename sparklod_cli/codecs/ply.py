@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from plyfile import PlyData, PlyParseError
 
-from ..errors import FormatError
+from ..errors import FormatError, NotSplatsError, TruncatedError
 from ..gaussian import normalized_quat
 from ..limits import MAX_SH_DEGREE
 from ..parallel import chunks_of, ordered_map
@@ -92,12 +92,12 @@ def _run(places: list[int]) -> slice | list[int]:
 def _checked_coefficients(header: Header) -> int:
     """SH coefficients a channel, if the vertices are splats."""
     if "vertex" not in header.elements:
-        raise FormatError("no vertex element in the PLY header")
+        raise NotSplatsError("no vertex element in the PLY header")
     have = _row_type(header).names or ()
     missing = [name for name in REQUIRED if name not in have]
     if missing:
         what = "a point cloud or mesh, not Gaussian splats" if "x" in have else "not Gaussian splats"
-        raise FormatError(f"{what}: its vertices have no {', '.join(missing)}")
+        raise NotSplatsError(f"{what}: its vertices have no {', '.join(missing)}")
     rest = sum(1 for name in have if re.fullmatch(r"f_rest_\d+", name))
     expected = {f"f_rest_{index}" for index in range(rest)}
     if rest % 3 or not expected.issubset(have):
@@ -108,7 +108,7 @@ def _checked_coefficients(header: Header) -> int:
 def _row_type(header: Header) -> np.dtype[Any]:
     row_type = header.row_type("vertex")
     if row_type is None:
-        raise FormatError("the vertices have list properties, splats have none")
+        raise NotSplatsError("the vertices have list properties, splats have none")
     return row_type
 
 
@@ -138,7 +138,7 @@ def _text_rows(file: BinaryIO, header: Header) -> Iterator[Rows]:
     for part in chunks_of(vertices):
         lines = list(islice(file, part.stop - part.start))
         if part.start + len(lines) < part.stop:
-            raise FormatError(f"cut short after {part.start + len(lines):,} of {vertices:,} vertices")
+            raise TruncatedError(f"cut short after {part.start + len(lines):,} of {vertices:,} vertices")
         if not all(map(bytes.strip, lines)):  # numpy would skip them
             raise FormatError(f"empty lines among the vertices after {part.start:,}")
         try:

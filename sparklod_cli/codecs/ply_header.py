@@ -9,7 +9,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
 
-from ..errors import FormatError
+from ..errors import FormatError, TruncatedError
 
 MAX_HEADER = 1 << 20
 
@@ -56,7 +56,7 @@ class Header:
                 need += count * (row_type.itemsize if row_type else 1)
         missing = need - size - (1 if self.text else 0)  # the last separator may be missing
         if missing > 0:
-            raise FormatError(f"cut short: {missing:,} bytes are missing of what the header promises")
+            raise TruncatedError(f"cut short: {missing:,} bytes are missing of what the header promises")
 
 
 def read_header(file: BinaryIO) -> Header:
@@ -72,7 +72,7 @@ def read_header(file: BinaryIO) -> Header:
         if not text.startswith(b"ply"):
             raise FormatError("not a PLY file")
         if not line or len(text) > MAX_HEADER:
-            raise FormatError("the PLY header does not end")
+            raise TruncatedError("the PLY header does not end")
     # plyfile gets what it must parse: no comments, which may be in any encoding, and counts of 0, as it would read all
     # data otherwise, and text value by value.
     lines, counts = [], []

@@ -11,7 +11,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from ..errors import FormatError
+from ..errors import FormatError, VersionError
 from ..parallel import for_chunks
 from ..progress import Progress, silent
 from ..scene import Scene
@@ -54,9 +54,9 @@ def decode(
     meta = files.meta
     version = meta.integer("version") if meta.has("version") else 1
     if version not in (1, 2):
-        raise FormatError(f"SOG version {version} is not known, only 1 and 2 are")
+        raise VersionError(f"SOG version {version} is not known, only 1 and 2 are")
     if version == 1 and meta.has("opacities"):
-        raise FormatError("SOG from before version 1, with opacities apart; only versions 1 and 2 are known")
+        raise VersionError("SOG from before version 1, with opacities apart; only versions 1 and 2 are known")
     count = meta.integer("count") if version == 2 else meta.integer("means", "shape", 0)
     if not 0 < count <= MAX_SPLATS:
         raise FormatError(f"{count:,} splats are not a number that SOG can hold")

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL.WebPImagePlugin import WebPImageFile
 
-from ..errors import FormatError
+from ..errors import FormatError, NotSplatsError
 from .compression import check_promise
 from .stream import size_of
 
@@ -40,7 +40,7 @@ class Meta:
         except (ValueError, RecursionError) as error:
             raise FormatError(f"{META} is not JSON: {error}") from None
         if not isinstance(self._root, dict):
-            raise FormatError(f"{META} is not that of a SOG")
+            raise NotSplatsError(f"{META} is not that of a SOG")
 
     def has(self, key: str) -> bool:
         """Whether there is such a key at the top, and not null."""
@@ -176,7 +176,7 @@ class _Archive:
             raise FormatError(f"not a whole zip archive: {error}") from None
         names = [name for name in self._zip.namelist() if name == META or name.endswith("/" + META)]
         if not names:
-            raise FormatError(f"a zip archive without {META} is not a SOG")
+            raise NotSplatsError(f"a zip archive without {META} is not a SOG")
         self._folder = min(names, key=len).removesuffix(META)
 
     def read(self, name: str) -> bytes:

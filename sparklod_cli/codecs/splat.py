@@ -8,7 +8,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FormatError
+from ..errors import FormatError, TruncatedError
 from ..parallel import chunks_of, ordered_map
 from ..progress import Progress, silent
 from ..scene import Scene
@@ -36,7 +36,7 @@ def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> 
     """
     size = size_of(file)
     if size % ROW.itemsize:
-        raise FormatError(f"cut short, or not .splat: its {size:,} bytes are not a multiple of {ROW.itemsize}")
+        raise TruncatedError(f"cut short, or not .splat: its {size:,} bytes are not a multiple of {ROW.itemsize}")
     count = size // ROW.itemsize
     splats = Splats.empty(count, 0)
 

@@ -8,27 +8,27 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FormatError, TreeError
+from ..errors import FormatError, MembersError, NotSplatsError, TreeError, TruncatedError, VersionError
 from ..limits import DEFAULT_COMPRESSION, DEFAULT_SPZ_VERSION, MAX_FRACTIONAL_BITS, MAX_SH_DEGREE, SPZ_VERSIONS
 from ..parallel import chunks_of, for_chunks, ordered_map
 from ..progress import Progress, silent
 from ..scene import Scene
 from ..sh import notes_on_degree
-from ..splats import FloatArray, Splats
+from ..splats import COLUMNS, FloatArray, Splats
 from ..tree import LodTree
 from . import compression, quantize
 from .spz_layout import ANTIALIASED, EXTENSIONS, LOD, Layout, Stream, StreamRows
 from .stream import Read, rows_of, size_of
 
 MAGIC = 0x5053474E  # "NGSP"
-HEADER = struct.Struct("<IIIBBBx")  # magic, version, splats, SH degree, fractional bits, flags, reserved
+HEADER = struct.Struct("<IIIBBBB")  # magic, version, splats, SH degree, fractional bits, flags, reserved
 HEADER_V4 = struct.Struct("<IIIBBBBI12x")  # ..., streams, offset of the table of streams, reserved
 STREAM_SIZES = struct.Struct("<QQ")  # of a version 4 stream: compressed, uncompressed
 
@@ -118,33 +118,52 @@ def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> 
         FormatError: it is not SPZ, not a version or degree that is known, cut short, corrupt, or claims far more splats
             than its size can hold; an LoD file whose tree is not one.
     """
+    scene = examine(file, threads=threads, progress=progress)
+    if scene.tree is not None:
+        try:
+            scene.tree.validate()
+        except TreeError as error:
+            raise FormatError(f"its LoD tree is broken: {error}") from error
+    return scene
+
+
+def examine(
+    file: BinaryIO, *, columns: Collection[str] = COLUMNS, threads: int = 1, progress: Progress = silent
+) -> Scene:
+    """Reads a file to look at it: only these columns, the others are 0; its tree may be broken.
+
+    The header tells of the flags, of the reserved byte, and of bytes behind the data that belong to nothing.
+
+    Raises:
+        FormatError: as `decode`, but for the tree.
+    """
     size = size_of(file)
     plain = file.read(4) == struct.pack("<I", MAGIC)
     file.seek(0)
-    layout, rows = _read_v4(file, size) if plain else _read_gzip(file, size)
-    splats = Splats.empty(layout.count, min(layout.sh_degree, MAX_SH_DEGREE))
+    header: dict[str, int] = {}
+    layout, rows = _read_v4(file, size, header) if plain else _read_gzip(file, size, header)
+    make = Splats.empty if set(COLUMNS) <= set(columns) else Splats.zeros
+    splats = make(layout.count, min(layout.sh_degree, MAX_SH_DEGREE))
     tree = None
     if layout.flags & LOD:
         tree = LodTree(np.empty(layout.count, np.uint16), np.empty(layout.count, np.uint32))
+    wanted = {*columns, "child_count", "child_start"}
 
     def fill(item: StreamRows) -> int:
         stream, part, codes = item
-        out = _column(splats, tree, stream)[part]
-        out[...] = stream.decode(codes).reshape(out.shape)
+        if stream.column in wanted:
+            out = _column(splats, tree, stream)[part]
+            out[...] = stream.decode(codes).reshape(out.shape)
         return codes.size
 
     done = 0
     for count in ordered_map(fill, rows, threads):
         done += count
         progress("reading", done, layout.total, "B")
-    if tree is not None:
-        try:
-            tree.validate()
-        except TreeError as error:
-            raise FormatError(f"its LoD tree is broken: {error}") from error
     name = f"SPZ {layout.version}" + (" LoD" if tree is not None else "")
-    header = {"version": layout.version, "fractional_bits": layout.fractional_bits}
-    return Scene(splats, tree, bool(layout.flags & ANTIALIASED), name, notes_on_degree(layout.sh_degree), header)
+    antialiased = bool(layout.flags & ANTIALIASED)
+    facts = {"version": layout.version, "fractional_bits": layout.fractional_bits, "flags": layout.flags} | header
+    return Scene(splats, tree, antialiased, name, notes_on_degree(layout.sh_degree), facts)
 
 
 def _column(splats: Splats, tree: LodTree | None, stream: Stream) -> NDArray[Any]:
@@ -166,7 +185,7 @@ def encode(scene: Scene, options: Options, *, progress: Progress = silent) -> It
     layout = Layout(options.version, len(splats), splats.sh_degree, bits, flags)
     data = np.empty(HEADER.size + layout.total, np.uint8)
     data[: HEADER.size] = np.frombuffer(
-        HEADER.pack(MAGIC, layout.version, layout.count, layout.sh_degree, bits, flags), np.uint8
+        HEADER.pack(MAGIC, layout.version, layout.count, layout.sh_degree, bits, flags, 0), np.uint8
     )
     codes, at = {}, HEADER.size
     for stream in layout.streams():
@@ -185,9 +204,9 @@ def encode(scene: Scene, options: Options, *, progress: Progress = silent) -> It
 def _checked(layout: Layout, file_size: int) -> Layout:
     """The layout, if it is one we read and the file's size makes its claims believable."""
     if layout.version not in READABLE:
-        raise FormatError(f"SPZ version {layout.version} is not known, only 1 to 4 are")
+        raise VersionError(f"SPZ version {layout.version} is not known, only 1 to 4 are")
     if layout.sh_degree > (4 if layout.version == 4 else MAX_SH_DEGREE):
-        raise FormatError(f"SH degree {layout.sh_degree} is not one that SPZ version {layout.version} has")
+        raise VersionError(f"SH degree {layout.sh_degree} is not one that SPZ version {layout.version} has")
     if layout.fractional_bits > 31:
         raise FormatError(f"{layout.fractional_bits} fractional bits are more than a position has")
     compression.check_promise(layout.total, file_size)
@@ -200,28 +219,38 @@ def _rows(layout: Layout, read: Read, stream: Stream) -> Iterator[StreamRows]:
         yield stream, part, codes
 
 
-def _read_gzip(file: BinaryIO, size: int) -> tuple[Layout, Iterator[StreamRows]]:
+def _read_gzip(file: BinaryIO, size: int, header: dict[str, int]) -> tuple[Layout, Iterator[StreamRows]]:
     inflate = compression.Inflate(file)
     head = inflate.read(HEADER.size)
     if len(head) < HEADER.size:
-        raise FormatError("cut short inside the SPZ header")
-    magic, *fields = HEADER.unpack(head)
+        raise TruncatedError("cut short inside the SPZ header")
+    magic, *fields, header["reserved"] = HEADER.unpack(head)
     if magic != MAGIC:
-        raise FormatError("gzip, but not of an SPZ file")
+        raise NotSplatsError("gzip, but not of an SPZ file")
     layout = _checked(Layout(*fields), size)
 
     def rows() -> Iterator[StreamRows]:
-        for stream in layout.streams():
-            yield from _rows(layout, inflate.read, stream)
+        try:
+            for stream in layout.streams():
+                yield from _rows(layout, inflate.read, stream)
+        except TruncatedError as error:
+            if inflate.behind().startswith(compression.GZIP_MAGIC):
+                raise MembersError(
+                    f"{error}; its data go on in a second gzip member, which Spark does not read"
+                ) from None
+            raise
         inflate.finish(allow_more=bool(layout.flags & EXTENSIONS))
+        behind = inflate.behind()
+        header["trailing_bytes"] = len(behind) + size - file.tell()
+        header["trailing_members"] = int(behind.startswith(compression.GZIP_MAGIC))
 
     return layout, rows()
 
 
-def _read_v4(file: BinaryIO, size: int) -> tuple[Layout, Iterator[StreamRows]]:
+def _read_v4(file: BinaryIO, size: int, header: dict[str, int]) -> tuple[Layout, Iterator[StreamRows]]:
     head = file.read(HEADER_V4.size)
     if len(head) < HEADER_V4.size:
-        raise FormatError("cut short inside the SPZ header")
+        raise TruncatedError("cut short inside the SPZ header")
     _, version, count, sh_degree, bits, flags, streams, table = HEADER_V4.unpack(head)
     if version != 4:
         raise FormatError(f"SPZ version {version} is not gzipped, as versions 1 to 3 are")
@@ -231,7 +260,7 @@ def _read_v4(file: BinaryIO, size: int) -> tuple[Layout, Iterator[StreamRows]]:
         raise FormatError(f"{streams} streams where SH degree {sh_degree} and flags {flags:#x} need {len(expected)}")
     at = table + streams * STREAM_SIZES.size
     if at > size:
-        raise FormatError("cut short inside the table of streams")
+        raise TruncatedError("cut short inside the table of streams")
     file.seek(table)
     sizes = list(STREAM_SIZES.iter_unpack(file.read(streams * STREAM_SIZES.size)))
     for stream, (packed, unpacked) in zip(expected, sizes, strict=False):
@@ -241,7 +270,7 @@ def _read_v4(file: BinaryIO, size: int) -> tuple[Layout, Iterator[StreamRows]]:
             )
         at += packed
         if at > size:
-            raise FormatError(f"cut short inside stream {stream.name}")
+            raise TruncatedError(f"cut short inside stream {stream.name}")
 
     def rows() -> Iterator[StreamRows]:
         for stream, (packed, _) in zip(expected, sizes, strict=False):
@@ -250,5 +279,6 @@ def _read_v4(file: BinaryIO, size: int) -> tuple[Layout, Iterator[StreamRows]]:
             yield from _rows(layout, unzstd.read, stream)
             unzstd.finish()
             file.seek(end)
+        header["trailing_bytes"] = size - end if streams == len(expected) else 0
 
     return layout, rows()

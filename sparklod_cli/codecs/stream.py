@@ -9,7 +9,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FormatError
+from ..errors import TruncatedError
 from ..parallel import chunks_of, ordered_map
 from ..progress import Progress
 
@@ -37,7 +37,7 @@ def rows_of(read: Read, row_type: np.dtype[Any], count: int, what: str = "splats
         data = read((part.stop - part.start) * row_type.itemsize)
         whole = len(data) // row_type.itemsize
         if part.start + whole < part.stop:
-            raise FormatError(f"cut short after {part.start + whole:,} of {count:,} {what}")
+            raise TruncatedError(f"cut short after {part.start + whole:,} of {count:,} {what}")
         yield part, np.frombuffer(data, row_type)
 
 

@@ -1,0 +1,1 @@
+"""What is in a splat file, and whether that is as it should be."""

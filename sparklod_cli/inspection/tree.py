@@ -1,0 +1,172 @@
+"""What a Level-of-Detail tree is like, and what is wrong with it, however broken it is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..gaussian import spark_size
+from ..lod.kernels.walk import walk
+from ..splats import FloatArray, Splats
+from ..tree import LodTree
+from .findings import Finding
+
+#: Splats of a chunk, as Spark streams them.
+CHUNK_SPLATS = 65_536
+
+#: A node may be this much smaller than its largest child. Of the nodes of good trees, quick ones of dense and of sparse
+#: scenes, the worst is 0.6 times as large.
+LEAST_RATIO = 0.5
+
+#: Coarse before fine: of so many parts of a file, none may have a median size of more than this times the least before.
+PARTS, MOST_RISE = 16, 2.0
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Level:
+    """The nodes that are equally many edges from the root.
+
+    Attributes:
+        nodes, leaves: how many.
+        size: the geometric mean of their feature sizes (`gaussian.spark_size`), world units; None where one is 0.
+    """
+
+    nodes: int
+    leaves: int
+    size: float | None
+
+
+@dataclass(frozen=True)
+class TreeFacts:
+    """What a tree is like.
+
+    Attributes:
+        leaves, inner: nodes without and with children.
+        growth: nodes over leaves.
+        depth: edges to the deepest node.
+        levels: by the number of edges from the root.
+        children: how many inner nodes have so many children, by that number as text.
+        more_than_opaque: the share of nodes with D > 1.
+        chunks: of `CHUNK_SPLATS` nodes.
+        chunks_of_coarse_cut: how many of them a viewer needs for the coarsest cut, the one that divides the largest
+            nodes first, of at most so many nodes as a chunk has.
+    """
+
+    leaves: int
+    inner: int
+    growth: float
+    depth: int
+    levels: list[Level]
+    children: dict[str, int]
+    more_than_opaque: float
+    chunks: int
+    chunks_of_coarse_cut: int
+
+
+def examine(splats: Splats, tree: LodTree) -> tuple[TreeFacts, list[Finding]]:
+    """The facts of a tree and what is wrong with it; of a broken one, the facts of what its root leads to.
+
+    Args:
+        splats: N nodes, of which scale and opacity are looked at.
+        tree: their links, N of them and at least one.
+    """
+    size = spark_size(splats)
+    parent, references, depth, limit = walk(tree.child_count, tree.child_start, size)
+    reached = depth >= 0
+    leaf = tree.is_leaf
+    levels = _levels(depth, reached, leaf, size)
+    many, counts = np.unique(tree.child_count[~leaf], return_counts=True)
+    facts = TreeFacts(
+        leaves=int(np.count_nonzero(leaf)),
+        inner=int(np.count_nonzero(~leaf)),
+        growth=round(len(tree) / max(1, int(np.count_nonzero(leaf))), 4),
+        depth=len(levels) - 1,
+        levels=levels,
+        children={str(children): int(count) for children, count in zip(many, counts, strict=True)},
+        more_than_opaque=round(float(np.count_nonzero(splats.opacity > 1)) / len(tree), 4),
+        chunks=-(-len(tree) // CHUNK_SPLATS),
+        chunks_of_coarse_cut=len(np.unique(_coarse_cut(tree, limit) // CHUNK_SPLATS)),
+    )
+    findings = _link_findings(tree, references, depth)
+    findings += _node_findings(splats, tree, parent, size)
+    return facts, findings
+
+
+def _levels(depth: NDArray[np.int32], reached: Mask, leaf: Mask, size: FloatArray) -> list[Level]:
+    with np.errstate(divide="ignore", invalid="ignore"):
+        logs = np.log(size[reached])
+        nodes = np.bincount(depth[reached])
+        means = np.exp(np.bincount(depth[reached], weights=logs) / nodes)
+    leaves = np.bincount(depth[reached & leaf], minlength=len(nodes))
+    return [
+        Level(int(count), int(ends), float(f"{mean:.4g}") if np.isfinite(mean) and mean > 0 else None)
+        for count, ends, mean in zip(nodes, leaves, means, strict=True)
+    ]
+
+
+def _coarse_cut(tree: LodTree, limit: FloatArray) -> NDArray[np.int64]:
+    """The nodes of the cut that divides the largest first, as far as it has no more than a chunk's."""
+    inner = np.flatnonzero(~tree.is_leaf & (limit > 0))
+    if len(inner) > CHUNK_SPLATS:  # each adds a node at least, so no more than these can be divided
+        inner = inner[np.argpartition(-limit[inner], CHUNK_SPLATS)[:CHUNK_SPLATS]]
+    inner = inner[np.argsort(-limit[inner], kind="stable")]
+    fits = np.cumsum(tree.child_count[inner].astype(np.int64) - 1) + 1 <= CHUNK_SPLATS
+    divided = inner[: int(np.argmin(fits)) if not fits.all() else len(inner)]
+    count = tree.child_count[divided].astype(np.int64)
+    start = tree.child_start[divided].astype(np.int64)
+    children = np.repeat(start - (np.cumsum(count) - count), count) + np.arange(count.sum())
+    nodes = np.concatenate([np.zeros(1, np.int64), children])
+    return np.setdiff1d(nodes[nodes < len(tree)], divided)
+
+
+def _found(code: str, mask: Mask, what: str) -> list[Finding]:
+    """A finding of the nodes of a mask, if there are any; {index} and {count} stand for the first and how many."""
+    count = int(np.count_nonzero(mask))
+    if not count:
+        return []
+    index = int(np.argmax(mask))
+    more = f" (and {count - 1:,} more)" if count > 1 else ""
+    return [Finding(code, f"node {index:,} {what}{more}", index, count)]
+
+
+def _link_findings(tree: LodTree, references: NDArray[np.int32], depth: NDArray[np.int32]) -> list[Finding]:
+    leaf = tree.is_leaf
+    node = np.arange(len(tree))
+    start = tree.child_start.astype(np.int64)
+    end = start + tree.child_count
+    nobodys = references == 0
+    nobodys[0] = False
+    root = np.zeros(len(tree), np.bool_)
+    root[0] = references[0] > 0
+    return [
+        *_found("tree.root", root, "is the root, and the child of another node"),
+        *_found("tree.range", ~leaf & (end > len(tree)), f"has children past the last node, {len(tree) - 1:,}"),
+        *_found("tree.order", ~leaf & (start <= node), "comes after one of its children, or is its own"),
+        *_found("tree.shared", references > 1, "is the child of more than one node"),
+        *_found("tree.orphan", nobodys, "is nobody's child"),
+        *_found("tree.unreachable", (depth < 0) & (references > 0), "has a parent, but the root does not lead to it"),
+        *_found("tree.leaf-start", leaf & (start != 0), "is a leaf with a child_start"),
+        *_found("tree.single-child", tree.child_count == 1, "has a single child"),
+    ]
+
+
+def _node_findings(splats: Splats, tree: LodTree, parent: NDArray[np.int64], size: FloatArray) -> list[Finding]:
+    findings = _found("tree.leaf-opacity", tree.is_leaf & (splats.opacity > 1), "is a leaf and more than opaque")
+    children = np.flatnonzero(parent >= 0)
+    smaller = np.zeros(len(tree), np.bool_)
+    above = parent[children]
+    smaller[above[size[above] < np.float32(LEAST_RATIO) * size[children]]] = True
+    findings += _found("tree.size", smaller, "is less than half as large as one of its children")
+    parts = [np.median(part) for part in np.array_split(size, min(PARTS, len(size)))]
+    least = np.minimum.accumulate(parts)
+    rises = np.flatnonzero(parts[1:] > MOST_RISE * least[:-1])
+    if len(size) >= PARTS * PARTS and rises.size:
+        at = int((rises[0] + 1) * len(size) // PARTS)
+        findings.append(
+            Finding("tree.coarse-first", f"nodes from {at:,} on are coarser than those before them", at, len(size) - at)
+        )
+    return findings

@@ -1,0 +1,180 @@
+"""What the numbers of splats are like, and what is wrong with them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..codecs import quantize
+from ..gaussian import spark_size
+from ..scene import Scene
+from ..sh import COEFFICIENTS
+from ..splats import COLUMNS, FloatArray, Splats
+from .findings import Finding
+
+#: The quantities that are looked at, by name; each makes (N,) numbers of N splats. `SH_QUANTITIES` join them.
+QUANTITIES: dict[str, Callable[[Splats], FloatArray]] = {
+    "x": lambda splats: splats.center[:, 0],
+    "y": lambda splats: splats.center[:, 1],
+    "z": lambda splats: splats.center[:, 2],
+    "scale": lambda splats: splats.scale.max(axis=1),
+    "scale_min": lambda splats: splats.scale.min(axis=1),
+    "anisotropy": lambda splats: splats.scale.max(axis=1) / splats.scale.min(axis=1),
+    "opacity": lambda splats: splats.opacity,
+    "size": spark_size,
+    "red": lambda splats: splats.rgb[:, 0],
+    "green": lambda splats: splats.rgb[:, 1],
+    "blue": lambda splats: splats.rgb[:, 2],
+}
+SH_QUANTITIES = ("sh1", "sh2", "sh3")  # root mean square of a splat's coefficients of a degree
+
+#: Those that a report has without --stats.
+MAIN = ("scale", "opacity", "anisotropy")
+PERCENTILES = {"p1": 1, "p25": 25, "p50": 50, "p75": 75, "p99": 99}
+
+#: The share of scales at the end of what SPZ holds from which on it is said.
+MANY = 0.01
+
+#: Coordinates from here on become infinite as float16, which Spark's PackedSplats have.
+FLOAT16_END = 65_520
+
+
+@dataclass(frozen=True)
+class Box:
+    """An axis-aligned box, world units."""
+
+    min: list[float]
+    max: list[float]
+
+
+@dataclass(frozen=True)
+class ValueFacts:
+    """What the numbers are like; those that are not finite are counted and left out.
+
+    Attributes:
+        box: of the centres.
+        box_98: between the 1 % and the 99 % quantiles of each coordinate.
+        non_finite: splats with a number that is not finite.
+        zero_opacity, zero_scale: splats that cannot be drawn.
+        more_than_opaque: splats with an opacity above 1.
+        quantities: min, mean, max and percentiles of `QUANTITIES`, by their names.
+    """
+
+    box: Box | None
+    box_98: Box | None
+    non_finite: int
+    zero_opacity: int
+    zero_scale: int
+    more_than_opaque: int
+    quantities: dict[str, dict[str, float | None]]
+
+
+def names_of(splats: Splats) -> list[str]:
+    """The quantities that these splats have."""
+    return [*QUANTITIES, *SH_QUANTITIES[: splats.sh_degree]]
+
+
+def quantity(splats: Splats, name: str) -> FloatArray:
+    """(N,) a quantity by its name; may have numbers that are not finite."""
+    with np.errstate(all="ignore"):
+        if name in QUANTITIES:
+            return QUANTITIES[name](splats)
+        degree = SH_QUANTITIES.index(name)
+        return np.sqrt(np.square(splats.sh[:, COEFFICIENTS[degree] : COEFFICIENTS[degree + 1]]).mean(axis=(1, 2)))
+
+
+def finite_rows(splats: Splats) -> NDArray[np.bool_]:
+    """(N,) whether all numbers of a splat are finite."""
+    finite = np.ones(len(splats), np.bool_)
+    with np.errstate(all="ignore"):
+        for name in COLUMNS:
+            finite &= np.isfinite(getattr(splats, name).reshape(len(splats), -1).sum(axis=1, dtype=np.float64))
+    return finite
+
+
+def examine(splats: Splats, *, all_quantities: bool = False) -> ValueFacts:
+    """The facts of N splats.
+
+    Args:
+        splats: N of them.
+        all_quantities: all of `QUANTITIES`, not only those of `MAIN`.
+    """
+    finite = finite_rows(splats)
+    good = splats if finite.all() else splats.take(finite)
+    names = names_of(splats) if all_quantities else MAIN
+    box = box_98 = None
+    if len(good):
+        box = Box(_numbers(good.center.min(axis=0)), _numbers(good.center.max(axis=0)))
+        low, high = np.percentile(good.center, [1, 99], axis=0)
+        box_98 = Box(_numbers(low), _numbers(high))
+    return ValueFacts(
+        box=box,
+        box_98=box_98,
+        non_finite=int(np.count_nonzero(~finite)),
+        zero_opacity=int(np.count_nonzero(good.opacity == 0)),
+        zero_scale=int(np.count_nonzero(good.scale.max(axis=1, initial=0) == 0)),
+        more_than_opaque=int(np.count_nonzero(good.opacity > 1)),
+        quantities={name: _summary(quantity(good, name)) for name in names},
+    )
+
+
+def _summary(values: FloatArray) -> dict[str, float | None]:
+    values = values[np.isfinite(values)]
+    if not len(values):
+        return dict.fromkeys(("min", *PERCENTILES, "max", "mean"))
+    levels = _numbers(np.percentile(values, [0, *PERCENTILES.values(), 100]))
+    summary: dict[str, float | None] = dict(zip(("min", *PERCENTILES, "max"), levels, strict=True))
+    return summary | {"mean": _number(values.mean(dtype=np.float64))}
+
+
+def _number(value: Any) -> float:
+    return float(f"{float(value):.6g}")
+
+
+def _numbers(values: NDArray[Any]) -> list[float]:
+    return [_number(value) for value in values]
+
+
+def check(scene: Scene) -> list[Finding]:
+    """What is wrong with the numbers of a scene."""
+    splats = scene.splats
+    if not len(splats):
+        return [Finding("values.empty", "there are no splats")]
+    found = []
+
+    def report(code: str, mask: Any, what: str) -> None:
+        count = int(np.count_nonzero(mask))
+        if count:
+            index = int(np.argmax(mask))
+            found.append(Finding(code, f"{count:,} splats {what}; the first is {index:,}", index, count))
+
+    finite = finite_rows(splats)
+    report("values.non-finite", ~finite, "have a number that is not finite, or a rotation of length 0")
+    top = np.inf if scene.tree is not None else 1
+    outside = (splats.opacity < 0) | (splats.opacity > top)
+    report("values.opacity", finite & outside, f"have an opacity outside of 0..{top:g}")
+    invisible = (splats.opacity == 0) | (splats.scale.max(axis=1) == 0)
+    report("values.invisible", finite & invisible, "cannot be drawn: their opacity or their scale is 0")
+    if "fractional_bits" in scene.header:
+        most = quantize.FIXED24_MAX * 2.0 ** -int(scene.header["fractional_bits"])
+        report(
+            "values.center-clamped",
+            (np.abs(splats.center) >= most).any(axis=1),
+            f"have a coordinate of {most:g}, the most that its code holds",
+        )
+        ends = quantize.decode_log_scale(np.array([0, 255], np.uint8))
+        clamped = ((splats.scale <= ends[0]) | (splats.scale >= ends[1])).any(axis=1)
+        if np.count_nonzero(clamped) > MANY * len(splats):
+            report(
+                "values.scale-clamped", clamped, f"have a scale of {ends[0]:.2g} or {ends[1]:.0f}, which SPZ ends at"
+            )
+    report(
+        "values.center-far",
+        (np.abs(splats.center) >= FLOAT16_END).any(axis=1),
+        f"have a coordinate of {FLOAT16_END:,} or more",
+    )
+    return found
