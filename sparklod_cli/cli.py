@@ -16,14 +16,14 @@ from .commands.console import say, say_error
 from .errors import SparklodError
 
 #: Sub-commands, each a module of `commands` with a function of its name; imported when it is called for.
-COMMANDS = {"build-lod": "build_lod"}
+COMMANDS = {"build-lod": "build_lod", "inspect": "inspect"}
 
 #: Signals that end a run: Ctrl-C, a polite kill, a terminal that is closed.
 ENDING = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 
 EPILOG = """
 \b
-Exit status: 0 done, 1 something failed, 2 wrong usage, 130 interrupted.
+Exit status: 0 done, 1 something failed, 2 wrong usage, 3 a check did not hold, 130 interrupted.
 Shell completion: eval "$(_SPARKLOD_COMPLETE=bash_source sparklod)", or zsh_source, fish_source.
 """
 

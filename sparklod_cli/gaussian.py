@@ -51,15 +51,18 @@ def covariance(scale: FloatArray, quat_xyzw: FloatArray) -> NDArray[np.float64]:
 
 def lod_opacity(opacity: FloatArray) -> FloatArray:
     """Spark's opacity parameter D from linear opacity A: A up to 1, sqrt(1 + e * ln A) above (Spark's LoD design)."""
-    above = np.maximum(opacity, np.float32(1))
-    return np.where(opacity > 1, np.sqrt(1 + np.float32(np.e) * np.log(above)), opacity).astype(np.float32, copy=False)
+    d = np.array(opacity, np.float32)
+    above = d > 1  # few are
+    d[above] = np.sqrt(1 + np.float32(np.e) * np.log(d[above]))
+    return d
 
 
 def linear_opacity(lod_opacity: FloatArray) -> FloatArray:
     """Linear opacity A from Spark's D, the inverse of `lod_opacity`: exp((D ** 2 - 1) / e) above 1."""
-    above = np.maximum(lod_opacity, np.float32(1))
-    linear = np.exp((above * above - 1) / np.float32(np.e))
-    return np.where(lod_opacity > 1, linear, lod_opacity).astype(np.float32, copy=False)
+    linear = np.array(lod_opacity, np.float32)
+    above = linear > 1
+    linear[above] = np.exp((linear[above] * linear[above] - 1) / np.float32(np.e))
+    return linear
 
 
 def spark_size(splats: Splats) -> FloatArray:
@@ -68,8 +71,18 @@ def spark_size(splats: Splats) -> FloatArray:
     Found in its output, see docs/decisions/2026-11-20-what-spark-does.md; its `encode_lod_tree` has it so.
     """
     x, y, z = splats.scale.T
-    beyond = np.maximum(lod_opacity(splats.opacity) - 1, 0)
-    return 2 * (1 + np.float32(0.7) * beyond) * ((x + y + z) / np.float32(3))
+    mean = x + y
+    mean += z
+    mean /= np.float32(3)
+    # 2 * (1 + 0.7 * beyond) * mean, in place: there may be tens of millions.
+    factor = lod_opacity(splats.opacity)
+    factor -= 1
+    np.maximum(factor, 0, out=factor)
+    factor *= np.float32(0.7)
+    factor += 1
+    factor *= 2
+    factor *= mean
+    return factor
 
 
 def design_size(splats: Splats) -> FloatArray:

@@ -88,6 +88,23 @@ def _opened(path: Path) -> Iterator[tuple[BinaryIO, Format, dict[str, Any]]]:
         raise UnreadableError(f"cannot be read: {_reason(error)}") from None
 
 
+def size_on_disk(path: Path) -> int | None:
+    """Bytes of a file, None where that cannot be told."""
+    try:
+        return path.stat().st_size
+    except OSError:
+        return None
+
+
+def read_text(path: Path) -> str:
+    """A small text file; `UnreadableError`, naming it, where that cannot be."""
+    try:
+        return path.read_text(encoding="utf-8")
+    except (OSError, ValueError) as error:
+        reason = _reason(error) if isinstance(error, OSError) else "it is not text"
+        raise UnreadableError(f"{path} cannot be read: {reason}") from None
+
+
 def _in_folder(folder: Path) -> Path:
     path = folder / "meta.json"
     if not path.is_file():

@@ -23,3 +23,6 @@ PLAIN_SUFFIXES = (".spz", ".ply", ".splat")
 
 #: In-memory layouts of viewers that a tree can be dumped in.
 ENCODINGS = ("packed", "ext", "lodtree", "texture")
+
+#: What colours can mean in a picture of `inspect`.
+PLOT_BY = ("level", "opacity", "size", "chunk")

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import InvalidSplatsError
-from .splats import COLUMNS, Splats
+from .splats import Splats
 
 Vector = tuple[float, float, float]
 
@@ -47,7 +47,7 @@ class Selection:
         """
         if len(splats) == 0:
             raise InvalidSplatsError("it has no splats")
-        finite = _finite(splats)
+        finite = splats.is_finite()
         if not (self.drop_invalid or finite.all()):
             bad = np.flatnonzero(~finite)
             raise InvalidSplatsError(
@@ -83,17 +83,6 @@ class Selection:
             offset = center.astype(np.float64) - middle
             inside &= np.einsum("ij,ij->i", offset, offset) <= radius * radius
         return inside
-
-
-def _finite(splats: Splats) -> NDArray[np.bool_]:
-    finite = np.ones(len(splats), np.bool_)
-    for name in COLUMNS:
-        column = getattr(splats, name).reshape(len(splats), -1)
-        # A sum is finite only if all its terms are, unless huge ones overflow: those rows are looked at one by one.
-        with np.errstate(over="ignore", invalid="ignore"):
-            suspect = np.flatnonzero(~np.isfinite(column.sum(axis=1, dtype=np.float64)))
-        finite[suspect[~np.isfinite(column[suspect]).all(axis=1)]] = False
-    return finite
 
 
 def describe(dropped: dict[str, int]) -> str:

@@ -78,6 +78,17 @@ class Splats:
         """The splats at an index array, a boolean mask or a slice: the one way to filter, permute and truncate."""
         return Splats(**{name: np.ascontiguousarray(getattr(self, name)[index]) for name in COLUMNS})
 
+    def is_finite(self) -> NDArray[np.bool_]:
+        """(N,) whether all numbers of a splat are finite."""
+        finite = np.ones(len(self), np.bool_)
+        for name in COLUMNS:
+            column = getattr(self, name).reshape(len(self), -1)
+            # A sum is finite only if all its terms are, unless huge ones overflow: those rows are looked at one by one.
+            with np.errstate(over="ignore", invalid="ignore"):
+                suspect = np.flatnonzero(~np.isfinite(column.sum(axis=1, dtype=np.float64)))
+            finite[suspect[~np.isfinite(column[suspect]).all(axis=1)]] = False
+        return finite
+
     def with_max_sh(self, degree: int) -> Splats:
         """These splats with the SH coefficients above `degree` left out."""
         keep = COEFFICIENTS[degree]

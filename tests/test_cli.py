@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from sparklod_cli import __version__
-from sparklod_cli.cli import cli, run
+from sparklod_cli.cli import COMMANDS, cli, run
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod import quick
 
@@ -258,19 +258,19 @@ def test_an_interruption_leaves_nothing_behind(tmp_path: Path, how: signal.Signa
 def test_version_and_help_everywhere() -> None:
     for arguments in (["--version"], ["build-lod", "--version"]):
         assert sparklod(*arguments).stdout.decode() == f"sparklod, version {__version__}\n"
-    for arguments in (["--help"], ["build-lod", "--help"]):
+    for arguments in (["--help"], *([command, "--help"] for command in COMMANDS)):
         assert b"Usage: sparklod" in sparklod(*arguments).stdout
     assert b"Examples:" in sparklod("build-lod", "--help").stdout
 
 
 def test_help_imports_nothing_heavy() -> None:
     code = "import sys; from sparklod_cli.cli import run; run(sys.argv[1:]); print(*sys.modules, file=sys.stderr)"
-    for arguments in (["--help"], ["build-lod", "--help"]):
+    for arguments in (["--help"], *([command, "--help"] for command in COMMANDS)):
         result = subprocess.run(
             [sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=True, cwd=ROOT
         )
         modules = set(result.stderr.split())
-        assert not modules & {"numpy", "numba", "plyfile", "zstandard", "tqdm", "open3d", "pyvista"}
+        assert not modules & {"numpy", "numba", "plyfile", "zstandard", "tqdm", "PIL", "open3d", "pyvista"}
 
 
 def test_completion_knows_the_options() -> None:
@@ -280,21 +280,3 @@ def test_completion_knows_the_options() -> None:
         [sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=ROOT, env={**os.environ, **words}
     )
     assert "--overwrite" in result.stdout
-
-
-def test_the_readme_quotes_the_help() -> None:
-    """Made by `python -m tests.test_cli`."""
-    assert help_text() in (ROOT / "README.md").read_text()
-
-
-def help_text() -> str:
-    command = cli.get_command(click.Context(cli), "build-lod")
-    assert command is not None
-    width = {"terminal_width": 100, "max_content_width": 100}
-    parent = click.Context(cli, info_name="sparklod", **cli.context_settings)
-    context = click.Context(command, info_name="build-lod", parent=parent, **width, **command.context_settings)
-    return command.get_help(context)
-
-
-if __name__ == "__main__":
-    print(help_text())

@@ -5,7 +5,10 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import click
 import pytest
+
+from sparklod_cli.cli import COMMANDS, cli
 
 from .conftest import FIXTURES, ROOT
 
@@ -23,3 +26,31 @@ def test_the_readmes_program_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.chdir(tmp_path)
     exec(code[1], {})
     assert (tmp_path / "scene-lod.spz").exists()
+
+
+def test_the_readme_quotes_the_help() -> None:
+    """Made by `python -m tests.test_docs`."""
+    text = (ROOT / "README.md").read_text()
+    assert with_help(text) == text
+
+
+def with_help(text: str) -> str:
+    """The README with what `--help` says of each command in the first block of its section."""
+    for name in COMMANDS:
+        pattern = re.compile(rf"(?<=\n## {name}\n\n```\n).*?(?=\n```\n)", re.DOTALL)
+        assert pattern.search(text), name
+        text = pattern.sub(lambda _, name=name: help_of(name), text, count=1)
+    return text
+
+
+def help_of(name: str) -> str:
+    command = cli.get_command(click.Context(cli), name)
+    assert command is not None
+    width = {"terminal_width": 100, "max_content_width": 100}
+    parent = click.Context(cli, info_name="sparklod", **cli.context_settings)
+    context = click.Context(command, info_name=name, parent=parent, **width, **command.context_settings)
+    return command.get_help(context)
+
+
+if __name__ == "__main__":
+    (ROOT / "README.md").write_text(with_help((ROOT / "README.md").read_text()))

@@ -65,7 +65,8 @@ def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> 
     decode_rows(_rows(file, header, "vertex"), unpack, count, threads, progress)
     if coefficients:
         decode_rows(_rows(file, header, "sh"), unpack_sh, count, threads, progress)
-    return Scene(splats, format="compressed PLY", notes=notes_on_degree(degree))
+    facts = {"chunks": header.count("chunk"), "color_bounds": int(bounds["color"] is not None)}
+    return Scene(splats, format="compressed PLY", notes=notes_on_degree(degree), header=facts)
 
 
 def _within(bounds: FloatArray | None, part: slice, unit: FloatArray) -> FloatArray:

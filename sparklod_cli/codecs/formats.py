@@ -22,8 +22,8 @@ class Format:
         beginning: a regular expression that the first bytes of its files match; None where they can be anything, and
             only the suffix tells.
         companions: its files name others beside them; `decode` takes another argument, `beside`, which opens these.
-        selective: its module also has `examine(file, *, columns, threads, progress) -> Scene`, which decodes some columns
-            and passes a broken tree on.
+        selective: its module also has `examine(file, *, columns, threads, progress) -> Scene`, which decodes columns
+            only and passes a broken tree on.
     """
 
     name: str

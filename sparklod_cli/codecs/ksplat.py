@@ -136,7 +136,7 @@ def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> 
         splats.sh[part, coefficients:] = 0  # other sections have more
 
     decode_rows(rows(), fill, count, threads, progress)
-    return Scene(splats, format="KSPLAT")
+    return Scene(splats, format="KSPLAT", header={"level": level, "sections": len(sections)})
 
 
 def _centers(section: Section, part: slice, codes: NDArray[np.uint16]) -> FloatArray:

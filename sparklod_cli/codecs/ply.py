@@ -68,7 +68,8 @@ def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> 
         splats.sh[part] = matrix[:, rest].reshape(len(some), 3, coefficients)[:, :, :kept].transpose(0, 2, 1)
 
     decode_rows(rows, fill, count, threads, progress)
-    return Scene(splats, format="PLY", notes=notes_on_degree(degree))
+    facts = {"properties": len(names), "ascii": int(header.text), "big_endian": int(header.byte_order == ">")}
+    return Scene(splats, format="PLY", notes=notes_on_degree(degree), header=facts)
 
 
 def _matrix(rows: NDArray[Any]) -> FloatArray:

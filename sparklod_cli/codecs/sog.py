@@ -73,7 +73,8 @@ def decode(
 
         for_chunks(work, count, threads, report)
     antialiased = version == 2 and meta.has("antialias") and meta.flag("antialias")
-    return Scene(splats, antialiased=antialiased, format=f"SOG {version}")
+    header = {"version": version, "palette": len(palette) if palette is not None else 0, "bytes": files.size}
+    return Scene(splats, antialiased=antialiased, format=f"SOG {version}", header=header)
 
 
 def _passes(files: Files, version: int, splats: Splats, palette: FloatArray | None) -> Iterator[Pass]:

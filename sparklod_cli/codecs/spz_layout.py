@@ -16,6 +16,7 @@ from . import quantize
 
 #: Flags of the header.
 ANTIALIASED, EXTENSIONS, LOD = 0x01, 0x02, 0x80
+KNOWN_FLAGS = ANTIALIASED | EXTENSIONS | LOD
 
 
 class Stream(NamedTuple):

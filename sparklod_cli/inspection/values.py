@@ -13,7 +13,7 @@ from ..codecs import quantize
 from ..gaussian import spark_size
 from ..scene import Scene
 from ..sh import COEFFICIENTS
-from ..splats import COLUMNS, FloatArray, Splats
+from ..splats import FloatArray, Splats
 from .findings import Finding
 
 #: The quantities that are looked at, by name; each makes (N,) numbers of N splats. `SH_QUANTITIES` join them.
@@ -36,8 +36,9 @@ SH_QUANTITIES = ("sh1", "sh2", "sh3")  # root mean square of a splat's coefficie
 MAIN = ("scale", "opacity", "anisotropy")
 PERCENTILES = {"p1": 1, "p25": 25, "p50": 50, "p75": 75, "p99": 99}
 
-#: The share of scales at the end of what SPZ holds from which on it is said.
-MANY = 0.01
+#: The shares of scales at the end of what SPZ holds, and of splats that cannot be drawn, from which on it is said: of
+#: many a good file's splats some are rounded to that.
+MANY_CLAMPED, MANY_INVISIBLE = 0.01, 0.1
 
 #: Coordinates from here on become infinite as float16, which Spark's PackedSplats have.
 FLOAT16_END = 65_520
@@ -87,15 +88,6 @@ def quantity(splats: Splats, name: str) -> FloatArray:
         return np.sqrt(np.square(splats.sh[:, COEFFICIENTS[degree] : COEFFICIENTS[degree + 1]]).mean(axis=(1, 2)))
 
 
-def finite_rows(splats: Splats) -> NDArray[np.bool_]:
-    """(N,) whether all numbers of a splat are finite."""
-    finite = np.ones(len(splats), np.bool_)
-    with np.errstate(all="ignore"):
-        for name in COLUMNS:
-            finite &= np.isfinite(getattr(splats, name).reshape(len(splats), -1).sum(axis=1, dtype=np.float64))
-    return finite
-
-
 def examine(splats: Splats, *, all_quantities: bool = False) -> ValueFacts:
     """The facts of N splats.
 
@@ -103,7 +95,7 @@ def examine(splats: Splats, *, all_quantities: bool = False) -> ValueFacts:
         splats: N of them.
         all_quantities: all of `QUANTITIES`, not only those of `MAIN`.
     """
-    finite = finite_rows(splats)
+    finite = splats.is_finite()
     good = splats if finite.all() else splats.take(finite)
     names = names_of(splats) if all_quantities else MAIN
     box = box_98 = None
@@ -150,31 +142,27 @@ def check(scene: Scene) -> list[Finding]:
         count = int(np.count_nonzero(mask))
         if count:
             index = int(np.argmax(mask))
-            found.append(Finding(code, f"{count:,} splats {what}; the first is {index:,}", index, count))
+            more = f" and {count - 1:,} more" if count > 1 else ""
+            found.append(Finding(code, f"splat {index:,}{more}: {what}", index, count))
 
-    finite = finite_rows(splats)
-    report("values.non-finite", ~finite, "have a number that is not finite, or a rotation of length 0")
+    finite = splats.is_finite()
+    report("values.non-finite", ~finite, "a number is not finite, or the rotation has length 0")
     top = np.inf if scene.tree is not None else 1
     outside = (splats.opacity < 0) | (splats.opacity > top)
-    report("values.opacity", finite & outside, f"have an opacity outside of 0..{top:g}")
+    report("values.opacity", finite & outside, f"the opacity is not in 0..{top:g}")
     invisible = (splats.opacity == 0) | (splats.scale.max(axis=1) == 0)
-    report("values.invisible", finite & invisible, "cannot be drawn: their opacity or their scale is 0")
-    if "fractional_bits" in scene.header:
-        most = quantize.FIXED24_MAX * 2.0 ** -int(scene.header["fractional_bits"])
-        report(
-            "values.center-clamped",
-            (np.abs(splats.center) >= most).any(axis=1),
-            f"have a coordinate of {most:g}, the most that its code holds",
-        )
-        ends = quantize.decode_log_scale(np.array([0, 255], np.uint8))
-        clamped = ((splats.scale <= ends[0]) | (splats.scale >= ends[1])).any(axis=1)
-        if np.count_nonzero(clamped) > MANY * len(splats):
-            report(
-                "values.scale-clamped", clamped, f"have a scale of {ends[0]:.2g} or {ends[1]:.0f}, which SPZ ends at"
-            )
-    report(
-        "values.center-far",
-        (np.abs(splats.center) >= FLOAT16_END).any(axis=1),
-        f"have a coordinate of {FLOAT16_END:,} or more",
-    )
+    if np.count_nonzero(invisible) > MANY_INVISIBLE * len(splats):
+        report("values.invisible", finite & invisible, "cannot be drawn, opacity or scale is 0")
+    header = scene.header
+    if header.get("version", 0) >= 2 and "fractional_bits" in header:  # SPZ version 1 has floats
+        most = quantize.FIXED24_MAX * 2.0 ** -int(header["fractional_bits"])
+        clamped = (np.abs(splats.center) >= most).any(axis=1)
+        report("values.center-clamped", clamped, f"a coordinate is {most:g}, the most that its code holds")
+    if "fractional_bits" in header:
+        low, high = quantize.decode_log_scale(np.array([0, 255], np.uint8))
+        clamped = ((splats.scale <= low) | (splats.scale >= high)).any(axis=1)
+        if np.count_nonzero(clamped) > MANY_CLAMPED * len(splats):
+            report("values.scale-clamped", clamped, f"a scale is {low:.2g} or {high:.0f}, the ends of what SPZ holds")
+    far = (np.abs(splats.center) >= FLOAT16_END).any(axis=1)
+    report("values.center-far", far, f"a coordinate is {FLOAT16_END:,} or more, which float16 cannot hold")
     return found

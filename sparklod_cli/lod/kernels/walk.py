@@ -6,10 +6,16 @@ import numpy as np
 
 from ...jit import kernel
 
+#: A tree has fewer links than nodes; of a broken one so many times as many are followed.
+STEPS = 4
+
 
 @kernel()
 def walk(child_count, child_start, size):
-    """Visits every node that the root leads to, once, in linear time, whatever the links are.
+    """Visits every node that the root leads to, once.
+
+    In linear time whatever the links are: those of a broken tree, where nodes share children, are followed so often and
+    no further.
 
     Args:
         child_count: (N,) of any unsigned type; N is at least 1.
@@ -17,33 +23,85 @@ def walk(child_count, child_start, size):
         size: (N,) of each node, any unit.
 
     Returns:
-        parent: (N,) int64, the node of the lowest index that has it as a child; -1 where there is none.
-        references: (N,) int32, how many nodes have it as a child.
         depth: (N,) int32, edges from the root by the first way found; -1 where none leads there.
         limit: (N,) float32, the least size from the root to the node on that way; 0 where none leads there.
     """
     count = len(child_count)
-    parent = np.full(count, -1, np.int64)
-    references = np.zeros(count, np.int32)
-    for node in range(count):
-        start = np.int64(child_start[node])
-        for child in range(start, min(count, start + np.int64(child_count[node]))):
-            if references[child] == 0:
-                parent[child] = node
-            references[child] += 1
     depth = np.full(count, -1, np.int32)
     limit = np.zeros(count, np.float32)
-    queue = np.empty(count, np.int64)
+    queue = np.empty(count, np.int32)
     depth[0], limit[0], queue[0] = 0, size[0], 0
-    first, last = 0, 1
-    while first < last:
+    first, last, steps = 0, 1, 0
+    while first < last and steps <= STEPS * count:
         node = queue[first]
         first += 1
         start = np.int64(child_start[node])
+        steps += child_count[node]
         for child in range(start, min(count, start + np.int64(child_count[node]))):
             if depth[child] < 0:
                 depth[child] = depth[node] + 1
                 limit[child] = min(limit[node], size[child])
                 queue[last] = child
                 last += 1
-    return parent, references, depth, limit
+    return depth, limit
+
+
+@kernel()
+def find_parents(child_count, child_start):
+    """Who has each node as a child, in linear time.
+
+    Args:
+        child_count: (N,) of any unsigned type.
+        child_start: (N,) of any unsigned type.
+
+    Returns:
+        parent: (N,) int32, a node that has it as a child; -1 where there is none, or where links are too broken to be
+            followed all.
+        references: (N,) int64, how many nodes have it as a child.
+    """
+    count = len(child_count)
+    parent = np.full(count, -1, np.int32)
+    references = np.zeros(count + 1, np.int64)  # first how many runs of children begin here, less those that end
+    steps = 0
+    for node in range(count):
+        start = np.int64(child_start[node])
+        end = min(count, start + np.int64(child_count[node]))
+        if start >= end:
+            continue
+        references[start] += 1
+        references[end] -= 1
+        steps += end - start
+        if steps <= STEPS * count:
+            for child in range(start, end):
+                parent[child] = node
+    for node in range(1, count):
+        references[node] += references[node - 1]
+    return parent, references[:count]
+
+
+@kernel()
+def sum_levels(depth, child_count, size):
+    """Counts and sizes of the nodes of each depth, in linear time; those of depth -1 are left out.
+
+    Args:
+        depth: (N,) int32.
+        child_count: (N,) uint16.
+        size: (N,) of each node, any unit.
+
+    Returns:
+        nodes, leaves: (levels,) int64, how many.
+        logs: (levels,) float64, the sum of the logarithms of their sizes.
+        children: (65536,) int64, how many nodes, of any depth, have so many children.
+    """
+    levels = depth.max() + 1
+    nodes = np.zeros(levels, np.int64)
+    leaves = np.zeros(levels, np.int64)
+    logs = np.zeros(levels, np.float64)
+    children = np.zeros(1 << 16, np.int64)
+    for node in range(len(depth)):
+        children[child_count[node]] += 1
+        if depth[node] >= 0:
+            nodes[depth[node]] += 1
+            leaves[depth[node]] += child_count[node] == 0
+            logs[depth[node]] += np.log(size[node])
+    return nodes, leaves, logs, children

@@ -1,0 +1,85 @@
+"""A report of `sparklod inspect` as a person reads it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from .console import count_of
+
+#: Numbers of children that get a row of their own.
+MOST_ROWS = 8
+
+
+def lines(report: dict[str, Any]) -> Iterator[str]:
+    """The lines of a report, given as its JSON."""
+    tree, values = report["tree"], report["values"]
+    noun = "node" if tree else "splat"
+    yield f"{report['file']}  {report['format']}, {size_of(report['bytes'])}"
+    about = [count_of(report["splats"], noun), f"SH {report['sh_degree']}"]
+    about += ["antialiased"] * bool(report["antialiased"])
+    if "fractional_bits" in report["header"]:
+        about.append(f"{report['header']['fractional_bits']} fractional bits")
+    yield _row("holds", ", ".join(about))
+    if report["bytes_per_splat"]:
+        yield _row(
+            "takes",
+            f"{report['bytes_per_splat']:.1f} bytes a {noun}, {report['compression_ratio']:.1f} times less than as floats",
+        )
+    for note in report["notes"]:
+        yield _row("note", note)
+    if tree:
+        yield from _tree(tree)
+    if values:
+        yield from _values(values)
+
+
+def size_of(size: int) -> str:
+    """ "2.9 MB"."""
+    return f"{size / 1e6:.1f} MB" if size >= 1e5 else f"{size / 1e3:.1f} kB"
+
+
+def _row(name: str, text: str) -> str:
+    return f"  {name:<10} {text}"
+
+
+def _tree(tree: dict[str, Any]) -> Iterator[str]:
+    inner = count_of(tree["inner"], "inner node")
+    yield _row("tree", f"{_leaves(tree['leaves'])}, {inner}, growth {tree['growth']:.3f}, {len(tree['levels'])} levels")
+    yield _row("", f"{100 * tree['more_than_opaque']:.1f} % of the nodes are more than opaque")
+    chunks = count_of(tree["chunks"], "chunk")
+    yield _row("", f"{chunks} of 65,536 nodes, the coarsest cut of as many nodes needs {tree['chunks_of_coarse_cut']}")
+    counts = sorted(tree["children"].items(), key=lambda item: -item[1])
+    shown = ", ".join(f"{children}: {count:,}" for children, count in counts[:MOST_ROWS])
+    yield _row(
+        "children", shown + (f", and {len(counts) - MOST_ROWS} other numbers" if len(counts) > MOST_ROWS else "")
+    )
+    yield _row("levels", f"{'edges':>5} {'nodes':>12} {'leaves':>12} {'size':>10}")
+    for depth, level in enumerate(tree["levels"]):
+        size = "" if level["size"] is None else f"{level['size']:.4g}"
+        yield _row("", f"{depth:>5} {level['nodes']:>12,} {level['leaves']:>12,} {size:>10}")
+
+
+def _leaves(count: int) -> str:
+    return "1 leaf" if count == 1 else f"{count:,} leaves"
+
+
+def _values(values: dict[str, Any]) -> Iterator[str]:
+    for name, what in (("box", "box"), ("box_98", "98 %")):
+        box = values[name]
+        if box:
+            low, high = (" ".join(f"{number:.4g}" for number in box[end]) for end in ("min", "max"))
+            yield _row(what, f"{low}  to  {high}")
+    names = ("min", "p1", "p25", "p50", "p75", "p99", "max", "mean")
+    yield _row("values", " ".join(f"{name:>10}" for name in names))
+    for quantity, summary in values["quantities"].items():
+        cells = ("" if summary[name] is None else f"{summary[name]:.4g}" for name in names)
+        yield _row(quantity, " ".join(f"{cell:>10}" for cell in cells))
+    counts = {
+        "not finite": values["non_finite"],
+        "of opacity 0": values["zero_opacity"],
+        "of scale 0": values["zero_scale"],
+    }
+    bad = ", ".join(f"{count:,} {what}" for what, count in counts.items() if count)
+    if bad:
+        yield _row("degenerate", bad)
