@@ -65,6 +65,10 @@ def run(arguments: list[str] | None = None) -> int:
         # Whoever read standard output has gone; pointing it elsewhere keeps the interpreter's last flush quiet.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
+    except OSError as error:  # all files are opened elsewhere, and their errors told: this is standard output
+        say_error(f"cannot write standard output: {(error.strerror or str(error)).lower()}")
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
     return code if isinstance(code, int) else 0
 
 

@@ -91,7 +91,7 @@ def _opened(path: Path) -> Iterator[tuple[BinaryIO, Format, dict[str, Any]]]:
 def size_on_disk(path: Path) -> int | None:
     """Bytes of a file, None where that cannot be told."""
     try:
-        return path.stat().st_size
+        return path.stat().st_size if path.is_file() else None
     except OSError:
         return None
 
@@ -99,7 +99,7 @@ def size_on_disk(path: Path) -> int | None:
 def read_text(path: Path) -> str:
     """A small text file; `UnreadableError`, naming it, where that cannot be."""
     try:
-        return path.read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8-sig")
     except (OSError, ValueError) as error:
         reason = _reason(error) if isinstance(error, OSError) else "it is not text"
         raise UnreadableError(f"{path} cannot be read: {reason}") from None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -82,7 +83,7 @@ class Splats:
         """(N,) whether all numbers of a splat are finite."""
         finite = np.ones(len(self), np.bool_)
         for name in COLUMNS:
-            column = getattr(self, name).reshape(len(self), -1)
+            column = getattr(self, name).reshape(len(self), math.prod(getattr(self, name).shape[1:]))
             # A sum is finite only if all its terms are, unless huge ones overflow: those rows are looked at one by one.
             with np.errstate(over="ignore", invalid="ignore"):
                 suspect = np.flatnonzero(~np.isfinite(column.sum(axis=1, dtype=np.float64)))

@@ -10,12 +10,11 @@ import sys
 import time
 from pathlib import Path
 
-import click
 import numpy as np
 import pytest
 
 from sparklod_cli import __version__
-from sparklod_cli.cli import COMMANDS, cli, run
+from sparklod_cli.cli import COMMANDS, run
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod import quick
 

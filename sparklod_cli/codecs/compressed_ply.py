@@ -39,7 +39,7 @@ def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> 
     size = size_of(file)
     header = read_header(file)
     count, coefficients = _checked(header)
-    header.check_size(size)
+    trailing = header.check_size(size)
     degree = degree_of(coefficients)
     splats = Splats.empty(count, min(degree, MAX_SH_DEGREE))
     bounds = _read_bounds(file, header, -(-count // CHUNK_SPLATS))
@@ -66,6 +66,7 @@ def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> 
     if coefficients:
         decode_rows(_rows(file, header, "sh"), unpack_sh, count, threads, progress)
     facts = {"chunks": header.count("chunk"), "color_bounds": int(bounds["color"] is not None)}
+    facts["trailing_bytes"] = trailing
     return Scene(splats, format="compressed PLY", notes=notes_on_degree(degree), header=facts)
 
 

@@ -107,9 +107,18 @@ class Inflate:
             raise TruncatedError("cut short: the gzip checksum is missing")
 
     def behind(self) -> bytes:
-        """What follows the member in the file, as far as it has been read; empty before the member's end."""
+        """The first bytes that follow the member in the file, two where there are so many; empty before its end."""
+        if not self._unpacker.eof:
+            return b""
         rest: bytes = self._unpacker.unused_data
-        return rest
+        at = self._file.tell()
+        more = self._file.read(2)
+        self._file.seek(at)
+        return (rest + more)[:2]
+
+    def end(self) -> int:
+        """Where the member ends in the file, once it has been read."""
+        return self._file.tell() - len(self._unpacker.unused_data)
 
 
 class _Window:
@@ -141,7 +150,8 @@ class Unzstd:
         try:
             piece: bytes = self._reader.read(size)
         except zstandard.ZstdError as error:
-            raise FormatError(f"corrupt zstd data in stream {self._name}: {error}") from None
+            kind = ChecksumError if "checksum" in str(error) else FormatError
+            raise kind(f"corrupt zstd data in stream {self._name}: {error}") from None
         return piece
 
     def finish(self) -> None:

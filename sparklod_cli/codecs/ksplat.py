@@ -76,7 +76,7 @@ class Section:
         first: index of its first splat in the scene.
         count: of splats.
         row_type: of a splat.
-        offset: of its first row in the file.
+        offset, end: of its first row in the file, and behind its last.
         middles: (buckets, 3) of the buckets.
         ends: (buckets,) splats up to the end of each bucket.
         step, steps: width of a step, and how many lead from a bucket's low corner to its middle.
@@ -86,6 +86,7 @@ class Section:
     count: int
     row_type: np.dtype[Any]
     offset: int
+    end: int
     middles: FloatArray
     ends: NDArray[np.int64]
     step: np.float32
@@ -105,7 +106,9 @@ def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> 
         raise VersionError(f"KSPLAT version {header['major']}.{header['minor']} is not known, only 0.1 is")
     if level >= len(LEVELS):
         raise VersionError(f"KSPLAT compression level {level} is not known, only 0 to {len(LEVELS) - 1} are")
-    sections = [section for section in _read_sections(file, size, int(header["sections"]), level) if section.count]
+    sections = list(_read_sections(file, size, int(header["sections"]), level))
+    end = sections[-1].end if sections else HEADER.itemsize
+    sections = [section for section in sections if section.count]
     firsts = [section.first for section in sections]
     found = sum(section.count for section in sections)
     if found != count:
@@ -136,7 +139,9 @@ def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> 
         splats.sh[part, coefficients:] = 0  # other sections have more
 
     decode_rows(rows(), fill, count, threads, progress)
-    return Scene(splats, format="KSPLAT", header={"level": level, "sections": len(sections)})
+    return Scene(
+        splats, format="KSPLAT", header={"level": level, "sections": len(sections), "trailing_bytes": size - end}
+    )
 
 
 def _centers(section: Section, part: slice, codes: NDArray[np.uint16]) -> FloatArray:
@@ -180,6 +185,6 @@ def _read_sections(file: BinaryIO, size: int, count: int, level: int) -> Iterato
             if of["splats"] > (ends[-1] if len(ends) else 0):
                 raise FormatError(f"a section's buckets do not hold its {of['splats']:,} splats")
         step = np.float32(of["bucket_width"] / 2 / steps)
-        yield Section(first, of["splats"], rows, offset, middles, ends, step, steps)
+        yield Section(first, of["splats"], rows, offset, end, middles, ends, step, steps)
         first += of["splats"]
         at = end

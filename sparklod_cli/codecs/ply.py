@@ -49,7 +49,7 @@ def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> 
     size = size_of(file)
     header = read_header(file)
     coefficients = _checked_coefficients(header)
-    header.check_size(size)
+    trailing = header.check_size(size)
     degree, count = degree_of(coefficients), header.count("vertex")
     splats = Splats.empty(count, min(degree, MAX_SH_DEGREE))
     rows = _text_rows(file, header) if header.text else _binary_rows(file, header)
@@ -69,6 +69,7 @@ def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> 
 
     decode_rows(rows, fill, count, threads, progress)
     facts = {"properties": len(names), "ascii": int(header.text), "big_endian": int(header.byte_order == ">")}
+    facts["trailing_bytes"] = trailing
     return Scene(splats, format="PLY", notes=notes_on_degree(degree), header=facts)
 
 

@@ -45,8 +45,11 @@ class Header:
             at += count * row_type.itemsize
         return at
 
-    def check_size(self, size: int) -> None:
-        """Raises `FormatError` where `size` bytes cannot hold what is promised, before memory is asked for."""
+    def check_size(self, size: int) -> int:
+        """Raises `FormatError` where `size` bytes cannot hold what is promised, before memory is asked for.
+
+        Returns how many bytes are left over, as far as that can be told.
+        """
         need = self.size
         for name, (element, count) in self.elements.items():
             row_type = self.row_type(name)
@@ -57,6 +60,7 @@ class Header:
         missing = need - size - (1 if self.text else 0)  # the last separator may be missing
         if missing > 0:
             raise TruncatedError(f"cut short: {missing:,} bytes are missing of what the header promises")
+        return 0 if self.text or any(self.row_type(name) is None for name in self.elements) else -missing
 
 
 def read_header(file: BinaryIO) -> Header:

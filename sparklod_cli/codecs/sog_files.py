@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL.WebPImagePlugin import WebPImageFile
 
-from ..errors import FormatError, NotSplatsError
+from ..errors import ChecksumError, FormatError, NotSplatsError
 from .compression import check_promise
 from .stream import size_of
 
@@ -191,7 +191,8 @@ class _Archive:
             with self._zip.open(member) as file:
                 return file.read(member.file_size)  # without a size it would unfold all there is before it counts
         except _ZIP_ERRORS as error:
-            raise FormatError(f"{name!r} cannot be unpacked: {error}") from None
+            kind = ChecksumError if "CRC" in str(error) else FormatError
+            raise kind(f"{name!r} cannot be unpacked: {error}") from None
 
 
 def _webp_size(data: bytes, name: str) -> tuple[int, int]:

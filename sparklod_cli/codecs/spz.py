@@ -29,7 +29,7 @@ from .stream import Read, rows_of, size_of
 
 MAGIC = 0x5053474E  # "NGSP"
 HEADER = struct.Struct("<IIIBBBB")  # magic, version, splats, SH degree, fractional bits, flags, reserved
-HEADER_V4 = struct.Struct("<IIIBBBBI12x")  # ..., streams, offset of the table of streams, reserved
+HEADER_V4 = struct.Struct("<IIIBBBBI12s")  # ..., streams, offset of the table of streams, reserved
 STREAM_SIZES = struct.Struct("<QQ")  # of a version 4 stream: compressed, uncompressed
 
 READABLE = (1, 2, 3, 4)
@@ -163,7 +163,10 @@ def examine(
     name = f"SPZ {layout.version}" + (" LoD" if tree is not None else "")
     antialiased = bool(layout.flags & ANTIALIASED)
     facts = {"version": layout.version, "fractional_bits": layout.fractional_bits, "flags": layout.flags} | header
-    return Scene(splats, tree, antialiased, name, notes_on_degree(layout.sh_degree), facts)
+    notes = notes_on_degree(layout.sh_degree)
+    if header.get("unknown_streams"):
+        notes += (f"{header['unknown_streams']} streams of an unknown kind are left out",)
+    return Scene(splats, tree, antialiased, name, notes, facts)
 
 
 def _column(splats: Splats, tree: LodTree | None, stream: Stream) -> NDArray[Any]:
@@ -234,15 +237,16 @@ def _read_gzip(file: BinaryIO, size: int, header: dict[str, int]) -> tuple[Layou
             for stream in layout.streams():
                 yield from _rows(layout, inflate.read, stream)
         except TruncatedError as error:
-            if inflate.behind().startswith(compression.GZIP_MAGIC):
+            if inflate.behind() == compression.GZIP_MAGIC:
                 raise MembersError(
                     f"{error}; its data go on in a second gzip member, which Spark does not read"
                 ) from None
             raise
         inflate.finish(allow_more=bool(layout.flags & EXTENSIONS))
-        behind = inflate.behind()
-        header["trailing_bytes"] = len(behind) + size - file.tell()
-        header["trailing_members"] = int(behind.startswith(compression.GZIP_MAGIC))
+        if layout.flags & EXTENSIONS:  # where the member ends is not looked for
+            return
+        header["trailing_bytes"] = size - inflate.end()
+        header["trailing_members"] = int(inflate.behind() == compression.GZIP_MAGIC)
 
     return layout, rows()
 
@@ -251,13 +255,14 @@ def _read_v4(file: BinaryIO, size: int, header: dict[str, int]) -> tuple[Layout,
     head = file.read(HEADER_V4.size)
     if len(head) < HEADER_V4.size:
         raise TruncatedError("cut short inside the SPZ header")
-    _, version, count, sh_degree, bits, flags, streams, table = HEADER_V4.unpack(head)
+    _, version, count, sh_degree, bits, flags, streams, table, reserved = HEADER_V4.unpack(head)
     if version != 4:
-        raise FormatError(f"SPZ version {version} is not gzipped, as versions 1 to 3 are")
+        raise VersionError(f"SPZ version {version} is not gzipped, as versions 1 to 3 are")
     layout = _checked(Layout(version, count, sh_degree, bits, flags), size)
     expected = layout.streams()
     if streams < len(expected):
         raise FormatError(f"{streams} streams where SH degree {sh_degree} and flags {flags:#x} need {len(expected)}")
+    header |= {"reserved": int(any(reserved)), "unknown_streams": streams - len(expected)}
     at = table + streams * STREAM_SIZES.size
     if at > size:
         raise TruncatedError("cut short inside the table of streams")

@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
-import json
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from ..limits import MAX_SH_DEGREE, PLOT_BY
-from .console import Console, count_of
-from .inspect_text import lines
+from .console import Console
+from .inspect_job import Job
 from .options import Real, common_options
 
 if TYPE_CHECKING:
     from ..inspection.expectations import Expectations
-    from ..inspection.findings import Finding
-    from ..inspection.report import Report, Wanted
+    from ..inspection.report import Wanted
     from ..scene import Scene
+
+#: Options that are expectations, by the names that `Expectations` has for them.
+EXPECTED = ("max_bytes", "min_splats", "max_splats", "sh", "max_growth")
+
+#: Options that have another name here.
+NAMES = {"style": "format", "fail_on": "fail-on"}
 
 EXAMPLES = """
 \b
@@ -29,6 +34,14 @@ Examples:
   sparklod inspect scene-lod.spz --field tree.leaves
   sparklod inspect scene-lod.spz --html report.html
 """
+
+
+def _print_schema(ctx: click.Context, param: click.Parameter, value: bool) -> None:
+    if value:
+        from importlib.resources import files
+
+        click.echo(files("sparklod_cli.inspection").joinpath("schema.json").read_text("utf-8"), nl=False)
+        ctx.exit()
 
 
 @click.command("inspect", epilog=EXAMPLES, context_settings={"show_default": True})
@@ -68,6 +81,14 @@ Examples:
 @click.option("--plot-by", type=click.Choice(PLOT_BY), default=PLOT_BY[0], help="What colours mean in the picture.")
 @click.option("--html", metavar="FILE", type=click.Path(path_type=Path), help="Write the reports as one page.")
 @click.option("--overwrite", is_flag=True, help="Replace pictures and pages that exist.")
+@click.option(
+    "--json-schema",
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=_print_schema,
+    help="Print the JSON Schema of --json and exit.",
+)
 @common_options
 @click.pass_context
 def inspect(
@@ -86,42 +107,60 @@ def inspect(
 
     A file that cannot be read is a finding, too; it does not stop the others.
     """
-    if settings["plot"] is not None and len(files) > 1:
-        raise click.UsageError(f"--plot takes one file, not {len(files)}")
-    if settings["field"] and as_json:
-        raise click.UsageError("--field and --json exclude each other")
+    _check_usage(ctx, files, settings, as_json)
     with Console(quiet=quiet, verbose=verbose) as console:
         from .. import jit
-        from ..inspection.report import inspect as look
+        from ..io import check_writable
 
         jit.use_threads(settings["threads"])
-        expected, wanted = _expectations(settings), _wanted(settings, as_json)
-        holds = wanted.check or expected is not None or settings["leaves_of"] is not None
-        worst, pages = 0, []
-        for file in files:
-            report, scene = look(file, wanted, threads=settings["threads"], progress=console.progress)
-            report = _with_expectations(report, scene, expected, settings["leaves_of"], holds)
-            console.clear()
-            if report.format is None and not holds:
-                console.error(f"{file}: {report.findings[0].message}" if report.findings else str(file))
-                worst = max(worst, 1)
-            elif holds and _fails(report.findings or [], settings["fail_on"]):
-                worst = max(worst, 3)
-            _print(console, report, scene, settings, as_json=as_json, holds=holds)
-            if scene is not None:
-                pages.append((report, scene))
+        for target in (settings["plot"], settings["html"]):
+            if target is not None:
+                check_writable(target, overwrite=settings["overwrite"])
+        job = Job(
+            console,
+            settings,
+            as_json,
+            _wanted(settings, as_json),
+            _expectations(settings),
+            _original(settings, console),
+        )
+        worst = max(job.inspect(file) for file in files)
+        job.write_page()
     if worst:
         ctx.exit(worst)
 
 
+def _check_usage(ctx: click.Context, files: tuple[Path, ...], settings: dict[str, Any], as_json: bool) -> None:
+    """A usage error where options exclude each other or would do nothing."""
+    if settings["plot"] is not None and len(files) > 1:
+        raise click.UsageError(f"--plot takes one file, not {len(files)}")
+    if settings["field"] and as_json:
+        raise click.UsageError("--field and --json exclude each other")
+    for name in settings["histogram"]:
+        from ..inspection.values import QUANTITIES, SH_QUANTITIES
+
+        if name not in (*QUANTITIES, *SH_QUANTITIES):
+            raise click.UsageError(f"--histogram knows {', '.join((*QUANTITIES, *SH_QUANTITIES))}, not {name}")
+    if settings["histogram"] and (settings["field"] or as_json):
+        raise click.UsageError("--histogram is for a person, it goes with neither --json nor --field")
+    if settings["stats"] and settings["check"] and not as_json:
+        raise click.UsageError("--check prints findings, it goes with --stats only as --json")
+    if not (settings["check"] or _asserts(settings)):
+        for name in ("style", "fail_on"):
+            if ctx.get_parameter_source(name) != click.core.ParameterSource.DEFAULT:
+                raise click.UsageError(f"--{NAMES.get(name, name)} needs --check or an expectation")
+
+
+def _asserts(settings: dict[str, Any]) -> bool:
+    given = any(settings[name] is not None for name in (*EXPECTED, "expect", "leaves_of"))
+    return given or bool(settings["require_lod"])
+
+
 def _expectations(settings: dict[str, Any]) -> Expectations | None:
     """Those of the file and of the options, which win; None where there are none."""
-    from dataclasses import replace
-
     from ..inspection.expectations import Expectations, read
 
-    names = ("max_bytes", "min_splats", "max_splats", "sh", "max_growth")
-    given = {name: settings[name] for name in names if settings[name] is not None}
+    given = {name: settings[name] for name in EXPECTED if settings[name] is not None}
     if settings["require_lod"]:
         given["lod"] = True
     if settings["expect"] is None:
@@ -132,95 +171,27 @@ def _expectations(settings: dict[str, Any]) -> Expectations | None:
 def _wanted(settings: dict[str, Any], as_json: bool) -> Wanted:
     from ..inspection.report import Wanted
 
-    field = settings["field"] or ""
-    asserting = settings["expect"] is not None or settings["leaves_of"] is not None
-    everything = settings["stats"] or asserting or field.startswith("values.") or bool(settings["histogram"])
+    way = settings["field"] or ""
+    asserting = _asserts(settings)
+    everything = (
+        settings["stats"] or settings["expect"] is not None or way.startswith("values") or bool(settings["histogram"])
+    )
     drawn = settings["html"] is not None or settings["plot"] is not None
-    person = not (as_json or field or settings["check"])
+    person = not (as_json or way or settings["check"])
     return Wanted(
         values=everything or drawn or person,
         all_quantities=everything or settings["html"] is not None,
-        check=settings["check"] or field.startswith("findings"),
+        check=settings["check"] or asserting or way.startswith("findings"),
     )
 
 
-def _with_expectations(
-    report: Report, scene: Scene | None, expected: Expectations | None, original: Path | None, holds: bool
-) -> Report:
-    """The report with what falls short of expectations among its findings."""
-    from dataclasses import replace
-
-    from ..inspection import expectations, leaves
+def _original(settings: dict[str, Any], console: Console) -> Scene | None:
+    """The scene of --leaves-of."""
+    from ..errors import FormatError
     from ..io import read_scene
 
-    if not holds or scene is None:
-        return report
-    findings = list(report.findings or [])
-    if expected is not None:
-        findings += expectations.check(report, expected)
-    if original is not None:
-        findings += leaves.check(scene, read_scene(original))
-    return replace(report, findings=findings)
-
-
-def _fails(findings: list[Finding], fail_on: str) -> bool:
-    return any(found.severity in ("error", fail_on) for found in findings)
-
-
-def _print(
-    console: Console,
-    report: Report,
-    scene: Scene | None,
-    settings: dict[str, Any],
-    *,
-    as_json: bool,
-    holds: bool,
-) -> None:
-    """What belongs on standard output of one file."""
-    plain = report.as_dict()
-    if as_json:
-        click.echo(json.dumps(plain, allow_nan=False))
-    elif settings["field"]:
-        if report.format is not None:
-            from ..inspection.expectations import value_at
-
-            value = value_at(plain, settings["field"])
-            click.echo(value if isinstance(value, str) else json.dumps(value))
-    elif holds:
-        for found in report.findings or []:
-            click.echo(_finding(report.file, found, settings["style"]))
-        if not report.findings:
-            console.say(f"{report.file}: nothing is wrong with its {count_of(report.splats or 0, _noun(report))}")
-    elif report.format is not None:
-        click.echo("\n".join(lines(plain)))
-    if scene is not None and settings["histogram"] and not as_json:
-        _print_histograms(scene, settings["histogram"])
-
-
-def _noun(report: Report) -> str:
-    return "node" if report.tree is not None else "splat"
-
-
-def _finding(file: str, found: Finding, style: str) -> str:
-    if style == "text":
-        return f"{file}: {found.severity}: {found.code}: {found.message}"
-    kind = {"note": "notice"}.get(found.severity, found.severity)
-    return f"::{kind} file={_escaped(file, ':,')},title={found.code}::{_escaped(found.message)}"
-
-
-def _escaped(text: str, more: str = "") -> str:
-    """As workflow commands of GitHub Actions want it."""
-    for mark in "%\r\n" + more:
-        text = text.replace(mark, f"%{ord(mark):02X}")
-    return text
-
-
-def _print_histograms(scene: Scene, names: tuple[str, ...]) -> None:
-    from ..inspection import values
-    from ..inspection.histograms import as_text, histogram
-
-    for name in names:
-        if name not in values.names_of(scene.splats):
-            raise click.UsageError(f"--histogram knows {', '.join(values.names_of(scene.splats))}, not {name}")
-        click.echo(f"\n  {name}")
-        click.echo(as_text(histogram(values.quantity(scene.splats, name))))
+    path = settings["leaves_of"]
+    try:
+        return path and read_scene(path, threads=settings["threads"], progress=console.progress)
+    except FormatError as error:
+        raise FormatError(f"{path}: {error}") from None

@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from .console import count_of
 
+if TYPE_CHECKING:
+    from ..inspection.findings import Finding
+
 #: Numbers of children that get a row of their own.
 MOST_ROWS = 8
+
+#: Levels of a tree that are listed; a good one has some twenty.
+MOST_LEVELS = 64
 
 
 def lines(report: dict[str, Any]) -> Iterator[str]:
@@ -22,10 +28,8 @@ def lines(report: dict[str, Any]) -> Iterator[str]:
         about.append(f"{report['header']['fractional_bits']} fractional bits")
     yield _row("holds", ", ".join(about))
     if report["bytes_per_splat"]:
-        yield _row(
-            "takes",
-            f"{report['bytes_per_splat']:.1f} bytes a {noun}, {report['compression_ratio']:.1f} times less than as floats",
-        )
+        ratio = f"{report['compression_ratio']:.1f} times less than as floats"
+        yield _row("takes", f"{report['bytes_per_splat']:.1f} bytes a {noun}, {ratio}")
     for note in report["notes"]:
         yield _row("note", note)
     if tree:
@@ -55,9 +59,11 @@ def _tree(tree: dict[str, Any]) -> Iterator[str]:
         "children", shown + (f", and {len(counts) - MOST_ROWS} other numbers" if len(counts) > MOST_ROWS else "")
     )
     yield _row("levels", f"{'edges':>5} {'nodes':>12} {'leaves':>12} {'size':>10}")
-    for depth, level in enumerate(tree["levels"]):
+    for depth, level in enumerate(tree["levels"][:MOST_LEVELS]):
         size = "" if level["size"] is None else f"{level['size']:.4g}"
         yield _row("", f"{depth:>5} {level['nodes']:>12,} {level['leaves']:>12,} {size:>10}")
+    if len(tree["levels"]) > MOST_LEVELS:
+        yield _row("", f"and {len(tree['levels']) - MOST_LEVELS:,} more")
 
 
 def _leaves(count: int) -> str:
@@ -83,3 +89,22 @@ def _values(values: dict[str, Any]) -> Iterator[str]:
     bad = ", ".join(f"{count:,} {what}" for what, count in counts.items() if count)
     if bad:
         yield _row("degenerate", bad)
+
+
+def finding_line(file: str, found: Finding, style: str) -> str:
+    """A finding in a line, as text or as an annotation of GitHub Actions."""
+    if style == "text":
+        return f"{_one_line(file)}: {found.severity}: {found.code}: {_one_line(found.message)}"
+    kind = {"note": "notice"}.get(found.severity, found.severity)
+    return f"::{kind} file={_escaped(file, ':,')},title={found.code}::{_escaped(found.message)}"
+
+
+def _one_line(text: str) -> str:
+    return text.replace("\r", "\\r").replace("\n", "\\n")
+
+
+def _escaped(text: str, more: str = "") -> str:
+    """As workflow commands of GitHub Actions want it."""
+    for mark in "%\r\n" + more:
+        text = text.replace(mark, f"%{ord(mark):02X}")
+    return text

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -66,7 +68,32 @@ def read(path: Path) -> Expectations:
             raise ExpectationError(f"{path}: {name} is not one of {', '.join(types)}")
         if not isinstance(value, types[name]) or (isinstance(value, bool) and name != "lod"):
             raise ExpectationError(f"{path}: {name} cannot be {value!r}")
-    return Expectations(**data)
+        if isinstance(value, (int, float)) and not 0 <= value < math.inf:
+            raise ExpectationError(f"{path}: {name} cannot be {value!r}")
+    values = dict(_flat(data.get("values", {}), str(path)))
+    return Expectations(**data | {"values": values})
+
+
+def _flat(table: dict[str, Any], path: str, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Expectations by the whole ways to their values; in TOML `tree.depth = 2` is a table in a table."""
+    for key, wanted in table.items():
+        way = prefix + key
+        if isinstance(wanted, dict) and wanted and not wanted.keys() & {"min", "max"}:
+            yield from _flat(wanted, path, f"{way}.")
+            continue
+        if isinstance(wanted, dict) and not (wanted and wanted.keys() <= {"min", "max"}):
+            raise ExpectationError(f"{path}: {way} is to have min and max, not {wanted!r}")
+        if isinstance(wanted, dict) and not all(map(_is_number, wanted.values())):
+            raise ExpectationError(f"{path}: min and max of {way} are to be numbers, not {wanted!r}")
+        try:
+            json.dumps(wanted)
+        except TypeError:
+            raise ExpectationError(f"{path}: {way} cannot be {wanted!r}, no report has such a value") from None
+        yield way, wanted
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and not math.isnan(value)
 
 
 def value_at(report: dict[str, Any], way: str) -> Any:
@@ -102,21 +129,28 @@ def check(report: Report, expected: Expectations) -> list[Finding]:
         found.append(Finding("expect.sh", f"SH degree {report.sh_degree}, expected {expected.sh}"))
     if expected.lod is not None and is_tree != expected.lod:
         found.append(Finding("expect.lod", "no tree, expected one" if expected.lod else "a tree, expected none"))
-    if expected.max_growth is not None and report.tree is not None and report.tree.growth > expected.max_growth:
-        found.append(Finding("expect.growth", f"growth {report.tree.growth}, expected at most {expected.max_growth:g}"))
-    plain = report.as_dict()
-    for way, wanted in expected.values.items():
-        value = value_at(plain, way)
-        if not _fits(value, wanted, way):
+    if expected.max_growth is not None:
+        growth = report.tree.growth if report.tree is not None else None
+        if growth is None or growth > expected.max_growth:
+            what = "no tree" if growth is None else f"growth {growth}"
+            found.append(Finding("expect.growth", f"{what}, expected a growth of at most {expected.max_growth:g}"))
+    return found + _values(report.as_dict(), expected.values)
+
+
+def _values(report: dict[str, Any], expected: dict[str, Any]) -> list[Finding]:
+    found = []
+    for way, wanted in expected.items():
+        try:
+            value = value_at(report, way)
+        except ExpectationError as error:
+            found.append(Finding("expect.value", f"{error}, expected {json.dumps(wanted)}"))
+            continue
+        if not _fits(value, wanted):
             found.append(Finding("expect.value", f"{way} is {json.dumps(value)}, expected {json.dumps(wanted)}"))
     return found
 
 
-def _fits(value: Any, wanted: Any, way: str) -> bool:
-    if not isinstance(wanted, dict):
-        return bool(value == wanted)
-    if not wanted or not wanted.keys() <= {"min", "max"}:
-        raise ExpectationError(f"{way}: a table of expectations has min and max, not {', '.join(wanted) or 'nothing'}")
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        return False
-    return bool(wanted.get("min", value) <= value <= wanted.get("max", value))
+def _fits(value: Any, wanted: Any) -> bool:
+    if isinstance(wanted, dict):
+        return _is_number(value) and bool(wanted.get("min", value) <= value <= wanted.get("max", value))
+    return bool(value == wanted) and isinstance(value, bool) == isinstance(wanted, bool)

@@ -2,77 +2,141 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
 from ..codecs.spz_layout import LOD, Layout
+from ..errors import InvalidSplatsError
 from ..scene import Scene
 from ..selection import Selection
 from ..splats import Splats
 from .findings import Finding
 
-#: Codes may differ by so much: writers round, cut off or go through float16.
-STEPS = 1
+#: Codes of one splat may differ by so much, as writers round, cut off, or go through float16; those of SH have upper
+#: bits only, so that a step is a bucket of 16.
+STEPS, SH_STEPS = 1, 16
 
 #: Degrees of rotation that two codes of one rotation may be apart, by the bytes of the code.
 DEGREES = {3: 14.0, 4: 0.8}
+
+#: Of more leaves than this that are neither there nor in the same order, none is looked for nearby.
+MOST_PAIRS = 20_000
+
+#: Columns whose codes may differ by a step, in the order of `_Coded.numbers`.
+COLUMNS = ("center", "opacity", "rgb", "scale", "sh")
+
+
+@dataclass(frozen=True)
+class _Coded:
+    """Splats as codes.
+
+    Attributes:
+        rows: (N,) all bytes of a splat, as one thing to compare.
+        numbers: (N, n) int32 codes of `COLUMNS`; the first three are of the centre.
+        quat_xyzw: (N, 4).
+    """
+
+    rows: NDArray[np.void]
+    numbers: NDArray[np.int32]
+    quat_xyzw: NDArray[np.float32]
 
 
 def check(scene: Scene, original: Scene) -> list[Finding]:
     """Findings where the leaves of `scene`, an SPZ tree, are not exactly the splats of `original` that can be drawn.
 
-    Both are compared as codes of the tree's file: its centres must be the same to a step, and so must be all else.
+    Both are compared as codes of the tree's file: most are the same, and the others must pair with one that lies within
+    a step in everything.
     """
     if scene.tree is None:
         return [Finding("expect.leaves", "there is no tree whose leaves could be compared")]
     leaves = scene.splats.take(scene.tree.is_leaf)
-    splats, _ = Selection(drop_invalid=True).apply(original.splats.with_max_sh(leaves.sh_degree))
+    source = original.splats if original.tree is None else original.splats.take(original.tree.is_leaf)
+    try:
+        splats, _ = Selection(drop_invalid=True).apply(source.with_max_sh(leaves.sh_degree))
+    except InvalidSplatsError as error:
+        return [Finding("expect.leaves", f"of the original {error}")]
     if len(leaves) != len(splats):
         return [Finding("expect.leaves", f"{len(leaves):,} leaves, the original has {len(splats):,} splats to draw")]
     if leaves.sh_degree != splats.sh_degree:
         return [Finding("expect.leaves", f"SH degree {leaves.sh_degree}, the original has {splats.sh_degree}")]
-    return _compare(scene, leaves, splats)
-
-
-def _codes(layout: Layout, splats: Splats) -> dict[str, NDArray[np.int64]]:
-    """(N, numbers) of each column, as whole numbers."""
-    codes = {}
-    for stream in layout.streams():
-        if hasattr(splats, stream.column) and stream.column != "quat_xyzw":
-            values = np.ascontiguousarray(stream.encode(getattr(splats, stream.column)))
-            rows = values.view(np.uint8).reshape(len(splats), stream.size).astype(np.int64)
-            if stream.column == "center":  # three bytes a coordinate
-                rows = rows.reshape(-1, 3, 3) @ np.array([1, 1 << 8, 1 << 16])
-                rows = np.where(rows >= 1 << 23, rows - (1 << 24), rows)
-            codes[stream.column] = rows
-    return codes
-
-
-def _order(codes: dict[str, NDArray[np.int64]]) -> NDArray[np.intp]:
-    keys = [codes[name][:, index] for name in ("opacity", "rgb", "scale") for index in range(codes[name].shape[1])]
-    return np.lexsort([*keys, *codes["center"].T])
-
-
-def _compare(scene: Scene, leaves: Splats, splats: Splats) -> list[Finding]:
-    header = scene.header
-    layout = Layout(max(2, int(header["version"])), len(leaves), leaves.sh_degree, int(header["fractional_bits"]), LOD)
-    ours, theirs = _codes(layout, leaves), _codes(layout, splats)
-    first, second = _order(ours), _order(theirs)
-    differs = np.zeros(len(leaves), np.bool_)
-    for name, codes in ours.items():
-        # SH codes keep their upper bits only: a step is a bucket of 8 or 16.
-        most = STEPS * (16 if name == "sh" else 1)
-        differs |= (np.abs(codes[first] - theirs[name][second]) > most).any(axis=1)
-    size = next(stream.size for stream in layout.streams() if stream.column == "quat_xyzw")
-    cosine = np.abs(np.einsum("ij,ij->i", leaves.quat_xyzw[first], splats.quat_xyzw[second]).astype(np.float64))
-    differs |= np.degrees(2 * np.arccos(np.minimum(cosine, 1))) > DEGREES[size]
-    count = int(np.count_nonzero(differs))
-    if not count:
+    bits, version = int(scene.header["fractional_bits"]), max(2, int(scene.header["version"]))
+    layout = Layout(version, len(leaves), leaves.sh_degree, bits, LOD)
+    missing = _unpaired(_coded(layout, leaves), _coded(layout, splats), DEGREES[3 if version == 2 else 4])
+    if not len(missing):
         return []
-    assert scene.tree is not None
-    index = int(np.flatnonzero(scene.tree.is_leaf)[first[int(np.argmax(differs))]])
-    return [
-        Finding(
-            "expect.leaves", f"{count:,} leaves are not splats of the original; the first is {index:,}", index, count
-        )
-    ]
+    index = int(np.flatnonzero(scene.tree.is_leaf)[missing[0]])
+    what = f"{len(missing):,} leaves are not splats of the original; the first is node {index:,}"
+    return [Finding("expect.leaves", what, index, len(missing))]
+
+
+def _coded(layout: Layout, splats: Splats) -> _Coded:
+    parts, numbers = [], {}
+    for stream in layout.streams():
+        if not hasattr(splats, stream.column):
+            continue  # the links
+        values = np.ascontiguousarray(stream.encode(getattr(splats, stream.column)))
+        codes = values.view(np.uint8).reshape(len(splats), stream.size)
+        parts.append(codes)
+        numbers[stream.column] = codes.astype(np.int32)
+    center = numbers["center"].reshape(-1, 3, 3) @ np.array([1, 1 << 8, 1 << 16], np.int32)
+    numbers["center"] = np.where(center >= 1 << 23, center - (1 << 24), center)
+    together = np.ascontiguousarray(np.concatenate(parts, axis=1))
+    rows = together.view(np.dtype((np.void, together.shape[1])))[:, 0]
+    columns = [numbers[name] for name in COLUMNS if name in numbers]
+    return _Coded(rows, np.concatenate(columns, axis=1), splats.quat_xyzw)
+
+
+def _unpaired(ours: _Coded, theirs: _Coded, degrees: float) -> NDArray[np.intp]:
+    """Ascending indices of ours that have no counterpart among theirs; each of theirs is one of one only."""
+    left, right = _not_equal(ours.rows, theirs.rows)
+    # Where a writer rounds otherwise, most still follow each other in the same order.
+    left = left[np.lexsort(ours.numbers[left].T[::-1])]
+    right = right[np.lexsort(theirs.numbers[right].T[::-1])]
+    apart = ~_alike(ours, left, theirs, right, degrees)
+    left, right = np.sort(left[apart]), right[apart]
+    if len(left) > MOST_PAIRS:
+        return left
+    # Looked for along the axis on which they are spread most.
+    axis = int(np.argmax([len(np.unique(theirs.numbers[right, axis])) for axis in range(3)]))
+    free = right[np.argsort(theirs.numbers[right, axis], kind="stable")]
+    along = theirs.numbers[free, axis]
+    taken = np.zeros(len(free), np.bool_)
+    missing = []
+    for leaf in left:
+        first, last = np.searchsorted(along, ours.numbers[leaf, axis] + [-STEPS, STEPS + 1])
+        near = np.arange(first, last)[~taken[first:last]]
+        fits = near[_alike(ours, np.full(len(near), leaf), theirs, free[near], degrees)]
+        if len(fits):
+            off = np.abs(theirs.numbers[free[fits]] - ours.numbers[leaf]).sum(axis=1)
+            taken[fits[np.argmin(off)]] = True
+        else:
+            missing.append(leaf)
+    return np.array(missing, np.intp)
+
+
+def _alike(
+    ours: _Coded, left: NDArray[np.intp], theirs: _Coded, right: NDArray[np.intp], degrees: float
+) -> NDArray[np.bool_]:
+    """Whether splats of ours and of theirs, pair by pair, lie within a step of each other in everything."""
+    most = np.full(ours.numbers.shape[1], STEPS)
+    most[10:] = SH_STEPS  # behind three of the centre, one of opacity, three of colour and three of scale
+    near = (np.abs(theirs.numbers[right] - ours.numbers[left]) <= most).all(axis=1)
+    cosine = np.abs(np.einsum("ij,ij->i", theirs.quat_xyzw[right], ours.quat_xyzw[left], dtype=np.float64))
+    return near & (np.degrees(2 * np.arccos(np.minimum(cosine, 1))) <= degrees)
+
+
+def _not_equal(ours: NDArray[np.void], theirs: NDArray[np.void]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Ascending indices of ours and of theirs that are left when equal rows have been taken away in pairs."""
+    count = len(ours)
+    rows = np.concatenate([ours, theirs])
+    order = np.argsort(rows, kind="stable")  # of equal rows ours come first
+    ordered, is_ours = rows[order], order < count
+    begins = np.concatenate([[True], ordered[1:] != ordered[:-1]])
+    group = np.cumsum(begins) - 1
+    of_ours = np.bincount(group[is_ours], minlength=group[-1] + 1)
+    of_theirs = np.bincount(group[~is_ours], minlength=group[-1] + 1)
+    rank = np.arange(len(rows)) - np.flatnonzero(begins)[group] - np.where(is_ours, 0, of_ours[group])
+    left = order[rank >= np.minimum(of_ours, of_theirs)[group]]
+    return np.sort(left[left < count]), np.sort(left[left >= count]) - count

@@ -121,9 +121,10 @@ def _container_findings(scene: Scene) -> list[Finding]:
     header = scene.header
     findings = [Finding("container.left-out", note) for note in scene.notes]
     unknown = header.get("flags", 0) & ~KNOWN_FLAGS
-    if unknown or header.get("reserved", 0):
-        what = f"flags {unknown:#04x}" if unknown else f"the reserved byte, {header['reserved']}"
-        findings.append(Finding("container.flags", f"the header has {what}, which mean nothing"))
+    if unknown:
+        findings.append(Finding("container.flags", f"the header has flags {unknown:#04x}, which mean nothing"))
+    if header.get("reserved", 0):
+        findings.append(Finding("container.flags", "reserved bytes of the header are not 0"))
     if header.get("trailing_members"):
         findings.append(Finding("container.members", "a second gzip member follows, which Spark does not read"))
     elif header.get("trailing_bytes"):

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..gaussian import spark_size
-from ..lod.kernels.walk import find_parents, sum_levels, walk
+from ..lod.kernels.walk import find_cycles, find_parents, sum_levels, walk
 from ..splats import FloatArray, Splats
 from ..tree import LodTree
 from .findings import Finding
@@ -20,8 +20,9 @@ CHUNK_SPLATS = 65_536
 #: of sparse scenes, the worst is 0.48 times as large: a faint large splat and a small opaque one.
 LEAST_RATIO = 1 / 3
 
-#: Coarse before fine: of so many parts of a file, none may have a median size of more than this times the least before.
-PARTS, MOST_RISE = 16, 2.0
+#: Coarse before fine: nodes are wanted when their parent has become too coarse. Of so many parts of a file, none may be
+#: wanted, by the median, more than so many times earlier than one before it; of fewer nodes chance decides.
+PARTS, MOST_RISE, LEAST_NODES = 16, 1.6, 1024
 
 Mask = NDArray[np.bool_]
 
@@ -98,14 +99,19 @@ def examine(splats: Splats, tree: LodTree, *, check: bool = True) -> tuple[TreeF
     if not check:
         return facts, []
     parent, references = find_parents(tree.child_count, tree.child_start)
-    return facts, _link_findings(tree, references, depth) + _node_findings(splats, tree, parent, size)
+    return facts, [
+        *_link_findings(tree, parent, references, depth),
+        *_node_findings(splats, tree, parent, size),
+        *_order_findings(parent, limit),
+    ]
 
 
 def _coarse_cut(tree: LodTree, limit: FloatArray) -> NDArray[np.int64]:
     """The nodes of the cut that divides the largest first, as far as it has no more than a chunk's."""
     inner = np.flatnonzero(~tree.is_leaf & (limit > 0))
     if len(inner) > CHUNK_SPLATS:  # each adds a node at least, so no more than these can be divided
-        inner = inner[np.argpartition(-limit[inner], CHUNK_SPLATS)[:CHUNK_SPLATS]]
+        inner = inner[limit[inner] >= -np.partition(-limit[inner], CHUNK_SPLATS)[CHUNK_SPLATS]]
+    # Stable, as a node that is larger than its parent has the limit of that, and comes after it.
     inner = inner[np.argsort(-limit[inner], kind="stable")]
     fits = np.cumsum(tree.child_count[inner].astype(np.int64) - 1) + 1 <= CHUNK_SPLATS
     divided = inner[: int(np.argmin(fits)) if not fits.all() else len(inner)]
@@ -126,7 +132,9 @@ def _found(code: str, mask: Mask, what: str) -> list[Finding]:
     return [Finding(code, f"node {index:,} {what}{more}", index, count)]
 
 
-def _link_findings(tree: LodTree, references: NDArray[np.int64], depth: NDArray[np.int32]) -> list[Finding]:
+def _link_findings(
+    tree: LodTree, parent: NDArray[np.int32], references: NDArray[np.int64], depth: NDArray[np.int32]
+) -> list[Finding]:
     leaf = tree.is_leaf
     node = np.arange(len(tree))
     start = tree.child_start.astype(np.int64)
@@ -141,7 +149,7 @@ def _link_findings(tree: LodTree, references: NDArray[np.int64], depth: NDArray[
         *_found("tree.order", ~leaf & (start <= node), "comes after one of its children, or is its own"),
         *_found("tree.shared", references > 1, "is the child of more than one node"),
         *_found("tree.orphan", nobodys, "is nobody's child"),
-        *_found("tree.unreachable", (depth < 0) & (references > 0), "has a parent, but the root does not lead to it"),
+        *_found("tree.unreachable", find_cycles(parent, depth), "has a parent, but the root does not lead to it"),
         *_found("tree.leaf-start", leaf & (start != 0), "is a leaf with a child_start"),
         *_found("tree.single-child", tree.child_count == 1, "has a single child"),
     ]
@@ -153,13 +161,18 @@ def _node_findings(splats: Splats, tree: LodTree, parent: NDArray[np.int32], siz
     smaller = np.zeros(len(tree), np.bool_)
     above = parent[children]
     smaller[above[size[above] < np.float32(LEAST_RATIO) * size[children]]] = True
-    findings += _found("tree.size", smaller, "is less than a third as large as one of its children")
-    parts = [np.median(part) for part in np.array_split(size, min(PARTS, len(size)))]
-    least = np.minimum.accumulate(parts)
-    rises = np.flatnonzero(parts[1:] > MOST_RISE * least[:-1])
-    if len(size) >= PARTS * PARTS and rises.size:
-        at = int((rises[0] + 1) * len(size) // PARTS)
-        findings.append(
-            Finding("tree.coarse-first", f"nodes from {at:,} on are coarser than those before them", at, len(size) - at)
-        )
-    return findings
+    return findings + _found("tree.size", smaller, "is less than a third as large as one of its children")
+
+
+def _order_findings(parent: NDArray[np.int32], limit: FloatArray) -> list[Finding]:
+    children = np.flatnonzero(parent >= 0)
+    if len(children) < LEAST_NODES:
+        return []
+    parts = np.array_split(children, PARTS)
+    wanted = np.array([np.median(limit[parent[part]]) for part in parts])
+    rises = np.flatnonzero(wanted[1:] > MOST_RISE * np.minimum.accumulate(wanted)[:-1])
+    if not rises.size:
+        return []
+    at = int(parts[rises[0] + 1][0])
+    what = f"nodes from {at:,} on are wanted before some that come before them"
+    return [Finding("tree.coarse-first", what, at, len(parent) - at)]

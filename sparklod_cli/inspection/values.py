@@ -23,7 +23,7 @@ QUANTITIES: dict[str, Callable[[Splats], FloatArray]] = {
     "z": lambda splats: splats.center[:, 2],
     "scale": lambda splats: splats.scale.max(axis=1),
     "scale_min": lambda splats: splats.scale.min(axis=1),
-    "anisotropy": lambda splats: splats.scale.max(axis=1) / splats.scale.min(axis=1),
+    "anisotropy": lambda splats: splats.scale.max(axis=1).astype(np.float64) / splats.scale.min(axis=1),
     "opacity": lambda splats: splats.opacity,
     "size": spark_size,
     "red": lambda splats: splats.rgb[:, 0],
@@ -85,7 +85,9 @@ def quantity(splats: Splats, name: str) -> FloatArray:
         if name in QUANTITIES:
             return QUANTITIES[name](splats)
         degree = SH_QUANTITIES.index(name)
-        return np.sqrt(np.square(splats.sh[:, COEFFICIENTS[degree] : COEFFICIENTS[degree + 1]]).mean(axis=(1, 2)))
+        return np.sqrt(
+            np.square(splats.sh[:, COEFFICIENTS[degree] : COEFFICIENTS[degree + 1]], dtype=np.float64).mean((1, 2))
+        )
 
 
 def examine(splats: Splats, *, all_quantities: bool = False) -> ValueFacts:
@@ -101,7 +103,7 @@ def examine(splats: Splats, *, all_quantities: bool = False) -> ValueFacts:
     box = box_98 = None
     if len(good):
         box = Box(_numbers(good.center.min(axis=0)), _numbers(good.center.max(axis=0)))
-        low, high = np.percentile(good.center, [1, 99], axis=0)
+        low, high = np.percentile(good.center.astype(np.float64), [1, 99], axis=0)
         box_98 = Box(_numbers(low), _numbers(high))
     return ValueFacts(
         box=box,
@@ -115,7 +117,7 @@ def examine(splats: Splats, *, all_quantities: bool = False) -> ValueFacts:
 
 
 def _summary(values: FloatArray) -> dict[str, float | None]:
-    values = values[np.isfinite(values)]
+    values = values[np.isfinite(values)].astype(np.float64)  # in which the span of no float32s overflows
     if not len(values):
         return dict.fromkeys(("min", *PERCENTILES, "max", "mean"))
     levels = _numbers(np.percentile(values, [0, *PERCENTILES.values(), 100]))
@@ -156,13 +158,14 @@ def check(scene: Scene) -> list[Finding]:
     header = scene.header
     if header.get("version", 0) >= 2 and "fractional_bits" in header:  # SPZ version 1 has floats
         most = quantize.FIXED24_MAX * 2.0 ** -int(header["fractional_bits"])
-        clamped = (np.abs(splats.center) >= most).any(axis=1)
+        clamped = finite & (np.abs(splats.center) >= most).any(axis=1)
         report("values.center-clamped", clamped, f"a coordinate is {most:g}, the most that its code holds")
     if "fractional_bits" in header:
         low, high = quantize.decode_log_scale(np.array([0, 255], np.uint8))
-        clamped = ((splats.scale <= low) | (splats.scale >= high)).any(axis=1)
+        most = splats.scale.max(axis=1)  # that a thin splat is not quite as thin is not seen
+        clamped = (most <= low) | (most >= high)
         if np.count_nonzero(clamped) > MANY_CLAMPED * len(splats):
             report("values.scale-clamped", clamped, f"a scale is {low:.2g} or {high:.0f}, the ends of what SPZ holds")
-    far = (np.abs(splats.center) >= FLOAT16_END).any(axis=1)
+    far = finite & (np.abs(splats.center) >= FLOAT16_END).any(axis=1)
     report("values.center-far", far, f"a coordinate is {FLOAT16_END:,} or more, which float16 cannot hold")
     return found

@@ -36,8 +36,9 @@ def walk(child_count, child_start, size):
         node = queue[first]
         first += 1
         start = np.int64(child_start[node])
-        steps += child_count[node]
-        for child in range(start, min(count, start + np.int64(child_count[node]))):
+        end = min(count, start + np.int64(child_count[node]))
+        steps += max(0, end - start)
+        for child in range(start, end):
             if depth[child] < 0:
                 depth[child] = depth[node] + 1
                 limit[child] = min(limit[node], size[child])
@@ -77,6 +78,34 @@ def find_parents(child_count, child_start):
     for node in range(1, count):
         references[node] += references[node - 1]
     return parent, references[:count]
+
+
+@kernel()
+def find_cycles(parent, depth):
+    """Nodes that the root does not lead to, and that have no topmost node above them either, in linear time.
+
+    Args:
+        parent: (N,) int32, of `find_parents`.
+        depth: (N,) int32, of `walk`.
+
+    Returns:
+        (N,) bool: the node is on a cycle, or below one.
+    """
+    unknown, ends, cycle, passed = 0, 1, 2, 3
+    state = np.zeros(len(parent), np.uint8)
+    for node in range(len(parent)):
+        at = node
+        while at >= 0 and depth[at] < 0 and state[at] == unknown:
+            state[at] = passed
+            at = parent[at]
+        found = ends
+        if at >= 0 and depth[at] < 0:
+            found = cycle if state[at] == passed else state[at]
+        at = node
+        while at >= 0 and state[at] == passed:
+            state[at] = found
+            at = parent[at]
+    return state == cycle
 
 
 @kernel()

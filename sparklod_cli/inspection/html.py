@@ -1,0 +1,279 @@
+"""Reports as one page that stands by itself: no server, no network, no script."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from html import escape
+from importlib.resources import files
+from typing import Any
+
+from .. import __version__
+from .charts import bar, children_groups, histogram_chart, text_of
+from .findings import CODES, ERROR, NOTE, WARNING
+from .histograms import Histogram
+from .plot import Picture
+
+#: Nothing but the style and the pictures inside the page is let in, whatever a file is called.
+POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
+
+#: What quantities are, for people.
+QUANTITIES = {
+    "x": "centres, world units",
+    "y": "centres, world units",
+    "z": "centres, world units",
+    "scale": "the largest standard deviation, world units",
+    "scale_min": "the smallest standard deviation, world units",
+    "anisotropy": "the largest standard deviation over the smallest",
+    "opacity": "linear; merged splats may have more than 1",
+    "size": "the feature size that Spark chooses nodes by, world units",
+    "red": "display-referred, 0 to 1",
+    "green": "display-referred, 0 to 1",
+    "blue": "display-referred, 0 to 1",
+    "sh1": "root mean square of the coefficients of degree 1",
+    "sh2": "root mean square of the coefficients of degree 2",
+    "sh3": "root mean square of the coefficients of degree 3",
+}
+
+#: Numbers of a header that say something to a person, by the names that they have there.
+HEADER = {"version": "Version", "fractional_bits": "Fractional bits"}
+
+#: From bad to harmless.
+SEVERITIES = (ERROR, WARNING, NOTE)
+
+NONE = "\u2013"
+
+
+@dataclass(frozen=True)
+class Section:
+    """What a page tells of a file.
+
+    Attributes:
+        report: as JSON has it (`report.Report.as_dict`); what is missing or None is left out.
+        picture: of the scene.
+        histograms: by the name of the quantity.
+    """
+
+    report: Mapping[str, Any]
+    picture: Picture | None = None
+    histograms: Mapping[str, Histogram] = field(default_factory=dict)
+
+
+def page(sections: Sequence[Section]) -> str:
+    """The page of some files, as HTML; to be written as UTF-8."""
+    one = len(sections) == 1
+    title = f"{text_of(sections[0].report.get('file', ''))} \u2013 sparklod inspect" if one else "sparklod inspect"
+    style = files(__package__).joinpath("page.css").read_text("utf-8")
+    contents = "" if one else _contents(sections)
+    body = "\n".join(_section(section, f"file-{number}") for number, section in enumerate(sections, 1))
+    return f"""<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta http-equiv="Content-Security-Policy" content="{escape(POLICY)}">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<meta name="generator" content="sparklod {__version__}">
+<title>{title}</title>
+<style>
+{style}</style>
+</head>
+<body>
+<header class="page"><h1>What is in {"this splat file" if one else f"{len(sections)} splat files"}</h1></header>
+<main>
+{contents}{body}
+</main>
+<footer>Written by sparklod {__version__}.</footer>
+</body>
+</html>
+"""
+
+
+def _number(value: float | None) -> str:
+    if value is None:
+        return NONE
+    return f"{value:,}" if isinstance(value, int) else f"{value:,.4g}" if abs(value) < 1e6 else f"{value:.4g}"
+
+
+def _size(size: int) -> str:
+    for unit, power in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
+        if size >= power:
+            return f"{size / power:.1f} {unit}"
+    return f"{size} bytes"
+
+
+def _panel(title: str, content: str) -> str:
+    return f'<section class="panel"><h3>{title}</h3>\n{content}\n</section>' if content else ""
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[str]], caption: str) -> str:
+    """A table of cells that are HTML already; the first of each row is its heading."""
+    columns = "".join(f'<th scope="col">{cell}</th>' for cell in head)
+    lines = (f'<tr><th scope="row">{row[0]}</th>{"".join(_cell(cell) for cell in row[1:])}</tr>' for row in rows)
+    body = "\n".join(lines)
+    return (
+        f'<div class="scroll" tabindex="0"><table><caption>{caption}</caption>\n<thead><tr>{columns}</tr></thead>\n'
+        f"<tbody>\n{body}\n</tbody></table></div>"
+    )
+
+
+def _cell(content: str) -> str:
+    return f'<td class="wide">{content}</td>' if content.startswith('<div class="track"') else f"<td>{content}</td>"
+
+
+def _verdict(report: Mapping[str, Any]) -> str:
+    """What the findings come to, as a badge."""
+    findings = report.get("findings")
+    if findings is None:
+        return '<span class="badge plain">not checked</span>'
+    for severity in SEVERITIES:
+        count = sum(found.get("severity") == severity for found in findings)
+        if count:
+            return f'<span class="badge {severity}">{count} {severity}{"s" if count > 1 else ""}</span>'
+    return '<span class="badge good">nothing is wrong</span>'
+
+
+def _contents(sections: Sequence[Section]) -> str:
+    rows = []
+    for number, report in enumerate((section.report for section in sections), 1):
+        name = f'<a href="#file-{number}">{text_of(report.get("file", number))}</a>'
+        size = report.get("bytes")
+        rows.append(
+            [
+                name,
+                text_of(report.get("format") or NONE),
+                _number(report.get("splats")),
+                NONE if size is None else _size(size),
+                _verdict(report),
+            ]
+        )
+    head = ("File", "Format", "Splats", "Size", "Findings")
+    return f'<nav class="panel" aria-label="Files">{_table(head, rows, "The files")}</nav>\n'
+
+
+def _section(section: Section, anchor: str) -> str:
+    report = section.report
+    form = f'<span class="badge plain">{text_of(report["format"])}</span>' if report.get("format") else ""
+    name = text_of(report.get("file", ""))
+    parts = [
+        f'<article id="{anchor}" aria-labelledby="{anchor}-name">',
+        f'<div class="head"><h2 id="{anchor}-name">{name}</h2>{form}{_verdict(report)}</div>',
+        _figures(report),
+        _findings(report),
+        _picture(section.picture),
+    ]
+    if report.get("tree"):
+        parts.append(_tree(report["tree"]))
+    if report.get("values"):
+        parts.append(_values(report["values"]))
+    parts.append(_histograms(section.histograms))
+    return "\n".join(part for part in [*parts, "</article>"] if part)
+
+
+def _figures(report: Mapping[str, Any]) -> str:
+    """The key figures, as cards."""
+    tree, header = report.get("tree") or {}, report.get("header") or {}
+    noun = "node" if tree else "splat"
+    cards: list[tuple[str, str, str]] = []
+    if report.get("splats") is not None:
+        cards.append((f"{noun.title()}s", _number(report["splats"]), ""))
+    if report.get("bytes") is not None:
+        each, ratio = report.get("bytes_per_splat"), report.get("compression_ratio")
+        of_each = f"{each:.1f} bytes a {noun}" if each else ""
+        of_ratio = f"{ratio:.1f} times smaller than floats" if ratio else ""
+        cards.append(("Size", _size(report["bytes"]), ", ".join(filter(None, (of_each, of_ratio)))))
+    if tree:
+        opaque, needed = 100 * (tree.get("more_than_opaque") or 0), _number(tree.get("chunks_of_coarse_cut"))
+        cards += [
+            ("Leaves", _number(tree.get("leaves")), "splats that it is made of"),
+            ("Inner nodes", _number(tree.get("inner")), f"{opaque:.1f} % of all have D &gt; 1"),
+            ("Growth", _number(tree.get("growth")), "nodes a leaf"),
+            ("Levels", _number(len(tree.get("levels") or ())), f"depth {_number(tree.get('depth'))}"),
+            ("Chunks", _number(tree.get("chunks")), f"{needed} for the coarsest cut"),
+        ]
+    if report.get("sh_degree") is not None:
+        cards.append(("SH degree", _number(report["sh_degree"]), ""))
+    if report.get("antialiased") is not None:
+        cards.append(("Antialiased", "yes" if report["antialiased"] else "no", ""))
+    cards += [(title, _number(header[name]), "") for name, title in HEADER.items() if name in header]
+    items = []
+    for title, value, small in cards:
+        more = f"<small>{small}</small>" if small else ""
+        items.append(f"<div><dt>{title}</dt><dd>{value}{more}</dd></div>")
+    return f'<dl class="figures">{"".join(items)}</dl>' if cards else ""
+
+
+def _findings(report: Mapping[str, Any]) -> str:
+    findings = report.get("findings")
+    notes = "".join(f"<p>{text_of(note)}</p>" for note in report.get("notes") or ())
+    if not findings:
+        return _panel("Notes", notes)
+    items = []
+    for found in sorted(findings, key=lambda found: SEVERITIES.index(found["severity"])):
+        severity, code, message = (text_of(found[name]) for name in ("severity", "code", "message"))
+        meaning = text_of(CODES[found["code"]][1]) if found["code"] in CODES else ""
+        head = f'<b>{severity}</b><code>{code}</code> <span class="faint">{meaning}</span>'
+        items.append(f'<li class="{severity}">{head}<p>{message}</p></li>')
+    return _panel("Findings", f'<ul class="findings">{"".join(items)}</ul>{notes}')
+
+
+def _picture(picture: Picture | None) -> str:
+    if picture is None:
+        return ""
+    data, words = base64.b64encode(picture.png).decode("ascii"), picture.description
+    image = f'<img alt="Drawing of {text_of(words.partition(";")[0])}" src="data:image/png;base64,{data}">'
+    return f"<figure>{image}<figcaption>{text_of(words)}</figcaption></figure>"
+
+
+def _tree(tree: Mapping[str, Any]) -> str:
+    levels = tree.get("levels") or ()
+    most = max((level["nodes"] for level in levels), default=0) or 1
+    rows = []
+    for number, level in enumerate(levels):
+        bars = bar((level["nodes"] - level["leaves"]) / most, level["leaves"] / most)
+        rows.append([f"{number}", *(_number(level[name]) for name in ("nodes", "leaves", "size")), bars])
+    key = '<span class="key">inner</span> <span class="key soft">leaves</span>'
+    caption = "By edges from the root. Size: geometric mean of the feature sizes, world units."
+    table = _table(("Level", "Nodes", "Leaves", "Size", key), rows, caption) if rows else ""
+    groups = children_groups(tree.get("children") or {})
+    most = max((count for _, count in groups), default=0) or 1
+    rows = [[name, _number(count), bar(count / most)] for name, count in groups]
+    children = _table(("Children", "Inner nodes", ""), rows, "Inner nodes by their number of children.") if rows else ""
+    return f'<div class="two">{_panel("Levels of the tree", table)}{_panel("Children", children)}</div>'
+
+
+def _values(values: Mapping[str, Any]) -> str:
+    quantities = values.get("quantities") or {}
+    columns = list(dict.fromkeys(name for summary in quantities.values() for name in summary))
+    rows = [[text_of(name), *(_number(row.get(column)) for column in columns)] for name, row in quantities.items()]
+    table = _table(["", *map(text_of, columns)], rows, "Numbers that are not finite are left out.") if rows else ""
+    boxes = []
+    for name, what in (("box", "of all centres"), ("box_98", "1 % to 99 %")):
+        box = values.get(name)
+        if box:
+            edges = [high - low for low, high in zip(box["min"], box["max"], strict=True)]
+            for end, numbers in (("from", box["min"]), ("to", box["max"]), ("extent", edges)):
+                boxes.append([f"{what}, {end}", *(_number(float(number)) for number in numbers)])
+    extent = _table(("", "x", "y", "z"), boxes, "World units.") if boxes else ""
+    counts = (
+        ("with a number that is not finite", "non_finite"),
+        ("of opacity 0", "zero_opacity"),
+        ("of scale 0", "zero_scale"),
+        ("more than opaque", "more_than_opaque"),
+    )
+    degenerate = [[what, _number(values[name])] for what, name in counts if name in values]
+    out_of_range = _table(("Splats", "Count"), degenerate, "Of all splats or nodes.") if degenerate else ""
+    side = f"{_panel('Box', extent)}{_panel('Out of the ordinary', out_of_range)}"
+    return f'{_panel("Values", table)}\n<div class="two">{side}</div>'
+
+
+def _histograms(histograms: Mapping[str, Histogram]) -> str:
+    parts = []
+    for name, counted in histograms.items():
+        chart = histogram_chart(counted, name)
+        beyond = ((counted.below, "below"), (counted.above, "above"), (counted.not_finite, "not finite"))
+        remarks = ["bins of equal ratios"] * counted.log + [f"{count:,} {where}" for count, where in beyond if count]
+        said = "; ".join(filter(None, [QUANTITIES.get(name, ""), *remarks]))
+        head = f'<h4>{text_of(name)}</h4><p class="faint">{text_of(said)}</p>'
+        parts.append(f"<div>{head}{chart or '<p>no numbers</p>'}</div>")
+    return _panel("Histograms", f'<div class="charts">{"".join(parts)}</div>' if parts else "")

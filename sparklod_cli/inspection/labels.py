@@ -1,0 +1,107 @@
+"""Writes on a rendered picture what it shows: a title, what the colours mean, and where the axes are."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+from .colors import Coloring
+from .shapes import Camera, Points, ticks
+
+BACKGROUND, INK, FAINT, LINE = "#0f141b", "#e6edf3", "#9aa7b4", "#7d8996"
+
+#: Least distance of the labels of an axis, in thousandths of the picture's height.
+LABEL_DISTANCE = 62
+
+Font = Any
+
+
+def write_png(
+    pixels: NDArray[np.uint8],
+    title: str,
+    lines: Sequence[str],
+    coloring: Coloring,
+    camera: Camera,
+    low: Points,
+    high: Points,
+) -> bytes:
+    """The PNG of a picture with its labels.
+
+    Args:
+        pixels: (H, W, 3) of the scene.
+        title, lines: what it shows, in words that fit into its width.
+        coloring: what the colours mean.
+        camera: that it was drawn with.
+        low, high: (3,) corners of the box that is measured, world units; y points down.
+    """
+    image = Image.fromarray(pixels)
+    draw = ImageDraw.Draw(image)
+    unit = min(image.height / 1000, image.width / 1600)
+    _title(draw, unit, title, lines)
+    _scale(image, draw, unit, coloring)
+    _axes(draw, unit, image.size, camera, low, high)
+    out = io.BytesIO()
+    image.save(out, "PNG", optimize=True)
+    return out.getvalue()
+
+
+def _font(unit: float, size: float) -> Font:
+    return ImageFont.load_default(size=max(7, size * unit))
+
+
+def _title(draw: ImageDraw.ImageDraw, unit: float, title: str, lines: Sequence[str]) -> None:
+    left, top = 40 * unit, 30 * unit
+    draw.text((left, top), title, INK, _font(unit, 32))
+    for number, line in enumerate(lines):
+        draw.text((left, top + (46 + 26 * number) * unit), line, FAINT, _font(unit, 19))
+
+
+def _scale(image: Image.Image, draw: ImageDraw.ImageDraw, unit: float, coloring: Coloring) -> None:
+    left, right = image.width - 170 * unit, image.width - 146 * unit
+    top, bottom = 0.26 * image.height, 0.84 * image.height
+    draw.text((left, top - 18 * unit), coloring.title, INK, _font(unit, 21), anchor="ls")
+    height = max(1, round(bottom - top))
+    rows = np.arange(height)[::-1] * len(coloring.ramp) // height
+    bar = np.broadcast_to(coloring.ramp[rows][:, None], (height, max(1, round(right - left)), 3))
+    image.paste(Image.fromarray(np.ascontiguousarray(bar)), (round(left), round(top)))
+    for place, text in coloring.marks:
+        y = bottom - place * (bottom - top)
+        draw.line([(right, y), (right + 6 * unit, y)], LINE, max(1, round(unit)))
+        draw.text((right + 12 * unit, y), text, FAINT, _font(unit, 17), anchor="lm")
+
+
+def _axes(
+    draw: ImageDraw.ImageDraw, unit: float, size: tuple[int, int], camera: Camera, low: Points, high: Points
+) -> None:
+    """Numbers along three edges of a box: two of its floor, towards the camera, and the upright one on the left."""
+    near = np.where(camera.position > (low + high) / 2, high, low)
+    near[1] = high[1]
+    middle = camera.project(((low + high) / 2)[None])[0] * size
+    floor = np.array([[x, high[1], z] for x in (low[0], high[0]) for z in (low[2], high[2])])
+    left = floor[np.argmin(camera.project(floor)[:, 0])]
+    for axis, origin in ((0, near), (2, near), (1, left)):
+        ends = np.stack([origin, origin])
+        ends[:, axis] = low[axis], high[axis]
+        first, last = camera.project(ends) * size
+        length = float(np.linalg.norm(last - first))
+        if length < LABEL_DISTANCE * unit:
+            continue
+        draw.line([tuple(first), tuple(last)], LINE, max(1, round(unit)))
+        # Labels stand outside: on the side of the edge that the middle of the box is not on.
+        along = (last - first) / length
+        out = np.array([-along[1], along[0]])
+        out *= -np.sign(out @ (middle - first)) or 1.0
+        extent = float(high[axis] - low[axis])
+        for value, text in ticks(float(low[axis]), float(high[axis]), extent * LABEL_DISTANCE * unit / length):
+            point = origin.copy()
+            point[axis] = value
+            at = (camera.project(point[None]) * size)[0]
+            draw.line([tuple(at), tuple(at + 7 * unit * out)], LINE, max(1, round(1.5 * unit)))
+            draw.text(tuple(at + 24 * unit * out), text, FAINT, _font(unit, 17), anchor="mm")
+        name = first - 26 * unit * along if axis == 1 else (first + last) / 2 + 62 * unit * out
+        draw.text(tuple(name), "y, down" if axis == 1 else "xyz"[axis], INK, _font(unit, 20), anchor="mm")

@@ -1,0 +1,196 @@
+"""What a picture of a scene is made of, as plain arrays: ellipsoids, cells, boxes, ticks and a place for the camera."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..limits import DEFAULT_BASE
+from ..splats import FloatArray, Splats
+
+#: (N, 3) points, or ends of lines by twos; (3,) where it is one.
+Points = NDArray[np.floating[Any]]
+
+#: The corners of the unit cube, and which of them its twelve edges join.
+CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], np.float64)
+EDGES = np.array([(a, b) for a in range(8) for b in range(a + 1, 8) if (a ^ b) in (1, 2, 4)])
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Triangles: (P, 3) points with a unit normal each, and (T, 3) indices of them."""
+
+    points: FloatArray
+    normals: FloatArray
+    triangles: NDArray[np.int64]
+
+
+def sphere(rounds: int) -> Mesh:
+    """The unit sphere: an icosahedron whose triangles are divided by four so many times."""
+    golden = (1 + math.sqrt(5)) / 2
+    one = np.array([[-1, golden, 0], [1, golden, 0], [-1, -golden, 0], [1, -golden, 0]])
+    points = np.concatenate([one, np.roll(one, 1, axis=1), np.roll(one, 2, axis=1)])
+    near = np.linalg.norm(points[:, None] - points[None], axis=2) < 2.1  # the edges are 2 long
+    found = [(a, b, c) for a, b, c in combinations(range(12), 3) if near[a, b] and near[b, c] and near[a, c]]
+    triangles = np.array(found)
+    for _ in range(rounds):
+        sides = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+        pairs, at = np.unique(sides, axis=0, return_inverse=True)
+        middle = at.reshape(-1, 3) + len(points)
+        points = np.concatenate([points, points[pairs].mean(axis=1)])
+        (a, b, c), (ab, bc, ca) = triangles.T, middle.T
+        triangles = np.concatenate(
+            [np.stack(corner, 1) for corner in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))]
+        )
+    unit = points / np.linalg.norm(points, axis=1, keepdims=True)
+    p, q, r = unit[triangles].transpose(1, 0, 2)
+    inward = np.einsum("ij,ij->i", np.cross(q - p, r - p), p) < 0
+    triangles[inward] = triangles[inward][:, ::-1]
+    return Mesh(unit.astype(np.float32), unit.astype(np.float32), triangles)
+
+
+def rotation(quat_xyzw: FloatArray) -> FloatArray:
+    """(N, 4) unit quaternions to (N, 3, 3) matrices: splat, world axis, local axis."""
+    x, y, z, w = quat_xyzw.T
+    axes = np.empty((len(quat_xyzw), 3, 3), np.float32)
+    axes[:, 0] = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], 1)
+    axes[:, 1] = np.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], 1)
+    axes[:, 2] = np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], 1)
+    return axes
+
+
+def ellipsoids(splats: Splats, deviations: float, of: Mesh, thinnest: float) -> Mesh:
+    """The surfaces of N splats at so many standard deviations, one after the other.
+
+    The normal of an ellipsoid is that of the sphere, divided by the radii where points are multiplied by them.
+
+    Args:
+        splats: N of them.
+        deviations: the radii, in standard deviations.
+        of: the unit sphere.
+        thinnest: no radius is drawn smaller than this, so that no splat falls between the pixels; world units.
+    """
+    axes = rotation(splats.quat_xyzw)
+    radii = np.maximum(splats.scale * np.float32(deviations), np.float32(thinnest))
+    points = of.points @ (axes * radii[:, None]).transpose(0, 2, 1) + splats.center[:, None]
+    normals = of.points @ (axes * (radii.min(axis=1, keepdims=True) / radii)[:, None]).transpose(0, 2, 1)
+    normals /= np.linalg.norm(normals, axis=2, keepdims=True)
+    triangles = of.triangles + len(of.points) * np.arange(len(splats))[:, None, None]
+    return Mesh(points.reshape(-1, 3), normals.reshape(-1, 3), triangles.reshape(-1, 3))
+
+
+def evenly(count: int, most: int) -> NDArray[np.int64]:
+    """At most so many of `count` indices, evenly spaced: always the same, and from all parts of the file."""
+    return np.arange(count) if count <= most else np.arange(most) * count // most
+
+
+def level_of_step(size: float, base: float = DEFAULT_BASE) -> int:
+    """The level of Quick-LoD that a size, 2 * max(scale), belongs to; its cells have edges of base ** level."""
+    return math.ceil(math.log(size, base) - 1e-9)
+
+
+def cells(center: FloatArray, step: float) -> Points:
+    """(C, 3) lowest corners of the cells of an edge of `step` that these centres are in."""
+    return np.unique(np.floor(center.astype(np.float64) / step), axis=0) * step
+
+
+def box_lines(low: Points, high: Points) -> Points:
+    """(24 B, 3) ends of the edges of B boxes with the corners (B, 3) `low` and `high`."""
+    corners = low[:, None] + CORNERS * (high - low)[:, None]
+    return corners[:, EDGES].reshape(-1, 3)
+
+
+def wall_lines(low: Points, high: Points, far: Points, spacing: float) -> Points:
+    """Ends of the lines at multiples of `spacing` on three walls of a box, those that go through its corner `far`."""
+    lines: list[Points] = []
+    for axis in range(3):
+        at = spacing * np.arange(math.ceil(low[axis] / spacing - 1e-9), math.floor(high[axis] / spacing + 1e-9) + 1)
+        for wall in {0, 1, 2} - {axis}:
+            along = 3 - axis - wall
+            ends = np.empty((len(at), 2, 3))
+            ends[:, :, axis], ends[:, :, wall] = at[:, None], far[wall]
+            ends[:, :, along] = low[along], high[along]
+            lines.append(ends.reshape(-1, 3))
+    return np.concatenate(lines)
+
+
+def nice_step(least: float) -> float:
+    """The least of 1, 2 and 5 times a power of ten that is not below `least`."""
+    power = 10.0 ** math.floor(math.log10(least))
+    return next(step for step in (power, 2 * power, 5 * power, 10 * power, 20 * power) if step >= least * (1 - 1e-9))
+
+
+def ticks(low: float, high: float, least: float) -> list[tuple[float, str]]:
+    """Round numbers from low to high, not closer than `least`, and as text."""
+    step = nice_step(least)
+    digits = max(0, -math.floor(math.log10(step) + 1e-9))
+    first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
+    plain = step > 1e-5 and max(abs(low), abs(high)) < 1e7
+    return [(step * n, f"{step * n:.{digits}f}" if plain else f"{step * n:.6g}") for n in range(first, last + 1)]
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A perspective camera.
+
+    Attributes:
+        position, target: (3,) world units.
+        axes: (3, 3) rows: to the right, up, and into the picture.
+        angle: degrees that the height of the picture spans.
+        aspect: width over height.
+        shift: where `target` stands in the picture: -1 left or bottom, 0 middle, 1 right or top.
+    """
+
+    position: Points
+    target: Points
+    axes: Points
+    angle: float
+    aspect: float
+    shift: Points
+
+    def project(self, points: Points) -> Points:
+        """(N, 3) points to (N, 2) places in the picture: 0..1 from its left and from its top."""
+        local = (np.asarray(points, np.float64) - self.position) @ self.axes.T
+        return (1 + (_seen(local, self.angle, self.aspect) + self.shift) * (1, -1)) / 2
+
+
+def camera(
+    points: Points, direction: Points, up: Points, *, aspect: float, frame: tuple[float, float, float, float]
+) -> Camera:
+    """The camera that looks along a direction and has all points just inside a frame.
+
+    Args:
+        points: (N, 3) to be seen.
+        direction, up: (3,) world axes.
+        aspect: width over height.
+        frame: left, top, right and bottom of the frame in the picture, 0..1 from its left and from its top.
+    """
+    angle = 25.0
+    forward = direction / np.linalg.norm(direction)
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right)
+    axes = np.stack([right, np.cross(right, forward), forward])
+    target = (points.min(axis=0) + points.max(axis=0)) / 2
+    local = (points - target) @ axes.T
+    left, top, end, bottom = frame
+    room = 2 * np.array([end - left, bottom - top])
+    radius = float(np.linalg.norm(local, axis=1).max()) or 1.0
+    near, far = 1.01 * radius, 1e3 * radius
+    for _ in range(60):  # halves what the distance can be: the picture shrinks with it
+        distance = (near + far) / 2
+        seen = _seen(local + np.array([0, 0, distance]), angle, aspect)
+        near, far = (near, distance) if (np.ptp(seen, axis=0) <= room).all() else (distance, far)
+    seen = _seen(local + np.array([0, 0, far]), angle, aspect)
+    shift = np.array([left + end - 1, 1 - top - bottom]) - (seen.min(axis=0) + seen.max(axis=0)) / 2
+    return Camera(target - far * forward, target, axes, angle, aspect, shift)
+
+
+def _seen(local: Points, angle: float, aspect: float) -> Points:
+    """(N, 3) points in the axes of a camera to (N, 2) places, -1..1 from the left and from the bottom."""
+    half = math.tan(math.radians(angle) / 2)
+    return local[:, :2] / (local[:, 2:] * (half * aspect, half))

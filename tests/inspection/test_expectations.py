@@ -1,0 +1,326 @@
+"""Expectations: how they are read, and what falls short of them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sparklod_cli.cli import run
+from sparklod_cli.errors import SparklodError
+from sparklod_cli.inspection.expectations import ExpectationError, Expectations, check, read, value_at
+from sparklod_cli.inspection.report import Report, Wanted, inspect
+
+from ..conftest import FIXTURES
+
+TREE, PLAIN = FIXTURES / "golden" / "hand-tree-v3.spz", FIXTURES / "golden" / "sh3-v3.spz"
+#: The tree has nine nodes, of which six are leaves, and two edges from the root to the deepest.
+NODES, LEAVES, DEPTH = 9, 6, 2
+
+
+@pytest.fixture(scope="module")
+def tree() -> Report:
+    return inspect(TREE, Wanted(values=True, all_quantities=True))[0]
+
+
+@pytest.fixture(scope="module")
+def plain() -> Report:
+    return inspect(PLAIN, Wanted(values=True))[0]
+
+
+def codes(report: Report, **expected: Any) -> list[str]:
+    return [found.code for found in check(report, Expectations(**expected))]
+
+
+def test_each_expectation_of_a_tree(tree: Report) -> None:
+    size = TREE.stat().st_size
+    assert codes(tree) == []
+    for name, holds, fails, code in [
+        ("max_bytes", size, size - 1, "expect.bytes"),
+        ("min_splats", LEAVES, LEAVES + 1, "expect.splats"),
+        ("max_splats", LEAVES, LEAVES - 1, "expect.splats"),
+        ("sh", 0, 1, "expect.sh"),
+        ("lod", True, False, "expect.lod"),
+        ("max_growth", NODES / LEAVES, 1.4, "expect.growth"),
+    ]:
+        assert codes(tree, **{name: holds}) == []
+        assert codes(tree, **{name: fails}) == [code]
+
+
+def test_each_expectation_of_plain_splats(plain: Report) -> None:
+    for name, holds, fails, code in [
+        ("min_splats", 60, 61, "expect.splats"),
+        ("max_splats", 60, 59, "expect.splats"),
+        ("sh", 3, 2, "expect.sh"),
+        ("lod", False, True, "expect.lod"),
+    ]:
+        assert codes(plain, **{name: holds}) == []
+        assert codes(plain, **{name: fails}) == [code]
+    assert codes(plain, max_growth=9.0) == ["expect.growth"]  # there is none without a tree
+
+
+def test_all_that_falls_short_is_said(tree: Report) -> None:
+    expected = {"max_bytes": 1, "max_splats": 1, "sh": 3, "lod": False, "max_growth": 1, "values": {"splats": 1}}
+    found = check(tree, Expectations(**expected))
+    assert [each.code.removeprefix("expect.") for each in found] == ["bytes", "splats", "sh", "lod", "growth", "value"]
+    assert found[1].message == "6 leaves, expected at most 1"
+    assert "growth 1.5, expected" in found[4].message
+    assert found[5].message == "splats is 9, expected 1"
+
+
+def test_of_what_cannot_be_read_nothing_is_expected() -> None:
+    report, scene = inspect(FIXTURES / "points.ply", Wanted())
+    assert scene is None
+    assert codes(report, min_splats=1, lod=True, values={"splats": 3}) == []
+
+
+@pytest.mark.parametrize(
+    ("way", "holds", "fails"),
+    [
+        ("format", "SPZ 3 LoD", "SPZ 2 LoD"),
+        ("splats", NODES, NODES + 1),
+        ("antialiased", False, True),
+        ("tree.depth", DEPTH, 3),
+        ("tree.levels.1.nodes", 3, 4),
+        ("tree.children", {"min": 0}, None),
+        ("tree.children.3", 2, 1),
+        ("header.fractional_bits", 12, 13),
+        ("values.non_finite", 0, 1),
+        ("values.box.max.0", 4.0, 4.1),
+        ("values.quantities.opacity.max", {"max": 4.0}, {"max": 0.5}),
+        ("tree.growth", {"min": 1.5}, {"min": 1.51}),
+        ("tree.growth", {"min": 1.2, "max": 1.8}, {"min": 1.2, "max": 1.4}),
+        ("tree.growth", {"max": 2}, {"max": 1}),
+        ("notes", [], ["SH degree 4 is cut to 3"]),
+    ],
+)
+def test_values_of_the_report(tree: Report, way: str, holds: Any, fails: Any) -> None:
+    if way == "tree.children":  # a table has no least and no most
+        assert codes(tree, values={way: holds}) == ["expect.value"]
+        return
+    assert codes(tree, values={way: holds}) == []
+    (found,) = check(tree, Expectations(values={way: fails}))
+    assert found.code == "expect.value"
+    assert found.message.startswith(f"{way} is ")
+    assert found.message.endswith(json.dumps(fails))
+
+
+def test_a_minimum_of_what_is_no_number_is_not_met(tree: Report) -> None:
+    for way in ("format", "antialiased", "values.box"):
+        assert codes(tree, values={way: {"min": 0}}) == ["expect.value"]
+
+
+@pytest.mark.parametrize("way", ["", "nothing", "tree.", "tree.levels.99", "tree.levels.x", "splats.0", "format.0"])
+def test_a_way_that_leads_nowhere_is_an_error(tree: Report, way: str) -> None:
+    with pytest.raises(ExpectationError, match=f"the report has no {way}"):
+        value_at(tree.as_dict(), way)
+
+
+def test_value_at(tree: Report) -> None:
+    plain = tree.as_dict()
+    assert value_at(plain, "tree.levels.0") == plain["tree"]["levels"][0]
+    assert value_at(plain, "tree.levels.2.leaves") == 5
+    assert value_at(plain, "tree.children.2") == 1
+    assert value_at(plain, "values.box.min.2") == 1.0
+    assert value_at(plain, "findings") is None
+
+
+EVERY = Expectations(
+    max_bytes=1000,
+    min_splats=1,
+    max_splats=10,
+    sh=0,
+    lod=True,
+    max_growth=1.5,
+    values={"tree.depth": 2, "tree.growth": {"min": 1, "max": 1.5}, "format": "SPZ 3 LoD"},
+)
+AS_TOML = """
+max_bytes = 1000
+min_splats = 1
+max_splats = 10
+sh = 0
+lod = true
+max_growth = 1.5
+
+[values]
+"tree.depth" = 2
+"tree.growth" = { min = 1, max = 1.5 }
+format = "SPZ 3 LoD"
+"""
+
+
+def written(folder: Path, text: str, name: str = "expect.json") -> Path:
+    path = folder / name
+    path.write_text(text)
+    return path
+
+
+def test_every_key_is_read_from_json_and_toml(tmp_path: Path, tree: Report) -> None:
+    as_json = written(tmp_path, json.dumps(vars(EVERY)))
+    as_toml = written(tmp_path, AS_TOML, "expect.TOML")
+    assert read(as_json) == read(as_toml) == EVERY
+    assert check(tree, EVERY) == []
+    assert read(written(tmp_path, "{}")) == read(written(tmp_path, "", "empty.toml")) == Expectations()
+
+
+def test_tables_of_toml_lead_to_values_as_dots_do(tmp_path: Path, tree: Report) -> None:
+    """`tree.depth = 2` without quotes is a table of a table, which one easily writes."""
+    path = written(tmp_path, "[values]\ntree.depth = 2\ntree.growth.max = 1.5\n", "expect.toml")
+    assert check(tree, read(path)) == []
+    path = written(tmp_path, "[values.tree]\ndepth = 3\n", "expect.toml")
+    assert [found.message for found in check(tree, read(path))] == ["tree.depth is 2, expected 3"]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('{"max_byte": 1}', "max_byte is not one of max_bytes"),
+        ('{"require_lod": true}', "require_lod is not one of"),
+        ('{"max_bytes": "1"}', "max_bytes cannot be '1'"),
+        ('{"max_bytes": 1.5}', "max_bytes cannot be 1.5"),
+        ('{"max_bytes": true}', "max_bytes cannot be True"),
+        ('{"max_bytes": null}', "max_bytes cannot be None"),
+        ('{"sh": [0]}', "sh cannot be"),
+        ('{"lod": 1}', "lod cannot be 1"),
+        ('{"lod": "yes"}', "lod cannot be 'yes'"),
+        ('{"max_growth": "1.5"}', "max_growth cannot be"),
+        ('{"max_growth": NaN}', "max_growth cannot be"),
+        ('{"max_bytes": -1}', "max_bytes cannot be -1"),
+        ('{"values": {"tree.depth": {}}}', "tree.depth"),
+        ('{"values": {"tree.depth": {"min": 1, "most": 2}}}', "tree.depth"),
+        ('{"values": {"tree.depth": {"min": "9"}}}', "tree.depth"),
+        ('{"values": {"tree.depth": {"max": null}}}', "tree.depth"),
+        ('{"values": {"tree.depth": {"max": [1]}}}', "tree.depth"),
+        ('{"values": {"tree.depth": {"max": true}}}', "tree.depth"),
+        ('{"values": {"tree.depth": {"max": NaN}}}', "tree.depth"),
+        ('{"values": ["tree.depth"]}', "values cannot be"),
+        ("[]", "is not a table of expectations"),
+        ("3", "is not a table of expectations"),
+        ("", "is not what it is called"),
+        ("{", "is not what it is called"),
+        ("max_bytes = 3", "is not what it is called"),
+        ("[" * 100_000, "is not what it is called"),
+    ],
+)
+def test_what_is_no_expectation_is_an_error_that_names_the_file(tmp_path: Path, text: str, message: str) -> None:
+    path = written(tmp_path, text)
+    with pytest.raises(SparklodError) as caught:
+        read(path)
+    assert str(caught.value).startswith(str(path))
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("content", [b"\xff\xfe\x00", None])
+def test_a_file_that_cannot_be_read_is_an_error_that_names_it(tmp_path: Path, content: bytes | None) -> None:
+    path = tmp_path / "expect.toml"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(SparklodError) as caught:
+        read(path)
+    assert str(path) in str(caught.value)
+
+
+def test_bad_toml_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(ExpectationError, match="not what it is called"):
+        read(written(tmp_path, '{"max_bytes": 1}', "expect.toml"))
+
+
+def test_a_date_is_not_what_a_value_is(tmp_path: Path, tree: Report) -> None:
+    """TOML has them, the report and JSON have not."""
+    for text in ("format = 2026-11-21", "format = [2026-11-21]", "splats = 12:00:00"):
+        path = written(tmp_path, f"[values]\n{text}\n", "expect.toml")
+        with pytest.raises(ExpectationError, match=r"format|splats"):
+            check(tree, read(path))
+
+
+OPTIONS = [
+    (["--max-bytes", TREE.stat().st_size], ["--max-bytes", 10], "expect.bytes"),
+    (["--min-splats", LEAVES], ["--min-splats", NODES], "expect.splats"),
+    (["--max-splats", LEAVES], ["--max-splats", 1], "expect.splats"),
+    (["--sh", 0], ["--sh", 3], "expect.sh"),
+    (["--max-growth", 1.5], ["--max-growth", 1.49], "expect.growth"),
+]
+
+
+@pytest.mark.parametrize(("holds", "fails", "code"), OPTIONS, ids=[option[0][0] for option in OPTIONS])
+def test_every_option_holds_a_file_to_something(
+    holds: list[Any], fails: list[Any], code: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["inspect", str(TREE), *map(str, holds)]) == 0
+    out, err = capsys.readouterr()
+    assert (out, err) == ("", f"{TREE}: nothing is wrong with its 9 nodes\n")
+    assert run(["inspect", str(TREE), *map(str, fails)]) == 3
+    out, err = capsys.readouterr()
+    assert out.startswith(f"{TREE}: error: {code}: ")
+    assert (out.count("\n"), err) == (1, "")
+
+
+def test_leaves_can_be_those_of_another_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    splats = tmp_path / "splats.spz"
+    assert run(["build-lod", "--unlod", str(TREE), "-o", str(splats), "-q"]) == 0
+    assert run(["inspect", str(TREE), "--leaves-of", str(splats)]) == 0
+    assert capsys.readouterr().out == ""
+    assert run(["inspect", str(TREE), "--leaves-of", str(PLAIN)]) == 3
+    assert capsys.readouterr().out == f"{TREE}: error: expect.leaves: 6 leaves, the original has 60 splats to draw\n"
+
+
+@pytest.mark.parametrize("original", ["missing.ply", FIXTURES / "points.ply"])
+def test_an_original_that_cannot_be_read_is_named(original: object, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["inspect", str(TREE), "--leaves-of", str(original)]) == 1
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith(f"error: {original}: ")
+
+
+def test_a_tree_can_be_required(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["inspect", str(TREE), "--require-lod"]) == 0
+    assert run(["inspect", str(TREE), str(PLAIN), "--require-lod"]) == 3
+    assert capsys.readouterr().out == f"{PLAIN}: error: expect.lod: no tree, expected one\n"
+
+
+def test_options_win_over_the_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = written(tmp_path, '{"max_splats": 1, "sh": 0, "values": {"tree.depth": 2}}')
+    assert run(["inspect", str(TREE), "--expect", str(path)]) == 3
+    assert run(["inspect", str(TREE), "--expect", str(path), "--max-splats", "6"]) == 0
+    assert run(["inspect", str(TREE), "--expect", str(path), "--max-splats", "6", "--sh", "2"]) == 3
+    assert "expect.sh" in capsys.readouterr().out
+
+
+def test_an_expectation_is_that_there_are_no_errors_either(capsys: pytest.CaptureFixture[str]) -> None:
+    broken, warned = (FIXTURES / "faults" / f"{name}.spz" for name in ("tree-orphan", "tree-single-child"))
+    assert run(["inspect", str(broken), "--require-lod"]) == 3
+    assert capsys.readouterr().out == f"{broken}: error: tree.orphan: node 9 is nobody's child\n"
+    assert run(["inspect", str(warned), "--require-lod", "--fail-on", "warning"]) == 0
+    assert capsys.readouterr().out == ""
+    assert run(["inspect", str(warned), "--require-lod", "--check", "--fail-on", "warning"]) == 3
+    assert "tree.single-child" in capsys.readouterr().out
+
+
+def test_values_are_there_for_who_expects_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = written(tmp_path, '{"values": {"values.quantities.sh1.max": {"max": 9}, "values.box.min.0": {"min": 99}}}')
+    assert run(["inspect", str(PLAIN), "--expect", str(path)]) == 3
+    assert capsys.readouterr().out.startswith(f"{PLAIN}: error: expect.value: values.box.min.0 is -")
+
+
+def test_a_way_that_one_file_has_not_does_not_stop_the_others(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = written(tmp_path, '{"values": {"tree.depth": 2}}')
+    assert run(["inspect", str(PLAIN), str(TREE), "--expect", str(path)]) == 3
+    out, err = capsys.readouterr()
+    assert "the report has no tree.depth" in out
+    assert f"{TREE}: nothing is wrong" in err
+
+
+@pytest.mark.parametrize("text", ['{"max_byte": 1}', "{"])
+def test_a_bad_file_of_expectations_fails_before_anything_is_read(
+    text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = written(tmp_path, text)
+    assert run(["inspect", str(TREE), "--expect", str(path)]) == 1
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith(f"error: {path}")

@@ -1,0 +1,245 @@
+"""The page is well-formed, stands by itself, and says what the report says, whatever is in that."""
+
+from __future__ import annotations
+
+import base64
+import itertools
+import re
+from html.parser import HTMLParser
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sparklod_cli.inspection.charts import children_groups
+from sparklod_cli.inspection.histograms import histogram, of_quantity
+from sparklod_cli.inspection.html import Section, page
+from sparklod_cli.inspection.plot import Picture
+from sparklod_cli.inspection.report import Wanted, inspect
+from sparklod_cli.inspection.values import names_of
+
+from ..conftest import FIXTURES
+from ..scenes import random_splats
+
+VOID = {"meta", "img", "link", "br", "hr", "input"}
+
+LEVELS = [
+    {"nodes": 1, "leaves": 0, "size": 4.5},
+    {"nodes": 3, "leaves": 2, "size": None},
+    {"nodes": 5000, "leaves": 5000, "size": 0.25},
+]
+TREE = {
+    "leaves": 5002,
+    "inner": 2,
+    "growth": 1.0004,
+    "depth": 2,
+    "levels": LEVELS,
+    "children": {"3": 1, "5000": 1},
+    "more_than_opaque": 0.125,
+    "chunks": 1,
+    "chunks_of_coarse_cut": 1,
+}
+REPORT = {
+    "schema_version": 1,
+    "file": "scene-lod.spz",
+    "bytes": 123_456,
+    "format": "SPZ 3 LoD",
+    "splats": 5004,
+    "sh_degree": 2,
+    "antialiased": False,
+    "header": {"version": 3, "fractional_bits": 12, "flags": 128},
+    "bytes_per_splat": 24.67,
+    "compression_ratio": 6.1,
+    "notes": [],
+    "tree": TREE,
+    "values": None,
+    "findings": None,
+}
+
+
+class Reader(HTMLParser):
+    """Checks that elements are nested as they should be, and remembers them."""
+
+    def __init__(self) -> None:
+        super().__init__(convert_charrefs=True)
+        self.open: list[str] = []
+        self.elements: list[tuple[str, dict[str, str | None]]] = []
+        self.text: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        assert len({name for name, _ in attrs}) == len(attrs)
+        self.elements.append((tag, dict(attrs)))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.elements.append((tag, dict(attrs)))
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if not self.open or self.open[-1] != "style":
+            self.text.append(data)
+
+    def all(self, tag: str) -> list[dict[str, str | None]]:
+        return [attributes for name, attributes in self.elements if name == tag]
+
+
+def read(text: str) -> Reader:
+    """Reads a page and holds it to what is true of all: nothing runs, nothing is fetched, all can be found."""
+    assert text.startswith("<!DOCTYPE html>")
+    text.encode("utf-8")
+    reader = Reader()
+    reader.feed(text)
+    reader.close()
+    assert reader.open == []
+    assert not {tag for tag, _ in reader.elements} & {"script", "link", "iframe", "object", "embed", "form", "base"}
+    for _, attributes in reader.elements:
+        assert not [name for name in attributes if name.startswith("on")]
+        assert (attributes.get("href") or "#").startswith("#")
+        assert (attributes.get("src") or "data:image/png;base64,").startswith("data:image/png;base64,")
+    assert not re.search(r"url\(|@import|https?:", text)
+    ids = [attributes["id"] for _, attributes in reader.elements if "id" in attributes]
+    assert len(set(ids)) == len(ids)
+    for _, attributes in reader.elements:
+        for name in ("aria-labelledby", "href"):
+            if attributes.get(name):
+                assert str(attributes[name]).lstrip("#") in ids
+    assert all(image.get("alt") for image in reader.all("img"))
+    assert all(chart.get("aria-label") for chart in reader.all("svg"))
+    assert {table["scope"] for table in reader.all("th")} <= {"col", "row"}
+    levels = [int(tag[1]) for tag, _ in reader.elements if re.fullmatch(r"h[1-6]", tag)]
+    assert levels[0] == 1
+    assert levels.count(1) == 1
+    assert all(after <= before + 1 for before, after in itertools.pairwise(levels))
+    assert reader.all("html") == [{"lang": "en"}]
+    return reader
+
+
+def said(section: Section) -> str:
+    return " ".join(" ".join(read(page([section])).text).split())
+
+
+def test_a_report() -> None:
+    text = said(Section(REPORT))
+    for part in (
+        "scene-lod.spz",
+        "SPZ 3 LoD",
+        "5,004",
+        "123.5 kB",
+        "24.7 bytes a node",
+        "12.5 %",
+        "1.0",
+        "not checked",
+    ):
+        assert part in text
+    assert "Fractional bits 12" in text
+    assert "4,097 to 8,192 1" in text  # children
+
+
+def test_levels_have_bars_of_their_shares() -> None:
+    text = page([Section(REPORT)])
+    rows = re.findall(r'<tr><th scope="row">(\d)</th>.*?<div class="track"[^>]*>(.*?)</div>', text)
+    widths = {level: re.findall(r'class="of(\d)" style="width:([\d.]+)%', bars) for level, bars in rows[:3]}
+    assert widths == {"0": [("0", "0.02")], "1": [("0", "0.02"), ("1", "0.04")], "2": [("1", "100.00")]}
+
+
+def test_both_colour_schemes() -> None:
+    text = page([Section(REPORT)])
+    assert "prefers-color-scheme: dark" in text
+    assert "color-scheme: light dark" in text
+    assert "default-src &#x27;none&#x27;" in text
+
+
+@pytest.mark.parametrize("name", ["<script>alert(1)</script>.spz", "a\"b'c&d.spz", "\udcff\x00\n.spz", "\u202egnp.spz"])
+def test_names_are_only_text(name: str) -> None:
+    finding = {"severity": "error", "code": name, "message": name, "index": None, "count": None}
+    report = REPORT | {"file": name, "format": name, "notes": [name], "findings": [finding]}
+    picture = Picture(b"png", f"{name}; {name}")
+    section = Section(report, picture, {name: histogram(np.arange(5, dtype=np.float32))})
+    text = page([section, section])
+    read(text)
+    assert "<script" not in text
+    if name.isprintable():
+        assert name in said(section)
+
+
+@pytest.mark.parametrize(
+    "report",
+    [
+        {},
+        {"file": "x.spz", "bytes": None, "format": None, "splats": None, "tree": None, "values": None, "findings": []},
+        REPORT | {"tree": None},
+        REPORT | {"tree": {}, "values": {}},
+        REPORT | {"tree": TREE | {"levels": [], "children": {}}, "header": {}},
+        {"file": "x.ply", "values": {"box": None, "box_98": None, "non_finite": 3, "quantities": {"x": {"p1": None}}}},
+    ],
+)
+def test_what_is_missing_is_left_out(report: dict[str, Any]) -> None:
+    said(Section(report))
+
+
+def test_findings_come_worst_first() -> None:
+    findings = [
+        {"severity": "note", "code": "tree.coarse-first", "message": "the note", "index": 1, "count": 2},
+        {"severity": "error", "code": "tree.range", "message": "the error", "index": None, "count": None},
+        {"severity": "warning", "code": "tree.size", "message": "the warning", "index": 1, "count": 2},
+        {"severity": "error", "code": "tree.order", "message": "another error", "index": None, "count": None},
+    ]
+    text = said(Section(REPORT | {"findings": findings}))
+    places = [text.index(message) for message in ("the error", "another error", "the warning", "the note")]
+    assert places == sorted(places)
+    assert "2 errors" in text
+    assert "a node has children past the last node" in text
+    assert "1 warning" in said(Section(REPORT | {"findings": findings[2:3]}))
+    assert "nothing is wrong" in said(Section(REPORT | {"findings": []}))
+
+
+def test_a_picture_is_inside_the_page() -> None:
+    section = Section(REPORT, Picture(b"\x89PNG bytes", "Level 3 of 9: 14 nodes; coloured by level"))
+    (image,) = read(page([section])).all("img")
+    assert image["alt"] == "Drawing of Level 3 of 9: 14 nodes"
+    assert base64.b64decode(str(image["src"]).partition(",")[2]) == b"\x89PNG bytes"
+    assert "coloured by level" in said(section)
+
+
+def test_histograms() -> None:
+    splats = random_splats(300, sh_degree=1)
+    values = np.array([np.nan, 1, 2, 3, 1e9, -1e9] + [2] * 2000, np.float32)
+    counted = {name: of_quantity(splats, name) for name in names_of(splats)}
+    counted |= {"odd": histogram(values), "none": histogram(values[:1]), "same": histogram(values[8:])}
+    reader = read(page([Section(REPORT, histograms=counted)]))
+    assert len(reader.all("svg")) == len(counted) - 1
+    text = " ".join(reader.text)
+    assert "no numbers" in text
+    assert "1 not finite" in text
+    assert all(0 <= float(str(rect["height"])) <= 150 for rect in reader.all("rect"))
+
+
+def test_many_files_are_listed() -> None:
+    sections = [Section(REPORT | {"file": f"{name}.spz"}) for name in "abc"]
+    reader = read(page(sections))
+    assert [link["href"] for link in reader.all("a")] == ["#file-1", "#file-2", "#file-3"]
+    assert len(reader.all("article")) == 3
+    assert "What is in 3 splat files" in " ".join(reader.text)
+
+
+@pytest.mark.parametrize("name", ["golden/tree-v3.spz", "golden/sh3-v2.sog", "sh1.ply", "points.ply"])
+def test_real_reports(name: str) -> None:
+    report, scene = inspect(FIXTURES / name, Wanted(values=True, all_quantities=True, check=True))
+    counted = {} if scene is None else {name: of_quantity(scene.splats, name) for name in names_of(scene.splats)}
+    text = said(Section(report.as_dict(), histograms=counted))
+    assert name in text
+    assert ("Levels of the tree" in text) == (report.tree is not None)
+    assert ("anisotropy" in text) == (scene is not None)
+
+
+def test_children_groups() -> None:
+    assert children_groups({}) == []
+    assert children_groups({"1": 4}) == [("1", 4)]
+    groups = children_groups({"2": 5, "9": 1, "16": 1, "17": 3, "65535": 2})
+    assert groups[1] == ("2", 5)
+    assert groups[8:10] == [("9 to 16", 2), ("17 to 32", 3)]
+    assert groups[-1] == ("32,769 to 65,536", 2)
+    assert sum(count for _, count in groups) == 12

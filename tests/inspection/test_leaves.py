@@ -1,0 +1,215 @@
+"""Whether the leaves of a tree are the splats of a file: yes for every tree that is baked, no after any change."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sparklod_cli.cli import run
+from sparklod_cli.codecs import spz
+from sparklod_cli.inspection import leaves
+from sparklod_cli.inspection.findings import Finding
+from sparklod_cli.inspection.leaves import check
+from sparklod_cli.io import examine_scene, read_scene
+from sparklod_cli.lod import quick
+from sparklod_cli.scene import Scene
+from sparklod_cli.splats import Splats
+from sparklod_cli.tree import LodTree
+
+from ..conftest import FIXTURES, real_scene
+from ..scenes import random_splats
+
+
+def baked(source: Path, folder: Path, *options: object) -> Scene:
+    output = folder / "out.spz"
+    assert run(["build-lod", str(source), "-o", str(output), "-q", "--overwrite", *map(str, options)]) == 0
+    return examine_scene(output)
+
+
+SOURCES = [f"sh{degree}.ply" for degree in range(4)]
+SOURCES += ["flat.ply", "needle.ply", "coincident.ply", "huge.ply", "one.ply", "demo.ply"]
+SOURCES += ["golden/sh3-v2.spz", "golden/sh3-v3.spz", "golden/hand-v1.spz", "golden/hand-v2.spz", "golden/hand-v4.spz"]
+SOURCES += ["golden/sh1-sog", "golden/sh3-v2.sog", "golden/sh2-v1.sog", "golden/sh3-compressed.ply"]
+SOURCES += ["golden/sh2-level0.ksplat", "golden/sh2-level2.ksplat", "golden/sh0.splat"]
+
+
+@pytest.mark.parametrize("version", [2, 3])
+@pytest.mark.parametrize("source", SOURCES)
+def test_the_leaves_of_a_baked_tree_are_the_splats(source: str, version: int, tmp_path: Path) -> None:
+    original = read_scene(FIXTURES / source)
+    for base in (1.1, 2.0):
+        scene = baked(FIXTURES / source, tmp_path, "--base", base, "--spz-version", version)
+        assert check(scene, original) == []
+
+
+@pytest.mark.parametrize("source", ["biker.ply", "biker.spz", "meadow.sog", "playbot-125k.ply"])
+def test_the_leaves_of_real_trees_are_the_splats(source: str, tmp_path: Path) -> None:
+    path = real_scene(source)
+    assert check(baked(path, tmp_path), read_scene(path)) == []
+
+
+@pytest.mark.parametrize("bits", [0, 4, 9])
+def test_coarse_positions_make_splats_fall_together(bits: int, tmp_path: Path) -> None:
+    path = real_scene("biker.ply")
+    assert check(baked(path, tmp_path, "--fractional-bits", bits), read_scene(path)) == []
+
+
+def test_what_cannot_be_drawn_is_not_expected() -> None:
+    splats = random_splats(50, sh_degree=1)
+    splats.opacity[3] = 0
+    splats.scale[8] = 0
+    splats.center[20, 1] = np.nan
+    good = np.setdiff1d(np.arange(50), [3, 8, 20])
+    assert check(tree_of(splats.take(good)), Scene(splats)) == []
+
+
+def test_less_sh_may_have_been_asked_for(tmp_path: Path) -> None:
+    original = read_scene(FIXTURES / "sh3.ply")
+    for degree in (0, 1, 2):
+        assert check(baked(FIXTURES / "sh3.ply", tmp_path, "--max-sh", degree), original) == []
+
+
+def tree_of(splats: Splats, **options: int) -> Scene:
+    """The tree of splats as it is read back."""
+    nodes, tree = quick.build(splats)
+    return coded(Scene(nodes, tree), **options)
+
+
+def coded(scene: Scene, **options: int) -> Scene:
+    return spz.decode(BytesIO(b"".join(spz.encode(scene, spz.Options(**options)))))
+
+
+@given(st.integers(1, 60), st.integers(0, 24), st.integers(0, 3), st.integers(0, 2**32 - 1))
+@settings(max_examples=60)
+def test_any_coding_has_the_same_leaves(count: int, bits: int, degree: int, seed: int) -> None:
+    splats = random_splats(count, sh_degree=degree, seed=seed, extent=0.02)
+    bits = min(bits, spz.largest_fractional_bits(splats.center))
+    for version in (2, 3):
+        assert check(tree_of(splats, version=version, fractional_bits=bits), Scene(splats)) == []
+
+
+@pytest.mark.parametrize("column", ["quat_xyzw", "sh", "rgb", "scale", "opacity"])
+def test_the_order_of_splats_that_differ_in_one_column_does_not_matter(column: str) -> None:
+    splats = random_splats(12, sh_degree=2, seed=4)
+    same = splats.take(np.zeros(12, np.int64))
+    splats = dataclasses.replace(same, **{column: getattr(splats, column)})
+    for seed in range(3):
+        order = np.random.default_rng(seed).permutation(12)
+        root = LodTree(np.array([12] + [0] * 12, np.uint16), np.array([1] + [0] * 12, np.uint32))
+        scene = coded(Scene(splats.take(np.concatenate([[0], order])), root))
+        assert check(scene, Scene(splats)) == []
+
+
+def changed_leaf(change: Callable[[Splats, int, Scene], None], degree: int = 1) -> tuple[int, list[Finding]]:
+    """A leaf of a baked tree, and what is found after a change to it."""
+    splats = random_splats(300, sh_degree=degree, seed=9)
+    scene = tree_of(splats)
+    assert scene.tree is not None
+    node = int(np.flatnonzero(scene.tree.is_leaf)[123])
+    change(scene.splats, node, scene)
+    return node, check(scene, Scene(splats))
+
+
+def moved(steps: int) -> Callable[[Splats, int, Scene], None]:
+    def change(splats: Splats, node: int, scene: Scene) -> None:
+        splats.center[node, 1] += steps * 2.0 ** -scene.header["fractional_bits"]
+
+    return change
+
+
+def set_to(column: str, change: Callable[[np.ndarray], object]) -> Callable[[Splats, int, Scene], None]:
+    def apply(splats: Splats, node: int, scene: Scene) -> None:
+        values = getattr(splats, column)
+        values[node] = change(values[node])
+
+    return apply
+
+
+CHANGES = {
+    "moved": moved(3),
+    "moved the other way": moved(-3),
+    "recoloured": set_to("rgb", lambda rgb: rgb + np.float32([0.05, 0, 0])),
+    "larger": set_to("scale", lambda scale: scale * np.float32(1.2)),
+    "fainter": set_to("opacity", lambda opacity: opacity - 0.03),
+    "turned": set_to("quat_xyzw", lambda quat: np.roll(quat, 1)),
+    "shining": set_to("sh", lambda sh: -sh[::-1]),
+}
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_a_leaf_that_is_changed_is_found(name: str) -> None:
+    node, findings = changed_leaf(CHANGES[name])
+    assert [(found.code, found.index, found.count) for found in findings] == [("expect.leaves", node, 1)]
+    assert f"{node:,}" in findings[0].message
+
+
+def test_a_step_is_no_change() -> None:
+    assert changed_leaf(moved(1))[1] == []
+    assert changed_leaf(set_to("rgb", lambda rgb: rgb + np.float32(0.007)))[1] == []
+
+
+def test_a_step_is_no_change_however_many_leaves_make_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another writer may round all colours down."""
+    monkeypatch.setattr(leaves, "MOST_PAIRS", 50, raising=False)
+    splats = random_splats(300, sh_degree=1)
+    scene = tree_of(splats)
+    scene.splats.rgb[:] += 0.007
+    assert check(scene, Scene(splats)) == []
+
+
+def test_a_leaf_that_takes_the_place_of_another_is_found() -> None:
+    copied = []
+
+    def change(splats: Splats, node: int, scene: Scene) -> None:
+        assert scene.tree is not None
+        other = int(np.flatnonzero(scene.tree.is_leaf)[200])
+        copied.append(other)
+        for column in vars(splats).values():
+            column[node] = column[other]
+
+    node, (found,) = changed_leaf(change)
+    assert found.count == 1
+    assert found.index in (node, *copied)
+
+
+def test_a_leaf_too_few_or_too_many_is_found() -> None:
+    splats = random_splats(100, seed=2)
+    for kept, original in ((99, 100), (100, 99)):
+        (found,) = check(tree_of(splats.take(slice(kept))), Scene(splats.take(slice(original))))
+        assert found.code == "expect.leaves"
+        assert f"{kept} leaves" in found.message
+        assert f"{original} splats" in found.message
+
+
+def test_more_sh_than_the_original_has_is_found() -> None:
+    splats = random_splats(100, sh_degree=2)
+    (found,) = check(tree_of(splats), Scene(splats.with_max_sh(1)))
+    assert found.message == "SH degree 2, the original has 1"
+
+
+def test_a_plain_file_has_no_leaves() -> None:
+    splats = random_splats(3)
+    (found,) = check(Scene(splats, format="PLY"), Scene(splats))
+    assert found.message == "there is no tree whose leaves could be compared"
+
+
+def test_an_original_that_is_a_tree_has_leaves_of_its_own() -> None:
+    splats = random_splats(100)
+    scene = tree_of(splats)
+    assert check(scene, scene) == []
+    assert check(scene, tree_of(splats, version=3, fractional_bits=20)) == []
+    assert check(tree_of(splats.take(slice(99))), scene) != []
+
+
+def test_an_original_without_anything_to_draw_is_a_finding() -> None:
+    splats = random_splats(3)
+    splats.opacity[:] = 0
+    (found,) = check(tree_of(random_splats(5)), Scene(splats))
+    assert found.code == "expect.leaves"

@@ -1,0 +1,311 @@
+"""What `--json` prints is what `schema.json` and docs/inspect.md say of it."""
+
+from __future__ import annotations
+
+import copy
+import json
+import re
+from collections.abc import Iterator
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from jsonschema import Draft202012Validator
+
+from sparklod_cli.cli import run
+from sparklod_cli.codecs import spz
+from sparklod_cli.codecs.formats import FORMATS
+from sparklod_cli.inspection import values
+from sparklod_cli.inspection.expectations import value_at
+from sparklod_cli.inspection.findings import CODES
+from sparklod_cli.inspection.report import SCHEMA_VERSION, Wanted, inspect
+from sparklod_cli.lod import quick
+from sparklod_cli.scene import Scene
+from sparklod_cli.tree import MAX_CHILDREN, LodTree
+from tests.conftest import FIXTURES, ROOT
+from tests.scenes import random_splats
+
+SCHEMA = json.loads(files("sparklod_cli.inspection").joinpath("schema.json").read_text(encoding="utf-8"))
+VALIDATOR = Draft202012Validator(SCHEMA)
+
+SUFFIXES = {suffix for form in FORMATS for suffix in form.suffixes}
+FILES = sorted(path for path in FIXTURES.rglob("*") if path.suffix in SUFFIXES)
+SMALL = [path for path in FILES if path.stat().st_size < 100_000 and "faults" not in path.parts]
+WAYS = {
+    "plain": Wanted(),
+    "values": Wanted(values=True),
+    "stats": Wanted(values=True, all_quantities=True),
+    "check": Wanted(check=True),
+    "all": Wanted(values=True, all_quantities=True, check=True),
+}
+
+Report = dict[str, Any]
+
+
+def name_of(value: Any) -> str | None:
+    """The name of a test of a fixture."""
+    return value.relative_to(FIXTURES).as_posix() if isinstance(value, Path) else None
+
+
+def report_of(path: Path, wanted: Wanted) -> Report:
+    """A report after its way through JSON, which would not take a NaN."""
+    report: Report = json.loads(json.dumps(inspect(path, wanted)[0].as_dict(), allow_nan=False))
+    return report
+
+
+def faults(report: Report) -> list[str]:
+    """Where a report is not what the schema says."""
+    return [f"{error.json_path}: {error.message}" for error in VALIDATOR.iter_errors(report)]
+
+
+@cache
+def tree_bytes(sh_degree: int) -> bytes:
+    scene = Scene(*quick.build(random_splats(300, sh_degree=sh_degree)))
+    return b"".join(spz.encode(scene, spz.Options()))
+
+
+@pytest.fixture
+def lod(tmp_path: Path) -> Path:
+    """A tree with everything that a report can tell."""
+    path = tmp_path / "tree.spz"
+    path.write_bytes(tree_bytes(3))
+    return path
+
+
+def broken(path: Path) -> Iterator[tuple[str, bytes]]:
+    """What may become of a file on its way, by name."""
+    data = path.read_bytes()
+    yield "empty", b""
+    for share in (0.01, 0.3, 0.9, 0.999):
+        yield f"cut at {share}", data[: int(share * len(data))]
+    for share in (0.001, 0.2, 0.6, 0.95):
+        at = int(share * len(data))
+        yield f"changed at {share}", data[:at] + bytes([data[at] ^ 0x55]) + data[at + 1 :]
+    yield "longer", data + b"more"
+    yield "twice", data + data
+
+
+@pytest.mark.parametrize("wanted", WAYS.values(), ids=WAYS.keys())
+@pytest.mark.parametrize("path", FILES, ids=name_of)
+def test_reports_of_the_fixtures(path: Path, wanted: Wanted) -> None:
+    assert faults(report_of(path, wanted)) == []
+
+
+@pytest.mark.parametrize("wanted", WAYS.values(), ids=WAYS.keys())
+@pytest.mark.parametrize("sh_degree", range(4))
+def test_reports_of_trees(tmp_path: Path, sh_degree: int, wanted: Wanted) -> None:
+    path = tmp_path / "tree.spz"
+    path.write_bytes(tree_bytes(sh_degree))
+    report = report_of(path, wanted)
+    assert faults(report) == []
+    assert report["tree"]["leaves"] == 300
+
+
+@pytest.mark.parametrize("wanted", WAYS.values(), ids=WAYS.keys())
+@pytest.mark.parametrize("path", SMALL, ids=name_of)
+def test_reports_of_broken_files(tmp_path: Path, path: Path, wanted: Wanted) -> None:
+    for name, data in broken(path):
+        file = tmp_path / f"broken{path.suffix}"
+        file.write_bytes(data)
+        assert faults(report_of(file, wanted)) == [], name
+
+
+@pytest.mark.parametrize("most", [1, 3, MAX_CHILDREN])
+@pytest.mark.parametrize("count", [1, 2, 5, 300])
+def test_reports_of_broken_trees(tmp_path: Path, count: int, most: int) -> None:
+    """Links that lead anywhere, and splats that are nowhere to be seen."""
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        splats = random_splats(count, seed=seed)
+        splats.scale[rng.random(count) < 0.2] = 0
+        splats.opacity[rng.random(count) < 0.2] = rng.choice([0, 1, 900])
+        tree = LodTree(
+            rng.integers(0, most + 1, count).astype(np.uint16), rng.integers(0, count + 2, count).astype(np.uint32)
+        )
+        path = tmp_path / "tree.spz"
+        path.write_bytes(b"".join(spz.encode(Scene(splats, tree), spz.Options(fractional_bits=12))))
+        for name, wanted in WAYS.items():
+            assert faults(report_of(path, wanted)) == [], (seed, name)
+
+
+@pytest.mark.parametrize("wanted", WAYS.values(), ids=WAYS.keys())
+@pytest.mark.parametrize("path", ["missing.spz", "."])
+def test_reports_of_nothing(tmp_path: Path, path: str, wanted: Wanted) -> None:
+    report = report_of(tmp_path / path, wanted)
+    assert faults(report) == []
+    assert report["findings"][0]["code"] == "file.unreadable"
+
+
+def test_the_command_prints_it(lod: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """With findings of expectations, too; many files give JSON lines."""
+    options = ["--json", "--stats", "--check", "--sh", "0", "--max-bytes", "1", "--max-growth", "1"]
+    assert run(["inspect", str(lod), "missing.spz", str(FIXTURES / "sh2.ply"), *options]) == 3
+    reports = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [faults(report) for report in reports] == [[], [], []]
+    assert [found["code"] for found in reports[0]["findings"]] == ["expect.bytes", "expect.sh", "expect.growth"]
+    assert reports[1]["findings"][0]["code"] == "file.unreadable"
+
+
+# --- The schema is strict ---------------------------------------------------------------------------------------------
+
+
+def places(report: Any, way: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    """The ways to every value of a report."""
+    for key, value in report.items() if isinstance(report, dict) else enumerate(report):
+        yield (*way, key)
+        if isinstance(value, (dict, list)):
+            yield from places(value, (*way, key))
+
+
+def holder(report: Any, way: tuple[Any, ...]) -> Any:
+    for key in way[:-1]:
+        report = report[key]
+    return report
+
+
+@pytest.fixture
+def full(lod: Path) -> Report:
+    """A report in which nothing is null that need not be."""
+    report = report_of(lod, Wanted(values=True, all_quantities=True, check=True))
+    finding = {"severity": "error", "code": "tree.size", "message": "node 3", "index": 3, "count": 1}
+    report = report | {"findings": [finding], "notes": ["a note"]}
+    assert faults(report) == []
+    return report
+
+
+def may_be_null(way: tuple[Any, ...]) -> bool:
+    """Whether a field may be null in a report of a file that was read."""
+    if len(way) == 1:
+        return way[0] in ("bytes", "bytes_per_splat", "compression_ratio", "tree", "values", "findings")
+    finding, level = way[0] == "findings", "levels" in way
+    return (
+        way in (("values", "box"), ("values", "box_98"))
+        or (way[:2] == ("values", "quantities") and len(way) == 4)
+        or (finding and way[-1] in ("index", "count"))
+        or (level and way[-1] == "size")
+    )
+
+
+def test_a_wrong_type_is_noticed(full: Report) -> None:
+    examples: dict[type | None, Any] = {str: "1", int: 1, float: 0.5, list: [], dict: {}, bool: True, None: None}
+    for way in places(full):
+        right = type(holder(full, way)[way[-1]])
+        for kind, other in examples.items():
+            if kind is right or (kind is int and right is float):
+                continue
+            changed = copy.deepcopy(full)
+            holder(changed, way)[way[-1]] = other
+            assert bool(faults(changed)) != (other is None and may_be_null(way)), (way, other)
+
+
+def test_a_missing_field_is_noticed(full: Report) -> None:
+    for way in places(full):
+        changed = copy.deepcopy(full)
+        del holder(changed, way)[way[-1]]
+        optional = isinstance(way[-1], int) and way[-2] not in ("min", "max")
+        optional |= len(way) > 1 and way[-2] in ("header", "children")
+        optional |= len(way) > 1 and way[-2] == "quantities" and way[-1] not in values.MAIN
+        assert bool(faults(changed)) != optional, way
+
+
+def test_an_unknown_field_is_noticed(full: Report) -> None:
+    objects = [way for way in places(full) if isinstance(holder(full, way)[way[-1]], dict)]
+    for way in [(), *objects]:
+        changed = copy.deepcopy(full)
+        holder(changed, (*way, ""))["more"] = 1
+        assert faults(changed), way
+
+
+@pytest.mark.parametrize(
+    "field, value", [("code", "tree.ghost"), ("severity", "fatal"), ("index", -1), ("count", 0), ("message", None)]
+)
+def test_a_finding_that_there_cannot_be_is_noticed(full: Report, field: str, value: object) -> None:
+    full["findings"][0][field] = value
+    assert faults(full)
+
+
+def test_what_was_not_read_has_no_numbers(full: Report) -> None:
+    assert faults(full | {"format": None})
+    report = report_of(Path("missing.spz"), Wanted())
+    assert faults(report | {"findings": []})
+    assert faults(report | {"splats": 3})
+    assert faults(report | {"format": "PLY"})
+
+
+# --- It is whole ------------------------------------------------------------------------------------------------------
+
+
+def schemas(schema: Any) -> Iterator[tuple[str, Any]]:
+    """Every property in the schema, by name."""
+    if isinstance(schema, dict):
+        for name, prop in schema.get("properties", {}).items():
+            yield name, prop
+            yield from schemas(prop)
+        for key, value in schema.items():
+            if key not in ("properties", "if", "then", "else"):
+                yield from schemas(value)
+    elif isinstance(schema, list):
+        for value in schema:
+            yield from schemas(value)
+
+
+def test_the_schema_is_one_and_tells_of_everything() -> None:
+    Draft202012Validator.check_schema(SCHEMA)
+    found = list(schemas(SCHEMA))
+    assert len(found) > 60
+    for name, schema in found:
+        assert schema["description"].endswith("."), name
+        assert "properties" not in schema or schema["additionalProperties"] is False, name
+    assert all(schema["description"] for schema in SCHEMA["$defs"].values())
+
+
+def test_the_schema_has_what_the_code_has() -> None:
+    assert SCHEMA["properties"]["schema_version"]["const"] == SCHEMA_VERSION
+    finding = SCHEMA["$defs"]["finding"]["properties"]
+    assert finding["code"]["enum"] == list(CODES)
+    assert set(finding["severity"]["enum"]) == {severity for severity, _ in CODES.values()}
+    quantities = SCHEMA["$defs"]["values"]["properties"]["quantities"]
+    assert list(quantities["properties"]) == [*values.QUANTITIES, *values.SH_QUANTITIES]
+    assert quantities["required"] == list(values.MAIN)
+    assert list(SCHEMA["$defs"]["summary"]["properties"]) == ["min", *values.PERCENTILES, "max", "mean"]
+
+
+def test_header_fields_are_of_files_that_there_are() -> None:
+    seen: set[str] = set()
+    for path in FILES:
+        seen |= report_of(path, Wanted())["header"].keys()
+    assert seen == SCHEMA["properties"]["header"]["properties"].keys()
+
+
+# --- The page ---------------------------------------------------------------------------------------------------------
+
+PAGE = (ROOT / "docs" / "inspect.md").read_text(encoding="utf-8")
+
+
+def rows(heading: str) -> list[list[str]]:
+    """The cells of the first table below a heading, without their marks."""
+    table = re.search(rf"^#+ {re.escape(heading)}\n(?:(?!#).*\n)*?\| ---.*\n((?:\|.*\n)+)", PAGE, re.MULTILINE)
+    assert table, heading
+    return [[cell.strip().strip("`") for cell in line.strip("|\n").split(" | ")] for line in table[1].splitlines()]
+
+
+def test_the_page_has_every_code() -> None:
+    assert [tuple(row) for row in rows("Findings")] == [(code, *told) for code, told in CODES.items()]
+
+
+def test_the_page_has_every_field(full: Report) -> None:
+    named = [row[0] for row in rows("The report, field by field")]
+    for way in named:
+        value_at(full, re.sub(r"\bN\b", "0", way).replace("NAME", "opacity").replace("CHILDREN", "2"))
+    tops = {way.split(".")[0] for way in named}
+    assert tops == SCHEMA["properties"].keys()
+    for name in ("tree", "values"):
+        assert {way.split(".")[1] for way in named if way.startswith(f"{name}.")} == full[name].keys()
+    assert {way.split(".")[2] for way in named if way.startswith("findings.")} == full["findings"][0].keys()
+
+
+def test_the_page_has_every_quantity() -> None:
+    assert [row[0] for row in rows("Quantities")] == [*values.QUANTITIES, *values.SH_QUANTITIES]

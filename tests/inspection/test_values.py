@@ -1,0 +1,280 @@
+"""What is said of the numbers of splats: against numpy, and by hand."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sparklod_cli.cli import run
+from sparklod_cli.codecs import ply, splat, spz
+from sparklod_cli.inspection import values
+from sparklod_cli.inspection.report import Wanted, inspect
+from sparklod_cli.inspection.values import MAIN, PERCENTILES, QUANTITIES, check, examine, names_of, quantity
+from sparklod_cli.scene import Scene
+from sparklod_cli.sh import COEFFICIENTS
+from sparklod_cli.splats import COLUMNS, Splats
+from sparklod_cli.tree import LodTree
+
+from ..scenes import random_splats
+
+NAN, INF = math.nan, math.inf
+EXACT = 1e-5  # of six digits
+
+
+def three() -> Splats:
+    """Three splats whose quantities can be told by hand."""
+    f32 = np.float32
+    sh = np.zeros((3, COEFFICIENTS[2], 3), f32)
+    sh[0, :3], sh[1, 3:] = 0.5, [3.0, 0.0, 4.0]
+    sh[2, 0, 0] = 3.0
+    return Splats(
+        center=np.array([[0, 0, 0], [1, 10, -5], [3, -10, 5]], f32),
+        scale=np.array([[1, 2, 4], [0.5, 0.5, 0.5], [3, 1, 2]], f32),
+        quat_xyzw=np.tile(f32([0, 0, 0, 1]), (3, 1)),
+        opacity=np.array([0.25, 1.0, 2.0], f32),
+        rgb=np.array([[0, 0.5, 1], [0.25, 0.5, 1], [0.5, 0.5, 2]], f32),
+        sh=sh,
+    )
+
+
+#: Of each of the three. Size: twice the mean scale, and more where D is above 1.
+D_OF_2 = math.sqrt(1 + math.e * math.log(2))
+BY_HAND = {
+    "x": [0, 1, 3],
+    "y": [0, 10, -10],
+    "z": [0, -5, 5],
+    "scale": [4, 0.5, 3],
+    "scale_min": [1, 0.5, 1],
+    "anisotropy": [4, 1, 3],
+    "opacity": [0.25, 1, 2],
+    "size": [14 / 3, 1, 4 * (1 + 0.7 * (D_OF_2 - 1))],
+    "red": [0, 0.25, 0.5],
+    "green": [0.5, 0.5, 0.5],
+    "blue": [1, 1, 2],
+    "sh1": [0.5, 0, 1],
+    "sh2": [0, math.sqrt(25 / 3), 0],
+}
+
+
+@pytest.mark.parametrize("name", BY_HAND)
+def test_each_quantity_of_three_splats(name: str) -> None:
+    assert quantity(three(), name).tolist() == pytest.approx(BY_HAND[name])
+    summary = examine(three(), all_quantities=True).quantities[name]
+    assert summary["min"] == pytest.approx(min(BY_HAND[name]), rel=EXACT)
+    assert summary["p50"] == pytest.approx(sorted(BY_HAND[name])[1], rel=EXACT)
+    assert summary["max"] == pytest.approx(max(BY_HAND[name]), rel=EXACT)
+    assert summary["mean"] == pytest.approx(sum(BY_HAND[name]) / 3, rel=EXACT)
+
+
+def test_the_other_facts_of_three_splats() -> None:
+    facts = examine(three())
+    assert facts.box is not None
+    assert facts.box_98 is not None
+    assert (facts.box.min, facts.box.max) == ([0, -10, -5], [3, 10, 5])
+    assert facts.box_98.min == pytest.approx([0.02, -9.8, -4.9])  # a fiftieth of the way to the middle one
+    assert facts.box_98.max == pytest.approx([2.96, 9.8, 4.9])
+    assert (facts.non_finite, facts.zero_opacity, facts.zero_scale, facts.more_than_opaque) == (0, 0, 0, 1)
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_what_there_is_depends_on_the_degree(degree: int) -> None:
+    splats = random_splats(5, sh_degree=degree)
+    names = [*QUANTITIES, *["sh1", "sh2", "sh3"][:degree]]
+    assert names_of(splats) == names
+    assert list(examine(splats, all_quantities=True).quantities) == names
+    assert list(examine(splats).quantities) == list(MAIN)
+
+
+def spoiled(seed: int) -> Splats:
+    """A scene of which every column has numbers that are not finite, and some splats no opacity or no scale."""
+    splats = random_splats(400, sh_degree=3, seed=seed)
+    rng = np.random.default_rng(seed)
+    for name in COLUMNS:
+        flat = getattr(splats, name).reshape(-1)
+        flat[rng.integers(flat.size, size=5)] = rng.choice([NAN, INF, -INF], 5)
+    splats.opacity[rng.integers(400, size=30)] = 0
+    splats.scale[rng.integers(400, size=20)] = 0
+    splats.scale[rng.integers(400, size=20), 1] = 0
+    splats.opacity[rng.integers(400, size=25)] = 3
+    return splats
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("seed", range(4))
+def test_facts_are_those_of_numpy_over_the_finite_splats(seed: int) -> None:
+    splats = spoiled(seed)
+    facts = examine(splats, all_quantities=True)
+    finite = np.ones(len(splats), np.bool_)
+    for name in COLUMNS:
+        finite &= np.isfinite(getattr(splats, name).reshape(len(splats), -1)).all(axis=1)
+    assert 350 < finite.sum() < 400
+    assert facts.non_finite == (~finite).sum()
+    assert facts.zero_opacity == (splats.opacity[finite] == 0).sum() > 0
+    assert facts.zero_scale == (splats.scale[finite] == 0).all(axis=1).sum() > 0
+    assert facts.more_than_opaque == (splats.opacity[finite] > 1).sum() > 0
+    center = splats.center[finite].astype(np.float64)
+    for box, low, high in ((facts.box, 0, 100), (facts.box_98, 1, 99)):
+        assert box is not None
+        assert box.min == pytest.approx(np.percentile(center, low, axis=0).tolist(), rel=EXACT)
+        assert box.max == pytest.approx(np.percentile(center, high, axis=0).tolist(), rel=EXACT)
+    scale = splats.scale[finite].astype(np.float64)
+    some = scale.min(axis=1) > 0  # without the others: they are infinitely thin
+    expected = {
+        "opacity": splats.opacity[finite].astype(np.float64),
+        "anisotropy": scale[some].max(axis=1) / scale[some].min(axis=1),
+        "z": center[:, 2],
+        "sh3": np.sqrt((splats.sh[finite].astype(np.float64)[:, 8:] ** 2).mean(axis=(1, 2))),
+    }
+    for name, numbers in expected.items():
+        summary = facts.quantities[name]
+        levels = {"min": 0, **PERCENTILES, "max": 100}
+        for key, level in levels.items():
+            assert summary[key] == pytest.approx(np.percentile(numbers, level), rel=EXACT, abs=1e-9), (name, key)
+        assert summary["mean"] == pytest.approx(numbers.mean(), rel=EXACT)
+
+
+@pytest.mark.parametrize("all_quantities", [True, False])
+@pytest.mark.parametrize("degree", [0, 3])
+def test_no_splats_have_no_numbers(degree: int, all_quantities: bool) -> None:
+    for splats in (random_splats(3, sh_degree=degree), random_splats(0, sh_degree=degree)):
+        splats.center[:] = NAN
+        facts = examine(splats, all_quantities=all_quantities)
+        assert (facts.box, facts.box_98, facts.non_finite) == (None, None, len(splats))
+        for summary in facts.quantities.values():
+            assert set(summary.values()) == {None}
+
+
+@pytest.mark.filterwarnings("error")
+def test_numbers_at_the_end_of_what_floats_hold_can_be_printed() -> None:
+    splats = random_splats(2, sh_degree=1)
+    largest = np.finfo(np.float32).max
+    for name in COLUMNS:
+        column = getattr(splats, name)
+        column[0], column[1] = largest, -largest if name != "scale" else np.float32(1e-45)
+    facts = examine(splats, all_quantities=True)
+    json.dumps(dataclasses.asdict(facts), allow_nan=False)
+    assert facts.box is not None
+    assert facts.box.max == pytest.approx([largest] * 3, rel=EXACT)
+
+
+def codes(splats: Splats, tree: LodTree | None = None, **header: int) -> list[str]:
+    return [found.code for found in check(Scene(splats, tree, header=header))]
+
+
+def with_first(name: str, value: float, count: int = 20) -> Splats:
+    """A scene of which one number of the first splat is given."""
+    splats = random_splats(count, sh_degree=1)
+    getattr(splats, name).reshape(count, -1)[0, 0] = value
+    return splats
+
+
+@pytest.mark.parametrize("name", COLUMNS)
+@pytest.mark.parametrize("value", [NAN, INF, -INF])
+def test_a_number_that_is_not_finite_is_an_error_in_every_column(name: str, value: float) -> None:
+    splats = with_first(name, value)
+    finding = check(Scene(splats))[0]
+    assert (finding.code, finding.index, finding.count) == ("values.non-finite", 0, 1)
+
+
+def test_an_opacity_out_of_range_is_an_error_where_there_is_no_tree() -> None:
+    tree = LodTree(np.array([19] + [0] * 19, np.uint16), np.array([1] + [0] * 19, np.uint32))
+    assert codes(with_first("opacity", 1.01)) == codes(with_first("opacity", -0.01)) == ["values.opacity"]
+    assert codes(with_first("opacity", 1.0)) == codes(with_first("opacity", 0.001)) == []
+    assert codes(with_first("opacity", 900.0), tree) == []
+    assert codes(with_first("opacity", -0.01), tree) == ["values.opacity"]
+
+
+@pytest.mark.parametrize("name", ["opacity", "scale"])
+def test_many_splats_that_cannot_be_drawn_are_said(name: str) -> None:
+    splats = random_splats(20)
+    column = getattr(splats, name)
+    column[:2] = 0
+    assert codes(splats) == []  # a tenth is not many
+    column[10] = 0
+    (finding,) = check(Scene(splats))
+    assert (finding.code, finding.index, finding.count) == ("values.invisible", 0, 3)
+    assert "splat 0 and 2 more" in finding.message
+
+
+def test_a_scale_of_0_along_one_axis_can_be_drawn() -> None:
+    splats = random_splats(20)
+    splats.scale[:, 2] = 0
+    assert codes(splats) == []
+
+
+@pytest.mark.parametrize("version", [1, 2, 3, 4])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_centers_at_the_end_of_the_fixed_point(version: int, sign: int) -> None:
+    """Version 1 has floats; and without a header nothing is known of codes."""
+    end = (2**23 - 1) / 2**12
+    at_end, inside = with_first("center", sign * end), with_first("center", sign * (end - 2**-12))
+    expected = ["values.center-clamped"] if version > 1 else []
+    assert codes(at_end, version=version, fractional_bits=12) == expected
+    assert codes(inside, version=version, fractional_bits=12) == []
+    assert codes(at_end, version=version) == codes(at_end) == []
+
+
+def test_many_scales_at_the_ends_of_their_code_are_said() -> None:
+    header = {"version": 3, "fractional_bits": 12}
+    for end in np.exp(np.float32([-10, 255 / 16 - 10])):
+        splats = random_splats(200)
+        splats.scale[:2] = end
+        assert codes(splats, **header) == []  # a hundredth is not many
+        splats.scale[7] = end
+        assert codes(splats, **header) == ["values.scale-clamped"]
+        assert codes(splats) == []
+
+
+def test_thin_splats_are_as_thin_as_their_code_goes_and_nobody_minds() -> None:
+    splats = random_splats(200)
+    splats.scale[:, 2] = np.exp(np.float32(-10))
+    assert codes(splats, version=3, fractional_bits=12) == []
+    splats.scale[:100, 2] = np.exp(np.float32(255 / 16 - 10))
+    assert codes(splats, version=3, fractional_bits=12) == ["values.scale-clamped"]
+
+
+@pytest.mark.parametrize(("far", "found"), [(65_519.9, False), (65_520.0, True), (-1e7, True)])
+def test_centers_that_float16_cannot_hold(far: float, found: bool) -> None:
+    assert codes(with_first("center", far)) == ["values.center-far"] * found
+    with np.errstate(over="ignore"):
+        assert bool(np.isinf(np.float32(far).astype(np.float16))) == found
+
+
+def test_the_bounds_are_said_of_scenes_as_they_are_written(tmp_path: Path) -> None:
+    """A scene that does not fit its code, through the codec and back."""
+    splats = random_splats(50)
+    splats.scale[:10] = 1e-6
+    path = tmp_path / "scene.spz"
+    path.write_bytes(b"".join(spz.encode(Scene(splats), spz.Options())))
+    report, _ = inspect(path, Wanted(check=True))
+    assert [(found.code, found.count) for found in report.findings or []] == [("values.scale-clamped", 10)]
+    path.write_bytes(b"".join(ply.encode(Scene(splats))))
+    assert inspect(path, Wanted(check=True))[0].findings == []
+
+
+@pytest.mark.parametrize("count", [1, 2, 1000])
+def test_values_of_files_are_those_of_what_was_written(count: int, tmp_path: Path) -> None:
+    splats = random_splats(count, seed=count)
+    path = tmp_path / "scene.splat"
+    path.write_bytes(b"".join(splat.encode(Scene(splats))))
+    report, scene = inspect(path, Wanted(values=True, all_quantities=True))
+    assert report.values is not None
+    assert scene is not None
+    assert report.values == examine(scene.splats, all_quantities=True)
+    opacity = report.values.quantities["opacity"]
+    assert opacity["mean"] == pytest.approx(splats.opacity.mean(dtype=np.float64), abs=1 / 255)
+    assert report.bytes == 32 * count
+    assert (report.bytes_per_splat, report.compression_ratio) == (32.0, 1.75)
+
+
+def test_names_are_what_the_command_line_takes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "scene.ply"
+    path.write_bytes(b"".join(ply.encode(Scene(random_splats(10, sh_degree=2)))))
+    for name in values.names_of(random_splats(1, sh_degree=2)):
+        assert run(["inspect", str(path), "--field", f"values.quantities.{name}.p50"]) == 0
+        assert math.isfinite(float(capsys.readouterr().out))
