@@ -42,9 +42,9 @@ def ordered_map(work: Callable[[Item], Result], items: Iterable[Item], threads: 
         pool.shutdown(wait=True, cancel_futures=True)
 
 
-def chunks_of(rows: int) -> list[slice]:
-    """Slices of `CHUNK` rows that cover `rows`; the last may be shorter."""
-    return [slice(start, min(start + CHUNK, rows)) for start in range(0, rows, CHUNK)]
+def chunks_of(rows: int, size: int = CHUNK) -> list[slice]:
+    """Slices of `size` rows that cover `rows`; the last may be shorter."""
+    return [slice(start, min(start + size, rows)) for start in range(0, rows, size)]
 
 
 def for_chunks(work: Callable[[slice], None], rows: int, threads: int, done: Callable[[int], None]) -> None:

@@ -10,8 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import TruncatedError
-from ..parallel import chunks_of, ordered_map
+from ..parallel import CHUNK, chunks_of, ordered_map
 from ..progress import Progress
+
+#: Narrow rows, such as the columns of SPZ, would otherwise be over before a thread has been handed them.
+CHUNK_BYTES = 1 << 18
 
 #: A run of rows: which they are, and their content.
 Rows = tuple[slice, NDArray[Any]]
@@ -28,12 +31,12 @@ def size_of(file: BinaryIO) -> int:
 
 
 def rows_of(read: Read, row_type: np.dtype[Any], count: int, what: str = "splats") -> Iterator[Rows]:
-    """`count` rows in chunks, read as they are asked for.
+    """`count` rows in chunks of at least CHUNK rows and CHUNK_BYTES, read as they are asked for.
 
     Raises:
         FormatError: the data ends before that.
     """
-    for part in chunks_of(count):
+    for part in chunks_of(count, max(CHUNK, CHUNK_BYTES // row_type.itemsize)):
         data = read((part.stop - part.start) * row_type.itemsize)
         whole = len(data) // row_type.itemsize
         if part.start + whole < part.stop:

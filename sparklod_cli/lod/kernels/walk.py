@@ -29,8 +29,28 @@ def walk(child_count, child_start, size):
     count = len(child_count)
     depth = np.full(count, -1, np.int32)
     limit = np.zeros(count, np.float32)
+    depth[0], limit[0] = 0, size[0]
+    sound = True
+    for node in range(count):  # in order, which is enough for a tree whose nodes come after their parents
+        start = np.int64(child_start[node])
+        end = start + np.int64(child_count[node])
+        if start == end:
+            continue
+        sound = start > node and end <= count and depth[node] >= 0
+        for child in range(start, end if sound else start):
+            if depth[child] >= 0:
+                sound = False
+                break
+            depth[child] = depth[node] + 1
+            limit[child] = min(limit[node], size[child])
+        if not sound:
+            break
+    if sound:
+        return depth, limit
+    depth[:], limit[:] = -1, 0
+    depth[0], limit[0] = 0, size[0]
     queue = np.empty(count, np.int32)
-    depth[0], limit[0], queue[0] = 0, size[0], 0
+    queue[0] = 0
     first, last, steps = 0, 1, 0
     while first < last and steps <= STEPS * count:
         node = queue[first]
