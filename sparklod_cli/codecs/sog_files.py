@@ -213,6 +213,6 @@ def _decode_webp(data: bytes, name: str) -> Texels:
     try:
         # Not by Image.open, which warns of large images and refuses larger ones: their size has been looked at.
         with WebPImageFile(io.BytesIO(data)) as image:
-            return np.asarray(image.convert("RGBA"))
+            return np.asarray(image if image.mode == "RGBA" else image.convert("RGBA"))
     except (OSError, ValueError, SyntaxError, EOFError) as error:
         raise FormatError(f"{name!r} is a corrupt WebP image: {error}") from None
