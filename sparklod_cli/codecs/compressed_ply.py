@@ -74,6 +74,7 @@ def _within(bounds: FloatArray | None, part: slice, unit: FloatArray) -> FloatAr
     """0..1 of the splats in `part` to between the bounds of their chunks, (chunks, 6): x y z of the least, the most."""
     if bounds is None:
         return unit
+    # A run of rows begins with a chunk: it has 16,384 of them, as the four words of a splat alone are 16 bytes.
     of_chunks = bounds[part.start // CHUNK_SPLATS : -(-part.stop // CHUNK_SPLATS)]
     low, high = np.split(np.repeat(of_chunks, CHUNK_SPLATS, axis=0)[: len(unit)], 2, axis=1)
     return low * (1 - unit) + high * unit

@@ -48,7 +48,7 @@ def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> 
         splats.quat_xyzw[part] = quantize.decode_quat_bytes(rows["quat_wxyz"])[:, [1, 2, 3, 0]]
 
     decode_rows(rows_of(file.read, ROW, count), fill, count, threads, progress)
-    return Scene(splats, format="SPLAT", notes=())
+    return Scene(splats, format="SPLAT")
 
 
 def importance_order(splats: Splats) -> NDArray[np.intp]:

@@ -15,6 +15,11 @@ def count_of(count: int, noun: str) -> str:
     return f"{count:,} {noun}" + ("" if count == 1 else "s")
 
 
+def size_of(size: int) -> str:
+    """ "2.9 MB"."""
+    return f"{size / 1e6:.1f} MB" if size >= 1e5 else f"{size / 1e3:.1f} kB"
+
+
 def is_terminal(stream: TextIO | None) -> bool:
     """Whether a person sits at a stream; one that is closed is None."""
     return stream is not None and stream.isatty()

@@ -177,7 +177,7 @@ def _wanted(settings: dict[str, Any], as_json: bool) -> Wanted:
         settings["stats"] or settings["expect"] is not None or way.startswith("values") or bool(settings["histogram"])
     )
     drawn = settings["html"] is not None or settings["plot"] is not None
-    person = not (as_json or way or settings["check"])
+    person = not (as_json or way or settings["check"] or asserting)
     return Wanted(
         values=everything or drawn or person,
         all_quantities=everything or settings["html"] is not None,

@@ -123,8 +123,10 @@ class Job:
         if plot is not None and picture is not None:
             write_whole(plot, [picture.png], overwrite=self.settings["overwrite"])
         if html is not None:
-            names = values.names_of(scene.splats) if scene is not None and len(scene.splats) else []
-            drawn = {name: histograms.of_quantity(scene.splats, name) for name in names} if scene is not None else {}
+            drawn = {}
+            if scene is not None and len(scene.splats):
+                names = values.names_of(scene.splats)
+                drawn = {name: histograms.of_quantity(scene.splats, name) for name in names}
             self.sections.append(pages.Section(report.as_dict(), picture, drawn))
 
     def write_page(self) -> None:

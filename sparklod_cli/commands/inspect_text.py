@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
-from .console import count_of
+from .console import count_of, size_of
 
 if TYPE_CHECKING:
     from ..inspection.findings import Finding
@@ -36,11 +36,6 @@ def lines(report: dict[str, Any]) -> Iterator[str]:
         yield from _tree(tree)
     if values:
         yield from _values(values)
-
-
-def size_of(size: int) -> str:
-    """ "2.9 MB"."""
-    return f"{size / 1e6:.1f} MB" if size >= 1e5 else f"{size / 1e3:.1f} kB"
 
 
 def _row(name: str, text: str) -> str:

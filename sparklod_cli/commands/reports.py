@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from .console import Console, count_of
+from .console import Console, count_of, size_of
 
 if TYPE_CHECKING:
     from ..bake import Baked
@@ -22,7 +22,7 @@ def report_baked(console: Console, source: Path, target: Path, baked: Baked) -> 
     console.say(
         f"{source}  {count_of(baked.splats, 'splat')}, SH {baked.sh_degree}  ->  {target} "
         f" {count_of(baked.nodes, 'node')}, {count_of(baked.levels, 'level')},"
-        f" {_size(baked.bytes)}, {_total(baked.seconds)}"
+        f" {size_of(baked.bytes)}, {_total(baked.seconds)}"
     )
     if baked.dropped:
         console.say(f"  dropped {describe(baked.dropped)}")
@@ -42,13 +42,9 @@ def report_unbaked(console: Console, source: Path, target: Path, unbaked: Unbake
     """A line."""
     console.say(
         f"{source}  {count_of(unbaked.nodes, 'node')}  ->  {target}  {count_of(unbaked.splats, 'splat')},"
-        f" SH {unbaked.sh_degree}, {_size(unbaked.bytes)}, {_total(unbaked.seconds)}"
+        f" SH {unbaked.sh_degree}, {size_of(unbaked.bytes)}, {_total(unbaked.seconds)}"
     )
     console.detail(f"  {unbaked.format}; {_stages(unbaked.seconds)}")
-
-
-def _size(size: int) -> str:
-    return f"{size / 1e6:.1f} MB" if size >= 1e5 else f"{size / 1e3:.1f} kB"
 
 
 def _total(seconds: dict[str, float]) -> str:
