@@ -75,3 +75,7 @@ class TreeError(SparklodError):
 
 class OutputError(SparklodError):
     """An output cannot be written: it exists already, or the file system refused it."""
+
+
+class CameraPathError(SparklodError):
+    """A camera path cannot be read or made: its file is broken or of no known format, or a camera makes no sense."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -47,6 +49,42 @@ def covariance(scale: FloatArray, quat_xyzw: FloatArray) -> NDArray[np.float64]:
     axes[2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
     axes *= scale.T
     return np.einsum("kin,kin->nk", axes[_ROW], axes[_COLUMN])
+
+
+def moved(points: FloatArray, matrix: NDArray[np.float64]) -> FloatArray:
+    """(N, 3) float32 points, multiplied by a (4, 4) matrix that ends in 0 0 0 1."""
+    result: FloatArray = (points @ matrix[:3, :3].T + matrix[:3, 3]).astype(np.float32)
+    return result
+
+
+def placed(splats: Splats, matrix: NDArray[np.float64]) -> Splats:
+    """Splats under a (4, 4) rotation, uniform scale and translation; their SH are not turned."""
+    size = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
+    turn = _quat_of(matrix[:3, :3] / size)
+    x, y, z, w = splats.quat_xyzw.T
+    a, b, c, d = turn
+    quat = [d * x + a * w + b * z - c * y, d * y - a * z + b * w + c * x, d * z + a * y - b * x + c * w]
+    return dataclasses.replace(
+        splats,
+        center=moved(splats.center, matrix),
+        scale=splats.scale * np.float32(size),
+        quat_xyzw=np.stack([*quat, d * w - a * x - b * y - c * z], axis=1).astype(np.float32),
+    )
+
+
+def _quat_of(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(4,) x y z w of a (3, 3) rotation: the eigenvector of Bar-Itzhack's matrix, which needs no special cases."""
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation
+    symmetric = np.array(
+        [
+            [xx - yy - zz, 0, 0, 0],
+            [yx + xy, yy - xx - zz, 0, 0],
+            [zx + xz, zy + yz, zz - xx - yy, 0],
+            [zy - yz, xz - zx, yx - xy, xx + yy + zz],
+        ]
+    )
+    quat: NDArray[np.float64] = np.linalg.eigh(symmetric, UPLO="L").eigenvectors[:, -1]
+    return quat
 
 
 def lod_opacity(opacity: FloatArray) -> FloatArray:

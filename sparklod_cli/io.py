@@ -105,6 +105,41 @@ def read_text(path: Path) -> str:
         raise UnreadableError(f"{path} cannot be read: {reason}") from None
 
 
+def read_together(path: Path, sets: Collection[Collection[str]], limit: int) -> dict[str, bytes]:
+    """Files that belong together, by name, the one that `path` names first.
+
+    Args:
+        path: of a file, or of a folder that holds one of the sets.
+        sets: names of files that belong together; where `path` is one of a set, the others beside it are read, too.
+        limit: bytes that a file may have.
+
+    Raises:
+        UnreadableError: there is no such file or set, or one is too large; the text names it.
+    """
+    try:
+        if path.is_dir():
+            folder = path
+            names = next((names for names in sets if all((folder / name).is_file() for name in names)), None)
+            if names is None:
+                known = ", or ".join(" and ".join(names) for names in sets)
+                raise UnreadableError(f"{path} cannot be read: is a directory, without {known}")
+        else:
+            folder = path.parent
+            others = next((names for names in sets if path.name in names), ())
+            names = [path.name, *(name for name in others if name != path.name and (folder / name).is_file())]
+        return {name: _read_up_to(folder / name, limit) for name in names}
+    except OSError as error:
+        raise UnreadableError(f"{path} cannot be read: {_reason(error)}") from None
+
+
+def _read_up_to(path: Path, limit: int) -> bytes:
+    if path.exists() and not path.is_file():
+        raise UnreadableError(f"{path} cannot be read: it is a pipe or a device; save it to a file first")
+    if path.stat().st_size > limit:
+        raise UnreadableError(f"{path} is larger than {limit >> 20:,} MiB, which nothing of its kind is")
+    return path.read_bytes()
+
+
 def _in_folder(folder: Path) -> Path:
     path = folder / "meta.json"
     if not path.is_file():

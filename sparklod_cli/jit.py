@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import hashlib
 import os
 from collections.abc import Callable, Iterator
@@ -42,15 +43,22 @@ def _cache_folder() -> Path | None:
 CACHE_FOLDER = _cache_folder()
 
 
-def kernel(*, parallel: bool = False) -> Callable[[Callable[..., Any]], Any]:
+def kernel(*, parallel: bool = False, nogil: bool = False, inline: bool = False) -> Callable[[Callable[..., Any]], Any]:
     """Decorator for a compiled function.
 
     No fastmath: results must not depend on the number of threads. The machine code is cached beside the source, or in
     the user's cache directory where the package is read-only; where neither can be written it is compiled every time.
+
+    Args:
+        parallel: has loops that run on the threads of `use_threads`.
+        nogil: lets other threads of this process run meanwhile.
+        inline: becomes part of the kernels that call it; LLVM does not do that by itself with all that deserve it.
     """
 
     def decorate(function: Callable[..., Any]) -> Any:
-        compiled: Any = numba.njit(error_model="numpy", parallel=parallel)(function)
+        compiled: Any = numba.njit(
+            error_model="numpy", parallel=parallel, nogil=nogil, inline="always" if inline else "never"
+        )(function)
         if CACHE_FOLDER is not None and hasattr(compiled, "enable_caching"):  # not with NUMBA_DISABLE_JIT
             theirs = numba.config.CACHE_DIR
             numba.config.CACHE_DIR = str(CACHE_FOLDER)
@@ -96,6 +104,12 @@ class _OnCompile(event.Listener):
         pass
 
 
-def on_first_compile(callback: Callable[[], None]) -> None:
-    """Calls back when a kernel is compiled because no cache has it, the first time only."""
-    event.register("numba:compile", _OnCompile(callback))
+def on_first_compile(callback: Callable[[], None]) -> Callable[[], None]:
+    """Calls back when a kernel is compiled because no cache has it, the first time only.
+
+    Returns:
+        what ends that.
+    """
+    listener = _OnCompile(callback)
+    event.register("numba:compile", listener)
+    return functools.partial(event.unregister, "numba:compile", listener)

@@ -26,3 +26,26 @@ ENCODINGS = ("packed", "ext", "lodtree", "texture")
 
 #: What colours can mean in a picture of `inspect`.
 PLOT_BY = ("level", "opacity", "size", "chunk")
+
+#: How many splats viewers draw by default: Spark 2's, by device, then those of its LoD design.
+PRESETS = {
+    "desktop": 2_500_000,
+    "ios": 1_500_000,
+    "android": 1_000_000,
+    "vision-pro": 750_000,
+    "quest": 500_000,
+    "preview-desktop": 1_500_000,
+    "mobile": 500_000,
+}
+
+#: Numbers that nodes can be read in: as the file has them, or as Spark's traversal holds them in memory.
+PRECISIONS = ("float32", "float16")
+
+#: Formats of a simulation's table.
+TABLES = ("csv", "json", "parquet")
+
+#: Spark 2's foveation: full angles of its cones in degrees, weights at the outer one and behind the camera.
+CONE_FOV0, CONE_FOV, CONE_FOVEATE, BEHIND_FOVEATE = 90.0, 120.0, 0.4, 0.2
+
+#: Chunks that Spark fetches at a time.
+FETCHERS = 3

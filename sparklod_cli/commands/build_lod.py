@@ -28,9 +28,6 @@ if TYPE_CHECKING:
 
 STDOUT = Path("-")
 
-#: Said when kernels are compiled; {} is how often that happens.
-COMPILING = "Compiling for this machine, which takes some 10 seconds; this happens {} ..."
-
 #: Options that only mean something for a tree that is built, and for SPZ.
 OF_BAKING = ("base", "max_sh", "min_opacity", "min_box", "max_box", "within", "on_invalid", "rgba", "encoding")
 OF_SPZ = ("spz_version", "fractional_bits", "compression_level")
@@ -248,9 +245,7 @@ def _bake(settings: dict[str, Any], output: Path | None, console: Console) -> Wo
     from ..selection import Selection
 
     jit.use_threads(settings["threads"])
-    jit.on_first_compile(
-        lambda: console.say(COMPILING.format("once" if jit.CACHE_FOLDER else "every time, as no cache can be written"))
-    )
+    console.announce_compiling()
     recipe = Recipe(
         base=settings["base"],
         max_sh=settings["max_sh"],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sys
 from types import TracebackType
@@ -48,12 +49,14 @@ class Console:
         self._quiet, self._verbose = quiet, verbose
         self._bars = not quiet and is_terminal(sys.stderr)
         self._bar: Any = None
+        self._ended = contextlib.ExitStack()
 
     def __enter__(self) -> Console:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         self.clear()
+        self._ended.close()
 
     def clear(self) -> None:
         """Takes the bar away."""
@@ -85,3 +88,13 @@ class Console:
             scaled = {"unit_scale": True, "unit": unit if unit == "B" else f" {unit}s"}
             self._bar = tqdm(total=total, desc=stage, leave=False, file=sys.stderr, dynamic_ncols=True, **scaled)
         self._bar.update(done - self._bar.n)
+
+    def announce_compiling(self) -> None:
+        """Says so when kernels are compiled, until this console ends."""
+        from .. import jit
+
+        often = "once" if jit.CACHE_FOLDER else "every time, as no cache can be written"
+        stop = jit.on_first_compile(
+            lambda: self.say(f"Compiling for this machine, which takes some 10 seconds; this happens {often} ...")
+        )
+        self._ended.callback(stop)

@@ -72,13 +72,32 @@ class AutoOr(click.IntRange):
         return "auto|N"
 
 
-def common_options(command: Command) -> Command:
-    """`--threads`, `--json`, `-q`, `-v`, `--version`."""
+class Quantity(click.ParamType):
+    """A text such as 20Mbit that a function of the library makes a number of, or says in a `ValueError` why not."""
+
+    def __init__(self, name: str, parse: Callable[[str], Any]) -> None:
+        self.name = name
+        self._parse = parse
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        if not isinstance(value, str):
+            return value
+        try:
+            return self._parse(value)
+        except ValueError as error:
+            self.fail(str(error), param, ctx)
+
+    def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:
+        return self.name
+
+
+def common_options(command: Command, *, json: str = "Print one JSON object a file on standard output.") -> Command:
+    """`--threads`, `--json`, `-q`, `-v`, `--version`; `json` is the help of the second."""
     for option in (
         click.version_option(__version__, package_name="sparklod"),
         click.option("-v", "--verbose", is_flag=True, help="Say how long each stage took, and what was chosen."),
         click.option("-q", "--quiet", is_flag=True, help="Say nothing but errors."),
-        click.option("--json", "as_json", is_flag=True, help="Print one JSON object a file on standard output."),
+        click.option("--json", "as_json", is_flag=True, help=json),
         click.option(
             "--threads",
             metavar="N",

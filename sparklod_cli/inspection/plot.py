@@ -11,12 +11,14 @@ from ..errors import SparklodError
 from ..gaussian import spark_size
 from ..limits import DEFAULT_BASE, PLOT_BY
 from ..lod.kernels.walk import walk
+from ..render.colors import VIRIDIS, ramp
+from ..render.labels import BACKGROUND, write_png
+from ..render.shapes import Points, box_lines, cells, evenly, level_of_step, nice_step, wall_lines
+from ..render.stage import Stage
+from ..render.viewpoint import bounds, is_drawable, viewpoint
 from ..scene import Scene
 from ..splats import FloatArray, Splats
-from .colors import VIRIDIS, color_by, ramp
-from .labels import BACKGROUND, write_png
-from .shapes import Points, box_lines, camera, cells, evenly, level_of_step, nice_step, wall_lines
-from .stage import Stage
+from .colors import color_by
 from .tree import CHUNK_SPLATS
 
 #: Of more nodes than this, so many are drawn.
@@ -28,11 +30,8 @@ MOST_CELLS, MOST_LINES = 150, 48
 #: The boxes of so many chunks are drawn at most.
 MOST_CHUNKS = 16
 
-#: The way the camera looks, from the front, from the right and from above: in scenes of 3DGS y points down.
+#: The way it is looked at, from the front, from the right and from above: in scenes of 3DGS y points down.
 DIRECTION, UP = np.array([-0.62, 0.5, -1.0]), np.array([0.0, -1.0, 0.0])
-
-#: The camera looks at the outermost splats too where they are not farther from the others than this share of these.
-NEAR = 0.35
 
 #: Left, top, right and bottom of the scene in the picture; the title, the labels and the colours stand around it.
 FRAME = (0.09, 0.2, 0.85, 0.93)
@@ -83,15 +82,15 @@ def plot(scene: Scene, *, by: str = "level", level: int | None = None, size: tup
     if by not in PLOT_BY:
         raise ValueError(f"by is {by}, not one of {', '.join(PLOT_BY)}")
     splats = scene.splats.with_max_sh(0)
-    drawable = _drawable(splats)
+    drawable = is_drawable(splats)
     if not drawable.any():
         raise SparklodError("there is nothing to draw: no splat is finite and has a size")
     subject = _subject(scene, level, drawable)
     by = "size" if by == "level" and subject.depth is None else by
     coloring = color_by(by, splats, subject.index, subject.depth)
     chosen = splats.take(subject.index)
-    low, high = _box(splats, drawable)
-    eye = camera(box_lines(low[None], high[None]), DIRECTION, UP, aspect=size[0] / size[1], frame=FRAME)
+    low, high = bounds(splats.take(drawable))
+    eye = viewpoint(box_lines(low[None], high[None]), DIRECTION, UP, aspect=size[0] / size[1], frame=FRAME)
     with Stage(low, high, size, BACKGROUND) as stage:
         drawn = stage.splats(chosen, coloring.rgb, eye)
         if len(subject.index) < subject.total:
@@ -105,12 +104,6 @@ def plot(scene: Scene, *, by: str = "level", level: int | None = None, size: tup
     lines = [line for line in (drawn, voxels, boxes) if line]
     png = write_png(pixels, subject.title, lines, coloring, eye, low, high)
     return Picture(png, "; ".join([subject.title, f"coloured by {coloring.title}", *lines]))
-
-
-def _drawable(splats: Splats) -> NDArray[np.bool_]:
-    columns = (splats.center, splats.scale, splats.quat_xyzw, splats.opacity[:, None])
-    finite = np.isfinite(np.sum([column.sum(axis=1, dtype=np.float64) for column in columns], axis=0))
-    return finite & (splats.scale.min(axis=1) >= 0) & (splats.scale.max(axis=1) > 0)
 
 
 def _subject(scene: Scene, level: int | None, drawable: NDArray[np.bool_]) -> _Subject:
@@ -138,22 +131,6 @@ def _subject(scene: Scene, level: int | None, drawable: NDArray[np.bool_]) -> _S
 
 def _counted(count: int, one: str, many: str = "") -> str:
     return f"{count:,} {one if count == 1 else many or one + 's'}"
-
-
-def _box(splats: Splats, drawable: NDArray[np.bool_]) -> tuple[Points, Points]:
-    """What the camera looks at: 1 % to 99 % of the splats along each axis, or all of them where the others are near."""
-    reach = splats.scale[drawable].max(axis=1).astype(np.float64)
-    ends = np.empty((4, 3))
-    for axis in range(3):
-        center = splats.center[drawable, axis].astype(np.float64)
-        low, high = np.percentile(center - reach, 1), np.percentile(center + reach, 99)
-        ends[:, axis] = min(low, center.min()), low, high, max(high, center.max())
-    least, low, high, most = ends
-    near = NEAR * float((high - low).max())
-    low, high = np.where(low - least < near, least, low), np.where(most - high < near, most, high)
-    # A speck, far out, is no larger than the steps of the numbers there.
-    margin = max(0.02 * float((high - low).max()), 1e-6 * float(np.abs([low, high]).max()))
-    return low - margin, high + margin
 
 
 def _voxels(stage: Stage, splats: Splats, low: Points, high: Points, eye: Points) -> str:

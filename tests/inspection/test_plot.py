@@ -14,10 +14,10 @@ from PIL import Image
 
 from sparklod_cli.errors import SparklodError
 from sparklod_cli.inspection import plot as plotting
-from sparklod_cli.inspection import stage
-from sparklod_cli.inspection.labels import BACKGROUND
 from sparklod_cli.inspection.plot import Picture, plot
 from sparklod_cli.lod import quick
+from sparklod_cli.render import stage
+from sparklod_cli.render.labels import BACKGROUND
 from sparklod_cli.scene import Scene
 from sparklod_cli.tree import LodTree
 

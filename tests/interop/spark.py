@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -62,6 +62,21 @@ class ExtSplats:
         return self.alpha if self.nodes is None else np.where(self.alpha > 1, 4 * self.alpha - 3, self.alpha)
 
 
+@dataclass(frozen=True)
+class Traversed:
+    """What Spark's traversal found.
+
+    Attributes:
+        indices: of each instance the nodes that are drawn, in Spark's order.
+        chunks: (tree, chunk) of what was looked into, the first first.
+        pixel_limit: as Spark tells it.
+    """
+
+    indices: list[NDArray[np.uint32]]
+    chunks: list[tuple[int, int]]
+    pixel_limit: float
+
+
 class Spark:
     """One Node process with Spark's worker in it; loads files one after the other."""
 
@@ -108,6 +123,35 @@ class Spark:
         reply = self._ask(f"load{layout}Splats", source, options)
         width = {"sh1": 2 if layout == "Packed" else 4}
         return {name: words.reshape(-1, width.get(name, 4))[: reply.count] for name, words in reply.words.items()}
+
+    def keep_tree(self, words: NDArray[np.uint32]) -> int:
+        """Gives Spark's worker a LodTree, four words a node; returns what Spark calls it."""
+        path = self._scratch / "tree"
+        words.tofile(path)
+        tree: int = self._node.ask({"method": "initLodTree", "path": str(path)})["lodId"]
+        path.unlink()
+        return tree
+
+    def traverse(self, budget: int, smallest: float, instances: Sequence[Mapping[str, Any]]) -> Traversed:
+        """Finds a cut, as `SparkRenderer` does.
+
+        Args:
+            budget: how many splats may be drawn.
+            smallest: the pixel scale limit.
+            instances: for each lodId, viewToObjectCols, lodScale, behindFoveate, coneFov0, coneFov and coneFoveate.
+        """
+        options = {
+            "maxSplats": budget,
+            "pixelScaleLimit": smallest,
+            "traverseMode": "standard",
+            "instances": list(instances),
+        }
+        out = self._scratch / "cut"
+        answer = self._node.ask({"method": "traverseLodTrees", "options": options, "out": str(out)})
+        indices = np.fromfile(out, "<u4")
+        out.unlink()
+        chunks = [(tree, chunk) for tree, chunk in answer["chunks"]]
+        return Traversed(np.split(indices, np.cumsum(answer["counts"])[:-1]), chunks, answer["pixelLimit"])
 
     def load_packed_sh(self, source: bytes) -> NDArray[np.float64]:
         """(N, K, 3) SH coefficients of a file as Spark's other layout, PackedSplats, holds them."""

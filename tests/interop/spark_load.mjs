@@ -4,6 +4,11 @@
 // loadPackedSplats) with the bytes at `path`, as if they had come from `name`. An answer a line on stdout:
 // {numSplats, lod, arrays}, or {error}. Each array is a raw file of uint32, `arrays` has its path by name.
 //
+// {method: "initLodTree", path} keeps the tree of that raw file of four uint32 a node; the answer is {lodId}. With it,
+// {method: "traverseLodTrees", options, out} finds a cut; `options` are the worker's, but for `instances`, a list. The
+// answer is {counts, chunks, pixelLimit, arrays}: nodes of each instance, [lodId, chunk] of what was looked into, and
+// the nodes' indices, one instance after the other.
+//
 // In a page Spark starts a Web Worker from the source that its module holds as a string, and posts it the wasm that
 // the module holds in base64. Here an EventTarget stands in for the worker's global scope.
 import { readFileSync, writeFileSync } from 'node:fs';
@@ -42,7 +47,27 @@ function call(name, args) {
   });
 }
 
+const uint32s = (path) => new Uint32Array(new Uint8Array(readFileSync(path)).buffer);
+
+async function initLodTree(path) {
+  const lodTree = uint32s(path);
+  const { lodId } = await call('initLodTree', { numSplats: lodTree.length / 4, lodTree });
+  return { lodId };
+}
+
+async function traverseLodTrees(options, out) {
+  const keys = options.instances.map((_, at) => `instance ${at}`);
+  const instances = Object.fromEntries(keys.map((key, at) => [key, { instanceId: key, ...options.instances[at] }]));
+  const { keyIndices, chunks, pixelLimit } = await call('traverseLodTrees', { ...options, instances });
+  const cuts = keys.map((key) => keyIndices[key]);
+  const indices = Uint32Array.from(cuts.flatMap(({ indices, numSplats }) => Array.from(indices.subarray(0, numSplats))));
+  writeFileSync(out, indices);
+  return { counts: cuts.map(({ numSplats }) => numSplats), chunks, pixelLimit, arrays: { indices: out } };
+}
+
 async function answer({ method, path, name, options, out }) {
+  if (method === 'initLodTree') return initLodTree(path);
+  if (method === 'traverseLodTrees') return traverseLodTrees(options, out);
   const result = await call(method, { ...options, fileBytes: new Uint8Array(readFileSync(path)), pathName: name });
   const splats = result.lodSplats ?? result;
   const found = { ext0: splats.extArrays?.[0], ext1: splats.extArrays?.[1], packed: splats.packedArray, ...splats.extra };

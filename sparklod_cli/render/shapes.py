@@ -1,4 +1,4 @@
-"""What a picture of a scene is made of, as plain arrays: ellipsoids, cells, boxes, ticks and a place for the camera."""
+"""What a picture of a scene is made of, as plain arrays: ellipsoids, cells, boxes and ticks."""
 
 from __future__ import annotations
 
@@ -132,65 +132,3 @@ def ticks(low: float, high: float, least: float) -> list[tuple[float, str]]:
     first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
     plain = step > 1e-5 and max(abs(low), abs(high)) < 1e7
     return [(step * n, f"{step * n:.{digits}f}" if plain else f"{step * n:.6g}") for n in range(first, last + 1)]
-
-
-@dataclass(frozen=True)
-class Camera:
-    """A perspective camera.
-
-    Attributes:
-        position, target: (3,) world units.
-        axes: (3, 3) rows: to the right, up, and into the picture.
-        angle: degrees that the height of the picture spans.
-        aspect: width over height.
-        shift: where `target` stands in the picture: -1 left or bottom, 0 middle, 1 right or top.
-    """
-
-    position: Points
-    target: Points
-    axes: Points
-    angle: float
-    aspect: float
-    shift: Points
-
-    def project(self, points: Points) -> Points:
-        """(N, 3) points to (N, 2) places in the picture: 0..1 from its left and from its top."""
-        local = (np.asarray(points, np.float64) - self.position) @ self.axes.T
-        return (1 + (_seen(local, self.angle, self.aspect) + self.shift) * (1, -1)) / 2
-
-
-def camera(
-    points: Points, direction: Points, up: Points, *, aspect: float, frame: tuple[float, float, float, float]
-) -> Camera:
-    """The camera that looks along a direction and has all points just inside a frame.
-
-    Args:
-        points: (N, 3) to be seen.
-        direction, up: (3,) world axes.
-        aspect: width over height.
-        frame: left, top, right and bottom of the frame in the picture, 0..1 from its left and from its top.
-    """
-    angle = 25.0
-    forward = direction / np.linalg.norm(direction)
-    right = np.cross(forward, up)
-    right /= np.linalg.norm(right)
-    axes = np.stack([right, np.cross(right, forward), forward])
-    target = (points.min(axis=0) + points.max(axis=0)) / 2
-    local = (points - target) @ axes.T
-    left, top, end, bottom = frame
-    room = 2 * np.array([end - left, bottom - top])
-    radius = float(np.linalg.norm(local, axis=1).max()) or 1.0
-    near, far = 1.01 * radius, 1e3 * radius
-    for _ in range(60):  # halves what the distance can be: the picture shrinks with it
-        distance = (near + far) / 2
-        seen = _seen(local + np.array([0, 0, distance]), angle, aspect)
-        near, far = (near, distance) if (np.ptp(seen, axis=0) <= room).all() else (distance, far)
-    seen = _seen(local + np.array([0, 0, far]), angle, aspect)
-    shift = np.array([left + end - 1, 1 - top - bottom]) - (seen.min(axis=0) + seen.max(axis=0)) / 2
-    return Camera(target - far * forward, target, axes, angle, aspect, shift)
-
-
-def _seen(local: Points, angle: float, aspect: float) -> Points:
-    """(N, 3) points in the axes of a camera to (N, 2) places, -1..1 from the left and from the bottom."""
-    half = math.tan(math.radians(angle) / 2)
-    return local[:, :2] / (local[:, 2:] * (half * aspect, half))

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from .colors import Coloring
-from .shapes import Camera, Points, ticks
+from .shapes import Points, ticks
+from .viewpoint import Viewpoint
 
 BACKGROUND, INK, FAINT, LINE = "#0f141b", "#e6edf3", "#9aa7b4", "#7d8996"
 
@@ -26,7 +27,7 @@ def write_png(
     title: str,
     lines: Sequence[str],
     coloring: Coloring,
-    camera: Camera,
+    eye: Viewpoint,
     low: Points,
     high: Points,
 ) -> bytes:
@@ -36,15 +37,15 @@ def write_png(
         pixels: (H, W, 3) of the scene.
         title, lines: what it shows, in words that fit into its width.
         coloring: what the colours mean.
-        camera: that it was drawn with.
-        low, high: (3,) corners of the box that is measured, world units; y points down.
+        eye: that it is seen from.
+        low, high: (3,) corners of the box that is measured, world units.
     """
     image = Image.fromarray(pixels)
     draw = ImageDraw.Draw(image)
     unit = min(image.height / 1000, image.width / 1600)
-    _title(draw, unit, title, lines)
+    write_title(draw, unit, title, [(line, FAINT) for line in lines])
     _scale(image, draw, unit, coloring)
-    _axes(draw, unit, image.size, camera, low, high)
+    _axes(draw, unit, image.size, eye, low, high)
     out = io.BytesIO()
     image.save(out, "PNG", optimize=True)
     return out.getvalue()
@@ -54,11 +55,18 @@ def _font(unit: float, size: float) -> Font:
     return ImageFont.load_default(size=max(7, size * unit))
 
 
-def _title(draw: ImageDraw.ImageDraw, unit: float, title: str, lines: Sequence[str]) -> None:
+def write_title(draw: ImageDraw.ImageDraw, unit: float, title: str, lines: Sequence[tuple[str, str]]) -> None:
+    """A title, and below it lines and their colours, at the upper left of a picture.
+
+    Args:
+        draw: the picture.
+        unit: a thousandth of the picture's height; 1 is for one of 1600 x 1000.
+        title, lines: in words that fit into its width.
+    """
     left, top = 40 * unit, 30 * unit
     draw.text((left, top), title, INK, _font(unit, 32))
-    for number, line in enumerate(lines):
-        draw.text((left, top + (46 + 26 * number) * unit), line, FAINT, _font(unit, 19))
+    for number, (line, color) in enumerate(lines):
+        draw.text((left, top + (46 + 26 * number) * unit), line, color, _font(unit, 19))
 
 
 def _scale(image: Image.Image, draw: ImageDraw.ImageDraw, unit: float, coloring: Coloring) -> None:
@@ -76,18 +84,24 @@ def _scale(image: Image.Image, draw: ImageDraw.ImageDraw, unit: float, coloring:
 
 
 def _axes(
-    draw: ImageDraw.ImageDraw, unit: float, size: tuple[int, int], camera: Camera, low: Points, high: Points
+    draw: ImageDraw.ImageDraw, unit: float, size: tuple[int, int], eye: Viewpoint, low: Points, high: Points
 ) -> None:
-    """Numbers along three edges of a box: two of its floor, towards the camera, and the upright one on the left."""
-    near = np.where(camera.position > (low + high) / 2, high, low)
-    near[1] = high[1]
-    middle = camera.project(((low + high) / 2)[None])[0] * size
-    floor = np.array([[x, high[1], z] for x in (low[0], high[0]) for z in (low[2], high[2])])
-    left = floor[np.argmin(camera.project(floor)[:, 0])]
-    for axis, origin in ((0, near), (2, near), (1, left)):
-        ends = np.stack([origin, origin])
-        ends[:, axis] = low[axis], high[axis]
-        first, last = camera.project(ends) * size
+    """Numbers along three edges of a box: two of its floor, towards the viewer, and the upright one on the left."""
+    upright = int(np.abs(eye.axes[1]).argmax())
+    down = bool(eye.axes[1, upright] < 0)
+    ends = np.stack([low, high])
+    ground = ends[int(down), upright]
+    near = np.where(eye.position > (low + high) / 2, high, low)
+    near[upright] = ground
+    middle = eye.project(((low + high) / 2)[None])[0] * size
+    floor = np.array([[x, y, z] for x in ends[:, 0] for y in ends[:, 1] for z in ends[:, 2]])
+    floor = floor[floor[:, upright] == ground]
+    left = floor[np.argmin(eye.project(floor)[:, 0])]
+    for axis in range(3):
+        origin = left if axis == upright else near
+        edge = np.stack([origin, origin])
+        edge[:, axis] = ends[:, axis]
+        first, last = eye.project(edge) * size
         length = float(np.linalg.norm(last - first))
         if length < LABEL_DISTANCE * unit:
             continue
@@ -100,8 +114,12 @@ def _axes(
         for value, text in ticks(float(low[axis]), float(high[axis]), extent * LABEL_DISTANCE * unit / length):
             point = origin.copy()
             point[axis] = value
-            at = (camera.project(point[None]) * size)[0]
+            at = (eye.project(point[None]) * size)[0]
             draw.line([tuple(at), tuple(at + 7 * unit * out)], LINE, max(1, round(1.5 * unit)))
             draw.text(tuple(at + 24 * unit * out), text, FAINT, _font(unit, 17), anchor="mm")
-        name = first - 26 * unit * along if axis == 1 else (first + last) / 2 + 62 * unit * out
-        draw.text(tuple(name), "y, down" if axis == 1 else "xyz"[axis], INK, _font(unit, 20), anchor="mm")
+        name = "xyz"[axis]
+        place = (first + last) / 2 + 62 * unit * out
+        if axis == upright:  # its name stands above it
+            name += ", down" if down else ""
+            place = first - 26 * unit * along if down else last + 26 * unit * along
+        draw.text(tuple(place), name, INK, _font(unit, 20), anchor="mm")

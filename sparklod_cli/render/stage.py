@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from ..errors import SparklodError
 from ..splats import FloatArray, Splats
-from .shapes import Camera, Points, ellipsoids, rotation, sphere
+from .shapes import Points, ellipsoids, rotation, sphere
+from .viewpoint import Viewpoint
 
 #: More splats than this are drawn as points, and those that would cover the picture more often than this, which takes
 #: minutes.
@@ -91,10 +92,10 @@ class Stage:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         self._plotter.close()
 
-    def splats(self, splats: Splats, rgb: NDArray[np.uint8], camera: Camera) -> str:
+    def splats(self, splats: Splats, rgb: NDArray[np.uint8], eye: Viewpoint) -> str:
         """Puts splats there in (N, 3) colours: as ellipsoids or, if they are many, as points. Says as which."""
-        away = (splats.center - camera.position) @ camera.axes[2]
-        half = math.tan(math.radians(camera.angle) / 2)
+        away = (splats.center - eye.position) @ eye.axes[2]
+        half = math.tan(math.radians(eye.angle) / 2)
         pixels = splats.scale.mean(axis=1) / np.maximum(away, 1e-3 * self._unit) * self._size[1] / half
         overdraw = float(np.square(pixels, dtype=np.float64).sum()) / (self._size[0] * self._size[1])
         if len(splats) > MOST_ELLIPSOIDS or overdraw > MOST_OVERDRAW:
@@ -131,26 +132,26 @@ class Stage:
         mesh = self._pyvista.PolyData(self._local(points))
         self._plotter.add_mesh(mesh, color=color, point_size=1.5 * OVERSAMPLING, lighting=False)
 
-    def lines(self, ends: Points, color: str, opacity: float) -> None:
-        """Puts lines there, between points by twos."""
+    def lines(self, ends: Points, color: str, opacity: float, *, width: float = 1) -> None:
+        """Puts lines there, between points by twos, so many pixels wide."""
         if len(ends):
             pairs = np.insert(np.arange(len(ends)).reshape(-1, 2), 0, 2, axis=1)
             mesh = self._pyvista.PolyData(self._local(ends), lines=pairs.ravel())
-            self._plotter.add_mesh(mesh, color=color, opacity=opacity, line_width=OVERSAMPLING, lighting=False)
+            self._plotter.add_mesh(mesh, color=color, opacity=opacity, line_width=width * OVERSAMPLING, lighting=False)
 
     def _local(self, points: Points) -> FloatArray:
         local: FloatArray = np.clip((points - self._middle) / self._unit, -FARTHEST, FARTHEST).astype(np.float32)
         return local
 
-    def photograph(self, camera: Camera) -> NDArray[np.uint8]:
-        """(H, W, 3) what a camera sees."""
-        eye = self._plotter.camera
-        eye.position, eye.focal_point = self._local(camera.position), self._local(camera.target)
-        eye.up, eye.view_angle = camera.axes[1], camera.angle
-        eye.SetWindowCenter(*-camera.shift)
+    def photograph(self, eye: Viewpoint) -> NDArray[np.uint8]:
+        """(H, W, 3) what is seen from a viewpoint."""
+        camera = self._plotter.camera
+        camera.position, camera.focal_point = self._local(eye.position), self._local(eye.target)
+        camera.up, camera.view_angle = eye.axes[1], eye.angle
+        camera.SetWindowCenter(*-eye.shift)
         # VTK would choose a range by the farthest of all splats, in which the scene itself is cut off.
-        distance = float(np.linalg.norm(camera.target - camera.position)) / self._unit
-        eye.clipping_range = (0.05 * distance, 20 * distance)
+        distance = float(np.linalg.norm(eye.target - eye.position)) / self._unit
+        camera.clipping_range = (0.05 * distance, 20 * distance)
         pixels = self._plotter.screenshot(None, return_img=True)
         width, height = self._size
         fine = pixels[..., :3].reshape(height, OVERSAMPLING, width, OVERSAMPLING, 3)

@@ -1,0 +1,175 @@
+"""Finding cuts, beside Spark's own traversal in one run: `python benchmarks/bench_traverse.py --help`."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import subprocess
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from bench_build import machine
+from scenes import load, tiled
+
+from sparklod_cli import jit
+from sparklod_cli.codecs import lod_tree
+from sparklod_cli.codecs.lod_tree import Nodes
+from sparklod_cli.lod import quick
+from sparklod_cli.lod.traversal import Forest, Instance, Traversal, View
+from sparklod_cli.parallel import ordered_map, processors
+from sparklod_cli.render.framing import framing
+from sparklod_cli.render.pose import look_at
+from sparklod_cli.splats import Splats
+
+HEADINGS = (
+    "million nodes",
+    "budget",
+    "drawn",
+    "a frame of a path, ms (min to max)",
+    "ns a splat",
+    "on one thread, ms",
+    "a first frame, ms",
+    "Spark ms (min to max)",
+    "ratio",
+    "ratio on one thread",
+)
+
+
+class Spark:
+    """Spark's traversal in a Node process."""
+
+    def __init__(self) -> None:
+        program = Path(__file__).with_name("spark_traverse.mjs")
+        self._node = subprocess.Popen(["node", str(program)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+
+    def ask(self, **request: Any) -> list[float]:
+        """Milliseconds of each view of a request."""
+        assert self._node.stdin and self._node.stdout
+        self._node.stdin.write(json.dumps(request) + "\n")
+        self._node.stdin.flush()
+        answer: list[float] = json.loads(self._node.stdout.readline())["ms"]
+        return answer
+
+    def close(self) -> None:
+        """Ends the process."""
+        assert self._node.stdin
+        self._node.stdin.close()
+        self._node.wait()
+
+
+def flight(center: np.ndarray, radius: float, frames: int) -> list[View]:
+    """Half a circle around the middle of a scene, at 1.5 times the radius of one tile, looking at it."""
+    views = []
+    for angle in np.linspace(0, np.pi, frames):
+        eye = center + 1.5 * radius * np.array([np.sin(angle), -0.4, np.cos(angle)])
+        views.append(View(look_at(eye, center, (0, -1, 0)), np.radians(90), np.radians(60)))
+    return views
+
+
+def tree_of(source: Splats, nodes: int) -> Nodes:
+    """The nodes of a scene that is tiled to about so many, as Spark holds them."""
+    sample = min(nodes // 4, 500_000)  # how much a tree grows over its leaves hardly depends on their number
+    growth = len(quick.build(tiled(source, sample))[1]) / sample
+    splats, tree = quick.build(tiled(source, round(nodes / growth)))
+    return lod_tree.unpack(lod_tree.pack(splats, tree, threads=processors()))
+
+
+def seconds_of(traversal: Traversal, views: list[View], budget: int, threads: int) -> float:
+    """Seconds a frame of a whole path."""
+    start = time.perf_counter()
+    for _ in ordered_map(lambda view: len(traversal.cut(view, budget=budget)), views, threads):
+        pass
+    return (time.perf_counter() - start) / len(views)
+
+
+def first(forest: Forest, view: View, budget: int) -> float:
+    """Seconds of a cut for which there is none before it to go by; its buffers are there."""
+    traversal = Traversal(forest, [Instance()])
+    traversal.cut(view, budget=budget)
+    traversal.forget()
+    start = time.perf_counter()
+    traversal.cut(view, budget=budget)
+    return time.perf_counter() - start
+
+
+def rows(nodes: Nodes, spark: Spark, budgets: list[int], frames: int, runs: int, radius: float, folder: Path) -> None:
+    """Measures one tree with every budget, in turns with Spark, and prints a row for each."""
+    forest = Forest([nodes])
+    center, _ = framing(nodes.center)
+    views = flight(center, radius, frames)
+    words, indices = folder / "tree.u32", folder / "nodes.u32"
+    words_of(nodes).tofile(words)
+    spark.ask(tree=str(words))
+    words.unlink()
+    traversal = Traversal(forest, [Instance()])
+    for budget in budgets:
+        asked = [
+            {"viewToObjectCols": view.camera_to_world.T.ravel().tolist(), "maxSplats": budget, "pixelScaleLimit": 0}
+            for view in views
+        ]
+        seconds_of(traversal, views, budget, processors())
+        spark.ask(views=asked[-1:], indices=str(indices))
+        cut = traversal.cut(views[-1], budget=budget).indices()[0]
+        if not np.array_equal(cut, np.sort(np.fromfile(indices, np.uint32))):
+            raise SystemExit(f"the cut of {budget:,} is not Spark's")
+        paths, alone, firsts, theirs = [], [], [], []
+        for _ in range(runs):
+            paths.append(seconds_of(traversal, views, budget, processors()))
+            alone.append(seconds_of(traversal, views, budget, 1))
+            firsts.append(first(forest, views[0], budget))
+            theirs += spark.ask(views=asked)
+        ours, spark_ms = 1e3 * statistics.median(paths), statistics.median(theirs)
+        cells = [
+            f"{len(nodes.size) / 1e6:.1f}",
+            f"{budget:,}",
+            f"{len(cut):,}",
+            f"{ours:.2f} ({1e3 * min(paths):.2f} to {1e3 * max(paths):.2f})",
+            f"{1e6 * ours / len(cut):.1f}",
+            f"{1e3 * statistics.median(alone):.2f}",
+            f"{1e3 * statistics.median(firsts):.2f}",
+            f"{spark_ms:.1f} ({min(theirs):.1f} to {max(theirs):.1f})",
+            f"{spark_ms / ours:.1f}x",
+            f"{spark_ms / 1e3 / statistics.median(alone):.1f}x",
+        ]
+        print("| " + " | ".join(cells) + " |", flush=True)
+
+
+def words_of(nodes: Nodes) -> np.ndarray:
+    """The words of nodes that came from words."""
+    rows = np.empty(len(nodes.size), lod_tree.NODE)
+    rows["center"], rows["size"] = nodes.center, nodes.size
+    rows["child_count"], rows["child_start"] = nodes.tree.child_count, nodes.tree.child_start
+    return rows
+
+
+def main() -> None:
+    """Prints a Markdown table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("scene", type=Path, help="splat file that is tiled and baked")
+    parser.add_argument("--millions", type=float, nargs="*", default=[0.5, 1, 2, 5, 10, 20], help="nodes of the trees")
+    parser.add_argument("--budgets", type=int, nargs="*", default=[50_000, 200_000, 500_000, 1_500_000])
+    parser.add_argument("--frames", type=int, default=24, help="of the path")
+    parser.add_argument("--runs", type=int, default=5, help="runs of each, in turns; medians are printed")
+    arguments = parser.parse_args()
+    jit.use_threads(processors())
+    print(f"Machine: {machine()}. Medians of {arguments.runs} runs of {arguments.frames} frames.\n")
+    print("| " + " | ".join(HEADINGS) + " |")
+    print("|---" * len(HEADINGS) + "|")
+    scene = load(arguments.scene).with_max_sh(0)
+    _, radius = framing(scene.center)
+    spark = Spark()
+    with tempfile.TemporaryDirectory() as folder:
+        for millions in arguments.millions:
+            nodes = tree_of(scene, round(millions * 1e6))
+            # A budget of more than the tree has is no budget.
+            budgets = [budget for budget in arguments.budgets if budget < len(nodes.size) / 2]
+            rows(nodes, spark, budgets, arguments.frames, arguments.runs, radius, Path(folder))
+    spark.close()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,273 @@
+"""Options that say which cameras look at a scene, and what becomes of them, shared by the commands that need any."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from ..errors import CameraPathError, SparklodError
+from ..render.axes import Axes
+from ..render.paths.formats import FORMATS, NAMES
+from .camera_values import Size, View, Views
+from .options import Command, Numbers, Real
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from ..render.camera import Matrix
+    from ..render.camera_path import CameraPath
+    from ..render.frame import Settings
+    from ..render.paths.source import Parsed
+
+    #: Gives the centres of the splats, (N, 3).
+    Centers = Callable[[], NDArray[Any]]
+
+#: The options that each are a source of cameras, of which one is taken, and the one that is where none is given.
+SOURCES = {
+    "camera_path": "--camera-path",
+    "orbit": "--orbit",
+    "dolly": "--dolly",
+    "look_at": "--look-at",
+    "keyframes": "--keyframes",
+}
+DEFAULT_ORBIT = 60
+
+#: Options that only mean something with some sources.
+ONLY_WITH = {
+    "camera_format": ("camera_path",),
+    "camera_axes": ("camera_path",),
+    "center": ("orbit", "dolly"),
+    "distance": ("orbit", "dolly"),
+    "elevation": ("orbit", "dolly"),
+    "seconds": ("dolly", "keyframes"),
+    "world_transform": ("camera_path", "look_at", "keyframes"),
+}
+
+DEFAULT_ELEVATION = 15.0
+
+#: What numbers with commas between are made of; anything else names a file.
+NUMERIC = set("0123456789+-.,eE ")
+
+#: Bytes of a camera path's file. COLMAP's images.txt has all points that its images see.
+LARGEST = 1 << 31
+
+
+def camera_options(command: Command) -> Command:
+    """The options of this module, in the order of the help; `cameras_from` takes what they are given."""
+    for option in reversed(
+        (
+            click.option(
+                "--camera-path",
+                metavar="FILE",
+                type=click.Path(path_type=Path),
+                help="Cameras of a file, or of a folder that COLMAP wrote.",
+            ),
+            click.option(
+                "--camera-format",
+                type=click.Choice(["auto", *(form.name for form in FORMATS)]),
+                help="What --camera-path is; auto tells it by its content.  [default: auto]",
+            ),
+            click.option(
+                "--camera-axes",
+                type=click.Choice([axes.value for axes in Axes]),
+                help="What the matrices of --camera-path mean, if not what its format says:"
+                " y up (opengl) or down (opencv), camera to world (c2w) or world to camera (w2c).",
+            ),
+            click.option(
+                "--orbit",
+                metavar="N",
+                type=click.IntRange(1, 1 << 20),
+                help=f"N cameras around the scene.  [default, without another source of cameras: {DEFAULT_ORBIT}]",
+            ),
+            click.option("--dolly", is_flag=True, help="Straight towards the scene, from far to near."),
+            click.option("--look-at", type=View(), help="One camera, as x,y,z:x,y,z."),
+            click.option("--keyframes", type=Views(), help="Smoothly from view to view, each as in --look-at."),
+            click.option(
+                "--center", type=Numbers("x", "y", "z"), help="What --orbit and --dolly look at.  [default: the scene]"
+            ),
+            click.option(
+                "--distance",
+                metavar="D",
+                type=Real(0, min_open=True),
+                help="Distance of --orbit, and of the first camera of --dolly, from there, in world units."
+                "  [default: where the scene fits the image; 4 times that]",
+            ),
+            click.option(
+                "--elevation",
+                metavar="DEGREES",
+                type=Real(-89, 89),
+                help=f"Of --orbit and --dolly above there.  [default: {DEFAULT_ELEVATION:g}]",
+            ),
+            click.option(
+                "--up",
+                type=Numbers("x", "y", "z"),
+                help="Which way is up, for cameras of which only eye and target are known."
+                "  [default: 0,-1,0, since y is down in scenes as training leaves them; 0,1,0 in SuperSplat's files]",
+            ),
+            click.option(
+                "--seconds",
+                metavar="S",
+                type=Real(0, 1e6, min_open=True),
+                help="Duration of --dolly, and of --keyframes from key to key.  [default: 2]",
+            ),
+            click.option(
+                "--world-transform",
+                metavar="MATRIX",
+                help="From the world of the cameras to that of the splats: 16 numbers with commas between, row by row,"
+                " or a file of them.",
+            ),
+            click.option(
+                "--size",
+                type=Size(),
+                help="Of the images; what is in view from top to bottom stays.  [default: the file's, or 1280x720]",
+            ),
+            click.option(
+                "--fov",
+                metavar="DEGREES",
+                type=Real(0, 180, min_open=True, max_open=True),
+                help="Vertical field of view.  [default: the file's, or 60]",
+            ),
+            click.option(
+                "--fps",
+                metavar="N",
+                type=Real(0, 1e6, min_open=True),
+                help="Frames a second.  [default: the file's times, or 30]",
+            ),
+            click.option(
+                "--every",
+                metavar="K",
+                type=click.IntRange(1),
+                default=1,
+                show_default=True,
+                help="Every Kth camera only.",
+            ),
+        )
+    ):
+        command = option(command)
+    return command
+
+
+def cameras_from(settings: Mapping[str, Any], centers: Centers) -> CameraPath:
+    """The cameras that the options of `camera_options` ask for.
+
+    Args:
+        settings: what click gave the command, by the parameters' names; others are not looked at.
+        centers: gives the centres of the splats, (N, 3); called only where --orbit or --dolly need to know the scene.
+
+    Raises:
+        click.UsageError: options contradict one another.
+        CameraPathError: a file cannot be read, or a camera makes no sense; the text names the file.
+    """
+    source = _source(settings)
+    for option, sources in ONLY_WITH.items():
+        if settings[option] is not None and source not in sources:
+            names = " or ".join(SOURCES[name] for name in sources)
+            raise click.UsageError(f"--{option.replace('_', '-')} only means something with {names}")
+
+    from ..render.camera_path import GENERATED, cameras_of
+
+    how = _settings(settings)
+    if source == "camera_path":
+        return _read(settings["camera_path"], settings["camera_format"], how)
+    return cameras_of(_generated(source, settings, how, centers), GENERATED[source], how)
+
+
+def _source(settings: Mapping[str, Any]) -> str:
+    given = [name for name in SOURCES if settings[name]]
+    if len(given) > 1:
+        raise click.UsageError(f"{' and '.join(SOURCES[name] for name in given)} cannot go together")
+    return given[0] if given else "orbit"
+
+
+def _settings(settings: Mapping[str, Any]) -> Settings:
+    from ..render.frame import Settings
+
+    axes, fov, world, up = (settings[name] for name in ("camera_axes", "fov", "world_transform", "up"))
+    if up is not None and not any(up):
+        raise click.UsageError("--up 0,0,0 is no direction")
+    return Settings(
+        axes=Axes(axes) if axes else None,
+        world=None if world is None else _world(world),
+        size=settings["size"],
+        fov_y=None if fov is None else math.radians(fov),
+        fps=settings["fps"],
+        every=settings["every"],
+        up=up,
+    )
+
+
+def _world(value: str) -> Matrix:
+    """(4, 4) of the text of --world-transform, or of the file that it names."""
+    from .. import io
+    from ..render.world import similarity
+
+    if "," in value and not set(value) - NUMERIC:
+        try:
+            return similarity(value)
+        except CameraPathError as error:
+            raise click.UsageError(f"--world-transform {error}") from None
+    try:
+        return similarity(io.read_text(Path(value)))
+    except CameraPathError as error:
+        raise CameraPathError(f"{value}: --world-transform {error}") from None
+    except SparklodError as error:
+        raise CameraPathError(str(error)) from None
+
+
+def _read(path: Path, form: str | None, how: Settings) -> CameraPath:
+    from .. import io
+    from ..render.camera_path import read
+    from ..render.paths.source import Files
+
+    try:
+        contents = io.read_together(path, NAMES, LARGEST)
+    except SparklodError as error:
+        raise CameraPathError(str(error)) from None
+    try:
+        return read(Files(path, contents), format=None if form in (None, "auto") else form, settings=how)
+    except CameraPathError as error:
+        raise CameraPathError(f"{path}: {error}") from None
+
+
+def _generated(source: str, settings: Mapping[str, Any], how: Settings, centers: Centers) -> Parsed:
+    from ..render import generate
+    from ..render.frame import DEFAULT_FPS, DEFAULT_UP, MAX_FRAMES
+    from ..render.paths.source import Parsed
+
+    fps, up = how.fps or DEFAULT_FPS, how.up or DEFAULT_UP
+    seconds = settings["seconds"] or generate.SECONDS
+    if source == "look_at":
+        eye, target = settings["look_at"]
+        return Parsed([generate.frame_looking(eye, target, up)])
+    if source == "keyframes":
+        keys = [generate.Key(eye, target) for eye, target in settings["keyframes"]]
+        return Parsed(generate.between(keys, fps, up, seconds=seconds))
+    center, distance = settings["center"], settings["distance"]
+    elevation = DEFAULT_ELEVATION if settings["elevation"] is None else settings["elevation"]
+    tilt = math.radians(elevation)
+    if center is None or distance is None:
+        middle, fits = _scene(centers, how)
+        center = middle if center is None else center
+        distance = distance or (fits if source == "orbit" else generate.DOLLY_START * fits)
+    if source == "orbit":
+        return Parsed(generate.orbit(settings["orbit"] or DEFAULT_ORBIT, center, distance, tilt, up))
+    count = max(2, round(seconds * fps))
+    if count > MAX_FRAMES:
+        raise click.UsageError(f"{count:,} frames are more than {MAX_FRAMES:,}; see --seconds and --fps")
+    return Parsed(generate.dolly(count, center, distance, distance / generate.DOLLY_ZOOM, tilt, up))
+
+
+def _scene(centers: Centers, how: Settings) -> tuple[Any, float]:
+    """The middle of the scene, (3,), and how far from it a camera sees all of it, world units."""
+    import numpy as np
+
+    from ..render.frame import Lens, camera_of
+    from ..render.framing import framing
+
+    middle, radius = framing(centers())
+    camera = camera_of(np.eye(4), Lens(), 0, "", how)
+    return middle, radius / math.sin(min(camera.fov_x, camera.fov_y) / 2)

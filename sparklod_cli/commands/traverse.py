@@ -1,0 +1,157 @@
+"""`sparklod traverse`: simulates budgeted cuts along a camera path."""
+
+from __future__ import annotations
+
+import functools
+import os
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import click
+
+from .. import limits
+from .camera_options import camera_options, cameras_from
+from .console import Console
+from .options import common_options
+from .world_options import placements_from, viewer_from, viewer_options, world_options
+
+#: Below this share of splats in front of the cameras, path and scene probably do not share their axes.
+LEAST_IN_FRONT = 0.05
+
+EXAMPLES = """
+\b
+Examples:
+  sparklod traverse scene-lod.spz --budget 500k            # an orbit, CSV on standard output
+  sparklod traverse scene-lod.spz --camera-path path.json -o frames.csv --summary
+  sparklod traverse scene-lod.spz --preset quest --assert 'churn_p95<0.2'    # exit status 3
+  sparklod traverse scene-lod.spz --dolly --bandwidth 20Mbit --latency 60ms --plot path.png
+  sparklod traverse --scene city.json --keyframes '0,-2,9:0,0,0 9,-2,0:0,0,0' --per-instance
+  sparklod traverse scene-lod.spz --look-at 0,-1,4:0,0,0 --indices-out cuts --padded
+"""
+
+
+@click.command("traverse", epilog=EXAMPLES, context_settings={"show_default": True})
+@world_options
+@camera_options
+@viewer_options
+@click.option(
+    "-o", "--output", metavar="FILE", type=click.Path(path_type=Path), help="Of the table.  [default: standard output]"
+)
+@click.option("--overwrite", is_flag=True, help="Replace outputs that exist.")
+@click.option(
+    "--format",
+    "form",
+    type=click.Choice(limits.TABLES),
+    help="Of the table.  [default: by the name of --output, or csv]",
+)
+@click.option("--per-instance", is_flag=True, help="A row for each instance, too.")
+@click.option("--no-timing", is_flag=True, help="Leave out traverse_ms, so that two runs give the same bytes.")
+@click.option(
+    "--summary/--no-summary",
+    default=None,
+    help="Say on standard error what the frames come to.  [default: if that is a terminal]",
+)
+@click.option(
+    "--assert",
+    "asserts",
+    metavar="TEXT",
+    multiple=True,
+    help="What must hold, such as 'churn_p95<0.2'; the exit status is 3 if it does not.",
+)
+@click.option("--plot", metavar="FILE", type=click.Path(path_type=Path), help="Draw the table and the path as a .png.")
+@click.option(
+    "--indices-out",
+    metavar="DIR",
+    type=click.Path(path_type=Path, file_okay=False),
+    help="Write the nodes of every cut as .npy of uint32.",
+)
+@click.option("--padded", is_flag=True, help="Fill them up to rows of 16,384, as Spark's index texture has them.")
+@functools.partial(
+    common_options, json="Print the summary, as one JSON object, on standard output; the table goes to --output alone."
+)
+@click.pass_context
+def traverse(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, **settings: Any) -> None:
+    """Simulate what a viewer draws of Level-of-Detail files along a camera path.
+
+    Finds for every frame the cut that Spark's traversal would find: the nodes of the trees that it draws within its
+    budget. Tells how fine they are, how many change from frame to frame, and what has to be fetched, as a table with a
+    row a frame. Files are those that build-lod writes; several are drawn together, within one budget.
+
+    Coordinates are those of the files; --up, --world-transform and --camera-axes bring cameras into them.
+    """
+    from ..simulation import assertions, tables
+    from ..simulation.simulate import Simulation
+    from ..world import TRAVERSED, read_world
+    from .traverse_job import Job, Wanted
+
+    viewer = viewer_from(ctx, settings)
+    form = settings["form"] or _form(settings["output"])
+    try:
+        asserts = [assertions.parse(text) for text in settings["asserts"]]
+    except assertions.BadAssertionError as error:
+        raise click.UsageError(f"--assert {error}") from None
+    wanted = Wanted(
+        output=settings["output"],
+        form=form,
+        columns=tables.select(timing=not settings["no_timing"]),
+        summary=settings["summary"],
+        as_json=as_json,
+        asserts=asserts,
+        plot=settings["plot"],
+        indices=settings["indices_out"],
+        padded=settings["padded"],
+        overwrite=settings["overwrite"],
+    )
+    if wanted.padded and wanted.indices is None:
+        raise click.UsageError("--padded only means something with --indices-out")
+    placements = placements_from(settings)
+    _keep_apart(
+        [wanted.output, wanted.plot],
+        [settings["scene"], settings["camera_path"], *(place.file for place in placements)],
+    )
+    with Console(quiet=quiet, verbose=verbose) as console:
+        from ..splats import COLUMNS
+
+        console.announce_compiling()
+        wanted.check()
+        world = read_world(
+            placements,
+            columns=TRAVERSED if wanted.plot is None else COLUMNS,
+            precision=settings["precision"],
+            threads=settings["threads"],
+            progress=console.progress,
+        )
+        path = cameras_from(settings, world.centers)
+        try:
+            simulation = Simulation(world, viewer, by_instance=settings["per_instance"])
+        except ValueError as error:
+            raise click.UsageError(str(error)) from None
+        for note in path.notes:
+            console.say(note)
+        job = Job(console, wanted, simulation, path)
+        job.run(settings["threads"])
+        if job.in_front < LEAST_IN_FRONT:
+            console.say(
+                f"warning: only {job.in_front:.1%} of the splats lie in front of the cameras; path and scene may not"
+                " share their axes (--camera-axes, --world-transform, --up)"
+            )
+        ctx.exit(job.report())
+
+
+def _keep_apart(outputs: Iterable[Path | None], inputs: Iterable[Path | None]) -> None:
+    """Raises a `click.UsageError` where an output would replace an input, or another output."""
+    taken = {os.path.realpath(path): "an input" for path in inputs if path is not None}
+    for path in outputs:
+        if path is None or str(path) == "-":
+            continue
+        place = os.path.realpath(path)
+        if place in taken:
+            raise click.UsageError(f"{path} is {taken[place]}; write elsewhere")
+        taken[place] = "an output already"
+
+
+def _form(output: Path | None) -> str:
+    """The format that a name asks for."""
+    suffix = output.suffix.lower().removeprefix(".") if output is not None else ""
+    return suffix if suffix in limits.TABLES else limits.TABLES[0]

@@ -1,0 +1,181 @@
+"""What `sparklod traverse` does with its frames."""
+
+from __future__ import annotations
+
+import io
+import json
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+import numpy as np
+
+from ..io import check_writable, write_stdout, write_whole
+from ..progress import Progress, silent
+from .console import Console, is_terminal
+from .traverse_text import lines
+
+if TYPE_CHECKING:
+    from ..render.camera_path import CameraPath
+    from ..simulation.assertions import Assertion
+    from ..simulation.columns import Column, Row
+    from ..simulation.simulate import Frame, Simulation
+    from ..simulation.summary import Summary
+
+#: Nodes of a row of Spark's index texture.
+ROW = 16_384
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What is to be made of the frames.
+
+    Attributes:
+        output: of the table; None for standard output.
+        form: of the table.
+        columns: of the table.
+        summary: say it; None where a person reads.
+        as_json: print it instead of the table.
+        asserts: what must hold.
+        plot, indices: outputs; None for none.
+        padded: indices fill rows of `ROW`.
+        overwrite: replace outputs.
+    """
+
+    output: Path | None
+    form: str
+    columns: Sequence[Column]
+    summary: bool | None
+    as_json: bool
+    asserts: Sequence[Assertion]
+    plot: Path | None
+    indices: Path | None
+    padded: bool
+    overwrite: bool
+
+    def check(self) -> None:
+        """Raises a `SparklodError` where an output cannot be made, before work goes into it."""
+        for target in (self.output, self.plot):
+            if target is not None and str(target) != "-":
+                check_writable(target, overwrite=self.overwrite)
+        if self.indices is not None:
+            check_writable(self.indices / "0.npy", overwrite=True, make_parent=True)
+        if self.form == "parquet":
+            from ..simulation.tables import load_pyarrow
+
+            load_pyarrow()
+        if self.plot is not None:
+            from ..simulation.charts import load_matplotlib
+
+            load_matplotlib()
+
+
+@dataclass
+class Job:
+    """Frames on their way through the outputs."""
+
+    console: Console
+    wanted: Wanted
+    simulation: Simulation
+    path: CameraPath
+    rows: list[Row] = field(default_factory=list)
+    in_front: float = 1.0
+
+    def run(self, threads: int) -> None:
+        """Simulates the path and writes what is made frame by frame, then the plot."""
+        from ..simulation.tables import encode
+
+        wanted, start = self.wanted, time.perf_counter()
+        to_stdout = wanted.output is None or str(wanted.output) == "-"
+        # A bar and a table do not go together on one screen.
+        screen = to_stdout and not wanted.as_json and is_terminal(sys.stdout)
+        rows = self._rows(threads, silent if screen else self.console.progress)
+        if not to_stdout:
+            assert wanted.output is not None
+            write_whole(wanted.output, encode(rows, wanted.columns, wanted.form), overwrite=wanted.overwrite)
+        elif wanted.as_json:
+            for _ in rows:
+                pass
+        else:
+            write_stdout(encode(rows, wanted.columns, wanted.form))
+        self.console.clear()
+        self.console.detail(
+            f"  {len(self.path.cameras):,} frames of {self.path.format}, {time.perf_counter() - start:.2f} s"
+        )
+        if wanted.plot is not None:
+            self._plot(wanted.plot)
+
+    def report(self) -> int:
+        """Says what is asked for; the exit status."""
+        from ..simulation.assertions import check
+        from ..simulation.summary import summarize
+
+        wanted = self.wanted
+        outcomes = check(wanted.asserts, self.rows)
+        summary = summarize(self.rows)
+        if wanted.as_json:
+            asserts = [{"assert": each.assertion.text, "held": each.held, "value": each.value} for each in outcomes]
+            click.echo(json.dumps(summary.as_dict() | {"asserts": asserts}, allow_nan=False))
+        if wanted.summary or (wanted.summary is None and is_terminal(sys.stderr)):
+            self._say(summary)
+        for outcome in outcomes:
+            if not outcome.held:
+                self.console.error(outcome.message())
+            else:
+                self.console.detail(f"  holds: {outcome.message()}")
+        return 0 if all(outcome.held for outcome in outcomes) else 3
+
+    def _say(self, summary: Summary) -> None:
+        for line in lines(summary):
+            self.console.say(line)
+
+    def _rows(self, threads: int, progress: Progress) -> Iterator[Row]:
+        """The rows of the table; on the way, cuts are written and rows kept for the report."""
+        shares = []
+        for frame in self.simulation.run(self.path, threads=threads, progress=progress):
+            shares.append(frame.in_front)
+            if self.wanted.indices is not None:
+                self._write_indices(frame, self.wanted.indices)
+            self.rows.append(frame.rows[0])
+            yield from frame.rows
+        self.in_front = float(np.mean(shares))
+
+    def _write_indices(self, frame: Frame, folder: Path) -> None:
+        parts = frame.cut.indices()
+        for number, nodes in enumerate(parts):
+            if self.wanted.padded:
+                nodes = np.concatenate([nodes, np.zeros(-len(nodes) % ROW, np.uint32)]).reshape(-1, ROW)
+            name = f"{frame.number:06d}" if len(parts) == 1 else f"{frame.number:06d}.{number}"
+            out = io.BytesIO()
+            np.save(out, nodes)
+            write_whole(folder / f"{name}.npy", [out.getvalue()], overwrite=self.wanted.overwrite)
+
+    def _plot(self, target: Path) -> None:
+        """Draws the charts, and the path over the cut of the frame that is most worth looking at."""
+        from ..simulation.plot import Scenery, plot
+        from ..simulation.summary import look_at
+        from ..splats import Splats
+
+        world = self.simulation.world
+        moments = look_at(self.rows)
+        numbers = list(self.path.numbers)
+        at = numbers.index(moments[0].frame) if moments else 0
+        nodes = self.simulation.cut(self.path.cameras[at]).indices()
+        splats = [world.splats_of(number, part) for number, part in enumerate(nodes)]
+        level = [world.trees[place.tree].level[part] for place, part in zip(world.instances, nodes, strict=True)]
+        degree = min(part.sh_degree for part in splats)
+        scenery = Scenery(
+            self.path.cameras,
+            Splats.concat([part.with_max_sh(degree) for part in splats]),
+            np.concatenate(level),
+            at,
+        )
+        title = ", ".join(dict.fromkeys(tree.file.name for tree in world.trees))
+        drawn = plot(self.rows, title, scenery)
+        if drawn.note:
+            self.console.say(f"{target}: {drawn.note}")
+        write_whole(target, [drawn.png], overwrite=self.wanted.overwrite)

@@ -1,0 +1,109 @@
+"""A summary of `sparklod traverse` as a person reads it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+from .console import count_of, size_of
+
+if TYPE_CHECKING:
+    from ..simulation.summary import Moment, Quantity, Summary
+
+#: No line is longer; names of frames are cut to fit.
+WIDTH = 100
+
+#: How the quantities are called, and how a number of each is said.
+QUANTITIES = {
+    "selected": ("splats drawn", "count"),
+    "budget_used": ("of the budget", "share"),
+    "pixel_scale_min": ("pixel scale", "plain"),
+    "projected_px_p95": ("large splats, px", "fixed"),
+    "overdraw_estimate": ("overdraw", "fixed"),
+    "in_frustum_share": ("in the picture", "share"),
+    "chunks_new": ("chunks fetched", "count"),
+    "bytes_new": ("fetched", "bytes"),
+    "missing": ("missing", "count"),
+    "complete_in_s": ("complete in", "seconds"),
+    "churn": ("churn", "share"),
+    "traverse_ms": ("traversal", "ms"),
+}
+
+#: What is to be seen in a frame that is worth a look, with its value.
+MOMENTS = {
+    "churn": ("{} of the splats pop", "share"),
+    "bytes": ("{} are fetched", "bytes"),
+    "coarsest": ("coarsest: {} times the pixel limit", "plain"),
+    "missing": ("{} splats are drawn too coarse", "count"),
+    "incomplete": ("{} until it is complete", "seconds"),
+    "overdraw": ("{} splats cover a pixel", "fixed"),
+}
+
+STOPS = {"budget": "at the budget", "pixel": "at the pixel limit", "exhausted": "in full detail"}
+
+
+def lines(summary: Summary) -> list[str]:
+    """The lines of a summary, none longer than `WIDTH`."""
+    return [_cut(line) for line in _lines(summary)]
+
+
+def _lines(summary: Summary) -> Iterator[str]:
+    yield _row("path", f"{count_of(summary.frames, 'frame')}, {summary.seconds:.3f} s")
+    if summary.stop_reasons:
+        stops = (f"{_share(share)} {STOPS.get(reason, reason)}" for reason, share in summary.stop_reasons.items())
+        yield _row("stops", ", ".join(stops))
+    if summary.chunks:
+        first = f"{size_of(summary.bytes_first)} of it in {count_of(summary.chunks_first, 'chunk')} for the first frame"
+        yield _row("fetches", f"{size_of(summary.bytes)} in {count_of(summary.chunks, 'chunk')}, {first}")
+    if summary.quantities:
+        yield _row("a frame", f"{'':<18} {'min':>12} {'median':>12} {'p95':>12} {'max':>12}")
+        for quantity in summary.quantities:
+            yield _row("", _quantity(quantity))
+    if summary.moments:
+        yield _row("look at", f"{'frame':>7} {'time':>11}")
+        for moment in summary.moments:
+            yield _row("", _moment(moment))
+
+
+def _row(name: str, text: str) -> str:
+    return f"  {name:<10} {text}".rstrip()
+
+
+def _quantity(quantity: Quantity) -> str:
+    name, style = QUANTITIES[quantity.name]
+    numbers = (quantity.min, quantity.p50, quantity.p95, quantity.max)
+    return f"{name:<18} " + " ".join(f"{_said(number, style):>12}" for number in numbers)
+
+
+def _moment(moment: Moment) -> str:
+    text, style = MOMENTS[moment.what]
+    time = "" if moment.time_s is None else f"{moment.time_s:.3f} s"
+    name = f"  {_one_line(moment.name)}" if moment.name else ""
+    return f"{moment.frame:>7,} {time:>11}  {text.format(_said(moment.value, style))}{name}"
+
+
+def _said(value: float, style: str) -> str:
+    """A number with its unit."""
+    if style == "count":
+        return f"{round(value):,}"
+    if style == "share":
+        return _share(value)
+    if style == "bytes":
+        return size_of(round(value)) if value else "0"
+    if style == "seconds":
+        return f"{value:.2f} s"
+    if style == "ms":
+        return f"{value:.2f} ms"
+    return f"{value:.1f}" if style == "fixed" else f"{value:.4g}"
+
+
+def _share(value: float) -> str:
+    return f"{100 * value:.1f} %"
+
+
+def _one_line(text: str) -> str:
+    return "".join(mark if mark.isprintable() else "\N{REPLACEMENT CHARACTER}" for mark in text)
+
+
+def _cut(line: str) -> str:
+    return line if len(line) <= WIDTH else f"{line[: WIDTH - 1]}…"

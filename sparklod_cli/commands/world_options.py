@@ -1,0 +1,204 @@
+"""Options that say what stands in the world and how a viewer is set, shared by the commands that look at it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from .. import limits
+from ..quantities import parse_bandwidth, parse_count, parse_latency
+from .options import Command, Quantity, Real
+
+if TYPE_CHECKING:
+    from ..simulation.simulate import Viewer
+    from ..world import Placement
+
+#: Options of the cones, which --outside-foveate leaves no room for.
+CONES = ("cone_fov0", "cone_fov", "cone_foveate")
+
+#: Options of streaming over a network, which need --bandwidth.
+OF_BANDWIDTH = ("latency", "fetchers")
+
+#: Options of numbers that the traversal multiplies in float32, and the most that it can take.
+MULTIPLIED = ("lod_render_scale", "pixel_scale_limit", "cone_foveate", "outside_foveate", "behind_foveate")
+LARGEST = 1e12
+
+#: Budgets are below this, so that they are whole numbers in every format of the table.
+BUDGETS = 1 << 53
+
+
+def world_options(command: Command) -> Command:
+    """The files, `--scene` and `--precision`."""
+    for option in (
+        click.option(
+            "--precision",
+            type=click.Choice(limits.PRECISIONS),
+            default=limits.PRECISIONS[0],
+            help="Of centres and sizes: as in the file, or as Spark's traversal has them in memory.",
+        ),
+        click.option(
+            "--scene",
+            metavar="FILE",
+            type=click.Path(path_type=Path),
+            help="Files and where they stand, as JSON; see docs/traverse.md.",
+        ),
+        click.argument("files", metavar="[FILE]...", nargs=-1, type=click.Path(path_type=Path)),
+    ):
+        command = option(command)
+    return command
+
+
+def placements_from(settings: Mapping[str, Any]) -> list[Placement]:
+    """What stands where: each FILE once, as it is, and all that --scene says."""
+    from ..world import Placement, names_of
+    from ..world_file import read_placements
+
+    files, scene = settings["files"], settings["scene"]
+    if not files and scene is None:
+        raise click.UsageError("a FILE is missing, or --scene")
+    if files and scene is not None:
+        raise click.UsageError("--scene names the files; leave out FILE")
+    if scene is not None:
+        return read_placements(scene)
+    return [Placement(file, name) for file, name in zip(files, names_of(files), strict=True)]
+
+
+def viewer_options(command: Command) -> Command:
+    """How many splats are drawn, and which."""
+    for option in reversed(
+        (
+            click.option(
+                "--budget",
+                type=Quantity("N", parse_count),
+                help="Splats to draw at most, such as 500k.  [default: of --preset]",
+            ),
+            click.option(
+                "--preset",
+                type=click.Choice(list(limits.PRESETS)),
+                default="desktop",
+                help="Budget of a device: Spark 2's, or with preview-desktop and mobile those of its LoD design.",
+            ),
+            click.option(
+                "--lod-splat-scale",
+                metavar="X",
+                type=Real(0, min_open=True),
+                default=1.0,
+                help="Multiplies the budget.",
+            ),
+            click.option(
+                "--lod-render-scale",
+                metavar="X",
+                type=Real(0),
+                default=1.0,
+                help="Divide down to so many pixels.",
+            ),
+            click.option(
+                "--pixel-scale-limit",
+                metavar="X",
+                type=Real(0),
+                help="Divide down to this size over distance.  [default: a pixel's, times --lod-render-scale]",
+            ),
+            click.option(
+                "--cone-fov0",
+                metavar="DEGREES",
+                type=Real(0, 180),
+                default=limits.CONE_FOV0,
+                help="Full weight inside.",
+            ),
+            click.option(
+                "--cone-fov",
+                metavar="DEGREES",
+                type=Real(0, 180),
+                default=limits.CONE_FOV,
+                help="There the weight has fallen to --cone-foveate.",
+            ),
+            click.option(
+                "--cone-foveate", metavar="X", type=Real(0), default=limits.CONE_FOVEATE, help="Weight at --cone-fov."
+            ),
+            click.option(
+                "--outside-foveate",
+                metavar="X",
+                type=Real(0),
+                help="Weight beside the picture, in place of the cones; as in Spark's LoD design.",
+            ),
+            click.option(
+                "--behind-foveate",
+                metavar="X",
+                type=Real(0),
+                help=f"Weight behind the camera.  [default: {limits.BEHIND_FOVEATE:g}; 1 with --outside-foveate]",
+            ),
+            click.option(
+                "--chunk-cache",
+                metavar="N",
+                type=click.IntRange(1),
+                help="Chunks of 65,536 nodes that fit into memory.  [default: all]",
+            ),
+            click.option(
+                "--bandwidth",
+                type=Quantity("RATE", parse_bandwidth),
+                help="Simulate streaming over a network of so much, such as 20Mbit.  [default: all is there]",
+            ),
+            click.option(
+                "--latency",
+                type=Quantity("TIME", parse_latency),
+                help="From asking to the first byte, such as 60ms.  [default: 0ms]",
+            ),
+            click.option(
+                "--fetchers",
+                metavar="N",
+                type=click.IntRange(1, 1000),
+                help=f"Chunks that are fetched at a time.  [default: {limits.FETCHERS}]",
+            ),
+        )
+    ):
+        command = option(command)
+    return command
+
+
+def viewer_from(ctx: click.Context, settings: Mapping[str, Any]) -> Viewer:
+    """The viewer that the options of `viewer_options` ask for."""
+    from ..lod.traversal import Cones, Frustum
+    from ..simulation.simulate import Viewer
+    from ..simulation.streaming import Network
+
+    def given(name: str) -> bool:
+        return ctx.get_parameter_source(name) not in (None, click.core.ParameterSource.DEFAULT)
+
+    behind, outside = settings["behind_foveate"], settings["outside_foveate"]
+    if outside is not None:
+        for name in CONES:
+            if given(name):
+                raise click.UsageError(f"--outside-foveate leaves nothing to --{name.replace('_', '-')}")
+    for name in OF_BANDWIDTH:
+        if settings[name] is not None and settings["bandwidth"] is None:
+            raise click.UsageError(f"--{name} only means something with --bandwidth")
+    for name in MULTIPLIED:
+        if settings[name] is not None and settings[name] > LARGEST:
+            raise click.UsageError(f"--{name.replace('_', '-')} {settings[name]:g} is beyond {LARGEST:g}")
+    if settings["budget"] is not None and given("preset"):
+        raise click.UsageError("--budget and --preset exclude each other")
+    if settings["pixel_scale_limit"] is not None and given("lod_render_scale"):
+        raise click.UsageError("--pixel-scale-limit and --lod-render-scale exclude each other")
+    foveation: Cones | Frustum
+    if outside is not None:
+        foveation = Frustum(outside, 1.0 if behind is None else behind)
+    else:
+        behind = limits.BEHIND_FOVEATE if behind is None else behind
+        foveation = Cones(settings["cone_fov0"], settings["cone_fov"], settings["cone_foveate"], behind)
+    network = Network()
+    if settings["bandwidth"] is not None:
+        network = Network(settings["bandwidth"], settings["latency"] or 0.0, settings["fetchers"] or limits.FETCHERS)
+    budget = limits.PRESETS[settings["preset"]] if settings["budget"] is None else settings["budget"]
+    if not 0 < budget * settings["lod_splat_scale"] < BUDGETS:
+        raise click.UsageError("the budget is to be more than 0, and no more than people can count")
+    return Viewer(
+        budget=max(1, int(budget * settings["lod_splat_scale"])),
+        foveation=foveation,
+        pixel_scale_limit=settings["pixel_scale_limit"],
+        render_scale=settings["lod_render_scale"],
+        network=network,
+        chunk_cache=settings["chunk_cache"],
+    )

@@ -1,0 +1,317 @@
+"""The budgeted cut through Level-of-Detail trees: what a viewer draws from where its camera is."""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..codecs.lod_tree import Nodes
+from .kernels import cut as kernels
+
+Matrix = NDArray[np.float64]
+
+#: Nodes of a chunk, as Spark streams them.
+CHUNK_NODES = 1 << kernels.CHUNK_BITS
+
+#: How many nodes are looked at for a cut of so many, at most where every node that is divided has two children or more;
+#: in others the buffers grow.
+LOOKS = 2
+
+#: The first threshold for a cut, of the last one of the cut before it: a little lower, for looking at a few nodes in
+#: vain costs less than another round.
+GUESS = 0.97
+
+#: Why a cut has no more nodes, by the number that the kernel tells.
+REASONS = {
+    kernels.BUDGET: "budget",
+    kernels.PIXEL: "pixel",
+    kernels.MISSING: "missing",
+    kernels.EXHAUSTED: "exhausted",
+}
+
+
+@dataclass(frozen=True)
+class Cones:
+    """Foveation by the angle to the optical axis, Spark 2's.
+
+    Attributes:
+        fov0: full angle in degrees of the cone inside of which everything counts 1; 0 for none.
+        fov: of the outer cone; between them the weight falls linearly in the cosine.
+        foveate: weight at the outer cone; it goes on to `behind` at 90 degrees.
+        behind: weight behind the camera.
+    """
+
+    fov0: float = 0.0
+    fov: float = 0.0
+    foveate: float = 1.0
+    behind: float = 1.0
+
+
+@dataclass(frozen=True)
+class Frustum:
+    """Foveation by the picture's own edges, as Spark's LoD design has it.
+
+    Attributes:
+        outside: weight in front of the camera but beside the picture.
+        behind: weight behind the camera.
+    """
+
+    outside: float = 1.0
+    behind: float = 1.0
+
+
+@dataclass(frozen=True)
+class Instance:
+    """One appearance of a tree in the world.
+
+    Attributes:
+        tree: which tree of its `Forest`.
+        object_to_world: (4, 4) rotation, uniform scale and translation.
+        lod_scale: how much its pixel scales count against those of others.
+        foveation: how they count by direction.
+    """
+
+    tree: int = 0
+    object_to_world: Matrix = field(default_factory=lambda: np.eye(4))
+    lod_scale: float = 1.0
+    foveation: Cones | Frustum = field(default_factory=Cones)
+
+
+@dataclass(frozen=True)
+class View:
+    """A camera, as far as the traversal cares.
+
+    Attributes:
+        camera_to_world: (4, 4), axes of OpenGL: x to the right, y up, looking along -z.
+        fov_x, fov_y: radians.
+    """
+
+    camera_to_world: Matrix
+    fov_x: float
+    fov_y: float
+
+
+class Forest:
+    """Trees ready to be traversed.
+
+    Attributes:
+        nodes: `kernels.NODE` of all trees, one after the other.
+        node_base: (trees + 1,) int64, where the nodes of each begin.
+        chunk_base: (trees + 1,) int64, where the chunks of each begin.
+    """
+
+    def __init__(self, trees: Sequence[Nodes]) -> None:
+        counts = [len(tree.size) for tree in trees]
+        self.node_base = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+        chunks = [-(-count // CHUNK_NODES) for count in counts]
+        self.chunk_base = np.concatenate([[0], np.cumsum(chunks)]).astype(np.int64)
+        self.nodes = np.empty(int(self.node_base[-1]), kernels.NODE)
+        for tree, start in zip(trees, self.node_base, strict=False):
+            part = self.nodes[start : start + len(tree.size)]
+            part["x"], part["y"], part["z"] = tree.center.T
+            part["size"] = tree.size
+            part["child_start"] = tree.tree.child_start
+            part["child_count"] = tree.tree.child_count
+
+    def __len__(self) -> int:
+        return len(self.node_base) - 1
+
+    @property
+    def chunks(self) -> int:
+        """Of all trees."""
+        return int(self.chunk_base[-1])
+
+
+@dataclass(frozen=True)
+class Cut:
+    """The nodes that are drawn; S of them, of all instances.
+
+    Attributes:
+        views: (instances,) `kernels.VIEW`.
+        node: (S,) uint32 index in its tree.
+        instance: (S,) uint16.
+        limit: (S,) float32, the least pixel scale from the root to it; negative for one that the queue took out, since
+            it has no children or they are not there.
+        reason: why there are no more: a value of `REASONS`.
+        missing: of the nodes, those that would be divided if their children were there; and roots that are not there.
+        least: the least pixel scale down to which everything has been divided; infinite if nothing was.
+        stop: (pixel scale, instance, index) of the node that would have exceeded the budget, None if none did.
+        wanted: (chunks,) float32, for each chunk of all trees how large the nodes are whose children are in it and
+            wanted, 0 for one that nobody wants.
+    """
+
+    views: NDArray[np.void]
+    node: NDArray[np.uint32]
+    instance: NDArray[np.uint16]
+    limit: NDArray[np.float32]
+    reason: str
+    missing: int
+    least: float
+    stop: tuple[float, int, int] | None
+    wanted: NDArray[np.float32]
+
+    def __len__(self) -> int:
+        return len(self.node)
+
+    def indices(self) -> list[NDArray[np.uint32]]:
+        """The nodes of the cut in each instance, ascending."""
+        return [np.sort(self.node[self.instance == number]) for number in range(len(self.views))]
+
+    def chunks(self) -> list[int]:
+        """The chunks that finding the cut looks into or wants to, of all trees, the most wanted first."""
+        wanted = np.flatnonzero(self.wanted > 0)
+        order: list[int] = wanted[np.argsort(-self.wanted[wanted], kind="stable")].tolist()
+        return order
+
+
+class Traversal:
+    """Finds cuts; buffers are kept from one to the next, for each thread its own.
+
+    Args:
+        forest: the trees.
+        instances: of them, at most 65,535.
+    """
+
+    def __init__(self, forest: Forest, instances: Sequence[Instance]) -> None:
+        self.forest, self.instances = forest, list(instances)
+        self._all = np.ones(forest.chunks, np.bool_)
+        self._local = threading.local()
+        sizes = np.diff(forest.node_base)
+        self._most = sum(int(sizes[instance.tree]) for instance in self.instances)
+
+    def cut(self, view: View, *, budget: int, smallest: float = 0.0, resident: NDArray[np.bool_] | None = None) -> Cut:
+        """The cut that a viewer draws.
+
+        Args:
+            view: where the camera is.
+            budget: how many splats may be drawn, all instances together; one for each instance at least.
+            smallest: nodes of this pixel scale are not divided; see `pixel_limit`.
+            resident: (chunks,) which chunks of all trees are there; all unless given.
+        """
+        views = views_of(self.forest, self.instances, view)
+        present = self._all if resident is None else resident
+        work = self._work(LOOKS * budget + CHUNK_NODES)
+        wanted = np.empty(self.forest.chunks, np.float32)
+        length = min(budget, self._most) + 1
+        cut = np.empty(length, np.uint32), np.empty(length, np.int32), np.empty(length, np.uint16)
+        while True:
+            selected, reason, missing, least, stop = kernels.find_cut(
+                self.forest.nodes,
+                views,
+                present,
+                np.float32(smallest).view(np.int32),
+                budget,
+                np.float32(work.guess),
+                *work.slots,
+                work.sums,
+                wanted,
+                cut,
+            )
+            if reason != kernels.FULL:
+                break
+            work = self._work(2 * len(work.slots[0]))
+        # The next cut will be much like this one.
+        work.guess = GUESS * least if reason == kernels.BUDGET else smallest
+        return Cut(
+            views=views,
+            node=cut[0][:selected],
+            instance=cut[2][:selected],
+            limit=cut[1][:selected].view(np.float32),
+            reason=REASONS[reason],
+            missing=missing,
+            least=float(least),
+            stop=None if stop < 0 else work.slot(stop),
+            wanted=wanted,
+        )
+
+    def forget(self) -> None:
+        """Begins the next cut on this thread without knowing of the last one. Its result is the same either way."""
+        work: _Work | None = getattr(self._local, "work", None)
+        if work is not None:
+            work.guess = 0.0
+
+    def _work(self, slots: int) -> _Work:
+        """Buffers of this thread, at least so long as is asked for or as could be needed."""
+        slots = min(slots, 2 * self._most)  # a node is looked at by its threshold, and once more by the queue
+        work: _Work | None = getattr(self._local, "work", None)
+        if work is None or len(work.slots[0]) < slots:
+            work = self._local.work = _Work(slots)
+        return work
+
+
+class _Work:
+    """Buffers to find a cut with, and where the last one ended."""
+
+    def __init__(self, slots: int) -> None:
+        kinds = (np.uint32, np.int32, np.uint16, np.int32, np.int32, np.int32, np.int32)
+        self.slots = [np.empty(slots + 1, kind) for kind in kinds]
+        self.sums = np.empty(kernels.BUCKETS, np.int32)
+        self.guess = 0.0
+
+    def slot(self, at: int) -> tuple[float, int, int]:
+        """The pixel scale, instance and index of the node in a slot."""
+        node, limit, instance, *_ = self.slots
+        return float(limit.view(np.float32)[at]), int(instance[at]), int(node[at])
+
+
+def pixel_limit(fov_y: float, height: int, scale: float = 1.0) -> float:
+    """The pixel scale of a pixel, Spark's `pixelScaleLimit`: 2 * tan(fov_y / 2) / height * scale.
+
+    Args:
+        fov_y: radians.
+        height: pixels.
+        scale: Spark's `lodRenderScale`.
+    """
+    return 2 * math.tan(fov_y / 2) / height * scale
+
+
+def views_of(forest: Forest, instances: Sequence[Instance], view: View) -> NDArray[np.void]:
+    """(instances,) `kernels.VIEW`: the camera in the space of each instance, in the precision that Spark has."""
+    views = np.zeros(len(instances), kernels.VIEW)
+    for row, instance in zip(views, instances, strict=True):
+        view_to_object = (np.linalg.inv(instance.object_to_world) @ view.camera_to_world).astype(np.float32)
+        right, up, backward, origin = view_to_object[:3].T
+        for name, vector in (
+            ("right", _unit(right)),
+            ("up", _unit(up)),
+            ("forward", -_unit(backward)),
+            ("origin", origin),
+        ):
+            row[f"{name}_x"], row[f"{name}_y"], row[f"{name}_z"] = vector
+        row["lod_scale"] = instance.lod_scale
+        row["node_base"] = forest.node_base[instance.tree]
+        row["chunk_base"] = forest.chunk_base[instance.tree]
+        foveation = instance.foveation
+        row["behind"] = foveation.behind
+        if isinstance(foveation, Frustum):
+            row["kind"] = kernels.FRUSTUM
+            row["side"] = foveation.outside
+            row["inner"], row["outer"] = math.tan(view.fov_x / 2), math.tan(view.fov_y / 2)
+        else:
+            row["kind"] = kernels.CONE
+            row["side"] = foveation.foveate
+            row["inner"] = _half_angle_cosine(foveation.fov0)
+            row["outer"] = min(row["inner"], _half_angle_cosine(foveation.fov))
+        if row["behind"] == row["side"] == 1:
+            row["kind"] = kernels.NO_FOVEATION
+    return views
+
+
+def _unit(vector: NDArray[np.float32]) -> NDArray[np.float32]:
+    """A unit vector as Spark's library makes it: over the length, in float32."""
+    x, y, z = vector
+    unit: NDArray[np.float32] = vector / np.sqrt((x * x + y * y) + z * z)
+    return unit
+
+
+def _half_angle_cosine(degrees: float) -> np.float32:
+    """The cosine of half an angle, 1 for none, that of 180 degrees for more; rounded to float32 where Spark rounds."""
+    if degrees <= 0:
+        return np.float32(1)
+    radians = np.float32(0.5) * np.float32(min(degrees, 180)) * np.float32(math.pi / 180)
+    return np.float32(math.cos(float(radians)))

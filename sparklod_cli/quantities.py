@@ -1,0 +1,62 @@
+"""Quantities as people write them: bandwidths, times and counts with units."""
+
+from __future__ import annotations
+
+import re
+from fractions import Fraction
+
+#: Decimal, and of any case: nobody means a thousandth of a bit.
+PREFIXES = {"": 1, "k": 10**3, "m": 10**6, "g": 10**9}
+
+NUMBER = r"(?P<number>(?:[0-9]{1,30}(?:\.[0-9]{0,30})?|\.[0-9]{1,30})(?:[eE][+-]?[0-9]{1,2})?)"
+COUNT = re.compile(rf"{NUMBER}\s*(?P<prefix>[kKmMgG]?)")
+LATENCY = re.compile(rf"{NUMBER}\s*(?P<unit>ms|s)")
+BANDWIDTH = re.compile(rf"{NUMBER}\s*(?P<prefix>[kKmMgG]?)(?P<unit>(?i:bits?|bytes?)|b|B)(?:/s|ps)?")
+
+
+def parse_bandwidth(text: str) -> float:
+    """Bytes/s of a text such as 20Mbit, 20Mbit/s, 20Mbps (bits) or 2.5MB/s, 2.5MBps, 2.5Mbyte (bytes).
+
+    Of the letters alone b is a bit and B a byte; the words may be of any case. Prefixes are decimal: k, M, G.
+
+    Raises:
+        ValueError: it is none, or not more than 0.
+    """
+    match = BANDWIDTH.fullmatch(text.strip())
+    if match is None:
+        raise ValueError(
+            f"{text!r} is not a bandwidth: a number and a unit, such as 20Mbit (bits/s) or 2.5MB/s (bytes/s)"
+        )
+    value = float(match["number"]) * PREFIXES[match["prefix"].lower()]
+    if not value > 0:
+        raise ValueError(f"{text!r} is too little bandwidth to bring anything; make it more than 0")
+    unit = match["unit"]
+    return value if unit == "B" or unit.lower().startswith("byte") else value / 8
+
+
+def parse_latency(text: str) -> float:
+    """Seconds of a text such as 60ms or 0.1s.
+
+    A plain number is refused: some tools mean seconds by it, others milliseconds.
+
+    Raises:
+        ValueError: it is none.
+    """
+    match = LATENCY.fullmatch(text.strip())
+    if match is None:
+        raise ValueError(f"{text!r} is not a latency: a number, 0 or more, and a unit, such as 60ms or 0.1s")
+    value = float(match["number"])
+    return value / 1000 if match["unit"] == "ms" else value
+
+
+def parse_count(text: str) -> int:
+    """A whole number of a text such as 65536, 500k or 1.5M; k, M and G are thousands, millions and billions.
+
+    Raises:
+        ValueError: it is none.
+    """
+    match = COUNT.fullmatch(text.strip())
+    value = Fraction(match["number"]) * PREFIXES[match["prefix"].lower()] if match else Fraction(-1, 2)
+    if value.denominator != 1:
+        raise ValueError(f"{text!r} is not a count: a whole number, such as 500000, 500k or 1.5M")
+    return int(value)

@@ -1,0 +1,1 @@
+"""Formats of camera paths, a module each; none imports another."""

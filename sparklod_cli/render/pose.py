@@ -1,0 +1,121 @@
+"""Poses as 4x4 matrices: made of quaternions and of eyes and targets, turned to OpenGL's axes, and made rigid."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from .axes import Axes
+from .camera import Matrix
+
+#: How far R^T R may be from a multiple of the identity. Files that round to three decimals stay well below it.
+SKEW = 0.02
+
+#: From OpenCV's axes to OpenGL's, and back: y and z turn around.
+FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+
+#: Beyond this a coordinate is no float32, which is what splats are placed by.
+FARTHEST = float(np.finfo(np.float32).max)
+
+
+def to_opengl(matrix: Matrix, axes: Axes) -> Matrix:
+    """A pose as camera-to-world in OpenGL's axes.
+
+    Args:
+        matrix: (4, 4), with 0 0 0 1 below; may have a uniform scale.
+        axes: what it means.
+
+    Raises:
+        ValueError: it cannot be inverted; its text goes on a sentence about it.
+    """
+    if axes.from_world:
+        try:
+            with np.errstate(all="ignore"):
+                matrix = np.asarray(np.linalg.inv(matrix), np.float64)
+        except np.linalg.LinAlgError:
+            raise ValueError("has a matrix that cannot be inverted") from None
+    return matrix @ FLIP if axes.opencv else matrix
+
+
+def rigid(matrix: Matrix) -> Matrix:
+    """A camera-to-world matrix without its scale, its rotation the nearest there is.
+
+    Args:
+        matrix: (4, 4).
+
+    Raises:
+        ValueError: it is no rotation, position and uniform scale; its text goes on a sentence about it.
+    """
+    with np.errstate(all="ignore"):
+        if not np.isfinite(matrix).all() or np.abs(matrix[:3, 3]).max() > FARTHEST:
+            raise ValueError("has numbers that are not finite, or too large")
+        if np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-4:
+            raise ValueError("has a matrix that does not end in a row of 0 0 0 1")
+        rotation = matrix[:3, :3]
+        volume = np.linalg.det(rotation)
+        if not np.isfinite(volume) or volume == 0:
+            raise ValueError("has a matrix that flattens")
+        if volume < 0:
+            raise ValueError("has a matrix that mirrors")
+        rotation = rotation / np.cbrt(volume)
+        if not np.abs(rotation.T @ rotation - np.eye(3)).max() <= SKEW:
+            raise ValueError("has axes that are not at right angles, or not of one length")
+    left, _, right = np.linalg.svd(rotation)
+    result = np.eye(4)
+    result[:3, :3] = left @ right  # the rotation that is nearest, in the sense of least squares
+    result[:3, 3] = matrix[:3, 3]
+    return result
+
+
+def pose(rotation: ArrayLike, position: ArrayLike) -> Matrix:
+    """(4, 4) of a (3, 3) rotation and a (3,) position."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation
+    matrix[:3, 3] = position
+    return matrix
+
+
+def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike) -> Matrix:
+    """Camera-to-world, in OpenGL's axes, of a camera at `eye` that looks at `target`.
+
+    Args:
+        eye, target, up: (3,) in the world. Where `up` is along the line of sight, another direction takes its place.
+
+    Raises:
+        ValueError: eye and target are the same point; its text goes on a sentence about the camera.
+    """
+    eye, target = np.asarray(eye, np.float64), np.asarray(target, np.float64)
+    back = normalized(eye - target)
+    if not np.isfinite(back).all():
+        raise ValueError("looks at the point where it is")
+    right = np.cross(normalized(up), back)
+    if not np.linalg.norm(right) > 1e-6:
+        right = np.cross(np.eye(3)[np.argmin(np.abs(back))], back)
+    right = normalized(right)
+    return pose(np.stack([right, np.cross(back, right), back], axis=1), eye)
+
+
+def normalized(vector: ArrayLike) -> Matrix:
+    """A (K,) vector of length 1; of NaN where it had none."""
+    array = np.asarray(vector, np.float64)
+    with np.errstate(all="ignore"):
+        array = array / np.abs(array).max()  # so that squares neither overflow nor vanish
+        return array / float(np.linalg.norm(array))
+
+
+def rotation_of(quat_wxyz: ArrayLike) -> Matrix:
+    """(3, 3) of a quaternion w x y z of any length but 0.
+
+    Raises:
+        ValueError: its length is 0 or not finite; its text goes on a sentence about it.
+    """
+    w, x, y, z = unit = normalized(quat_wxyz)
+    if not np.isfinite(unit).all():
+        raise ValueError("has a quaternion of length 0")
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )

@@ -1,0 +1,247 @@
+"""Our traversal draws the very nodes that Spark's draws, from wherever the camera is."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sparklod_cli.codecs import ext_splats, lod_tree
+from sparklod_cli.codecs.lod_tree import Nodes
+from sparklod_cli.io import read_scene
+from sparklod_cli.lod import quick
+from sparklod_cli.lod.traversal import CHUNK_NODES, Cones, Cut, Forest, Instance, Traversal, View, pixel_limit, views_of
+from tests import reference
+from tests.conftest import FIXTURES, real_scene
+from tests.lod.forests import rotation, transform
+
+from .spark import NODE, Spark
+
+SPARKS_CONES = Cones(90, 120, 0.4, 0.2)
+FOVEATIONS = (
+    Cones(),
+    SPARKS_CONES,
+    Cones(0, 120, 0.4, 0.2),  # no inner cone
+    Cones(70, 70, 0.4, 0.2),  # nothing between the cones
+    Cones(120, 60, 0.5, 0.1),  # the outer one inside of the inner one
+    Cones(90, 120, 0.4, 0.0),  # nothing behind the camera
+    Cones(60, 180, 0.3, 0.3),
+    Cones(90, 200, 0.3, 0.1),
+    Cones(0, 0, 0.4, 0.2),
+    Cones(90, 120, 1.0, 0.2),
+    Cones(33.3, 77.7, 0.123, 0.0456),
+)
+BUDGETS = (100, 1_000, 10_000, 50_000, 100_000, 250_000, 500_000, 1_500_000)
+#: Of a field of view of 60 degrees: everything, a pixel of several pictures, a large pixel, and more than anything is.
+FOV_Y = math.radians(60)
+LIMITS = (0.0, *(pixel_limit(FOV_Y, height) for height in (480, 1080, 2160)), pixel_limit(FOV_Y, 1080, 20.0), 1e9)
+
+LOD_SCALES = (1.0, 1.0, 1.0, 0.3, 2.5)
+
+
+@dataclass(frozen=True)
+class Tree:
+    """A tree as we and as Spark have it."""
+
+    words: np.ndarray
+    nodes: Nodes
+
+    @classmethod
+    def of(cls, words: np.ndarray) -> Tree:
+        return cls(words, lod_tree.unpack({"lod_tree": words}))
+
+
+@cache
+def baked(path: Path) -> Tree:
+    """Our tree of a scene, measured as Spark does: what it holds of the splats, after their coding."""
+    splats, tree = quick.build(read_scene(path).splats)
+    return Tree.of(lod_tree.pack(ext_splats.unpack(ext_splats.pack(splats)), tree)["lod_tree"])
+
+
+def scene(name: str) -> Path:
+    return FIXTURES / name if name == "demo.ply" else real_scene(name)
+
+
+class Both:
+    """Trees that Spark's worker has, too."""
+
+    def __init__(self, spark: Spark, trees: Sequence[Tree]) -> None:
+        self._spark, self._trees = spark, trees
+        self._ids = [spark.keep_tree(tree.words) for tree in trees]
+        self._forest = Forest([tree.nodes for tree in trees])
+
+    def check(self, instances: Sequence[Instance], camera: np.ndarray, budget: int, smallest: float) -> Cut:
+        """The same nodes of each instance, the same least pixel scale, and the same chunks in the order in which they
+        are wanted; but for those of the roots, which Spark always looks into.
+        """
+        view = View(camera, FOV_Y, FOV_Y)
+        found = Traversal(self._forest, instances)
+        cut = found.cut(view, budget=budget, smallest=smallest)
+        theirs = self._spark.traverse(budget, smallest, [self._instance(each, camera) for each in instances])
+        for ours, indices in zip(cut.indices(), theirs.indices, strict=True):
+            np.testing.assert_array_equal(ours, np.sort(indices))
+        base = self._forest.chunk_base
+        roots = {int(base[each.tree]) for each in instances}
+        touched = [int(base[self._ids.index(tree)]) + chunk for tree, chunk in theirs.chunks]
+        assert set(touched) == roots | set(cut.chunks())
+        beyond = [chunk for chunk in touched if chunk not in roots]
+        if len(set(cut.wanted[beyond])) == len(beyond):
+            assert beyond == [chunk for chunk in cut.chunks() if chunk not in roots]
+        if cut.stop:  # Spark tells the least pixel scale on the way to the node that would have exceeded the budget
+            _, instance, node = cut.stop
+            assert [theirs.pixel_limit] == cut.limit[(cut.instance == instance) & (cut.node == node)].tolist()
+        again = found.cut(view, budget=budget, smallest=smallest)  # which begins where the first one ended
+        assert [nodes.tolist() for nodes in again.indices()] == [nodes.tolist() for nodes in cut.indices()]
+        return cut
+
+    def pixel_scale(self, instance: Instance, camera: np.ndarray) -> np.float32:
+        """Of the root."""
+        (view,) = views_of(self._forest, [instance], View(camera, FOV_Y, FOV_Y))
+        return reference.pixel_scale(self._forest.nodes[view["node_base"]], view)
+
+    def _instance(self, instance: Instance, camera: np.ndarray) -> dict[str, Any]:
+        view_to_object = np.linalg.inv(instance.object_to_world) @ camera
+        cones = instance.foveation
+        assert isinstance(cones, Cones)
+        return {
+            "lodId": self._ids[instance.tree],
+            "viewToObjectCols": view_to_object.T.ravel().tolist(),
+            "lodScale": instance.lod_scale,
+            "coneFov0": cones.fov0,
+            "coneFov": cones.fov,
+            "coneFoveate": cones.foveate,
+            "behindFoveate": cones.behind,
+        }
+
+
+def cameras(nodes: Nodes, count: int, seed: int) -> list[np.ndarray]:
+    """(4, 4) each: far, near, amid the splats, exactly at a node, and turned to them, away or anywhere."""
+    rng = np.random.default_rng(seed)
+    middle = np.median(nodes.center, axis=0).astype(np.float64)
+    radius = float(np.percentile(np.linalg.norm(nodes.center - middle, axis=1), 90))
+    found = []
+    for number in range(count):
+        camera = np.eye(4)
+        camera[:3, :3] = rotation(rng)
+        direction = rng.normal(size=3)
+        direction /= np.linalg.norm(direction)
+        camera[:3, 3] = middle + (50, 3, 1.5, 0.7, 0.1)[number % 5] * radius * direction
+        if number % 4 == 3:
+            camera[:3, 3] = nodes.center[rng.integers(len(nodes.size))]
+        if number % 3:  # to the scene or away from it
+            backward = camera[:3, 3] - middle - 0.3 * radius * rng.normal(size=3)
+            camera[:3, :3] = facing(backward if number % 3 == 1 else -backward)
+        found.append(camera)
+    return found
+
+
+def facing(backward: np.ndarray) -> np.ndarray:
+    """(3, 3) of a camera with its z axis along that vector."""
+    z = backward / np.linalg.norm(backward)
+    x = np.cross([0.1, 1.0, 0.2], z)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z], axis=1)
+
+
+@pytest.mark.parametrize("name, views", [("demo.ply", 88), ("biker.spz", 88), ("playbot.sog", 48)])
+def test_one_tree(spark: Spark, name: str, views: int) -> None:
+    tree = baked(scene(name))
+    both = Both(spark, [tree])
+    reasons = set()
+    for number, camera in enumerate(cameras(tree.nodes, views, seed=len(tree.words))):
+        instance = Instance(0, np.eye(4), LOD_SCALES[number % 5], FOVEATIONS[number % len(FOVEATIONS)])
+        # Three of four limits end above what the budget allows.
+        smallest = LIMITS[number // 2 % len(LIMITS)] if number % 4 else 0.0
+        budget = BUDGETS[number % len(BUDGETS)]
+        reasons.add(both.check([instance], camera, budget, smallest).reason)
+    assert reasons >= {"budget", "pixel"}
+
+
+def test_every_cone_at_a_budget_that_is_used_up(spark: Spark) -> None:
+    tree = baked(scene("demo.ply"))
+    both = Both(spark, [tree])
+    for camera in cameras(tree.nodes, 12, seed=3):
+        for foveation in FOVEATIONS:
+            cut = both.check([Instance(0, foveation=foveation)], camera, len(tree.words) // 7, 0.0)
+            assert cut.reason == "budget" or foveation.behind == 0  # there, everything may count nothing
+
+
+def test_every_budget(spark: Spark) -> None:
+    """From a single node to all."""
+    tree = baked(scene("demo.ply"))
+    both = Both(spark, [tree])
+    camera = cameras(tree.nodes, 2, seed=4)[1]
+    leaves = int(np.count_nonzero(tree.nodes.tree.is_leaf))
+    for budget in (*range(1, 150), leaves - 1, leaves, leaves + 1):
+        cut = both.check([Instance(0, foveation=SPARKS_CONES)], camera, budget, 0.0)
+        assert (cut.reason == "exhausted") == (budget >= leaves)
+
+
+@pytest.mark.parametrize("names, views", [(["demo.ply"], 40), (["demo.ply", "biker.spz", "playbot.sog"], 20)])
+def test_instances_compete_for_one_budget(spark: Spark, names: list[str], views: int) -> None:
+    """Several of one tree, and of several: turned, scaled, moved, and some of them exactly where others are."""
+    trees = [baked(scene(name)) for name in names]
+    both = Both(spark, trees)
+    rng = np.random.default_rng(len(names))
+    for number, camera in enumerate(cameras(trees[0].nodes, views, seed=5)):
+        instances = []
+        for _ in range(rng.integers(2, 7)):
+            moved = transform(rng, scale=math.exp(rng.normal(0, 0.7)), spread=1.5)
+            if instances and rng.random() < 0.3:
+                moved = instances[-1].object_to_world
+            chosen = (int(rng.integers(len(trees))), rng.choice(LOD_SCALES), FOVEATIONS[rng.integers(len(FOVEATIONS))])
+            instances.append(Instance(chosen[0], moved, float(chosen[1]), chosen[2]))
+        if number % 4 == 0:
+            instances = [instances[0]] * len(instances)  # they tie all the way down
+        both.check(instances, camera, BUDGETS[number % 5], LIMITS[number % 3])
+
+
+@pytest.mark.parametrize("name", ["demo.ply", "biker.ply"])
+def test_trees_of_spark(spark: Spark, name: str) -> None:
+    """Its own builder's, which measures after another coding than ours; four words a node as they lie in memory."""
+    words = spark.load_words("Packed", scene(name), lod=True)["lodTree"]
+    tree = Tree.of(words)
+    assert (tree.nodes.tree.child_count == words.view(NODE)["child_count"][:, 0]).all()
+    both = Both(spark, [tree])
+    for number, camera in enumerate(cameras(tree.nodes, 40, seed=6)):
+        instance = Instance(0, np.eye(4), LOD_SCALES[number % 5], FOVEATIONS[number % len(FOVEATIONS)])
+        both.check([instance], camera, BUDGETS[number % 6], LIMITS[number % 3])
+
+
+def test_pixel_scales_are_those_of_spark_bit_for_bit(spark: Spark) -> None:
+    """A root is divided where the limit is the number before its pixel scale, not where it is that."""
+    words = np.zeros((3, 4), np.uint32)
+    nodes = words.view(NODE)[:, 0]
+    nodes["center"], nodes["size"] = [0.3, -0.7, 0.2], 0.9
+    nodes["child_count"][0], nodes["child_start"][0] = 2, 1
+    both = Both(spark, [Tree.of(words)])
+    rng = np.random.default_rng(8)
+    for number in range(600):
+        camera = transform(rng, spread=(0.2, 3.0, 100.0)[number % 3])
+        moved = transform(rng, scale=math.exp(rng.normal())) if number % 2 else np.eye(4)
+        instance = Instance(0, moved, rng.uniform(0.1, 3), FOVEATIONS[rng.integers(len(FOVEATIONS))])
+        scale = both.pixel_scale(instance, camera)
+        if scale > 0:
+            assert len(both.check([instance], camera, 9, float(np.nextafter(scale, np.float32(0))))) == 2
+        assert len(both.check([instance], camera, 9, float(scale))) == 1
+
+
+@pytest.mark.parametrize("name", ["biker.spz", "playbot.sog"])
+def test_chunks(spark: Spark, name: str) -> None:
+    """Those of the largest nodes are looked into first."""
+    tree = baked(scene(name))
+    both = Both(spark, [tree])
+    chunks = -(-len(tree.words) // CHUNK_NODES)
+    assert chunks > 2
+    touched = {
+        len(both.check([Instance()], camera, budget, 0.0).chunks())
+        for camera in cameras(tree.nodes, 15, seed=7)
+        for budget in (1_000, 30_000, 200_000)
+    }
+    assert touched >= {1, chunks - 1, chunks}

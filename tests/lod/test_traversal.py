@@ -1,0 +1,251 @@
+"""The budgeted cut against one plain queue, and the laws of cuts."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sparklod_cli.codecs.lod_tree import Nodes
+from sparklod_cli.lod.traversal import (
+    CHUNK_NODES,
+    LOOKS,
+    Cones,
+    Forest,
+    Frustum,
+    Instance,
+    View,
+    pixel_limit,
+    views_of,
+)
+
+from .. import reference
+from .forests import Case, ancestors_drawn, cases, check, drawn, links, random_tree, rotation, transform, views
+
+#: Pixel scales at which nothing happens, something does, and everything does.
+LIMITS = (0.0, 0.02, 0.3)
+
+
+@given(cases())
+@settings(max_examples=400)
+def test_the_cut_is_that_of_one_queue(case: Case) -> None:
+    check(case, case.find())
+
+
+@given(cases(), st.data())
+def test_what_is_no_larger_than_the_limit_is_not_divided(case: Case, data: st.DataObject) -> None:
+    """The limit is exactly a node's pixel scale."""
+    found = case.traversal()
+    sight = views_of(found.forest, case.instances, case.view)
+    number = data.draw(st.integers(0, len(sight) - 1))
+    node = data.draw(st.integers(0, len(case.trees[case.instances[number].tree].size) - 1))
+    smallest = float(reference.pixel_scale(found.forest.nodes[sight[number]["node_base"] + node], sight[number]))
+    case = dataclasses.replace(case, smallest=smallest)
+    check(case, case.find(found))
+
+
+@given(cases(), st.data())
+def test_cuts_before_do_not_matter(case: Case, data: st.DataObject) -> None:
+    found = case.traversal()
+    for _ in range(data.draw(st.integers(2, 5))):
+        budget = data.draw(st.integers(len(case.instances), case.most + 3))
+        smallest = data.draw(st.sampled_from([*LIMITS, math.inf]))
+        case = dataclasses.replace(case, view=data.draw(views(case.trees)), budget=budget, smallest=smallest)
+        check(case, case.find(found))
+
+
+@given(cases(), st.data())
+def test_numbers_that_are_none(case: Case, data: st.DataObject) -> None:
+    """NaN counts as more than infinity, as in Spark; what comes of it is a cut."""
+    bad = st.sampled_from([math.nan, math.inf, -math.inf, 65504.0, 3e38, 1e-45])
+    for tree in case.trees:
+        for node in data.draw(st.lists(st.integers(0, len(tree.size) - 1), max_size=4)):
+            if data.draw(st.booleans()):
+                tree.size[node] = abs(data.draw(bad))
+            else:
+                tree.center[node, data.draw(st.integers(0, 2))] = data.draw(bad)
+    cut = case.find()
+    check(case, cut)
+    check_laws(case, cut.indices())
+
+
+def check_laws(case: Case, indices: list[np.ndarray]) -> None:
+    """Every leaf is drawn once, by itself or by a node above it; there are no more than may be."""
+    assert sum(map(len, indices)) <= case.budget
+    for instance, nodes in zip(case.instances, indices, strict=True):
+        tree = case.trees[instance.tree].tree
+        assert (ancestors_drawn(tree, nodes)[tree.is_leaf] == 1).all()
+
+
+@given(cases())
+def test_every_leaf_is_drawn_once(case: Case) -> None:
+    check_laws(case, case.find().indices())
+
+
+@given(cases(), st.data())
+def test_more_budget_is_never_coarser(case: Case, data: st.DataObject) -> None:
+    found = case.traversal()
+    finer = dataclasses.replace(case, budget=data.draw(st.integers(case.budget, case.most + 3)))
+    lower = dataclasses.replace(case, smallest=case.smallest * data.draw(st.floats(0, 1)) if case.smallest else 0.0)
+    coarse = case.find(found).indices()
+    for other in (finer, dataclasses.replace(lower, budget=case.most)):
+        for instance, before, after in zip(case.instances, coarse, other.find(found).indices(), strict=True):
+            assert (ancestors_drawn(case.trees[instance.tree].tree, before)[after] == 1).all()
+
+
+@given(cases())
+def test_enough_budget_draws_all_leaves_that_can_be_seen(case: Case) -> None:
+    case = dataclasses.replace(case, budget=case.most, smallest=0.0)
+    cut = case.find()
+    assert cut.reason in ("exhausted", "pixel")
+    if cut.reason == "exhausted":
+        for instance, nodes in zip(case.instances, cut.indices(), strict=True):
+            np.testing.assert_array_equal(nodes, np.flatnonzero(case.trees[instance.tree].tree.is_leaf))
+
+
+def large_case(seed: int, *, nodes: int = 150_000, instances: int = 3) -> Case:
+    rng = np.random.default_rng(seed)
+    trees = [random_tree(rng, nodes, 5), random_tree(rng, nodes // 3, 2)]
+    foveations = (Cones(90, 120, 0.4, 0.2), Frustum(0.3, 0.1), Cones())
+    placed = [
+        Instance(number % 2, transform(rng, scale=rng.uniform(0.5, 2), spread=2.0), 1.0 + number, foveations[number])
+        for number in range(instances)
+    ]
+    return Case(trees, placed, View(transform(rng, spread=4.0), math.radians(80), math.radians(60)), 10_000, 0.0)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_large_trees(seed: int) -> None:
+    case = large_case(seed)
+    found = case.traversal()
+    for budget, smallest in [(3, 0.0), (20_000, 0.0), (1_000, 0.0), (20_000, pixel_limit(math.radians(60), 100))]:
+        case = dataclasses.replace(case, budget=budget, smallest=smallest)
+        check(case, case.find(found))
+
+
+def test_threads_share_a_traversal() -> None:
+    case, rng = large_case(9), np.random.default_rng(9)
+    found = case.traversal()
+    asked = [
+        dataclasses.replace(
+            case, view=View(transform(rng, spread=4.0), 1.4, 1.0), budget=int(rng.integers(3, 80_000)), smallest=limit
+        )
+        for limit in LIMITS * 14
+    ]
+    alone = [sorted(drawn(each.find())) for each in asked]
+    with ThreadPoolExecutor(4) as pool:
+        together = list(pool.map(lambda each: each.find(found), asked))
+    assert [sorted(drawn(cut)) for cut in together] == alone
+
+
+@pytest.mark.parametrize("ends", [1, 2, 3])
+def test_chains_that_are_longer_than_the_buffers(ends: int) -> None:
+    """A node of one child adds nothing, so no budget bounds how many are looked at."""
+    length = 4 * CHUNK_NODES
+    assert length > LOOKS * ends + CHUNK_NODES
+    tree = links([1] * length + ([ends] + [1] * ends * 1000 if ends > 1 else []))
+    rng = np.random.default_rng(ends)
+    size = rng.uniform(0.5, 1, len(tree)).astype(np.float32)
+    case = Case([Nodes(np.zeros((len(tree), 3), np.float32), size, tree)], [Instance()], seen_from(2.0), ends, 0.0)
+    found = case.traversal()
+    for budget in (ends, 1, ends):
+        cut = dataclasses.replace(case, budget=budget).find(found)
+        stopped = [length] if ends > 1 and budget == 1 else range(len(tree) - ends, len(tree))
+        assert sorted(cut.node.tolist()) == list(stopped)
+        assert cut.reason == ("budget" if ends > 1 and budget == 1 else "exhausted")
+
+
+def seen_from(distance: float) -> View:
+    """A camera that looks at the origin."""
+    camera = np.eye(4)
+    camera[2, 3] = distance
+    return View(camera, 1.4, 1.0)
+
+
+def test_a_node_is_looked_at_twice() -> None:
+    """Where the buffers are as long as the tree: by the threshold, then by the queue."""
+    tree = links([2, 2, 2])
+    size = np.array([1, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5], np.float32)
+    case = Case([Nodes(np.zeros((7, 3), np.float32), size, tree)], [Instance()], seen_from(5.0), 3, 0.0)
+    cut = case.find()
+    check(case, cut)
+    assert sorted(cut.node.tolist()) == [1, 5, 6]
+
+
+def test_many_children_and_many_instances() -> None:
+    tree = links([65535])
+    rng = np.random.default_rng(0)
+    center = rng.normal(size=(65536, 3)).astype(np.float32)
+    instances = [Instance(object_to_world=transform(rng)) for _ in range(300)]
+    case = Case([Nodes(center, np.ones(65536, np.float32), tree)], instances, seen_from(20.0), 65534 + 300, 0.0)
+    cut = case.find()
+    assert len(cut) == 300 + 65534
+    assert cut.reason == "budget"
+    assert np.count_nonzero(cut.node == 0) == 299
+    assert len(dataclasses.replace(case, budget=65533 + 300).find()) == 300
+
+
+@given(st.integers(0, 2**32 - 1), st.sampled_from([Cones(), Cones(90, 120, 0.4, 0.2), Frustum(0.5, 0.25)]))
+def test_pixel_scales_are_those_of_the_world(seed: int, foveation: Cones | Frustum) -> None:
+    """An instance is seen in its own space, which comes to the same but for rounding."""
+    rng = np.random.default_rng(seed)
+    scale = rng.uniform(0.2, 5)
+    placed = Instance(0, transform(rng, scale=scale), rng.uniform(0.5, 2), foveation)
+    view = View(transform(rng, spread=3.0), 1.4, 1.0)
+    tree = random_tree(rng, 50, 3)
+    forest = Forest([tree])
+    (sight,) = views_of(forest, [placed], view)
+    camera = np.linalg.inv(view.camera_to_world) @ placed.object_to_world
+    x, y, z = camera[:3, :3] @ tree.center.T.astype(np.float64) + camera[:3, 3:]
+    distance = np.sqrt(x * x + y * y + z * z)
+    if isinstance(foveation, Cones):
+        angles = [0, foveation.fov0 / 2, max(foveation.fov0, foveation.fov) / 2, 90]
+        cosines = np.cos(np.radians(angles))[::-1]
+        if foveation.fov0:
+            weights = [foveation.behind, foveation.foveate, 1, 1]
+            weight = np.where(z < 0, np.interp(-z / distance, cosines, weights), foveation.behind)
+        else:
+            weight = np.ones(len(z))
+    else:
+        seen = (abs(x) <= np.tan(view.fov_x / 2) * -z) & (abs(y) <= np.tan(view.fov_y / 2) * -z)
+        weight = np.where(z < 0, np.where(seen, 1, foveation.outside), foveation.behind)
+    expected = scale * tree.size / distance * placed.lod_scale * weight
+    got = np.array([reference.pixel_scale(node, sight) for node in forest.nodes])
+    # One in a thousand lies on an edge, where it falls to the other side.
+    assert np.count_nonzero(~np.isclose(got, expected, rtol=1e-4)) <= 1
+
+
+def test_a_pixel() -> None:
+    """At distance 1 the picture is 2 * tan(fov_y / 2) high."""
+    assert pixel_limit(math.radians(90), 1000) == pytest.approx(2 / 1000)
+    assert pixel_limit(math.radians(60), 1080, 2.0) == pytest.approx(2 * pixel_limit(math.radians(60), 1080))
+
+
+def test_the_order_of_equals_is_that_of_instances_and_indices() -> None:
+    """The last instance first, and in it the last node."""
+    tree = links([3, 2, 2, 2])
+    nodes = Nodes(np.zeros((10, 3), np.float32), np.ones(10, np.float32), tree)
+    case = Case([nodes], [Instance(), Instance()], seen_from(2.0), 0, 0.0)
+    found = case.traversal()
+    divided = {2: [], 3: [], 4: [(1, 0)], 5: [(1, 0), (1, 3)], 7: [(1, 0), (1, 3), (1, 2), (1, 1)], 9: [(1, 0), (0, 0)]}
+    everything = set(itertools.product(range(2), range(10)))
+    for budget in (2, 3, 4, 5, 7):
+        got = set(drawn(dataclasses.replace(case, budget=budget).find(found)))
+        children = {(i, child) for i, node in divided[budget] for child in children_of(nodes, node)}
+        assert got == ({(0, 0), (1, 0)} | children) - set(divided[budget])
+        assert got <= everything
+
+
+def children_of(nodes: Nodes, node: int) -> range:
+    start = int(nodes.tree.child_start[node])
+    return range(start, start + int(nodes.tree.child_count[node]))
+
+
+def test_rotations_are_rotations() -> None:
+    assert np.linalg.det(rotation(np.random.default_rng(0))) == pytest.approx(1)

@@ -1,0 +1,340 @@
+"""Streaming: laws, closed forms, and an exact twin that moves every byte of every transfer at every event."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass, field
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from sparklod_cli.simulation.chunks import Chunks
+from sparklod_cli.simulation.streaming import Network, Stream
+
+from .test_chunks import NaiveCache, roots_first
+
+MB = 1_000_000
+#: Nearer than this to each other, rounding decides which of two events comes first.
+TIE = Fraction(1, 10**9)
+
+networks = st.builds(
+    Network,
+    bandwidth=st.integers(1, 50).map(lambda k: k * 997.0),
+    latency=st.integers(0, 400).map(lambda ms: ms / 1000),
+    fetchers=st.integers(1, 5),
+)
+tree_sizes = st.lists(st.lists(st.integers(1, 9999), min_size=1, max_size=6), min_size=1, max_size=3)
+
+
+@dataclass
+class Fetch:
+    """A fetch under way."""
+
+    asked: Fraction
+    chunk: int
+    latency: Fraction
+    left: Fraction
+
+
+@dataclass
+class Twin:
+    """What `Stream` does, in fractions, one fetch at a time, with a cache that is looked through."""
+
+    chunks: Chunks
+    network: Network
+    cache: NaiveCache
+    now: Fraction = Fraction(0)
+    fetches: list[Fetch] = field(default_factory=list)
+    arrivals: list[tuple[Fraction, int]] = field(default_factory=list)
+    tied: bool = False  # rounding may have decided otherwise
+
+    def advance(self, to_time: Fraction) -> None:
+        while True:
+            active = [fetch for fetch in self.fetches if fetch.latency == 0]
+            rate = Fraction(self.network.bandwidth) / max(1, len(active))
+            due = [fetch.left / rate for fetch in active]
+            due += [fetch.latency for fetch in self.fetches if fetch.latency > 0]
+            ends = sorted((fetch.left / rate, fetch.asked, self.chunks.sizes[fetch.chunk]) for fetch in active)
+            self.tied |= any(b[0] - a[0] <= TIE and a != b for a, b in itertools.pairwise(ends))
+            self.tied |= any(abs(end[0] - (to_time - self.now)) <= TIE for end in ends)
+            step = min([to_time - self.now, *due])
+            self.now += step
+            for fetch in self.fetches:
+                if fetch in active:
+                    fetch.left -= step * rate
+                else:
+                    fetch.latency -= step
+            done = [fetch for fetch in active if fetch.left == 0]
+            if not done and self.now == to_time:
+                return
+            for fetch in done[:1]:
+                self.fetches.remove(fetch)
+                self.arrivals.append((self.now, fetch.chunk))
+                self.cache.arrive(fetch.chunk)
+                self.ask()
+
+    def want(self, wanted: list[int]) -> None:
+        self.cache.want(roots_first(self.chunks, wanted))
+        self.ask()
+
+    def ask(self) -> None:
+        for place, chunk in enumerate(self.cache.wanted):
+            if place < self.cache.capacity and len(self.fetches) < self.network.fetchers:
+                under_way = [fetch.chunk for fetch in self.fetches]
+                if chunk not in self.cache.used and chunk not in under_way:
+                    latency = Fraction(self.network.latency)
+                    self.fetches.append(Fetch(self.now, chunk, latency, Fraction(self.chunks.sizes[chunk])))
+
+
+def here(stream: Stream) -> set[int]:
+    return set(np.flatnonzero(stream.cache.resident()).tolist())
+
+
+def rest(stream: Stream, wanted: list[int]) -> list[tuple[float, int]]:
+    """When everything arrives, the camera resting: by what `complete_in` says of one more chunk after the other."""
+    stream.want(wanted)
+    arrivals = []
+    for chunk in stream.cache.wanted:
+        twin = stream._copy()
+        while chunk not in twin.cache and twin._happens(math.inf):
+            pass
+        arrivals.append((twin._since, chunk))
+    return sorted(arrivals)
+
+
+@settings(max_examples=400)  # what goes wrong here takes several steps that suit each other
+@given(st.data(), tree_sizes, networks)
+def test_the_same_as_the_twin(data: st.DataObject, sizes: list[list[int]], network: Network) -> None:
+    chunks = Chunks(sizes)
+    capacity = data.draw(st.none() | st.integers(len(sizes), len(chunks)))
+    stream, twin = Stream(chunks, network, capacity=capacity), Twin(chunks, network, NaiveCache(capacity))
+    seen: list[int] = []
+    for _ in range(data.draw(st.integers(1, 8))):
+        wanted = data.draw(st.lists(st.integers(0, len(chunks) - 1), max_size=12))
+        stream.want(wanted)
+        twin.want(wanted)
+        time = stream.now + data.draw(st.integers(1, 3000)) / 1009
+        twin.advance(Fraction(time))
+        assume(not twin.tied)
+        stream.advance(time)
+        seen += stream.take_arrivals()
+        assert seen == [chunk for _, chunk in twin.arrivals]
+        assert here(stream) == set(twin.cache.used)
+        assert capacity is None or len(stream.cache) <= capacity
+    complete_in = stream.complete_in(wanted)
+    if capacity is not None and len(twin.cache.wanted) > capacity:
+        assert complete_in is None
+    else:
+        assert complete_in is not None
+        missing = set(twin.cache.wanted) - set(twin.cache.used)
+        known = len(twin.arrivals)
+        twin.advance(twin.now + 1000)
+        last = max((time for time, chunk in twin.arrivals[known:] if chunk in missing), default=Fraction(stream.now))
+        assert complete_in == pytest.approx(float(last) - stream.now, rel=1e-9, abs=1e-9)
+
+
+@given(st.data(), tree_sizes, networks)
+def test_every_byte_comes_once_and_never_faster_than_the_link(
+    data: st.DataObject, sizes: list[list[int]], network: Network
+) -> None:
+    chunks = Chunks(sizes)
+    stream = Stream(chunks, network)
+    stream.want(data.draw(st.permutations(range(len(chunks)))))
+    arrived: list[int] = []
+    before = 0
+    while len(arrived) < len(chunks):
+        start = stream.now
+        stream.advance(start + data.draw(st.integers(1, 4000)) / 1000)
+        arrived += stream.take_arrivals()
+        so_far = chunks.bytes_of(arrived)
+        assert so_far <= network.bandwidth * max(0.0, stream.now - network.latency) * (1 + 1e-9)
+        under_way = network.fetchers * max(chunks.sizes)  # of which most may have come before
+        assert so_far - before <= network.bandwidth * (stream.now - start) + under_way
+        before = so_far
+    assert sorted(arrived) == list(range(len(chunks)))
+    assert before == sum(map(sum, sizes))
+    stream.advance(stream.now + 1000)
+    assert stream.take_arrivals() == []
+
+
+@given(st.data(), tree_sizes, networks)
+def test_it_does_not_matter_in_how_many_steps_time_advances(
+    data: st.DataObject, sizes: list[list[int]], network: Network
+) -> None:
+    chunks = Chunks(sizes)
+    one, many = (Stream(chunks, network, capacity=len(sizes) + 2) for _ in range(2))
+    for _ in range(3):
+        wanted = data.draw(st.lists(st.integers(0, len(chunks) - 1), max_size=12))
+        one.want(wanted)
+        many.want(wanted)
+        start, stop = one.now, one.now + data.draw(st.floats(0.001, 3))
+        for time in sorted(data.draw(st.lists(st.floats(start, stop), max_size=20))):
+            many.advance(time)
+            many.complete_in(data.draw(st.lists(st.integers(0, len(chunks) - 1), max_size=5)))  # looks, changes nothing
+        many.advance(stop)
+        one.advance(stop)
+        assert many.take_arrivals() == one.take_arrivals()
+        assert here(many) == here(one)
+        assert many.complete_in(wanted) == one.complete_in(wanted)  # to the last bit
+
+
+@given(tree_sizes, networks)
+def test_complete_is_when_it_says(sizes: list[list[int]], network: Network) -> None:
+    chunks = Chunks(sizes)
+    stream = Stream(chunks, network, start=5.0)
+    wanted = list(range(len(chunks)))
+    stream.want(wanted)
+    left = stream.complete_in(wanted)
+    assert left is not None and left > 0
+    stream.advance(5 + left * (1 - 1e-9))
+    assert stream.cache.missing()
+    stream.advance(5 + left * (1 + 1e-9))
+    assert not stream.cache.missing()
+    assert stream.complete_in(wanted) == 0
+
+
+@given(tree_sizes, networks, st.floats(1, 10))
+def test_with_more_bandwidth_a_resting_camera_waits_no_longer(
+    sizes: list[list[int]], network: Network, factor: float
+) -> None:
+    """One fetcher, or one for each chunk, or no latency, or chunks of one size."""
+    chunks = Chunks(sizes)
+    even = Chunks([[sizes[0][0]] * len(tree) for tree in sizes])
+    wanted = list(range(len(chunks)))
+    for case, latency, fetchers in (
+        (chunks, network.latency, 1),
+        (chunks, network.latency, len(chunks)),
+        (chunks, 0.0, network.fetchers),
+        (even, network.latency, network.fetchers),
+    ):
+        slow = Stream(case, Network(network.bandwidth, latency, fetchers)).complete_in(wanted)
+        fast = Stream(case, Network(network.bandwidth * factor, latency, fetchers)).complete_in(wanted)
+        assert slow is not None and fast is not None
+        assert fast <= slow * (1 + 1e-9)
+
+
+def test_a_wider_link_can_be_the_slower_one_by_a_little() -> None:
+    """Fetchers that fall into step wait together while the link is idle; the twin agrees."""
+    chunks = Chunks([[2, 50, 2, 5, 10, 2]])
+    for bandwidth, expected in ((2.0, 87.5), (2.2, 88.1818)):
+        network = Network(bandwidth, 20, 2)
+        twin = Twin(chunks, network, NaiveCache(None))
+        twin.want([0, 1, 2, 3, 4, 5])
+        twin.advance(Fraction(1000))
+        assert float(twin.arrivals[-1][0]) == pytest.approx(expected, abs=1e-4)
+        assert Stream(chunks, network).complete_in([0, 1, 2, 3, 4, 5]) == pytest.approx(expected, abs=1e-4)
+
+
+@given(st.data(), tree_sizes, networks)
+def test_one_fetcher_brings_them_in_order_one_after_the_other(
+    data: st.DataObject, sizes: list[list[int]], network: Network
+) -> None:
+    chunks = Chunks(sizes)
+    stream = Stream(chunks, Network(network.bandwidth, network.latency, 1))
+    wanted = data.draw(st.permutations(range(len(chunks))))
+    stream.want(wanted)
+    order = roots_first(chunks, wanted)
+    time = np.cumsum([network.latency + chunks.sizes[chunk] / network.bandwidth for chunk in order])
+    assert stream.complete_in(wanted) == pytest.approx(time[-1])
+    stream.advance(time[-1] * 1.001)
+    assert stream.take_arrivals() == order
+
+
+def test_one_chunk_takes_the_latency_and_its_bytes() -> None:
+    stream = Stream(Chunks([[MB]]), Network(2.5 * MB, 0.06))
+    assert stream.complete_in([0]) == pytest.approx(0.06 + 0.4)
+    stream.want([])  # a root is always wanted
+    stream.advance(0.459)
+    assert stream.take_arrivals() == []
+    stream.advance(0.461)
+    assert stream.take_arrivals() == [0]
+    assert stream.complete_in([0]) == 0
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 6, 8])
+@pytest.mark.parametrize("fetchers", [1, 3, 4])
+def test_equal_chunks_come_in_rounds(count: int, fetchers: int) -> None:
+    rounds, remainder = divmod(count, fetchers)
+    expected = rounds * (0.1 + fetchers * 0.5) + (0.1 + remainder * 0.5 if remainder else 0)
+    stream = Stream(Chunks([[MB] * count]), Network(2 * MB, 0.1, fetchers))
+    assert stream.complete_in(list(range(count))) == pytest.approx(expected)
+
+
+def test_transfers_share_the_link() -> None:
+    # 1 and 3 MB together at 1 MB/s: the small one has half of it and ends after 2 s, the large one after 4 s.
+    stream = Stream(Chunks([[1 * MB], [3 * MB]]), Network(1 * MB, 1.0))
+    assert [(pytest.approx(3.0), 0), (pytest.approx(5.0), 1)] == rest(stream, [])
+
+
+def test_what_is_under_way_is_not_cancelled_when_the_camera_turns() -> None:
+    stream = Stream(Chunks([[MB] * 5]), Network(MB, 0.5, 1))
+    stream.want([])
+    stream.advance(1.5)
+    stream.want([1, 2])
+    stream.advance(2.5)
+    stream.want([3, 4])  # while 1 is under way
+    stream.advance(6.0)
+    assert stream.take_arrivals() == [0, 1, 3, 4]
+    assert here(stream) == {0, 1, 3, 4}
+
+
+def test_what_comes_too_late_takes_no_place_of_what_is_wanted() -> None:
+    stream = Stream(Chunks([[MB] * 4]), Network(MB, 0.25, 1), capacity=2)
+    stream.want([1])
+    stream.advance(3.0)
+    stream.want([2])
+    stream.advance(3.5)
+    stream.want([1])  # while 2 is under way
+    stream.advance(9.0)
+    assert stream.complete_in([2]) == pytest.approx(1.25)  # it would have to come again
+    assert stream.take_arrivals() == [0, 1, 2]  # its bytes have been spent
+    assert here(stream) == {0, 1}
+
+
+@given(st.data(), tree_sizes)
+def test_the_default_network_brings_at_once_what_fits(data: st.DataObject, sizes: list[list[int]]) -> None:
+    sizes = [[0 if size % 3 else size for size in tree] for tree in sizes]  # some of no bytes
+    chunks = Chunks(sizes)
+    capacity = data.draw(st.none() | st.integers(len(sizes), len(chunks)))
+    stream = Stream(chunks, capacity=capacity)
+    for time in range(data.draw(st.integers(1, 6))):
+        stream.advance(time)
+        assert stream.take_arrivals() == []
+        before = here(stream)
+        wanted = data.draw(st.lists(st.integers(0, len(chunks) - 1), max_size=12))
+        stream.want(wanted)
+        admitted = roots_first(chunks, wanted)[:capacity]
+        assert set(stream.take_arrivals()) == set(admitted) - before
+        assert set(admitted) <= here(stream) <= set(admitted) | before
+        if capacity is not None:
+            assert len(stream.cache) == min(capacity, len(before | set(admitted)))
+        stream.want(wanted)  # nothing goes in and out within a frame
+        assert stream.take_arrivals() == []
+        fits = capacity is None or len(roots_first(chunks, wanted)) <= capacity
+        assert stream.complete_in(wanted) == (0.0 if fits else None)
+
+
+def test_time_goes_forward() -> None:
+    stream = Stream(Chunks([[1]]), start=1.0)
+    for time in (0.5, math.nan, math.inf):
+        with pytest.raises(ValueError, match="only go forward"):
+            stream.advance(time)
+
+
+@pytest.mark.parametrize(
+    ("bandwidth", "latency", "fetchers", "message"),
+    [
+        (0.0, 0.0, 3, "bandwidth of 0"),
+        (math.nan, 0.0, 3, "bandwidth of nan"),
+        (1.0, -1.0, 3, "latency of -1"),
+        (1.0, math.inf, 3, "latency of inf"),
+        (1.0, 0.0, 0, "0 fetchers"),
+    ],
+)
+def test_networks_that_cannot_be(bandwidth: float, latency: float, fetchers: int, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Network(bandwidth, latency, fetchers)

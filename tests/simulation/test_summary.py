@@ -1,0 +1,120 @@
+"""A summary has the statistics of all frames, and leads to those that are worth a look."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from sparklod_cli.commands.traverse_text import WIDTH, lines
+from sparklod_cli.simulation.assertions import check, parse
+from sparklod_cli.simulation.columns import COLUMNS
+from sparklod_cli.simulation.summary import IN_FRUSTUM, MOMENTS, QUANTITIES, summarize
+
+from .rows import flight, row
+
+
+def test_its_statistics_are_what_assertions_compare() -> None:
+    rows = flight()
+    for quantity in summarize(rows).quantities:
+        if quantity.name == IN_FRUSTUM:
+            continue
+        for name in ("min", "p50", "p95", "max"):
+            (outcome,) = check([parse(f"{quantity.name}_{name}<0")], rows)
+            assert getattr(quantity, name) == pytest.approx(outcome.value, rel=1e-8)
+
+
+def test_the_share_in_the_picture() -> None:
+    rows = flight()
+    shares = [row["in_frustum"] / row["selected"] for row in rows]  # type: ignore[operator]
+    (quantity,) = [each for each in summarize(rows).quantities if each.name == IN_FRUSTUM]
+    assert quantity.p95 == pytest.approx(np.percentile(shares, 95), rel=1e-8)
+
+
+def test_totals() -> None:
+    rows = flight()
+    summary = summarize(rows)
+    assert summary.frames == 300
+    assert summary.seconds == pytest.approx(299 / 30, abs=1e-5)
+    assert summary.bytes == sum(row["bytes_new"] for row in rows)  # type: ignore[misc]
+    assert summary.bytes_first == rows[0]["bytes_new"]
+    assert sum(summary.stop_reasons.values()) == pytest.approx(1, abs=1e-5)
+    assert list(summary.stop_reasons.values()) == sorted(summary.stop_reasons.values(), reverse=True)
+
+
+def test_frames_to_look_at() -> None:
+    rows = flight()
+    moments = {moment.what: moment for moment in summarize(rows).moments}
+    assert set(moments) == set(MOMENTS)
+    for what, column in (("churn", "churn"), ("missing", "missing"), ("overdraw", "overdraw_estimate")):
+        moment = moments[what]
+        assert moment.value == max(row[column] for row in rows if row[column] is not None)  # type: ignore[type-var]
+        assert rows[moment.frame][column] == moment.value
+        assert rows[moment.frame]["time_s"] == moment.time_s
+    assert moments["bytes"].frame == int(0.73 * 300)  # not the first, which fetches more
+    assert moments["coarsest"].value > 1
+
+
+def test_the_first_of_equal_frames_is_looked_at() -> None:
+    rows = [row(frame, churn=0.5 if frame in (2, 4) else 0.1) for frame in range(6)]
+    assert [moment.frame for moment in summarize(rows).moments] == [2]
+
+
+def test_what_is_empty_or_nothing_is_left_out() -> None:
+    rows = [row(frame, selected=5, missing=0, pixel_scale_min=1.0, pixel_scale_limit=1.0) for frame in range(3)]
+    summary = summarize(rows)
+    assert [quantity.name for quantity in summary.quantities] == ["selected", "pixel_scale_min", "missing"]
+    assert summary.moments == ()
+    assert summary.stop_reasons == {}
+
+
+def test_single_instances_are_left_out() -> None:
+    rows = flight(20)
+    assert summarize([*rows, *(each | {"instance": "tree"} for each in rows)]) == summarize(rows)
+
+
+def test_no_frames() -> None:
+    summary = summarize([])
+    assert (summary.frames, summary.seconds, summary.quantities, summary.moments) == (0, 0, (), ())
+    assert lines(summary) == ["  path       0 frames, 0.000 s"]
+
+
+def test_it_is_json() -> None:
+    plain = summarize(flight()).as_dict()
+    assert json.loads(json.dumps(plain, allow_nan=False)) == plain
+    assert set(plain["quantities"]) == set(QUANTITIES)
+    assert plain["quantities"]["churn"]["unit"] == "share"
+    assert plain["moments"]["churn"]["frame"] == 219
+
+
+def test_quantities_are_columns() -> None:
+    assert set(QUANTITIES) - {IN_FRUSTUM} <= {column.name for column in COLUMNS}
+
+
+class TestText:
+    def test_it_fits(self) -> None:
+        text = lines(summarize(flight()))
+        assert max(map(len, text)) <= WIDTH
+        assert len(text) == 3 + 1 + len(QUANTITIES) + 1 + len(MOMENTS)
+        assert all(line == line.rstrip() for line in text)
+
+    def test_large_numbers_and_long_names_fit(self) -> None:
+        rows = flight(40, budget=900_000_000)
+        for each in rows:
+            each |= {"name": "a long\nname " * 20, "bytes_new": 10**13, "frame": 9_999_999, "time_s": 123456.789}
+        text = lines(summarize(rows))
+        assert max(map(len, text)) <= WIDTH
+        assert not any("\n" in line for line in text)
+
+    def test_it_says_it_for_people(self) -> None:
+        text = "\n".join(lines(summarize(flight())))
+        assert "300 frames, 9.967 s" in text
+        assert "67.3 % at the pixel limit, 32.7 % at the budget" in text
+        assert "45.5 MB in 56 chunks, 11.4 MB of it in 14 chunks for the first frame" in text
+        assert "219     7.300 s  39.9 % of the splats pop" in text
+
+    def test_empty_columns_have_no_line(self) -> None:
+        text = "\n".join(lines(summarize(flight(bandwidth=False, timing=False))))
+        assert "complete" not in text
+        assert "traversal" not in text

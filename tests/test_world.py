@@ -1,0 +1,224 @@
+"""Trees and where they stand: `World` against plain matrices."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sparklod_cli import world
+from sparklod_cli.errors import FormatError, SparklodError, TreeError
+from sparklod_cli.gaussian import moved, placed, spark_size
+from sparklod_cli.io import read_scene
+from sparklod_cli.lod.traversal import CHUNK_NODES, Cones, Frustum
+from sparklod_cli.splats import COLUMNS
+from sparklod_cli.world import Placement, World, names_of, read_world
+
+from . import reference
+from .conftest import FIXTURES
+from .lod.forests import transform
+from .scenes import random_splats
+
+TREE, TOWN = FIXTURES / "golden" / "tree-v3.spz", FIXTURES / "traverse" / "town.spz"
+HAND = FIXTURES / "golden" / "hand-tree-v3.spz"
+SHIFTED = np.array([[0.0, 0, 2, 5], [0, 2, 0, -6], [-2, 0, 0, 7], [0, 0, 0, 1]])  # a quarter turn, twice the size
+
+
+def matrices(count: int = 6) -> list[np.ndarray]:
+    rng = np.random.default_rng(5)
+    halves = [np.diag([*signs, 1.0]) for signs in ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))]
+    return [*halves, SHIFTED, *(transform(rng, scale=float(np.exp(rng.normal())), spread=9) for _ in range(count))]
+
+
+@pytest.mark.parametrize("matrix", matrices())
+def test_placed_splats_have_the_covariance_of_the_matrix(matrix: np.ndarray) -> None:
+    """M cov M^T, however the rotation is turned; half turns have quaternions whose w is 0."""
+    splats = random_splats(200, sh_degree=1)
+    there = placed(splats, matrix)
+    axes = matrix[:3, :3]
+    expected = axes @ reference.covariance(splats.scale, splats.quat_xyzw) @ axes.T
+    found = reference.covariance(there.scale, there.quat_xyzw)
+    size = np.abs(expected).max(axis=(1, 2), keepdims=True)
+    assert (np.abs(found - expected) <= 2e-6 * size).all()
+    assert np.allclose(np.linalg.norm(there.quat_xyzw, axis=1), 1, atol=1e-6)
+    homogeneous = np.concatenate([splats.center, np.ones((200, 1))], axis=1)
+    assert np.allclose(there.center, (homogeneous @ matrix.T)[:, :3], rtol=1e-6, atol=1e-5)
+    assert np.array_equal(there.center, moved(splats.center, matrix))
+    for name in ("opacity", "rgb", "sh"):
+        assert np.array_equal(getattr(there, name), getattr(splats, name))
+    for column in dataclasses.fields(there):
+        assert getattr(there, column.name).dtype == getattr(splats, column.name).dtype
+
+
+def test_nothing_moves_where_it_stands() -> None:
+    splats = random_splats(50)
+    there = placed(splats, np.eye(4))
+    assert np.array_equal(there.center, splats.center)
+    assert np.array_equal(there.scale, splats.scale)
+    assert np.allclose(np.abs((there.quat_xyzw * splats.quat_xyzw).sum(axis=1)), 1, atol=1e-6)
+
+
+def five() -> list[Placement]:
+    """Three trees, two of them twice."""
+    spots = [np.eye(4), SHIFTED, *matrices(3)[-3:]]
+    files = [TREE, TOWN, TREE, HAND, HAND]
+    return [
+        Placement(file, f"{number}", spot, 1 + number)
+        for number, (file, spot) in enumerate(zip(files, spots, strict=True))
+    ]
+
+
+def test_centres_are_those_of_all_leaves_in_the_world() -> None:
+    placements = five()
+    parts = []
+    for place in placements:
+        scene = read_scene(place.file)
+        assert scene.tree is not None
+        leaves = scene.splats.center[scene.tree.child_count == 0].astype(np.float64)
+        parts.append(leaves @ place.object_to_world[:3, :3].T + place.object_to_world[:3, 3])
+    centers = read_world(placements).centers()
+    assert np.allclose(centers, np.concatenate(parts), rtol=1e-6, atol=1e-5)
+
+
+def test_splats_of_an_instance_are_placed() -> None:
+    placements = five()
+    made = read_world(placements, columns=COLUMNS)
+    for number, place in enumerate(placements):
+        splats = read_scene(place.file).splats
+        nodes = np.array([5, 0, 3], np.uint32)
+        expected = placed(splats.take(nodes), place.object_to_world)
+        for column in dataclasses.fields(expected):
+            found = getattr(made.splats_of(number, nodes), column.name)
+            assert np.array_equal(found, getattr(expected, column.name)), column.name
+
+
+def test_the_forest_has_the_nodes_of_the_files() -> None:
+    made = read_world(five())
+    assert [tree.file for tree in made.trees] == [TREE, TOWN, HAND]
+    assert [instance.tree for instance in made.instances] == [0, 1, 0, 2, 2]
+    assert [instance.lod_scale for instance in made.instances] == [1, 2, 3, 4, 5]
+    for tree, (start, end) in zip(made.trees, itertools.pairwise(made.forest.node_base), strict=True):
+        scene = read_scene(tree.file)
+        assert scene.tree is not None
+        part = made.forest.nodes[start:end]
+        for axis, values in zip("xyz", scene.splats.center.T, strict=True):
+            assert np.array_equal(part[axis], values)
+        assert np.array_equal(part["size"], spark_size(scene.splats))
+        assert np.array_equal(part["child_count"], scene.tree.child_count)
+        assert np.array_equal(part["child_start"], scene.tree.child_start)
+        level = np.zeros(len(part), int)
+        for node in np.flatnonzero(scene.tree.child_count):
+            first = int(scene.tree.child_start[node])
+            level[first : first + int(scene.tree.child_count[node])] = level[node] + 1
+        assert np.array_equal(tree.level, level)
+
+
+def test_precision_float16_is_what_float16_holds() -> None:
+    exact, half = (
+        read_world([Placement(TOWN, "town")], precision=name).forest.nodes for name in ("float32", "float16")
+    )
+    for name in ("x", "y", "z", "size"):
+        assert np.array_equal(half[name], exact[name].astype(np.float16).astype(np.float32))
+    assert not np.array_equal(half["size"], exact["size"])
+    for name in ("child_count", "child_start"):
+        assert np.array_equal(half[name], exact[name])
+
+
+def test_a_file_is_read_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    read: list[Path] = []
+    examine: Callable[..., object] = world.examine_scene
+
+    def counted(file: Path, **settings: object) -> object:
+        read.append(file)
+        return examine(file, **settings)
+
+    monkeypatch.setattr(world, "examine_scene", counted)
+    assert len(read_world(five()).trees) == 3
+    assert read == [TREE, TOWN, HAND]
+
+
+def test_chunks_share_the_bytes_of_a_file() -> None:
+    made = read_world(five())
+    for tree, sizes in zip(made.trees, made.chunk_bytes(), strict=True):
+        assert sizes.sum() == tree.bytes == tree.file.stat().st_size
+        assert len(sizes) == -(-len(tree.level) // CHUNK_NODES)
+        nodes = np.minimum(len(tree.level) - CHUNK_NODES * np.arange(len(sizes)), CHUNK_NODES)
+        assert (np.abs(sizes - nodes * tree.bytes / len(tree.level)) <= 1).all()  # each its share of the nodes
+    assert made.forest.chunks == sum(map(len, made.chunk_bytes())) == 1 + 3 + 1
+
+
+@pytest.mark.parametrize("nodes", [1, CHUNK_NODES - 1, CHUNK_NODES, CHUNK_NODES + 1, 3 * CHUNK_NODES])
+def test_chunks_end_where_nodes_do(nodes: int) -> None:
+    (tree,) = read_world([Placement(TREE, "tree")]).trees
+    long = dataclasses.replace(tree, level=np.zeros(nodes, np.int32), bytes=10**12 + 7)
+    (sizes,) = World([long], None, [], []).chunk_bytes()  # type: ignore[arg-type]
+    assert len(sizes) == -(-nodes // CHUNK_NODES)
+    assert sizes.sum() == 10**12 + 7
+    assert sizes.min() > 0
+
+
+def test_foveation_is_that_of_all_or_its_own() -> None:
+    own, of_all = Frustum(0.5, 0.1), Cones(90, 120, 0.4, 0.2)
+    placements = [Placement(TREE, "a"), Placement(TREE, "b", SHIFTED, 3.0, own), Placement(HAND, "c")]
+    made = read_world(placements)
+    instances = made.foveated(of_all)
+    assert [instance.foveation for instance in instances] == [of_all, own, of_all]
+    assert [instance.lod_scale for instance in instances] == [1, 3, 1]
+    assert np.array_equal(instances[1].object_to_world, SHIFTED)
+    assert made.foveated(Cones())[1].foveation == own
+
+
+@pytest.mark.parametrize(
+    ("file", "kind", "said"),
+    [
+        (FIXTURES / "sh2.ply", FormatError, "it is not a Level-of-Detail tree; bake it first with sparklod build-lod"),
+        (FIXTURES / "golden" / "sh3-v3.spz", FormatError, "it is not a Level-of-Detail tree"),
+        (FIXTURES / "faults" / "tree-cycle.spz", TreeError, "its tree is broken: node"),
+        (FIXTURES / "faults" / "tree-orphan.spz", TreeError, "its tree is broken: node 9 is nobody's child"),
+        (FIXTURES / "faults" / "spz-flipped-bit.spz", FormatError, "corrupt gzip data"),
+        (FIXTURES / "faults" / "missing.spz", FormatError, "cannot be read: no such file or directory"),
+        (FIXTURES / "points.ply", FormatError, ""),
+        (FIXTURES, FormatError, "is a directory"),
+        (Path("/dev/null"), FormatError, "pipe or a device"),
+    ],
+    ids=lambda value: getattr(value, "name", None),
+)
+def test_what_cannot_be_read_names_its_file(file: Path, kind: type[SparklodError], said: str) -> None:
+    with pytest.raises(kind) as caught:
+        read_world([Placement(TREE, "good"), Placement(file, "bad")])
+    assert str(caught.value).startswith(f"{file}: {said}") or said in str(caught.value)
+    assert str(file) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("file", sorted((FIXTURES / "faults").glob("tree-*.spz")), ids=lambda file: file.name)
+def test_faulty_trees_are_refused_or_traversed(file: Path) -> None:
+    """Whatever a file's tree is, it is refused in a line, or sound."""
+    try:
+        made = read_world([Placement(file, "tree")])
+    except SparklodError as error:
+        assert str(error).startswith(f"{file}: ")
+    else:
+        assert made.trees[0].level.max() < len(made.forest.nodes)
+
+
+def test_names_are_those_of_files() -> None:
+    files = [Path("a/door.spz"), Path("b/door.spz"), Path("wall.spz"), Path("c/door.ply")]
+    assert names_of(files) == ["door", "door 2", "wall", "door 3"]
+    assert names_of([Path("total.spz"), Path("x/total.spz")]) == ["total.spz", "total.spz 2"]
+
+
+stems = st.sampled_from(["a", "a 2", "a 2 2", "a 3", "total", "total.spz", "total.spz 2", "b"])
+
+
+@given(st.lists(stems, max_size=12), st.lists(stems, max_size=4))
+def test_names_are_unique(names: list[str], taken: list[str]) -> None:
+    given_names = names_of([Path(f"{name}.spz") for name in names], taken)
+    assert len(set(given_names)) == len(names)
+    assert not {"total", *taken} & set(given_names)

@@ -1,0 +1,251 @@
+"""The file that --scene names: what it may say, and that whatever else it says is told in a line."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from sparklod_cli.errors import FormatError, SparklodError
+from sparklod_cli.lod.traversal import Cones, Frustum
+from sparklod_cli.world import Placement
+from sparklod_cli.world_file import KEYS, WorldFileError, read_placements
+
+
+def written(path: Path, *instances: object) -> list[Placement]:
+    path.write_text(json.dumps({"instances": instances}))
+    return read_placements(path)
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    return tmp_path / "scene.json"
+
+
+def test_an_instance_says_where_its_file_is_and_nothing_else(scene: Path) -> None:
+    (place,) = written(scene, {"file": "trees/door.spz"})
+    assert place.file == scene.parent / "trees" / "door.spz"
+    assert (place.name, place.lod_scale, place.foveation) == ("door", 1.0, None)
+    assert np.array_equal(place.object_to_world, np.eye(4))
+
+
+def test_a_file_may_be_anywhere(scene: Path) -> None:
+    assert [place.file for place in written(scene, {"file": "/srv/a.spz"}, {"file": "../b.spz"})] == [
+        Path("/srv/a.spz"),
+        scene.parent / "../b.spz",
+    ]
+
+
+def test_every_key(scene: Path) -> None:
+    turn = [0, math.sqrt(0.5), 0, math.sqrt(0.5)]  # a quarter around y: z goes to x
+    (place,) = written(
+        scene,
+        {
+            "file": "a.spz",
+            "name": "west wing",
+            "translation": [1, 2, 3],
+            "rotation": turn,
+            "scale": 2,
+            "lod_scale": 0.5,
+            "foveation": {"outside_foveate": 0.25, "behind_foveate": 0.125},
+        },
+    )
+    assert (place.name, place.lod_scale, place.foveation) == ("west wing", 0.5, Frustum(0.25, 0.125))
+    assert np.allclose(place.object_to_world, [[0, 0, 2, 1], [0, 2, 0, 2], [-2, 0, 0, 3], [0, 0, 0, 1]], atol=1e-12)
+    assert set(KEYS) == {"file", "name", "translation", "rotation", "scale", "lod_scale", "foveation", "matrix"}
+
+
+numbers = st.floats(-1e3, 1e3)
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    st.tuples(numbers, numbers, numbers),
+    st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda quat: math.hypot(*quat) > 1e-3),
+    st.floats(1e-3, 1e3),
+)
+def test_a_matrix_says_the_same_as_its_parts(
+    scene: Path, translation: tuple[float, ...], rotation: tuple[float, ...], scale: float
+) -> None:
+    parts = {"file": "a.spz", "translation": translation, "rotation": rotation, "scale": scale}
+    (first,) = written(scene, parts)
+    rows = first.object_to_world.tolist()
+    for matrix in (rows, [number for row in rows for number in row]):
+        (second,) = written(scene, {"file": "a.spz", "matrix": matrix})
+        assert np.array_equal(second.object_to_world, first.object_to_world)
+    x, y, z, w = np.array(rotation) / math.hypot(*rotation)
+    for point in np.eye(3):  # turned by q p q*, multiplied out as cross products
+        turned = point + 2 * np.cross([x, y, z], np.cross([x, y, z], point) + w * point)
+        expected = scale * turned + translation
+        assert np.allclose(first.object_to_world @ [*point, 1], [*expected, 1], rtol=1e-9, atol=1e-9)
+
+
+def test_parts_that_are_left_out_change_nothing(scene: Path) -> None:
+    for parts, index, value in (
+        ({"translation": [4, 5, 6]}, (slice(0, 3), 3), [4, 5, 6]),
+        ({"scale": 3}, (range(3), range(3)), [3, 3, 3]),
+        ({"scale": [3]}, (range(3), range(3)), [3, 3, 3]),
+    ):
+        (place,) = written(scene, {"file": "a.spz"} | parts)
+        expected = np.eye(4)
+        expected[index] = value
+        assert np.array_equal(place.object_to_world, expected)
+
+
+def test_foveation_of_cones(scene: Path) -> None:
+    cones = {"cone_fov0": 90, "cone_fov": 120, "cone_foveate": 0.4, "behind_foveate": 0.2}
+    kinds = [cones, {}, {"behind_foveate": 0.5}, {"outside_foveate": 0}, None]
+    found = [
+        place.foveation for place in written(scene, *({"file": "a.spz", "foveation": foveation} for foveation in kinds))
+    ]
+    assert found == [Cones(90, 120, 0.4, 0.2), Cones(), Cones(behind=0.5), Frustum(0, 1), None]
+
+
+def test_names_are_given_where_there_are_none(scene: Path) -> None:
+    places = written(
+        scene,
+        *({"file": name} for name in ("a.spz", "x/a.spz", "total.spz", "a 2.spz")),
+        {"file": "b.spz", "name": "a"},
+        {"file": "b.spz", "name": ""},
+    )
+    names = [place.name for place in places]
+    assert names == ["a 2", "a 3", "total.spz", "a 2 2", "a", "b"]
+
+
+WRONG: list[tuple[object, str]] = [
+    ({}, "names no file"),
+    ({"file": ""}, "names no file"),
+    ({"file": 3}, "names no file"),
+    ({"file": "a\0b.spz"}, "which no file can be called"),
+    ({"file": "a\ud800.spz"}, "which no file can be called"),
+    ("a.spz", "is 'a.spz', not an object"),
+    (None, "is None, not an object"),
+    ([], "is [], not an object"),
+    ({"path": "a.spz"}, "has 'path', which is not one of file, name"),
+    ({"file": "a.spz", "two\nlines": 1}, r"has 'two\nlines', which is not one of"),
+    ({"file": "a.spz", "name": 7}, "cannot be called 7"),
+    ({"file": "a.spz", "name": "total"}, "cannot be called 'total'"),
+    ({"file": "a.spz", "scale": 0}, "has a scale of 0, which is not more than 0"),
+    ({"file": "a.spz", "scale": -2}, "has a scale of -2, which is not more than 0"),
+    ({"file": "a.spz", "scale": 1e-300}, "has a scale of 1e-300, which is too little"),
+    ({"file": "a.spz", "scale": 1e300}, "beyond 1e+12"),
+    ({"file": "a.spz", "scale": 10**400}, "beyond 1e+12"),
+    ({"file": "a.spz", "scale": math.inf}, "which is not 1 finite number"),
+    ({"file": "a.spz", "scale": [1, 2, 3]}, "has scale [1, 2, 3], which is not 1 finite number"),
+    ({"file": "a.spz", "scale": True}, "which is not 1 finite number"),
+    ({"file": "a.spz", "scale": None}, "which is not 1 finite number"),
+    ({"file": "a.spz", "translation": [1, 2]}, "has translation [1, 2], which is not 3 finite numbers"),
+    ({"file": "a.spz", "translation": [1, 2, math.nan]}, "which is not 3 finite numbers"),
+    ({"file": "a.spz", "translation": ["1", 2, 3]}, "which is not 3 finite numbers"),
+    ({"file": "a.spz", "translation": [[1, 2, 3]]}, "which is not 3 finite numbers"),
+    ({"file": "a.spz", "translation": [1, 2, 1e39]}, "beyond 1e+12"),
+    ({"file": "a.spz", "rotation": [0, 0, 0]}, "which is not 4 finite numbers"),
+    ({"file": "a.spz", "rotation": [0, 0, 0, 0]}, "has a quaternion of length 0"),
+    ({"file": "a.spz", "lod_scale": -1}, "has a lod_scale of -1"),
+    ({"file": "a.spz", "lod_scale": "x" * 1000}, "which is not 1 finite number"),
+    ({"file": "a.spz", "matrix": [1] * 15}, "which is not 16 finite numbers"),
+    ({"file": "a.spz", "matrix": [1] * 16}, "is no rotation, uniform scale and translation, row by row"),
+    ({"file": "a.spz", "matrix": [0] * 16}, "is no rotation"),
+    ({"file": "a.spz", "matrix": np.diag([1, 1, -1, 1]).tolist()}, "is no rotation"),
+    ({"file": "a.spz", "matrix": np.diag([1, 1, 1.01, 1]).tolist()}, "is no rotation"),
+    ({"file": "a.spz", "matrix": np.diag([1e-200, 1e-200, 1e-200, 1]).tolist()}, "is no rotation"),
+    ({"file": "a.spz", "matrix": [*np.eye(4)[:3].ravel(), 1, 2, 3, 1]}, "row by row"),
+    ({"file": "a.spz", "matrix": np.eye(4).tolist(), "scale": 2}, "has a matrix, and parts of one too"),
+    ({"file": "a.spz", "foveation": 0.5}, "has a foveation of 0.5"),
+    ({"file": "a.spz", "foveation": {"cone": 1}}, "has 'cone' in its foveation, which is not one of cone_fov0"),
+    ({"file": "a.spz", "foveation": {"outside_foveate": 1, "cone_fov": 90}}, "has 'cone_fov' in its foveation"),
+    ({"file": "a.spz", "foveation": {"behind_foveate": -1}}, "has a negative foveation"),
+    ({"file": "a.spz", "foveation": {"cone_fov": 181}}, "has a cone of more than 180 degrees"),
+    ({"file": "a.spz", "foveation": {"cone_fov": "wide"}}, "which is not 1 finite number"),
+]
+
+
+@pytest.mark.parametrize(("wrong", "said"), WRONG, ids=[said[:30] for _, said in WRONG])
+def test_a_mistake_is_told_in_a_line(wrong: object, said: str, scene: Path) -> None:
+    with pytest.raises(WorldFileError) as caught:
+        written(scene, {"file": "good.spz"}, wrong)
+    text = str(caught.value)
+    assert text.startswith(f"{scene}: instance 1 ")
+    assert said in text
+    assert "\n" not in text
+    assert len(text) < len(str(scene)) + 250
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "is not JSON"),
+        ("{", "is not JSON"),
+        ('{"instances": [{"file": "a.spz"}', "is not JSON"),
+        ("[" * 100_000, "is not JSON"),
+        ("9" * 10_000, ""),
+        ("[]", "has no list of instances"),
+        ("{}", "has no list of instances"),
+        ('{"instances": []}', "has no list of instances"),
+        ('{"instances": {"file": "a.spz"}}', "has no list of instances"),
+        ('{"instances": [{"file": "a", "name": "b"}, {"file": "c", "name": "b"}]}', "two instances are called 'b'"),
+    ],
+)
+def test_a_file_that_is_none(text: str, said: str, scene: Path) -> None:
+    scene.write_text(text)
+    with pytest.raises(WorldFileError) as caught:
+        read_placements(scene)
+    assert str(caught.value).startswith(str(scene))
+    assert said in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("depth", range(900, 1000, 7))
+def test_however_deep_it_is(depth: int, scene: Path) -> None:
+    scene.write_text('{"instances": [{"file": "a", "scale": ' + "[" * depth + "]" * depth + "}]}")
+    with pytest.raises(WorldFileError):
+        read_placements(scene)
+
+
+def test_a_file_that_cannot_be_read(tmp_path: Path) -> None:
+    (tmp_path / "bytes.json").write_bytes(b"\xff\xfe\x00")
+    for path in (tmp_path / "missing.json", tmp_path, tmp_path / "bytes.json"):
+        with pytest.raises(FormatError, match="cannot be read") as caught:
+            read_placements(path)
+        assert str(caught.value).startswith(str(path))
+
+
+def test_a_byte_order_mark_is_no_mistake(scene: Path) -> None:
+    scene.write_bytes(b'\xef\xbb\xbf{"instances": [{"file": "a.spz"}]}')
+    assert len(read_placements(scene)) == 1
+
+
+def test_many_instances_take_no_time(scene: Path) -> None:
+    places = written(scene, *({"file": "a.spz"} for _ in range(30_000)))
+    assert len({place.name for place in places}) == 30_000
+
+
+cells = st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5)
+anything = st.recursive(
+    cells, lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=5), inner, max_size=4)
+)
+lists = st.lists(st.integers(-2, 2) | st.floats(), min_size=1, max_size=16)
+some_instances = st.dictionaries(st.sampled_from([*KEYS, "cone_fov", "outside_foveate"]), anything | lists, max_size=5)
+optional = dict.fromkeys(list(KEYS)[1:], anything | lists)
+plausible = st.fixed_dictionaries({"file": st.text(min_size=1)}, optional=optional)
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=300)
+@given(anything | st.fixed_dictionaries({"instances": st.lists(some_instances | plausible | anything, max_size=3)}))
+def test_whatever_it_says_it_is_understood_or_refused_in_a_line(scene: Path, data: Any) -> None:
+    scene.write_text(json.dumps(data))
+    try:
+        places = read_placements(scene)
+    except SparklodError as error:
+        assert str(error).startswith(str(scene))
+        assert "\n" not in str(error)
+    else:
+        assert len({place.name for place in places}) == len(places)
+        for place in places:
+            assert np.isfinite(np.linalg.inv(place.object_to_world).astype(np.float32)).all()
