@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from sparklod_cli.gaussian import MAX_OPACITY, MIN_OPACITY, THOMSEN_P
-from sparklod_cli.lod.kernels.cut import CONE, FRUSTUM
+from sparklod_cli.lod.kernels.sight import CONE, FRUSTUM
 from sparklod_cli.splats import Splats
 
 

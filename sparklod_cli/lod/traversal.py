@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ..codecs.lod_tree import Nodes
 from .kernels import cut as kernels
+from .kernels import sight
 
 Matrix = NDArray[np.float64]
 
@@ -100,7 +101,7 @@ class Forest:
     """Trees ready to be traversed.
 
     Attributes:
-        nodes: `kernels.NODE` of all trees, one after the other.
+        nodes: `sight.NODE` of all trees, one after the other.
         node_base: (trees + 1,) int64, where the nodes of each begin.
         chunk_base: (trees + 1,) int64, where the chunks of each begin.
     """
@@ -110,7 +111,7 @@ class Forest:
         self.node_base = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
         chunks = [-(-count // CHUNK_NODES) for count in counts]
         self.chunk_base = np.concatenate([[0], np.cumsum(chunks)]).astype(np.int64)
-        self.nodes = np.empty(int(self.node_base[-1]), kernels.NODE)
+        self.nodes = np.empty(int(self.node_base[-1]), sight.NODE)
         for tree, start in zip(trees, self.node_base, strict=False):
             part = self.nodes[start : start + len(tree.size)]
             part["x"], part["y"], part["z"] = tree.center.T
@@ -132,7 +133,7 @@ class Cut:
     """The nodes that are drawn; S of them, of all instances.
 
     Attributes:
-        views: (instances,) `kernels.VIEW`.
+        views: (instances,) `sight.VIEW`.
         node: (S,) uint32 index in its tree.
         instance: (S,) uint16.
         limit: (S,) float32, the least pixel scale from the root to it; negative for one that the queue took out, since
@@ -271,8 +272,8 @@ def pixel_limit(fov_y: float, height: int, scale: float = 1.0) -> float:
 
 
 def views_of(forest: Forest, instances: Sequence[Instance], view: View) -> NDArray[np.void]:
-    """(instances,) `kernels.VIEW`: the camera in the space of each instance, in the precision that Spark has."""
-    views = np.zeros(len(instances), kernels.VIEW)
+    """(instances,) `sight.VIEW`: the camera in the space of each instance, in the precision that Spark has."""
+    views = np.zeros(len(instances), sight.VIEW)
     for row, instance in zip(views, instances, strict=True):
         view_to_object = (np.linalg.inv(instance.object_to_world) @ view.camera_to_world).astype(np.float32)
         right, up, backward, origin = view_to_object[:3].T
@@ -289,16 +290,16 @@ def views_of(forest: Forest, instances: Sequence[Instance], view: View) -> NDArr
         foveation = instance.foveation
         row["behind"] = foveation.behind
         if isinstance(foveation, Frustum):
-            row["kind"] = kernels.FRUSTUM
+            row["kind"] = sight.FRUSTUM
             row["side"] = foveation.outside
             row["inner"], row["outer"] = math.tan(view.fov_x / 2), math.tan(view.fov_y / 2)
         else:
-            row["kind"] = kernels.CONE
+            row["kind"] = sight.CONE
             row["side"] = foveation.foveate
             row["inner"] = _half_angle_cosine(foveation.fov0)
             row["outer"] = min(row["inner"], _half_angle_cosine(foveation.fov))
         if row["behind"] == row["side"] == 1:
-            row["kind"] = kernels.NO_FOVEATION
+            row["kind"] = sight.NO_FOVEATION
     return views
 
 

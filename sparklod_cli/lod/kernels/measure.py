@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...jit import kernel
-from .cut import NEAREST, ONE, ZERO
+from .sight import NEAREST, ONE, ZERO
 
 #: Columns of the counts of an instance.
 SELECTED, LEAVES, FRONTIER, IN_FRUSTUM, OUTSIDE, BEHIND, LEVEL_MIN, LEVEL_SUM, LEVEL_MAX, AREA = range(10)
