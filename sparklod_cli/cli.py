@@ -16,7 +16,7 @@ from .commands.console import say, say_error
 from .errors import SparklodError
 
 #: Sub-commands, each a module of `commands` with a function of its name; imported when it is called for.
-COMMANDS = {"build-lod": "build_lod", "inspect": "inspect", "traverse": "traverse"}
+COMMANDS = {"build-lod": "build_lod", "inspect": "inspect", "traverse": "traverse", "render": "render"}
 
 #: Signals that end a run: Ctrl-C, a polite kill, a terminal that is closed.
 ENDING = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]

@@ -43,7 +43,9 @@ def _cache_folder() -> Path | None:
 CACHE_FOLDER = _cache_folder()
 
 
-def kernel(*, parallel: bool = False, nogil: bool = False, inline: bool = False) -> Callable[[Callable[..., Any]], Any]:
+def kernel(
+    *, parallel: bool = False, nogil: bool = False, inline: bool = False, contract: bool = False
+) -> Callable[[Callable[..., Any]], Any]:
     """Decorator for a compiled function.
 
     No fastmath: results must not depend on the number of threads. The machine code is cached beside the source, or in
@@ -52,12 +54,17 @@ def kernel(*, parallel: bool = False, nogil: bool = False, inline: bool = False)
     Args:
         parallel: has loops that run on the threads of `use_threads`.
         nogil: lets other threads of this process run meanwhile.
+        contract: a product and a sum may be rounded once instead of twice, where the processor can.
         inline: becomes part of the kernels that call it; LLVM does not do that by itself with all that deserve it.
     """
 
     def decorate(function: Callable[..., Any]) -> Any:
         compiled: Any = numba.njit(
-            error_model="numpy", parallel=parallel, nogil=nogil, inline="always" if inline else "never"
+            error_model="numpy",
+            parallel=parallel,
+            nogil=nogil,
+            inline="always" if inline else "never",
+            fastmath={"contract"} if contract else False,
         )(function)
         if CACHE_FOLDER is not None and hasattr(compiled, "enable_caching"):  # not with NUMBA_DISABLE_JIT
             theirs = numba.config.CACHE_DIR
@@ -113,3 +120,9 @@ def on_first_compile(callback: Callable[[], None]) -> Callable[[], None]:
     listener = _OnCompile(callback)
     event.register("numba:compile", listener)
     return functools.partial(event.unregister, "numba:compile", listener)
+
+
+def threads_in_use() -> int:
+    """How many threads kernels run on."""
+    threads: int = numba.get_num_threads()
+    return threads

@@ -27,6 +27,15 @@ ENCODINGS = ("packed", "ext", "lodtree", "texture")
 #: What colours can mean in a picture of `inspect`.
 PLOT_BY = ("level", "opacity", "size", "chunk")
 
+#: What `render` draws splats with, as what, in which colours but their own, and after which encoding.
+BACKENDS = ("numba", "osmesa", "open3d")
+STYLES = ("splats", "points", "billboards", "sorted-billboards")
+COLOR_BY = ("level", "lod-opacity", "size", "chunk", "overdraw", "depth")
+THROUGH = ("packed", "ext", "spz")
+
+#: Pixels a pixel along a side.
+MAX_SUPERSAMPLE = 4
+
 #: How many splats viewers draw by default: Spark 2's, by device, then those of its LoD design.
 PRESETS = {
     "desktop": 2_500_000,
@@ -49,3 +58,9 @@ CONE_FOV0, CONE_FOV, CONE_FOVEATE, BEHIND_FOVEATE = 90.0, 120.0, 0.4, 0.2
 
 #: Chunks that Spark fetches at a time.
 FETCHERS = 3
+
+#: Ratio of the pixel scales between which continuous cuts blend a node and its children.
+BLEND = 1.25
+
+#: How the backend osmesa sorts splats.
+SORTINGS = ("exact", "counting16")

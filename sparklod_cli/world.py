@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from .limits import PRECISIONS
 from .lod.traversal import CHUNK_NODES, Cones, Forest, Frustum, Instance, Matrix
 from .progress import Progress, silent
 from .scene import Scene
-from .splats import FloatArray, Splats
+from .splats import COLUMNS, FloatArray, Splats
 
 #: What all instances together are called.
 TOTAL = "total"
@@ -132,23 +132,47 @@ def read_world(
         FormatError: a file cannot be read, or is no tree; names the file.
         TreeError: a tree is broken; names the file.
     """
+    scenes = {}
+    for file in dict.fromkeys(place.file for place in placements):
+        scenes[file] = read_file(file, columns=columns, threads=threads, progress=progress)
+        if scenes[file].tree is None:
+            raise FormatError(f"{file}: it is not a Level-of-Detail tree; bake it first with sparklod build-lod")
+    return world_of(placements, scenes, precision=precision, threads=threads)
+
+
+def read_file(
+    file: Path, *, columns: Collection[str] = COLUMNS, threads: int = 1, progress: Progress = silent
+) -> Scene:
+    """Reads a file that may be a tree.
+
+    Raises:
+        FormatError: it cannot be read; names the file.
+        TreeError: its tree is broken; names the file.
+    """
+    try:
+        scene = examine_scene(file, columns=columns, threads=threads, progress=progress)
+        if scene.tree is not None:
+            scene.tree.validate()
+    except TreeError as error:
+        raise TreeError(f"{file}: its tree is broken: {error}") from None
+    except SparklodError as error:
+        raise type(error)(f"{file}: {error}") from None
+    return scene
+
+
+def world_of(
+    placements: Sequence[Placement], scenes: Mapping[Path, Scene], *, precision: str = PRECISIONS[0], threads: int = 1
+) -> World:
+    """The world of trees that `read_file` read, by their files."""
     files = list(dict.fromkeys(place.file for place in placements))
-    trees = [_read_tree(file, columns, threads, progress) for file in files]
+    trees = [_tree(file, scenes[file]) for file in files]
     forest = Forest([_nodes(tree.scene, precision, threads) for tree in trees])
     instances = [Instance(files.index(place.file), place.object_to_world, place.lod_scale) for place in placements]
     return World(trees, forest, placements, instances)
 
 
-def _read_tree(file: Path, columns: Collection[str], threads: int, progress: Progress) -> Tree:
-    try:
-        scene = examine_scene(file, columns=columns, threads=threads, progress=progress)
-        if scene.tree is None:
-            raise FormatError("it is not a Level-of-Detail tree; bake it first with sparklod build-lod")
-        scene.tree.validate()
-    except TreeError as error:
-        raise TreeError(f"{file}: its tree is broken: {error}") from None
-    except SparklodError as error:
-        raise type(error)(f"{file}: {error}") from None
+def _tree(file: Path, scene: Scene) -> Tree:
+    assert scene.tree is not None
     return Tree(file, size_on_disk(file) or 0, scene, scene.tree.depths())
 
 

@@ -56,8 +56,13 @@ NUMERIC = set("0123456789+-.,eE ")
 LARGEST = 1 << 31
 
 
-def camera_options(command: Command) -> Command:
-    """The options of this module, in the order of the help; `cameras_from` takes what they are given."""
+def camera_options(command: Command, *, orbit: int = DEFAULT_ORBIT) -> Command:
+    """The options of this module, in the order of the help; `cameras_from` takes what they are given.
+
+    Args:
+        command: that gets them.
+        orbit: how many cameras there are around the scene where no source of cameras is given.
+    """
     for option in reversed(
         (
             click.option(
@@ -81,7 +86,7 @@ def camera_options(command: Command) -> Command:
                 "--orbit",
                 metavar="N",
                 type=click.IntRange(1, 1 << 20),
-                help=f"N cameras around the scene.  [default, without another source of cameras: {DEFAULT_ORBIT}]",
+                help=f"N cameras around the scene.  [default, without another source of cameras: {orbit}]",
             ),
             click.option("--dolly", is_flag=True, help="Straight towards the scene, from far to near."),
             click.option("--look-at", type=View(), help="One camera, as x,y,z:x,y,z."),
@@ -151,18 +156,21 @@ def camera_options(command: Command) -> Command:
     return command
 
 
-def cameras_from(settings: Mapping[str, Any], centers: Centers) -> CameraPath:
+def cameras_from(settings: Mapping[str, Any], centers: Centers, *, orbit: int = DEFAULT_ORBIT) -> CameraPath:
     """The cameras that the options of `camera_options` ask for.
 
     Args:
         settings: what click gave the command, by the parameters' names; others are not looked at.
         centers: gives the centres of the splats, (N, 3); called only where --orbit or --dolly need to know the scene.
+        orbit: as for `camera_options`.
 
     Raises:
         click.UsageError: options contradict one another.
         CameraPathError: a file cannot be read, or a camera makes no sense; the text names the file.
     """
     source = _source(settings)
+    if source == "orbit":
+        settings = {**settings, "orbit": settings["orbit"] or orbit}
     for option, sources in ONLY_WITH.items():
         if settings[option] is not None and source not in sources:
             names = " or ".join(SOURCES[name] for name in sources)
@@ -254,7 +262,7 @@ def _generated(source: str, settings: Mapping[str, Any], how: Settings, centers:
         center = middle if center is None else center
         distance = distance or (fits if source == "orbit" else generate.DOLLY_START * fits)
     if source == "orbit":
-        return Parsed(generate.orbit(settings["orbit"] or DEFAULT_ORBIT, center, distance, tilt, up))
+        return Parsed(generate.orbit(settings["orbit"], center, distance, tilt, up))
     count = max(2, round(seconds * fps))
     if count > MAX_FRAMES:
         raise click.UsageError(f"{count:,} frames are more than {MAX_FRAMES:,}; see --seconds and --fps")

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import functools
-import os
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +11,7 @@ import click
 from .. import limits
 from .camera_options import camera_options, cameras_from
 from .console import Console
-from .options import common_options
+from .options import common_options, keep_apart
 from .world_options import placements_from, viewer_from, viewer_options, world_options
 
 #: Below this share of splats in front of the cameras, path and scene probably do not share their axes.
@@ -106,7 +104,7 @@ def traverse(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, *
     if wanted.padded and wanted.indices is None:
         raise click.UsageError("--padded only means something with --indices-out")
     placements = placements_from(settings)
-    _keep_apart(
+    keep_apart(
         [wanted.output, wanted.plot],
         [settings["scene"], settings["camera_path"], *(place.file for place in placements)],
     )
@@ -137,18 +135,6 @@ def traverse(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, *
                 " share their axes (--camera-axes, --world-transform, --up)"
             )
         ctx.exit(job.report())
-
-
-def _keep_apart(outputs: Iterable[Path | None], inputs: Iterable[Path | None]) -> None:
-    """Raises a `click.UsageError` where an output would replace an input, or another output."""
-    taken = {os.path.realpath(path): "an input" for path in inputs if path is not None}
-    for path in outputs:
-        if path is None or str(path) == "-":
-            continue
-        place = os.path.realpath(path)
-        if place in taken:
-            raise click.UsageError(f"{path} is {taken[place]}; write elsewhere")
-        taken[place] = "an output already"
 
 
 def _form(output: Path | None) -> str:

@@ -10,7 +10,7 @@ import click
 
 from .. import limits
 from ..quantities import parse_bandwidth, parse_count, parse_latency
-from .options import Command, Quantity, Real
+from .options import Command, Quantity, Real, is_given
 
 if TYPE_CHECKING:
     from ..simulation.simulate import Viewer
@@ -67,13 +67,24 @@ def placements_from(settings: Mapping[str, Any]) -> list[Placement]:
 
 
 def viewer_options(command: Command) -> Command:
-    """How many splats are drawn, and which."""
+    """How many splats are drawn and which, and how they get there."""
+    return cut_options(_streaming_options(command))
+
+
+def cut_options(command: Command, *, budgets: Quantity | None = None) -> Command:
+    """How many splats are drawn, and which; for a viewer that has all of a file.
+
+    Args:
+        command: takes the options.
+        budgets: type of --budget where it can be several.
+    """
+    several = "; with --compare several, such as 5%,500k" if budgets else ""
     for option in reversed(
         (
             click.option(
                 "--budget",
-                type=Quantity("N", parse_count),
-                help="Splats to draw at most, such as 500k.  [default: of --preset]",
+                type=budgets or Quantity("N", parse_count),
+                help=f"Splats to draw at most, such as 500k{several}.  [default: of --preset]",
             ),
             click.option(
                 "--preset",
@@ -130,6 +141,16 @@ def viewer_options(command: Command) -> Command:
                 type=Real(0),
                 help=f"Weight behind the camera.  [default: {limits.BEHIND_FOVEATE:g}; 1 with --outside-foveate]",
             ),
+        )
+    ):
+        command = option(command)
+    return command
+
+
+def _streaming_options(command: Command) -> Command:
+    """What of a file is there."""
+    for option in reversed(
+        (
             click.option(
                 "--chunk-cache",
                 metavar="N",
@@ -159,28 +180,25 @@ def viewer_options(command: Command) -> Command:
 
 
 def viewer_from(ctx: click.Context, settings: Mapping[str, Any]) -> Viewer:
-    """The viewer that the options of `viewer_options` ask for."""
+    """The viewer that the options of `viewer_options`, or of `cut_options`, ask for."""
     from ..lod.traversal import Cones, Frustum
     from ..simulation.simulate import Viewer
     from ..simulation.streaming import Network
 
-    def given(name: str) -> bool:
-        return ctx.get_parameter_source(name) not in (None, click.core.ParameterSource.DEFAULT)
-
     behind, outside = settings["behind_foveate"], settings["outside_foveate"]
     if outside is not None:
         for name in CONES:
-            if given(name):
+            if is_given(ctx, name):
                 raise click.UsageError(f"--outside-foveate leaves nothing to --{name.replace('_', '-')}")
     for name in OF_BANDWIDTH:
-        if settings[name] is not None and settings["bandwidth"] is None:
+        if settings.get(name) is not None and settings["bandwidth"] is None:
             raise click.UsageError(f"--{name} only means something with --bandwidth")
     for name in MULTIPLIED:
         if settings[name] is not None and settings[name] > LARGEST:
             raise click.UsageError(f"--{name.replace('_', '-')} {settings[name]:g} is beyond {LARGEST:g}")
-    if settings["budget"] is not None and given("preset"):
+    if settings["budget"] is not None and is_given(ctx, "preset"):
         raise click.UsageError("--budget and --preset exclude each other")
-    if settings["pixel_scale_limit"] is not None and given("lod_render_scale"):
+    if settings["pixel_scale_limit"] is not None and is_given(ctx, "lod_render_scale"):
         raise click.UsageError("--pixel-scale-limit and --lod-render-scale exclude each other")
     foveation: Cones | Frustum
     if outside is not None:
@@ -189,7 +207,7 @@ def viewer_from(ctx: click.Context, settings: Mapping[str, Any]) -> Viewer:
         behind = limits.BEHIND_FOVEATE if behind is None else behind
         foveation = Cones(settings["cone_fov0"], settings["cone_fov"], settings["cone_foveate"], behind)
     network = Network()
-    if settings["bandwidth"] is not None:
+    if settings.get("bandwidth") is not None:
         network = Network(settings["bandwidth"], settings["latency"] or 0.0, settings["fetchers"] or limits.FETCHERS)
     budget = limits.PRESETS[settings["preset"]] if settings["budget"] is None else settings["budget"]
     if not 0 < budget * settings["lod_splat_scale"] < BUDGETS:
@@ -200,5 +218,5 @@ def viewer_from(ctx: click.Context, settings: Mapping[str, Any]) -> Viewer:
         pixel_scale_limit=settings["pixel_scale_limit"],
         render_scale=settings["lod_render_scale"],
         network=network,
-        chunk_cache=settings["chunk_cache"],
+        chunk_cache=settings.get("chunk_cache"),
     )

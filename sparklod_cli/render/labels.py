@@ -44,7 +44,7 @@ def write_png(
     draw = ImageDraw.Draw(image)
     unit = min(image.height / 1000, image.width / 1600)
     write_title(draw, unit, title, [(line, FAINT) for line in lines])
-    _scale(image, draw, unit, coloring)
+    write_scale(image, draw, unit, coloring)
     _axes(draw, unit, image.size, eye, low, high)
     out = io.BytesIO()
     image.save(out, "PNG", optimize=True)
@@ -69,7 +69,14 @@ def write_title(draw: ImageDraw.ImageDraw, unit: float, title: str, lines: Seque
         draw.text((left, top + (46 + 26 * number) * unit), line, color, _font(unit, 19))
 
 
-def _scale(image: Image.Image, draw: ImageDraw.ImageDraw, unit: float, coloring: Coloring) -> None:
+def write_scale(image: Image.Image, draw: ImageDraw.ImageDraw, unit: float, coloring: Coloring) -> None:
+    """What the colours mean, at the right of a picture.
+
+    Args:
+        image, draw: the picture.
+        unit: a thousandth of the picture's height; 1 is for one of 1600 x 1000.
+        coloring: what they mean.
+    """
     left, right = image.width - 170 * unit, image.width - 146 * unit
     top, bottom = 0.26 * image.height, 0.84 * image.height
     draw.text((left, top - 18 * unit), coloring.title, INK, _font(unit, 21), anchor="ls")

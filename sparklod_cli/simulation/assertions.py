@@ -107,7 +107,7 @@ class Outcome:
         return f"{found}; the worst is {where} with {number_text(cell)}"
 
 
-def parse(text: str) -> Assertion:
+def parse(text: str, columns: Sequence[Column] = COLUMNS) -> Assertion:
     """An assertion from `NAME[_STATISTIC] SIGN NUMBER`.
 
     NAME is that of a numeric column, and the longest name that fits is taken: `pixel_scale_min<1` is about every cell
@@ -121,27 +121,27 @@ def parse(text: str) -> Assertion:
         raise BadAssertionError(f"{text!r} is not an assertion like 'churn_p95<0.2'")
     if found["sign"] not in COMPARISONS:
         raise BadAssertionError(f"{text!r}: {found['sign']} is not one of {' '.join(COMPARISONS)}")
-    column, name = _column(text, found["left"])
+    column, name = _column(text, found["left"], columns)
     return Assertion(text.strip(), column, name, found["sign"], _bound(text, found["right"]))
 
 
-def _column(text: str, left: str) -> tuple[Column, str]:
+def _column(text: str, left: str, columns: Sequence[Column]) -> tuple[Column, str]:
     """The column and the statistic that stand on the left, the latter may be empty."""
-    every = {column.name: column for column in COLUMNS}
+    every = {column.name: column for column in columns}
     fitting = [
         name for name in every if left == name or (left.startswith(f"{name}_") and is_statistic(left[len(name) + 1 :]))
     ]
     if not fitting:
-        raise BadAssertionError(f"{text!r}: {_unknown(left)}")
+        raise BadAssertionError(f"{text!r}: {_unknown(left, columns)}")
     name = max(fitting, key=len)
     if every[name].kind is str:
         raise BadAssertionError(f"{text!r}: {name} is text, and only numbers can be compared")
     return every[name], left[len(name) + 1 :]
 
 
-def _unknown(left: str) -> str:
+def _unknown(left: str, columns: Sequence[Column]) -> str:
     """What is wrong with a name that is neither a column nor a column with a statistic."""
-    numeric = [column.name for column in COLUMNS if column.kind is not str]
+    numeric = [column.name for column in columns if column.kind is not str]
     stem, _, last = left.rpartition("_")
     name = stem if stem and is_statistic(last) else left
     meant = near(name, numeric, cutoff=0.8)
@@ -167,7 +167,7 @@ def check(assertions: Sequence[Assertion], rows: Iterable[Row]) -> list[Outcome]
 
     Args:
         assertions: the questions.
-        rows: of all frames; those of single instances are left out.
+        rows: of all frames; those of single instances, in a table that has any, are left out.
 
     Raises:
         BadAssertionError: there is no frame, or all cells of a column are empty.

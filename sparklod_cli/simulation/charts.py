@@ -242,11 +242,12 @@ def draw(rows: Sequence[Row]) -> NDArray[np.uint8]:
     matplotlib = load_matplotlib()
     with matplotlib.rc_context():
         matplotlib.rcdefaults()  # whatever a matplotlibrc says
-        matplotlib.rcParams.update(_style())
+        matplotlib.rcParams.update(style())
         return _draw(matplotlib, rows)
 
 
-def _style() -> dict[str, Any]:
+def style() -> dict[str, Any]:
+    """Parameters of matplotlib for charts that go with the pictures of scenes."""
     return {
         "axes.edgecolor": LINE, "axes.facecolor": PANEL, "axes.labelcolor": FAINT, "axes.titlecolor": INK,
         "axes.labelsize": 10, "axes.titlesize": 12, "axes.titlelocation": "left", "axes.titlepad": 8,

@@ -129,15 +129,24 @@ class Simulation:
 
     def _warm_up(self, camera: Camera) -> None:
         """Loads or compiles the kernels, which must not count as the first frame's time."""
-        view = View(camera.camera_to_world, camera.fov_x, camera.fov_y)
+        view = self.view(camera)
         self._traversal.cut(view, budget=len(self._traversal.instances))
+
+    @property
+    def traversal(self) -> Traversal:
+        """What finds its cuts."""
+        return self._traversal
+
+    def view(self, camera: Camera) -> View:
+        """A camera, as far as the traversal cares."""
+        return View(camera.camera_to_world, camera.fov_x, camera.fov_y)
 
     def cut(self, camera: Camera) -> Cut:
         """What a camera would see if all chunks were there."""
         return self._find(camera).cut
 
     def _find(self, camera: Camera, resident: NDArray[np.bool_] | None = None) -> _Found:
-        view = View(camera.camera_to_world, camera.fov_x, camera.fov_y)
+        view = self.view(camera)
         smallest = self.viewer.smallest(camera)
         start = time.perf_counter()
         cut = self._traversal.cut(view, budget=self.viewer.budget, smallest=smallest, resident=resident)

@@ -45,8 +45,8 @@ def statistic(name: str, values: Sequence[Number]) -> Number:
 
 
 def totals(rows: Iterable[Row]) -> list[Row]:
-    """The rows that stand for all instances together, one a frame."""
-    return [row for row in rows if row["instance"] == TOTAL]
+    """The rows that stand for all instances together, one a frame; all of a table that does not tell these apart."""
+    return [row for row in rows if row.get("instance", TOTAL) == TOTAL]
 
 
 def numbers(rows: Iterable[Row], name: str) -> list[Number]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,10 +11,13 @@ import pytest
 
 from . import npm
 from .foreign import PACKAGES, Foreign
+from .page import Page
 from .spark import Spark
 
 #: The version that these tests were tried with; layouts and file names inside the package may change with it.
 SPARK = {"@sparkjsdev/spark": "2.2.0"}
+#: What Spark draws with, and what drives the browser that it draws in.
+PAGE = {**SPARK, "three": "0.187.0", "playwright-core": "1.65.1"}
 
 
 @pytest.fixture(scope="session")
@@ -30,6 +34,24 @@ def spark(spark_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator
     process = Spark(spark_dir, tmp_path_factory.mktemp("spark-arrays"))
     yield process
     process.close()
+
+
+@pytest.fixture(scope="session")
+def page(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    """Spark in a browser, started once for all tests."""
+    chromium = shutil.which("chromium")
+    if chromium is None:
+        pytest.skip("Chromium is not installed (Debian's package chromium)")
+    if shutil.which("node") is None:
+        pytest.skip("Node is not installed")
+    if given := os.environ.get("SPARK_DIR"):  # one with Spark alone will do for all other tests
+        missing = [name for name in PAGE if not (Path(given) / "node_modules" / name).is_dir()]
+        if missing:
+            pytest.skip(f"SPARK_DIR has no {' and no '.join(missing)}")
+    folder = npm.folder_with(PAGE, variable="SPARK_DIR", request=request, tmp_path_factory=tmp_path_factory)
+    browser = Page(folder, chromium, tmp_path_factory.mktemp("pictures"))
+    yield browser
+    browser.close()
 
 
 @pytest.fixture(scope="session")

@@ -1,0 +1,91 @@
+"""Our pictures beside Spark's own, in headless Chromium: `python -m benchmarks.bench_spark_pictures --help`.
+
+Run it from the repository's root; it uses the program that the tests drive the browser with.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from sparklod_cli import jit
+from sparklod_cli.io import read_scene
+from sparklod_cli.parallel import processors
+from sparklod_cli.render.look import SORTS, Look
+from tests.interop.page import Page
+from tests.interop.pictures import AROUND, Difference, cameras_around, compare
+
+HEADINGS = (
+    "scene",
+    "view",
+    "splats",
+    "covered",
+    "PSNR",
+    "of what is covered",
+    "largest difference",
+    "PSNR, unrounded",
+    "of Spark's numbers",
+    "same cut",
+)
+
+
+def row(scene: str, view: int, found: Difference) -> str:
+    """One view, in Markdown."""
+    around, up, away = AROUND[view]
+    cells = [
+        scene,
+        f"{around}°, {up}° up, {away:g} radii",
+        f"{found.drawn:,}",
+        f"{found.share:.0%}",
+        f"{found.psnr:.1f} dB",
+        f"{found.covered:.1f} dB",
+        f"{found.most} of 255",
+        f"{found.unrounded:.1f} dB",
+        f"{found.held:.1f} dB",
+        {None: "", True: "yes", False: "**no**"}[found.same_cut],
+    ]
+    return "| " + " | ".join(cells) + " |"
+
+
+def main() -> None:
+    """Prints a Markdown table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("scenes", type=Path, nargs="+", help="files of splats, and of trees")
+    parser.add_argument("--budgets", type=int, nargs="*", default=[50_000], help="how much of a tree is drawn")
+    parser.add_argument("--size", default="960x540")
+    parser.add_argument("--views", type=int, default=len(AROUND), help="how many of them")
+    parser.add_argument("--sort", choices=SORTS, default=SORTS[0])
+    arguments = parser.parse_args()
+    chromium = shutil.which("chromium")
+    if chromium is None or "SPARK_DIR" not in os.environ:
+        raise SystemExit(
+            "needs Chromium, and SPARK_DIR: a folder with Spark, three and playwright-core in its node_modules"
+        )
+    jit.use_threads(processors())
+    width, height = map(int, arguments.size.split("x"))
+    print("| " + " | ".join(HEADINGS) + " |")
+    print("|---" * len(HEADINGS) + "|")
+    least = np.inf
+    with tempfile.TemporaryDirectory() as folder:
+        page = Page(Path(os.environ["SPARK_DIR"]), chromium, Path(folder))
+        for file in arguments.scenes:
+            scene = read_scene(file)
+            leaves = scene.splats.center[slice(None) if scene.tree is None else scene.tree.is_leaf]
+            cameras = cameras_around(leaves, width, height)
+            for budget in [0] if scene.tree is None else arguments.budgets:
+                name = file.name + (f", {budget:,} nodes" if budget else "")
+                pictures = compare(page, file, cameras[: arguments.views], Look(sort=arguments.sort), budget)
+                for view, found in enumerate(pictures):
+                    print(row(name, view, found), flush=True)
+                    least = min(least, found.psnr)
+        page.close()
+    print(f"\nThe least PSNR is {least:.1f} dB.")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,312 @@
+"""`sparklod render`: pictures of splat files, as a viewer draws them."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from .camera_options import SOURCES, camera_options, cameras_from
+from .camera_values import View
+from .console import Console
+from .options import Real, common_options, is_given, keep_apart
+from .render_compare import BUDGETS, compare_options
+from .render_options import GAIN, background_from, blend_from, check_size, look_options, manner_from
+from .world_options import cut_options, placements_from, viewer_from, world_options
+
+if TYPE_CHECKING:
+    from ..preview.scenery import Scenery
+    from ..render.camera_path import CameraPath
+    from ..simulation.simulate import Viewer
+    from ..world import Placement
+    from .render_output import Output
+
+#: Options of how many splats are drawn that --full leaves no room for.
+CUTS = ("budget", "preset", "lod_splat_scale", "lod_render_scale", "pixel_scale_limit")
+
+#: Options that --compare leaves no room for, and those that are called otherwise.
+NOT_COMPARED = (
+    "full",
+    "preset",
+    "lod_splat_scale",
+    "background",
+    "alpha",
+    "supersample",
+    "style",
+    "color_by",
+    "no_bar",
+    "through",
+    "diff",
+    "gain",
+    "sheet",
+    "jobs",
+)
+NAMES = {"views": "view", "asserts": "assert"}
+
+EXAMPLES = """
+\b
+Examples:
+  sparklod render scene-lod.spz --budget 500k --size 1280x720 -o preview.png
+  sparklod render scene.ply --look-at 0,-1,4:0,0,0 --supersample 2 --alpha -o thumbnail.webp
+  sparklod render scene-lod.spz --view 0,-1,4:0,0,0 --view 4,-1,0:0,0,0 -o sheet.png
+  sparklod render scene-lod.spz --orbit 120 -o orbit.mp4             # or .gif, .webp
+  sparklod render scene-lod.spz --camera-path path.json -o 'frames/out.%04d.png' --jobs 4
+  sparklod render scene-lod.spz --budget 100k --color-by level -o levels.png
+  sparklod render scene-lod.spz --full --through packed --diff scene-lod.spz -o rounding.png
+  sparklod render scene-lod.spz --orbit 6 --compare --budget 5%,25% --assert '25%:psnr>30'   # exit status 3
+"""
+
+
+@click.command("render", epilog=EXAMPLES, context_settings={"show_default": True})
+@world_options
+@functools.partial(camera_options, orbit=1)
+@click.option("--view", "views", type=View(), multiple=True, help="As --look-at; several of them make a contact sheet.")
+@click.option("--sheet", is_flag=True, help="Put the pictures of all cameras on a contact sheet.")
+@functools.partial(cut_options, budgets=BUDGETS)
+@click.option("--full", is_flag=True, help="Draw all leaves, however many there are.")
+@look_options
+@compare_options
+@click.option(
+    "--diff",
+    metavar="FILE",
+    type=click.Path(path_type=Path),
+    help="Draw how far the picture is from that of another file, and say its PSNR.",
+)
+@click.option(
+    "--gain", metavar="X", type=Real(0, min_open=True), help=f"Multiplies the difference.  [default: {GAIN:g}]"
+)
+@click.option(
+    "-o",
+    "--output",
+    metavar="FILE",
+    type=click.Path(path_type=Path),
+    help="A .png, .webp or .npy (floats), or out.%04d.png for many; .mp4, .gif or .webp for an animation; - for a PNG"
+    " on standard output.  [default: NAME.png, here]",
+)
+@click.option("--overwrite", is_flag=True, help="Replace outputs that exist.")
+@click.option(
+    "--jobs",
+    metavar="N",
+    type=click.IntRange(1, 256),
+    default=2,
+    help="Pictures to work on at a time: while one is drawn, others are sorted and written.",
+)
+@functools.partial(common_options, json="Print what was drawn, as one JSON object, on standard output.")
+@click.pass_context
+def render(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, **settings: Any) -> None:
+    """Draw pictures of splat files, as a viewer draws them.
+
+    Of Level-of-Detail files that build-lod wrote, what is drawn is the cut that Spark's traversal finds within the
+    budget; of other files, and with --full, all splats. Several files are drawn together.
+
+    Without a camera, the scene is seen from its front, where it fits the image. A camera path makes frames, or an
+    animation, by the name of --output.
+
+    Coordinates are those of the files; --up, --world-transform and --camera-axes bring cameras into them.
+    """
+    if settings["compare"]:
+        ctx.exit(_compare(ctx, settings, Console(quiet=quiet, verbose=verbose), as_json=as_json))
+    viewer = viewer_from(ctx, settings | {"budget": _one_budget(ctx, settings)})
+    if settings["full"]:
+        for name in CUTS:
+            if is_given(ctx, name):
+                raise click.UsageError(f"--full leaves nothing to --{name.replace('_', '-')}")
+    _check_usage(settings, as_json)
+    manner = manner_from(ctx, settings)
+    placements = placements_from(settings)
+    # Before much is read, what is wrong with the output already.
+    _output(settings, placements, _least_cameras(settings))
+    with Console(quiet=quiet, verbose=verbose) as console:
+        from ..preview import animation
+        from ..preview.fitting import with_reach
+        from ..preview.pictures import Painter
+        from .render_job import Job, Wanted
+
+        console.announce_compiling()
+        _use_threads(settings["threads"])
+
+        start = time.perf_counter()
+
+        @functools.cache
+        def scenery() -> Scenery:
+            return _read(placements, None if settings["full"] else viewer, settings, console)
+
+        path = _cameras(settings, lambda: scenery().centers())
+        if _is_free(settings) and not is_given(ctx, "near") and not is_given(ctx, "far"):
+            look = with_reach(manner.look, path.cameras[0], scenery().centers())
+            manner = dataclasses.replace(manner, look=look)
+        sheet = _is_sheet(settings)
+        output = _output(settings, placements, len(path.cameras))
+        background = background_from(ctx, settings, output.form)
+        for camera in path.cameras:
+            check_size(camera.width, camera.height, manner.supersample, output.form)
+        if output.kind in ("animation", "sheet") and len({(at.width, at.height) for at in path.cameras}) > 1:
+            raise click.UsageError(
+                f"the cameras have pictures of several sizes, which no {output.kind} has; see --size"
+            )
+        inputs = [settings["scene"], settings["camera_path"], settings["diff"], *(place.file for place in placements)]
+        keep_apart(output.paths(path.numbers), inputs)
+        output.check(path.numbers, overwrite=settings["overwrite"])
+        if output.kind == "animation":
+            animation.check(output.form)
+        notes = [*path.notes, *scenery().notes]
+        if is_given(ctx, "budget") and all(source.level is None for source in scenery().sources):
+            notes.append("no file is a Level-of-Detail tree, so all splats are drawn, whatever --budget says")
+        for note in notes:
+            console.say(note)
+        console.detail(f"  read in {time.perf_counter() - start:.2f} s")
+        painter, other = Painter(scenery(), manner, path.cameras), None
+        if settings["diff"] is not None:
+            from ..world import Placement
+
+            compared = [Placement(settings["diff"], settings["diff"].stem)]
+            plain = settings | {"through": None}
+            other = Painter(_read(compared, None if settings["full"] else viewer, plain, console), manner, path.cameras)
+        wanted = Wanted(
+            output=output,
+            overwrite=settings["overwrite"],
+            background=background,
+            bar=not settings["no_bar"],
+            gain=settings["gain"] or GAIN,
+            jobs=settings["jobs"],
+            threads=settings["threads"],
+        )
+        captions = [camera.name or f"frame {number}" for number, camera in zip(path.numbers, path.cameras, strict=True)]
+        job = Job(console, wanted, painter, other, path, captions if sheet else [])
+        job.run()
+        job.report(as_json=as_json)
+
+
+def _one_budget(ctx: click.Context, settings: Mapping[str, Any]) -> int | None:
+    """The budget of a picture, None where none is given."""
+    for name in ("asserts", "plot", "max_sh"):
+        if is_given(ctx, name):
+            raise click.UsageError(f"--{NAMES.get(name, name).replace('_', '-')} only means something with --compare")
+    budgets = settings["budget"]
+    if budgets is None:
+        return None
+    if len(budgets) > 1 or budgets[0].count is None:
+        texts = ",".join(budget.text for budget in budgets)
+        raise click.UsageError(f"--budget {texts} only means something with --compare; a picture takes one count")
+    count: int = budgets[0].count
+    return count
+
+
+def _compare(ctx: click.Context, settings: dict[str, Any], console: Console, *, as_json: bool) -> int:
+    """What --compare does; the exit status."""
+    for name in NOT_COMPARED:
+        if is_given(ctx, name):
+            raise click.UsageError(f"--compare leaves nothing to --{NAMES.get(name, name).replace('_', '-')}")
+    viewer = viewer_from(ctx, settings | {"budget": None})
+    manner = manner_from(ctx, settings)
+    with console:
+        from ..preview.compare import How
+        from ..render.backends import BACKENDS
+        from ..splats import COLUMNS
+        from ..world import read_world
+        from .render_compare import run, wanted_from
+
+        wanted = wanted_from(settings, settings["budget"], output=settings["output"], as_json=as_json)
+        placements = placements_from(settings)
+        inputs = [settings["scene"], settings["camera_path"], *(place.file for place in placements)]
+        keep_apart([wanted.output, wanted.plot], inputs)
+        console.announce_compiling()
+        _use_threads(settings["threads"])
+        world = read_world(
+            placements,
+            columns=COLUMNS,
+            precision=settings["precision"],
+            threads=settings["threads"],
+            progress=console.progress,
+        )
+        path = _cameras(settings, world.centers)
+        for note in path.notes:
+            console.say(note)
+        how = How(BACKENDS[settings["backend"]].draw, manner.look, settings["max_sh"], blend_from(settings))
+        return run(console, world, viewer, path, how, wanted, threads=settings["threads"])
+
+
+def _check_usage(settings: Mapping[str, Any], as_json: bool) -> None:
+    if settings["views"]:
+        given = [option for name, option in SOURCES.items() if settings[name]]
+        if given:
+            raise click.UsageError(f"--view and {' and '.join(given)} cannot go together")
+    if settings["diff"] is None and settings["gain"] is not None:
+        raise click.UsageError("--gain only means something with --diff")
+    if settings["diff"] is not None:
+        if settings["color_by"] is not None:
+            raise click.UsageError("--diff is between colours as they are; leave out --color-by")
+        if settings["alpha"] or settings["background"] is None:
+            raise click.UsageError("--diff is between pictures without alpha; name a --background")
+    if as_json and str(settings["output"]) == "-":
+        raise click.UsageError("--json and the picture cannot both go to standard output")
+
+
+def _is_sheet(settings: Mapping[str, Any]) -> bool:
+    return settings["sheet"] or len(settings["views"]) > 1
+
+
+def _least_cameras(settings: Mapping[str, Any]) -> int:
+    """How many cameras there are, or are at least, as far as that can be told before a file is read."""
+    if settings["views"]:
+        return len(settings["views"])
+    if settings["dolly"] or settings["keyframes"]:
+        return 2 if settings["every"] == 1 else 1
+    return -(-(settings["orbit"] or 1) // settings["every"])
+
+
+def _output(settings: Mapping[str, Any], placements: list[Placement], cameras: int) -> Output:
+    from .render_output import output_for
+
+    name = settings["scene"] or placements[0].file
+    return output_for(settings["output"], name.stem or name.name, cameras, sheet=_is_sheet(settings))
+
+
+def _is_free(settings: Mapping[str, Any]) -> bool:
+    """Whether nobody says where the camera is."""
+    return not any(settings[name] for name in (*SOURCES, "views", "center", "distance"))
+
+
+def _cameras(settings: Mapping[str, Any], centers: Callable[[], Any]) -> CameraPath:
+    """The cameras of a source, or of each --view, named after it; without any, one that sees the whole scene."""
+    if not settings["views"]:
+        if not _is_free(settings):
+            return cameras_from(settings, centers, orbit=1)
+        from ..preview.fitting import fitted
+
+        path = cameras_from({**settings, "center": (0.0, 0.0, 0.0), "distance": 1.0}, centers, orbit=1)
+        return dataclasses.replace(path, cameras=(fitted(path.cameras[0], centers()),))
+    paths = [cameras_from({**settings, "look_at": view}, centers) for view in settings["views"]]
+    cameras = [
+        dataclasses.replace(path.cameras[0], name=" to ".join(", ".join(f"{x:g}" for x in point) for point in view))
+        for path, view in zip(paths, settings["views"], strict=True)
+    ]
+    return dataclasses.replace(paths[0], cameras=tuple(cameras), numbers=tuple(range(len(cameras))))
+
+
+def _read(placements: list[Placement], viewer: Viewer | None, settings: Mapping[str, Any], console: Console) -> Scenery:
+    from ..preview.scenery import read_scenery
+
+    try:
+        return read_scenery(
+            placements,
+            viewer,
+            through=settings["through"],
+            blend=blend_from(settings),
+            precision=settings["precision"],
+            threads=settings["threads"],
+            progress=console.progress,
+        )
+    except ValueError as error:
+        raise click.UsageError(str(error)) from None
+
+
+def _use_threads(count: int) -> None:
+    from .. import jit
+
+    jit.use_threads(count)

@@ -1,0 +1,213 @@
+"""What `sparklod render` does with its cameras."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+import numpy as np
+
+from .. import jit
+from ..io import write_stdout, write_whole
+from ..parallel import ordered_map
+from ..preview import pixels as codes
+from ..preview.coloring import OF_PIXELS
+from ..preview.metrics import psnr
+from .console import Console, count_of, size_of
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from ..preview.pictures import Drawn, Painter
+    from ..preview.pixels import Color, Pixels
+    from ..render.camera import Camera
+    from ..render.camera_path import CameraPath
+    from .render_output import Output
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What is to be made of what is drawn.
+
+    Attributes:
+        output: where it goes.
+        overwrite: replace files that exist.
+        background: behind the splats; None keeps alpha.
+        bar: say in the picture what its colours mean.
+        gain: how many times as strong differences are.
+        jobs: pictures at a time.
+        threads: of kernels.
+    """
+
+    output: Output
+    overwrite: bool
+    background: Color | None
+    bar: bool
+    gain: float
+    jobs: int
+    threads: int
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A picture that is done.
+
+    Attributes:
+        number: of its camera.
+        facts: what the report says of it.
+        pixels: None where they are in `data`, as they are written.
+        data: bytes of a file.
+        empty: nothing is in view.
+    """
+
+    number: int
+    facts: dict[str, Any]
+    pixels: Pixels | None
+    data: bytes
+    empty: bool
+
+
+@dataclass
+class Job:
+    """Pictures on their way into files.
+
+    Attributes:
+        painter: draws them.
+        other: draws what they are compared with; None for nothing.
+        path: the cameras.
+        captions: of each, for a contact sheet.
+    """
+
+    console: Console
+    wanted: Wanted
+    painter: Painter
+    other: Painter | None
+    path: CameraPath
+    captions: list[str]
+    frames: list[dict[str, Any]] = field(default_factory=list)
+    seconds: float = 0.0
+    written: int = 0
+    _empty: bool = True
+
+    def run(self) -> None:
+        """Draws and writes all of them."""
+        from ..preview.animation import animate
+        from ..preview.sheet import sheet
+
+        start, output = time.perf_counter(), self.wanted.output
+        drawn = self._drawn()
+        if output.kind == "frames":
+            for frame in drawn:
+                self._write(output.path(frame.number), frame.data)
+        elif output.kind == "picture":
+            (frame,) = drawn
+            self._write(output.name, frame.data)
+        elif output.kind == "animation":
+            data = animate((_pixels(frame) for frame in drawn), output.form, frame_rate(self.path))
+            self._write(output.name, data)
+        else:
+            whole = sheet([_pixels(frame) for frame in drawn], self.captions)
+            self._write(output.name, codes.encode(whole, output.form))
+        self.seconds = time.perf_counter() - start
+        self.console.clear()
+        if self._empty:
+            self.console.say(
+                "warning: nothing is in view; cameras and scene may not share their axes (--camera-axes,"
+                " --world-transform, --up), or --near and --far leave nothing"
+            )
+
+    def _drawn(self) -> Iterator[Frame]:
+        """The pictures, in order."""
+        count = len(self.path.cameras)
+        for done, frame in enumerate(ordered_map(self._frame, range(count), min(self.wanted.jobs, count)), 1):
+            self.frames.append(frame.facts)
+            self._empty &= frame.empty
+            self.console.progress("drawing", done, count, "frame")
+            yield frame
+
+    def _frame(self, at: int) -> Frame:
+        jit.use_threads(self.wanted.threads)  # that is said of each thread by itself
+        camera, number = self.path.cameras[at], self.path.numbers[at]
+        drawn = self.painter.draw(camera)
+        facts = self._facts(number, camera, drawn)
+        image = codes.over(drawn.image, self.wanted.background)
+        if self.other is not None:
+            reference = codes.over(self.other.draw(camera).image, self.wanted.background)
+            clipped = [np.clip(each[..., :3], 0, 1) for each in (image, reference)]
+            facts["psnr_db"] = round(psnr(*clipped), 3)
+            image = codes.difference(image, reference, self.wanted.gain)
+        empty = not drawn.image[..., 3].any()
+        if self.wanted.output.form == "npy":
+            return Frame(number, facts, None, codes.encode_floats(self._floats(drawn, image)), empty)
+        pixels = codes.eight_bits(image)
+        if self.wanted.bar and self.painter.scale is not None:
+            pixels = codes.with_scale(pixels, self.painter.scale.bar)
+        if self.wanted.output.kind in ("picture", "frames"):
+            return Frame(number, facts, None, codes.encode(pixels, self.wanted.output.form), empty)
+        return Frame(number, facts, pixels, b"", empty)
+
+    def _facts(self, number: int, camera: Camera, drawn: Drawn) -> dict[str, Any]:
+        facts = {"frame": number, "time_s": camera.time, "name": camera.name, "splats": drawn.splats}
+        facts |= {"width": camera.width, "height": camera.height}
+        if self.wanted.output.kind == "frames":
+            facts["file"] = str(self.wanted.output.path(number))
+        return facts
+
+    def _floats(self, drawn: Drawn, image: NDArray[np.float32]) -> NDArray[np.float32]:
+        """What a .npy holds: the numbers behind the colours where those are of pixels, else the colours."""
+        by = self.painter.manner.color_by
+        return drawn.values if by in OF_PIXELS and drawn.values is not None else image
+
+    def _write(self, target: Path | None, data: bytes) -> None:
+        self.written += len(data)
+        if target is None:
+            write_stdout([data])
+        else:
+            write_whole(target, [data], overwrite=self.wanted.overwrite)
+
+    def report(self, *, as_json: bool) -> None:
+        """Says what was drawn."""
+        output, frames = self.wanted.output, self.frames
+        if as_json:
+            report = {
+                "output": str(output.name),
+                "format": output.form,
+                "kind": output.kind,
+                "bytes": self.written,
+                "frames": frames,
+                "seconds": round(self.seconds, 3),
+            }
+            click.echo(json.dumps(report, allow_nan=False))
+        name = "standard output" if output.name is None else output.name
+        sizes = dict.fromkeys(f"{frame['width']} x {frame['height']}" for frame in frames)
+        splats = sorted({frame["splats"] for frame in frames})
+        said = [count_of(len(frames), "frame")] if len(frames) > 1 else []
+        said.append(next(iter(sizes)) + (" and others" if len(sizes) > 1 else ""))
+        said.append(" to ".join(f"{count:,}" for count in dict.fromkeys([splats[0], splats[-1]])) + " splats")
+        if self.other is not None:
+            worst = min(frame["psnr_db"] for frame in frames)
+            said.append(f"PSNR {worst:.2f} dB" + (" or more" if len(frames) > 1 else ""))
+        self.console.say(f"{name}  {', '.join(said)}, {self.seconds:.2f} s")
+        manner = self.painter.manner
+        self.console.detail(
+            f"  {self.path.format}, {size_of(self.written)} of {output.form}; {manner.style} by {manner.backend},"
+            f" from {manner.look.near:g} to {manner.look.far:g} units away"
+        )
+
+
+def frame_rate(path: CameraPath) -> float:
+    """Frames a second, on average."""
+    from ..render.frame import DEFAULT_FPS
+
+    span = path.cameras[-1].time - path.cameras[0].time
+    return (len(path.cameras) - 1) / span if span > 0 else DEFAULT_FPS
+
+
+def _pixels(frame: Frame) -> Pixels:
+    assert frame.pixels is not None
+    return frame.pixels

@@ -1,0 +1,151 @@
+"""What colours mean where they are not the splats' own: numbers of splats, or of pixels, on a scale."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import SparklodError
+from ..gaussian import lod_opacity, moved, spark_size
+from ..lod.traversal import CHUNK_NODES
+from ..render.camera import Camera
+from ..render.colors import CLIPPED, MAGMA, PLASMA, Coloring, Mark, smooth, whole_numbers
+from ..render.look import Look
+from ..render.shapes import ticks
+from ..splats import FloatArray
+from .scenery import Piece, Scenery
+
+#: Colours that are of pixels rather than of splats.
+OF_PIXELS = ("overdraw", "depth")
+
+#: So many splats and cameras are looked at to find the ends of a scale.
+SAMPLE, CAMERAS = 1 << 18, 64
+
+#: The least span of a logarithmic scale, in powers of ten.
+LEAST_DECADES = 0.1
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Which numbers have which colours; the same for all pictures of a run.
+
+    Attributes:
+        bar: the colours, with their meaning.
+        low, high: numbers of the first colour and of the last; those beyond have these, too.
+        log: they are powers of ten.
+    """
+
+    bar: Coloring
+    low: float
+    high: float
+    log: bool = False
+
+    def rgb(self, values: FloatArray) -> NDArray[np.float32]:
+        """(..., 3) colours, 0..1, of numbers; what is not a number has the first."""
+        values = np.asarray(values, np.float64)
+        if self.log:
+            values = np.log10(np.clip(values, 1e-30, 1e30))
+        at = np.nan_to_num((values - self.low) / ((self.high - self.low) or 1))
+        index = np.rint(np.clip(at, 0, 1) * (len(self.bar.ramp) - 1)).astype(np.intp)
+        colors: NDArray[np.float32] = (self.bar.ramp[index] / 255).astype(np.float32)
+        return colors
+
+
+def values_of(by: str, piece: Piece) -> FloatArray:
+    """(M,) the numbers that some splats are coloured by: "level", "lod-opacity", "size" or "chunk".
+
+    Sizes are in world units; splats of files without a tree are of level 0.
+    """
+    if by == "level":
+        level = piece.source.level
+        return np.zeros(len(piece.index), np.float32) if level is None else level[piece.index].astype(np.float32)
+    if by == "chunk":
+        return (piece.source.first_chunk + piece.index // CHUNK_NODES).astype(np.float64)
+    if by == "lod-opacity":
+        return lod_opacity(np.maximum(piece.splats.opacity, 0))
+    return spark_size(piece.splats) * np.float32(np.cbrt(np.linalg.det(piece.object_to_world[:3, :3])))
+
+
+def scale_of_splats(by: str, scenery: Scenery) -> Scale:
+    """The scale of a colour that is of splats, for all that cameras may see.
+
+    Raises:
+        SparklodError: by level, where no file is a tree.
+    """
+    if by == "chunk":
+        return _whole("chunk", 0, max(source.first_chunk + source.chunks for source in scenery.sources) - 1)
+    if by == "level":
+        levels = [int(source.level.max()) for source in scenery.sources if source.level is not None]
+        if not levels:
+            raise SparklodError("there are no levels to colour by: no file is a Level-of-Detail tree")
+        return _whole("level", 0, max(levels))
+    pieces = scenery.candidates()
+    every = max(1, sum(len(piece.index) for piece in pieces) // SAMPLE)
+    values = np.concatenate([values_of(by, piece)[::every] for piece in pieces])
+    return _opacities(values) if by == "lod-opacity" else _sizes(values)
+
+
+def scale_of_depth(scenery: Scenery, cameras: Sequence[Camera], look: Look) -> Scale:
+    """From the nearest splats to the farthest that cameras see, but for a few."""
+    pieces = scenery.candidates()
+    every = max(1, sum(len(piece.index) for piece in pieces) // SAMPLE)
+    centers = np.concatenate([moved(piece.splats.center[::every], piece.object_to_world) for piece in pieces])
+    seen = [np.empty(0)]
+    for camera in cameras[:: max(1, len(cameras) // CAMERAS)]:
+        local = (centers - camera.position) @ camera.camera_to_world[:3, :3]
+        depth = -local[:, 2]
+        with np.errstate(all="ignore"):
+            inside = (depth > look.near) & (depth < look.far)
+            inside &= abs(camera.focal[0] * local[:, 0] / depth) <= camera.width / 2
+            inside &= abs(camera.focal[1] * local[:, 1] / depth) <= camera.height / 2
+        seen.append(depth[inside])
+    depths = np.concatenate(seen)
+    low, high = np.percentile(depths, [CLIPPED, 100 - CLIPPED]) if len(depths) else (look.near, look.near + 1)
+    # A scene that is as good as flat gets no more contrast than there is.
+    high = max(high, low + 1e-3 * abs(low))
+    return _linear("depth", float(low), float(high), tuple(reversed(PLASMA)), ends=True)
+
+
+def scale_of_overdraw(counts: Sequence[FloatArray]) -> Scale:
+    """From none to the most that but a few pixels of some pictures have."""
+    most = max(float(np.percentile(count, 99.9)) for count in counts)
+    return _linear("overdraw", 0.0, max(1.0, float(math.ceil(most))), MAGMA, ends=True)
+
+
+def _whole(title: str, low: int, high: int) -> Scale:
+    return Scale(whole_numbers(title, np.arange(low, high + 1), low, high), low, high)
+
+
+def _linear(title: str, low: float, high: float, stops: tuple[str, ...], *, ends: bool) -> Scale:
+    marks = [((tick - low) / (high - low), text) for tick, text in ticks(low, high, (high - low) / 6)]
+    if ends:
+        marks = _with_ends(marks, f"{low:.3g} or less" if low else None, f"{high:.3g} or more")
+    return Scale(smooth(title, np.empty(0), stops, marks), low, high)
+
+
+def _opacities(values: FloatArray) -> Scale:
+    top = max(1.0, math.ceil(10 * float(np.percentile(values, 100 - CLIPPED))) / 10)
+    return _linear("LoD opacity", 0.0, top, MAGMA, ends=bool(values.max() > top))
+
+
+def _sizes(values: FloatArray) -> Scale:
+    logs = np.log10(np.clip(values, 1e-30, 1e30).astype(np.float64))
+    low, high = (float(end) for end in np.percentile(logs, [CLIPPED, 100 - CLIPPED]))
+    if high - low < LEAST_DECADES:
+        low, high = (low + high - LEAST_DECADES) / 2, (low + high + LEAST_DECADES) / 2
+    span = high - low
+    factors = (1,) if span > 2.5 else (1, 2, 5) if span > 0.8 else (1, 1.25, 1.5, 2, 2.5, 3, 4, 5, 6, 8)
+    places = [math.log10(factor) + n for n in range(math.floor(low), math.ceil(high) + 1) for factor in factors]
+    marks = [((at - low) / span, f"{10**at:.3g}") for at in places if low <= at <= high]
+    marks = _with_ends(marks, f"{10**low:.2g} or less", f"{10**high:.2g} or more")
+    return Scale(smooth("feature size", np.empty(0), PLASMA, marks), low, high, log=True)
+
+
+def _with_ends(marks: list[Mark], low: str | None, high: str | None) -> list[Mark]:
+    """The marks of a scale with those of its ends, and without those that would touch them."""
+    ends = [(place, text) for place, text in ((0.0, low), (1.0, high)) if text is not None]
+    return [mark for mark in marks if all(abs(mark[0] - place) > 0.05 for place, _ in ends)] + ends

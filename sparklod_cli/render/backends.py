@@ -1,0 +1,52 @@
+"""The backends that draw splats, behind one interface."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Any, Protocol, cast
+
+from ..errors import SparklodError
+from .camera import Camera
+from .look import Look
+from .rasterizer import Image
+from .shown import Shown
+
+
+class BackendError(SparklodError):
+    """A backend cannot draw here; its text says what is missing and which package brings it."""
+
+
+class Draw(Protocol):
+    """What draws.
+
+    Returns:
+        (height, width, 4) float32: red, green and blue, multiplied by alpha, and alpha, all 0..1.
+
+    Raises:
+        BackendError: it cannot draw here.
+    """
+
+    def __call__(self, shown: Shown, camera: Camera, look: Look, **options: Any) -> Image: ...
+
+
+@dataclass(frozen=True)
+class Backend:
+    """One way to draw; its module has a function `draw`."""
+
+    name: str
+    module: str
+
+    def draw(self, shown: Shown, camera: Camera, look: Look, **options: Any) -> Image:
+        """What a camera sees; see `Draw`. Options are those of the module's function."""
+        return cast(Draw, import_module(self.module, __package__).draw)(shown, camera, look, **options)
+
+
+BACKENDS = {
+    backend.name: backend
+    for backend in (
+        Backend("numba", ".rasterizer"),
+        Backend("osmesa", ".osmesa"),
+        Backend("open3d", ".open3d_backend"),
+    )
+}

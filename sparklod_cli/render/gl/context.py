@@ -1,0 +1,171 @@
+"""OpenGL without a window: a moderngl context over libOSMesa or, where that is missing, over EGL.
+
+Run as a module, with the name of one of the two, it says whether that draws here, by doing so. That is for a process of
+its own: a broken driver does not raise, it ends the process.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import ctypes.util
+import functools
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from typing import Any
+
+#: OpenGL that the shaders need: unpackHalf2x16 came with 4.2.
+VERSION = 420
+
+#: What a context is made over, in the order of trying, and the packages of Debian and Ubuntu that have it.
+PACKAGES = {"osmesa": "libosmesa6", "egl": "libegl1 libgl1 libgl1-mesa-dri"}
+
+#: The library has had these names; Mesa's last release with it is 25.0.
+OSMESA_NAMES = ("libOSMesa.so.8", "libOSMesa.so.6", "libOSMesa.so")
+
+#: The process that tries a context is given so many seconds: Mesa compiles its first shaders in well under one.
+PATIENCE = 60
+
+# GL/osmesa.h
+_FORMAT, _DEPTH_BITS, _STENCIL_BITS, _PROFILE, _CORE_PROFILE = 0x22, 0x30, 0x31, 0x33, 0x34
+_MAJOR_VERSION, _MINOR_VERSION = 0x36, 0x37
+_RGBA, _UNSIGNED_BYTE = 0x1908, 0x1401
+
+
+class NoContextError(Exception):
+    """There is no context to be had; its text says why."""
+
+
+class OSMesa:
+    """A context of libOSMesa, as moderngl takes one: it has `load_opengl_function`.
+
+    It is current on the thread that made it. What it draws on by itself is 1 x 1 and never looked at; pictures are
+    drawn on framebuffer objects.
+    """
+
+    def __init__(self) -> None:
+        self._library = _load(OSMESA_NAMES)
+        for name in ("OSMesaCreateContextAttribs", "OSMesaGetProcAddress"):
+            if not hasattr(self._library, name):
+                raise NoContextError(f"this libOSMesa is too old: it has no {name}")
+            getattr(self._library, name).restype = ctypes.c_void_p
+        attributes = [_FORMAT, _RGBA, _DEPTH_BITS, 0, _STENCIL_BITS, 0, _PROFILE, _CORE_PROFILE]
+        attributes += [_MAJOR_VERSION, VERSION // 100, _MINOR_VERSION, VERSION // 10 % 10, 0]
+        create = self._library.OSMesaCreateContextAttribs
+        self._context = ctypes.c_void_p(create((ctypes.c_int * len(attributes))(*attributes), ctypes.c_void_p()))
+        self._pixel = (ctypes.c_ubyte * 4)()  # the library writes here as long as the context is current
+        if not self._context:
+            raise NoContextError(f"this libOSMesa has no OpenGL {VERSION // 100}.{VERSION // 10 % 10}")
+        if not self._library.OSMesaMakeCurrent(self._context, self._pixel, _UNSIGNED_BYTE, 1, 1):
+            raise NoContextError("libOSMesa does not make its context current")
+
+    def load_opengl_function(self, name: str) -> int:
+        """The address of a function of OpenGL; 0 if there is none of that name."""
+        return self._library.OSMesaGetProcAddress(name.encode()) or 0
+
+    def release(self) -> None:
+        """Frees it; it must be current."""
+        self._library.OSMesaMakeCurrent(None, None, _UNSIGNED_BYTE, 0, 0)
+        self._library.OSMesaDestroyContext(self._context)
+
+
+def _load(names: tuple[str, ...]) -> Any:
+    reason = ""
+    for name in names:
+        try:
+            return ctypes.CDLL(name)
+        except OSError as error:  # noqa: PERF203
+            reason = reason or str(error)
+    raise NoContextError(reason)
+
+
+def _osmesa() -> Any:
+    import moderngl
+
+    how: Any = {"context": OSMesa()}  # its type hints do not know of this
+    return moderngl.create_context(require=VERSION, **how)
+
+
+def _egl() -> Any:
+    import moderngl
+
+    # glcontext looks for names that only the packages for developers have; glvnd has the functions in either library.
+    libgl = ctypes.util.find_library("GL") or ctypes.util.find_library("OpenGL") or "libGL.so.1"
+    libegl = ctypes.util.find_library("EGL") or "libEGL.so.1"
+    how: Any = {"backend": "egl", "libgl": libgl, "libegl": libegl}
+    return moderngl.create_context(require=VERSION, standalone=True, **how)
+
+
+_MAKE: dict[str, Callable[[], Any]] = {"osmesa": _osmesa, "egl": _egl}
+
+
+def create(kind: str) -> Any:
+    """A moderngl.Context over one of `PACKAGES`, current on this thread.
+
+    Raises:
+        NoContextError: there is none; but a broken driver may end the process instead, see `probe`.
+    """
+    try:
+        context = _MAKE[kind]()
+        # Python drops objects on any thread, at any time; OpenGL must hear of it on this one only, when `gc` is called.
+        context.gc_mode = "context_gc"
+        return context
+    except NoContextError:
+        raise
+    except Exception as error:  # moderngl and glcontext raise plain ones
+        raise NoContextError(str(error) or type(error).__name__) from None
+
+
+@functools.cache
+def probe(kind: str) -> str:
+    """Why a context over one of `PACKAGES` does not draw here, found out in a process of its own; empty if it does."""
+    # The child finds the modules that this process has found, wherever they are.
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    command = [sys.executable, "-m", __name__, kind]
+    try:
+        child = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, env=environment)
+    except (OSError, subprocess.SubprocessError) as error:
+        return str(error)
+    if child.returncode == 0:
+        return ""
+    said = child.stderr.strip().splitlines()
+    if child.returncode < 0:
+        return f"the driver ended the process that tried it, by signal {-child.returncode}"
+    return said[-1] if said else f"trying it failed, with exit code {child.returncode}"
+
+
+_VERTEX = """
+#version 420 core
+void main() { gl_Position = vec4(vec2(gl_VertexID & 1, gl_VertexID >> 1) * 4.0 - 1.0, 0.0, 1.0); }
+"""
+
+_FRAGMENT = """
+#version 420 core
+out vec4 color;
+void main() { color = vec4(0.25, 0.5, 2.0, 1.0); }
+"""
+
+
+def _try(kind: str) -> None:
+    """Draws a triangle on floats and looks at it."""
+    import struct
+
+    import moderngl
+
+    context = create(kind)
+    target = context.framebuffer([context.texture((8, 8), 4, dtype="f4")])
+    target.use()
+    target.clear()
+    program = context.program(vertex_shader=_VERTEX, fragment_shader=_FRAGMENT)
+    context.vertex_array(program, []).render(moderngl.TRIANGLES, vertices=3)
+    seen = struct.unpack("4f", target.read(components=4, dtype="f4")[:16])
+    if seen != (0.25, 0.5, 2.0, 1.0):
+        raise NoContextError(f"a triangle came out as {seen}")
+
+
+if __name__ == "__main__":
+    try:
+        _try(sys.argv[1])
+    except Exception as error:
+        sys.exit(str(error) or type(error).__name__)

@@ -1,0 +1,90 @@
+"""Goes through splats in bands of a picture's rows, each of which one thread owns: discs, and counts of fragments."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import prange
+
+from ...jit import kernel
+from .project import END, HALF_HEIGHT, HALF_WIDTH, OPACITY, POWER, A, B, C, X, Y
+
+f32 = np.float32
+
+#: Rows of a band: few enough that all threads have some, and that those with more to do do not hold up the others.
+ROWS = 8
+
+
+@kernel(parallel=True)
+def draw_discs(x, y, radius, rgb, alpha, image):
+    """Blends discs in the order that they have, each over those before it.
+
+    Args:
+        x, y: (N,) float32 centres, pixels from the upper left corner.
+        radius: (N,) float32, pixels.
+        rgb: (N, 3) float32.
+        alpha: float32, of all of them.
+        image: (height, width, 4) float32 to draw on: red, green and blue, multiplied by alpha, and alpha.
+    """
+    height, width = image.shape[:2]
+    for band in prange((height + ROWS - 1) // ROWS):
+        top = band * ROWS
+        bottom = min(top + ROWS, height)
+        for i in range(len(x)):
+            r = radius[i]
+            if y[i] + r < top or y[i] - r > bottom:
+                continue
+            for line in range(top, bottom):
+                dy = f32(line) + f32(0.5) - y[i]
+                square = r * r - dy * dy
+                if square < 0:
+                    continue
+                half = np.sqrt(square)
+                first = max(0, math.ceil(x[i] - half - f32(0.5)))
+                last = min(width - 1, math.floor(x[i] + half - f32(0.5)))
+                for column in range(first, last + 1):
+                    for c in range(3):
+                        image[line, column, c] += alpha * (rgb[i, c] - image[line, column, c])
+                    image[line, column, 3] += alpha * (f32(1) - image[line, column, 3])
+
+
+@kernel(parallel=True)
+def count_fragments(screen, shifted, least, counts):
+    """How many splats are blended into each pixel, hidden ones too.
+
+    Args:
+        screen: (N, COLUMNS) of `project`, those that are on the screen, in any order.
+        shifted: D above 1 falls off as in Spark's LoD design.
+        least: less alpha than this is not drawn, float32.
+        counts: (height, width) int32, added to.
+    """
+    height, width = counts.shape
+    for band in prange((height + ROWS - 1) // ROWS):
+        top = band * ROWS
+        bottom = min(top + ROWS, height)
+        for i in range(len(screen)):
+            row = screen[i]
+            first_line = max(top, math.ceil(row[Y] - row[HALF_HEIGHT] - f32(0.5)))
+            last_line = min(bottom - 1, math.floor(row[Y] + row[HALF_HEIGHT] - f32(0.5)))
+            if first_line > last_line:
+                continue
+            first = max(0, math.ceil(row[X] - row[HALF_WIDTH] - f32(0.5)))
+            last = min(width - 1, math.floor(row[X] + row[HALF_WIDTH] - f32(0.5)))
+            d = row[OPACITY]
+            for line in range(first_line, last_line + 1):
+                dy = f32(line) + f32(0.5) - row[Y]
+                for column in range(first, last + 1):
+                    dx = f32(column) + f32(0.5) - row[X]
+                    z2 = row[A] * dx * dx + f32(2) * row[B] * dx * dy + row[C] * dy * dy
+                    if z2 > row[END]:
+                        continue
+                    if d <= 1:
+                        alpha = d * math.exp(f32(-0.5) * z2)
+                    elif shifted:
+                        beyond = max(math.sqrt(max(z2, f32(0))) - (d - f32(1)), f32(0))
+                        alpha = math.exp(f32(-0.5) * d * beyond * beyond)
+                    else:
+                        alpha = f32(1) - (f32(1) - math.exp(f32(-0.5) * z2)) ** row[POWER]
+                    if alpha >= least:
+                        counts[line, column] += 1

@@ -1,0 +1,70 @@
+"""Spherical harmonics: the colour that a splat has from one direction."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import prange
+
+from ...jit import kernel
+
+f32 = np.float32
+
+#: Normalisations of the real spherical harmonics of degree 1 to 3, in the order of 3D Gaussian Splatting.
+C1 = f32(0.4886025119029199)
+C2 = tuple(
+    map(f32, (1.0925484305920792, -1.0925484305920792, 0.31539156525252005, -1.0925484305920792, 0.5462742152960396))
+)
+C3 = tuple(
+    map(
+        f32,
+        (
+            -0.5900435899266435,
+            2.890611442640554,
+            -0.4570457994644658,
+            0.3731763325901154,
+            -0.4570457994644658,
+            1.445305721320277,
+            -0.5900435899266435,
+        ),
+    )
+)
+
+
+@kernel(parallel=True)
+def add_sh(center, sh, eye, degree, rgb):
+    """Adds spherical harmonics to colours.
+
+    Args:
+        center: (N, 3) float32.
+        sh: (N, K, 3) float32 coefficients of degree 1 and above.
+        eye: (3,) float32, where they are seen from.
+        degree: 1 to 3.
+        rgb: (N, 3) float32, added to.
+    """
+    for i in prange(len(center)):
+        x, y, z = center[i, 0] - eye[0], center[i, 1] - eye[1], center[i, 2] - eye[2]
+        length = np.sqrt(x * x + y * y + z * z)
+        if length == 0:
+            continue
+        x, y, z = x / length, y / length, z / length
+        for c in range(3):
+            value = C1 * (-y * sh[i, 0, c] + z * sh[i, 1, c] - x * sh[i, 2, c])
+            if degree > 1:
+                value += (
+                    C2[0] * x * y * sh[i, 3, c]
+                    + C2[1] * y * z * sh[i, 4, c]
+                    + C2[2] * (f32(2) * z * z - x * x - y * y) * sh[i, 5, c]
+                    + C2[3] * x * z * sh[i, 6, c]
+                    + C2[4] * (x * x - y * y) * sh[i, 7, c]
+                )
+            if degree > 2:
+                value += (
+                    C3[0] * y * (f32(3) * x * x - y * y) * sh[i, 8, c]
+                    + C3[1] * x * y * z * sh[i, 9, c]
+                    + C3[2] * y * (f32(4) * z * z - x * x - y * y) * sh[i, 10, c]
+                    + C3[3] * z * (f32(2) * z * z - f32(3) * x * x - f32(3) * y * y) * sh[i, 11, c]
+                    + C3[4] * x * (f32(4) * z * z - x * x - y * y) * sh[i, 12, c]
+                    + C3[5] * z * (x * x - y * y) * sh[i, 13, c]
+                    + C3[6] * x * (x * x - f32(3) * y * y) * sh[i, 14, c]
+                )
+            rgb[i, c] += value

@@ -1,0 +1,71 @@
+"""The reference backend: splats drawn in tiles on the processor."""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..jit import threads_in_use
+from .camera import Camera
+from .kernels import project, raster
+from .look import BLUR, CLIP, MAX_STD_DEV, MIN_ALPHA, STD_DEV_PER_D, Look
+from .shown import Shown
+
+Image = NDArray[np.float32]
+
+_kept = threading.local()
+
+#: Pieces a thread to sort splats into tiles in.
+CHUNKS = 2
+
+
+def draw(shown: Shown, camera: Camera, look: Look) -> Image:
+    """What a camera sees: (height, width, 4) float32, red, green, blue, multiplied by alpha, and alpha; 0..1.
+
+    The image is the same for any number of threads.
+    """
+    screen = seen(shown, camera, look)
+    across, down = -(-camera.width // raster.TILE), -(-camera.height // raster.TILE)
+    start, splats = raster.sort_into_tiles(screen, across, down, CHUNKS * threads_in_use())
+    image = np.empty((camera.height, camera.width, 4), np.float32)
+    raster.draw_tiles(screen, start, splats, across, down, look.profile == "shifted", np.float32(MIN_ALPHA), image)
+    return image
+
+
+def seen(shown: Shown, camera: Camera, look: Look) -> NDArray[np.float32]:
+    """The splats on the screen, (M, `project.COLUMNS`) from near to far; a buffer, which the next call overwrites."""
+    screen, arranged, keys = _buffers(len(shown))
+    project.project(
+        shown.center,
+        shown.scale,
+        shown.quat_xyzw,
+        shown.lod_opacity,
+        shown.rgb,
+        world_to_camera(camera),
+        np.array([*camera.focal, *camera.principal, camera.width, camera.height], np.float32),
+        np.array([look.near, look.far, CLIP, BLUR, MIN_ALPHA, MAX_STD_DEV, STD_DEV_PER_D, look.max_radius], np.float32),
+        look.sort == "radial",
+        screen,
+        keys,
+    )
+    keys = np.sort(keys[keys != project.NOWHERE])
+    arranged = arranged[: len(keys)]
+    project.arrange(screen, keys, arranged)
+    return arranged
+
+
+def _buffers(count: int) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint64]]:
+    """To put splats on the screen in; kept by each thread, as new memory is slow the first time that it is touched."""
+    if len(getattr(_kept, "keys", ())) < count:
+        _kept.screens = [np.empty((count, project.COLUMNS), np.float32) for _ in range(2)]
+        _kept.keys = np.empty(count, np.uint64)
+    first, second = _kept.screens
+    return first[:count], second[:count], _kept.keys[:count]
+
+
+def world_to_camera(camera: Camera) -> NDArray[np.float32]:
+    """(3, 4): into axes with y down, looking along z."""
+    turned = camera.camera_to_world @ np.diag([1.0, -1.0, -1.0, 1.0])
+    return np.linalg.inv(turned)[:3].astype(np.float32)

@@ -1,0 +1,128 @@
+"""The same views drawn by us and by Spark, and how far apart they are."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sparklod_cli.codecs import ext_splats, lod_tree
+from sparklod_cli.io import read_scene
+from sparklod_cli.lod.traversal import Forest, Instance, Traversal, View, pixel_limit
+from sparklod_cli.render.camera import Camera
+from sparklod_cli.render.framing import framing
+from sparklod_cli.render.look import Look
+from sparklod_cli.render.pose import look_at
+from sparklod_cli.render.rasterizer import draw
+from sparklod_cli.render.shown import show
+from sparklod_cli.scene import Scene
+from sparklod_cli.splats import Splats
+
+from .page import Page
+
+FOV_Y = math.radians(50)
+
+#: Where views are from: degrees around, up, and away, in radii of the scene.
+AROUND = ((0, 15, 3.0), (60, 10, 1.6), (120, 40, 2.0), (180, -5, 1.2), (240, 70, 2.5), (300, 5, 0.7))
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Our picture of one view, in 8 bits, beside Spark's.
+
+    Attributes:
+        drawn: splats that Spark sorted.
+        psnr: of red, green and blue of all pixels, dB.
+        covered: the same of the pixels that splats cover to a tenth and more, which are `share` of all.
+        share: 0..1.
+        most: the largest difference, of 255.
+        unrounded: PSNR where Spark does not round to 8 bits after every splat, dB.
+        held: the same, of a picture of ours that is drawn from the numbers that Spark holds, after its coding of them.
+        held_most: the largest difference then, of 255.
+        same_cut: whether our traversal draws the very nodes of the tree; None if there is no tree.
+    """
+
+    drawn: int
+    psnr: float
+    covered: float
+    share: float
+    most: int
+    unrounded: float
+    held: float
+    held_most: float
+    same_cut: bool | None
+
+
+def cameras_around(center: NDArray[np.floating], width: int, height: int) -> list[Camera]:
+    """Cameras around a scene whose up is -y, one for each of `AROUND`; they all look at its middle."""
+    middle, radius = framing(center)
+    focal = height / 2 / math.tan(FOV_Y / 2)
+    cameras = []
+    for around, up, away in AROUND:
+        turn, lift = math.radians(around), math.radians(up)
+        direction = (math.sin(turn) * math.cos(lift), -math.sin(lift), math.cos(turn) * math.cos(lift))
+        pose = look_at(middle + away * radius * np.array(direction), middle, (0, -1, 0))
+        cameras.append(Camera(pose, width, height, (focal, focal), (width / 2, height / 2)))
+    return cameras
+
+
+def cut_of(held: Scene, camera: Camera, budget: int) -> NDArray[np.uint32]:
+    """The nodes of a tree that our traversal draws, ascending, all directions alike."""
+    assert held.tree is not None
+    nodes = lod_tree.unpack(lod_tree.pack(held.splats, held.tree))
+    view = View(camera.camera_to_world, camera.fov_x, camera.fov_y)
+    smallest = pixel_limit(camera.fov_y, camera.height)
+    return Traversal(Forest([nodes]), [Instance()]).cut(view, budget=budget, smallest=smallest).indices()[0]
+
+
+def compare(page: Page, file: Path, cameras: Sequence[Camera], look: Look, budget: int = 0) -> Iterator[Difference]:
+    """Draws a file from several places, one after the other.
+
+    Args:
+        page: Spark.
+        file: of splats, or of a tree if there is a budget.
+        cameras: all of one size.
+        look: how.
+        budget: how many nodes of the tree are drawn at most.
+    """
+    scene = read_scene(file)
+    count = page.open(file, cameras[0], look)
+    assert count == len(scene.splats), f"Spark has {count:,} splats of {file.name}, not {len(scene.splats):,}"
+    held = Scene(ext_splats.unpack(ext_splats.pack(scene.splats)), scene.tree)
+    for camera in cameras:
+        yield _difference(page, scene.splats, held, camera, look, budget)
+
+
+def _difference(page: Page, splats: Splats, held: Scene, camera: Camera, look: Look, budget: int) -> Difference:
+    theirs = page.draw(camera, look, budget=budget or None)
+    nodes = cut_of(held, camera, budget) if budget else None
+    rows = slice(None) if nodes is None else nodes
+    image, again = (
+        np.clip(draw(show([(some.take(rows), np.eye(4))], camera), camera, look), 0, 1)
+        for some in (splats, held.splats)
+    )
+    off = (np.rint(255 * image) / 255 - theirs.rounded)[..., :3]
+    exact = np.clip(theirs.exact, 0, 1)
+    held_off = (again - exact)[..., :3]
+    covered = image[..., 3] >= 0.1
+    return Difference(
+        drawn=theirs.drawn,
+        psnr=psnr(off),
+        covered=psnr(off[covered]),
+        share=float(covered.mean()),
+        most=round(255 * float(np.abs(off).max())),
+        unrounded=psnr((image - exact)[..., :3]),
+        held=psnr(held_off),
+        held_most=255 * float(np.abs(held_off).max()),
+        same_cut=None if nodes is None else np.array_equal(nodes, theirs.nodes),
+    )
+
+
+def psnr(difference: NDArray[np.floating]) -> float:
+    """Of numbers of 0..1, dB."""
+    square = float(np.mean(np.square(difference, dtype=np.float64))) if difference.size else 0.0
+    return 10 * math.log10(1 / square) if square else math.inf

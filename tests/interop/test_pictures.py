@@ -1,0 +1,84 @@
+"""Our rasterizer draws the pictures that Spark draws, in a browser."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sparklod_cli.codecs import spz
+from sparklod_cli.io import read_scene
+from sparklod_cli.lod import quick
+from sparklod_cli.render.look import SORTS, Look
+from sparklod_cli.scene import Scene
+from sparklod_cli.splats import Splats
+from tests.conftest import FIXTURES
+from tests.scenes import random_splats
+
+from .page import Page
+from .pictures import Difference, cameras_around, compare
+
+SIZE = 320, 180
+
+#: dB. What is asked of us is 40, of pictures in 8 bits; Spark rounds to them after every splat, which we do not. Where
+#: it does not either, and we draw its numbers, there is the order of operations in float32 between us, and half floats.
+LEAST, LEAST_COVERED, LEAST_HELD = 45, 40, 58
+
+
+def check(found: Iterable[Difference]) -> None:
+    for view, difference in enumerate(found):
+        assert difference.share > 0.05, f"view {view} shows nothing"
+        assert difference.same_cut is not False, f"view {view} is of another cut"
+        assert difference.psnr >= LEAST and difference.covered >= LEAST_COVERED, f"view {view}: {difference}"
+        assert difference.held >= LEAST_HELD, f"view {view}: {difference}"
+
+
+@cache
+def demo() -> Splats:
+    return read_scene(FIXTURES / "demo.ply").splats
+
+
+def written(folder: Path, scene: Scene) -> Path:
+    path = folder / "scene.spz"
+    path.write_bytes(b"".join(spz.encode(scene, spz.Options())))
+    return path
+
+
+@pytest.mark.parametrize("sort", SORTS)
+def test_splats(page: Page, sort: str) -> None:
+    cameras = cameras_around(demo().center, *SIZE)
+    check(compare(page, FIXTURES / "demo.ply", cameras[::2], Look(sort=sort)))
+
+
+@pytest.mark.parametrize("budget", [300, 8_000])
+def test_tree(page: Page, tmp_path: Path, budget: int) -> None:
+    """Most of 300 are merged splats, many of them more than opaque."""
+    file = written(tmp_path, Scene(*quick.build(demo())))
+    check(compare(page, file, cameras_around(demo().center, *SIZE)[1::2], Look(), budget))
+
+
+@pytest.mark.parametrize("sh_degree", range(1, 4))
+def test_spherical_harmonics(page: Page, tmp_path: Path, sh_degree: int) -> None:
+    splats = random_splats(3_000, sh_degree=sh_degree)
+    check(compare(page, written(tmp_path, Scene(splats)), cameras_around(splats.center, *SIZE)[:2], Look()))
+
+
+@pytest.mark.parametrize("sort", SORTS)
+def test_splats_in_one_place(page: Page, tmp_path: Path, sort: str) -> None:
+    """Which of them is in front."""
+    splats = random_splats(300).take(np.repeat(np.arange(300), 3))
+    splats.rgb[:] = np.random.default_rng(1).uniform(0, 1, splats.rgb.shape)
+    file = written(tmp_path, Scene(splats))
+    check(compare(page, file, cameras_around(splats.center, *SIZE)[1:2], Look(sort=sort)))
+
+
+def test_planes(page: Page, tmp_path: Path) -> None:
+    """Splats that are nearer, farther or too far out are dropped as a whole."""
+    splats = random_splats(3_000)
+    cameras = cameras_around(splats.center, *SIZE)
+    distance = float(np.linalg.norm(cameras[0].position))
+    look = Look(near=0.8 * distance, far=1.1 * distance)
+    check(compare(page, written(tmp_path, Scene(splats)), cameras[:1], look))
