@@ -5,23 +5,23 @@ from __future__ import annotations
 import dataclasses
 import functools
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from .camera_options import SOURCES, camera_options, cameras_from
+from .camera_options import SOURCES, camera_options
 from .camera_values import View
 from .console import Console
 from .options import Real, common_options, is_given, keep_apart
+from .render_cameras import cameras, is_free, least_cameras
 from .render_compare import BUDGETS, compare_options
 from .render_options import GAIN, background_from, blend_from, check_size, look_options, manner_from
 from .world_options import cut_options, placements_from, viewer_from, world_options
 
 if TYPE_CHECKING:
     from ..preview.scenery import Scenery
-    from ..render.camera_path import CameraPath
     from ..simulation.simulate import Viewer
     from ..world import Placement
     from .render_output import Output
@@ -120,7 +120,7 @@ def render(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, **s
     manner = manner_from(ctx, settings)
     placements = placements_from(settings)
     # Before much is read, what is wrong with the output already.
-    _output(settings, placements, _least_cameras(settings))
+    _output(settings, placements, least_cameras(settings))
     with Console(quiet=quiet, verbose=verbose) as console:
         from ..preview import animation
         from ..preview.fitting import with_reach
@@ -136,8 +136,8 @@ def render(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, **s
         def scenery() -> Scenery:
             return _read(placements, None if settings["full"] else viewer, settings, console)
 
-        path = _cameras(settings, lambda: scenery().centers())
-        if _is_free(settings) and not is_given(ctx, "near") and not is_given(ctx, "far"):
+        path = cameras(settings, lambda: scenery().centers())
+        if is_free(settings) and not is_given(ctx, "near") and not is_given(ctx, "far"):
             look = with_reach(manner.look, path.cameras[0], scenery().centers())
             manner = dataclasses.replace(manner, look=look)
         sheet = _is_sheet(settings)
@@ -224,7 +224,7 @@ def _compare(ctx: click.Context, settings: dict[str, Any], console: Console, *, 
             threads=settings["threads"],
             progress=console.progress,
         )
-        path = _cameras(settings, world.centers)
+        path = cameras(settings, world.centers)
         for note in path.notes:
             console.say(note)
         how = How(BACKENDS[settings["backend"]].draw, manner.look, settings["max_sh"], blend_from(settings))
@@ -251,42 +251,11 @@ def _is_sheet(settings: Mapping[str, Any]) -> bool:
     return settings["sheet"] or len(settings["views"]) > 1
 
 
-def _least_cameras(settings: Mapping[str, Any]) -> int:
-    """How many cameras there are, or are at least, as far as that can be told before a file is read."""
-    if settings["views"]:
-        return len(settings["views"])
-    if settings["dolly"] or settings["keyframes"]:
-        return 2 if settings["every"] == 1 else 1
-    return -(-(settings["orbit"] or 1) // settings["every"])
-
-
 def _output(settings: Mapping[str, Any], placements: list[Placement], cameras: int) -> Output:
     from .render_output import output_for
 
     name = settings["scene"] or placements[0].file
     return output_for(settings["output"], name.stem or name.name, cameras, sheet=_is_sheet(settings))
-
-
-def _is_free(settings: Mapping[str, Any]) -> bool:
-    """Whether nobody says where the camera is."""
-    return not any(settings[name] for name in (*SOURCES, "views", "center", "distance"))
-
-
-def _cameras(settings: Mapping[str, Any], centers: Callable[[], Any]) -> CameraPath:
-    """The cameras of a source, or of each --view, named after it; without any, one that sees the whole scene."""
-    if not settings["views"]:
-        if not _is_free(settings):
-            return cameras_from(settings, centers, orbit=1)
-        from ..preview.fitting import fitted
-
-        path = cameras_from({**settings, "center": (0.0, 0.0, 0.0), "distance": 1.0}, centers, orbit=1)
-        return dataclasses.replace(path, cameras=(fitted(path.cameras[0], centers()),))
-    paths = [cameras_from({**settings, "look_at": view}, centers) for view in settings["views"]]
-    cameras = [
-        dataclasses.replace(path.cameras[0], name=" to ".join(", ".join(f"{x:g}" for x in point) for point in view))
-        for path, view in zip(paths, settings["views"], strict=True)
-    ]
-    return dataclasses.replace(paths[0], cameras=tuple(cameras), numbers=tuple(range(len(cameras))))
 
 
 def _read(placements: list[Placement], viewer: Viewer | None, settings: Mapping[str, Any], console: Console) -> Scenery:
