@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...jit import kernel
+from .queue import comes_before, rise, sink
 from .sight import ZERO, pixel_scale
 
 #: Nodes of a chunk, as a power of 2.
@@ -355,40 +356,3 @@ def finish(
                 selected += 1
             count += 1
     return selected, BUDGET, missing, number_of(least), -1
-
-
-@kernel(inline=True)
-def comes_before(node, limit, instance, a, b):
-    """Whether slot `a` is divided before slot `b`: by pixel scale, then instance, then index, the greatest first."""
-    if limit[a] != limit[b]:
-        return limit[a] > limit[b]
-    if instance[a] != instance[b]:
-        return instance[a] > instance[b]
-    return node[a] > node[b]
-
-
-@kernel(nogil=True)
-def rise(node, limit, instance, heap, at):
-    """Moves the heap's entry at `at` up to its place."""
-    while at > 0:
-        above = (at - 1) >> 1
-        if not comes_before(node, limit, instance, heap[at], heap[above]):
-            return
-        heap[at], heap[above] = heap[above], heap[at]
-        at = above
-
-
-@kernel(nogil=True)
-def sink(node, limit, instance, heap, length):
-    """Moves the heap's first entry down to its place."""
-    at = 0
-    while True:
-        child = 2 * at + 1
-        if child >= length:
-            return
-        if child + 1 < length and comes_before(node, limit, instance, heap[child + 1], heap[child]):
-            child += 1
-        if not comes_before(node, limit, instance, heap[child], heap[at]):
-            return
-        heap[at], heap[child] = heap[child], heap[at]
-        at = child
