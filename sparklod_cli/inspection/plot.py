@@ -11,6 +11,7 @@ from ..errors import SparklodError
 from ..gaussian import spark_size
 from ..limits import DEFAULT_BASE, PLOT_BY
 from ..lod.kernels.walk import walk
+from ..lod.traversal import CHUNK_NODES
 from ..render.colors import VIRIDIS, ramp
 from ..render.labels import BACKGROUND, write_png
 from ..render.shapes import Points, box_lines, cells, evenly, level_of_step, nice_step, wall_lines
@@ -19,7 +20,6 @@ from ..render.viewpoint import bounds, is_drawable, viewpoint
 from ..scene import Scene
 from ..splats import FloatArray, Splats
 from .colors import color_by
-from .tree import CHUNK_SPLATS
 
 #: Of more nodes than this, so many are drawn.
 MOST_POINTS = 600_000
@@ -154,14 +154,14 @@ def _voxels(stage: Stage, splats: Splats, low: Points, high: Points, eye: Points
 
 def _boxes(stage: Stage, scene: Scene, index: NDArray[np.int64], drawable: NDArray[np.bool_], by: str) -> str:
     """The boxes around all nodes of the chunks that some nodes are in; says which."""
-    count = -(-len(drawable) // CHUNK_SPLATS)
-    chunks = np.unique(index // CHUNK_SPLATS)
+    count = -(-len(drawable) // CHUNK_NODES)
+    chunks = np.unique(index // CHUNK_NODES)
     colors = ramp(VIRIDIS, count)
     for chunk in chunks[:MOST_CHUNKS]:
-        rows = slice(chunk * CHUNK_SPLATS, (chunk + 1) * CHUNK_SPLATS)
+        rows = slice(chunk * CHUNK_NODES, (chunk + 1) * CHUNK_NODES)
         center: FloatArray = scene.splats.center[rows][drawable[rows]]
         color, opacity = (f"#{bytes(colors[chunk]).hex()}", 0.8) if by == "chunk" else (BOXES, 0.4)
         stage.lines(box_lines(center.min(axis=0)[None], center.max(axis=0)[None]), color, opacity)
     drawn = f", the first {MOST_CHUNKS} of them" if len(chunks) > MOST_CHUNKS else ""
     what = "splats" if scene.tree is None else "nodes"
-    return f"boxes: chunks of {CHUNK_SPLATS:,} {what}, the {len(chunks)} of {count} that these are in{drawn}"
+    return f"boxes: chunks of {CHUNK_NODES:,} {what}, the {len(chunks)} of {count} that these are in{drawn}"

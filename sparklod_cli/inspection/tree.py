@@ -9,12 +9,10 @@ from numpy.typing import NDArray
 
 from ..gaussian import spark_size
 from ..lod.kernels.walk import find_cycles, find_parents, sum_levels, walk
+from ..lod.traversal import CHUNK_NODES
 from ..splats import FloatArray, Splats
 from ..tree import LodTree
 from .findings import Finding
-
-#: Splats of a chunk, as Spark streams them.
-CHUNK_SPLATS = 65_536
 
 #: A node may be this much smaller than its largest child. Of ten million nodes of good trees, quick ones of dense and
 #: of sparse scenes, the worst is 0.48 times as large: a faint large splat and a small opaque one.
@@ -52,7 +50,7 @@ class TreeFacts:
         levels: by the number of edges from the root.
         children: how many inner nodes have so many children, by that number as text.
         more_than_opaque: the share of nodes with D > 1.
-        chunks: of `CHUNK_SPLATS` nodes.
+        chunks: of `CHUNK_NODES` nodes.
         chunks_of_coarse_cut: how many of them a viewer needs for the coarsest cut, the one that divides the largest
             nodes first, of at most so many nodes as a chunk has.
     """
@@ -93,8 +91,8 @@ def examine(splats: Splats, tree: LodTree, *, check: bool = True) -> tuple[TreeF
         ],
         children={str(number): int(children[number]) for number in np.flatnonzero(children) if number},
         more_than_opaque=round(float(np.count_nonzero(splats.opacity > 1)) / len(tree), 4),
-        chunks=-(-len(tree) // CHUNK_SPLATS),
-        chunks_of_coarse_cut=len(np.unique(_coarse_cut(tree, limit) // CHUNK_SPLATS)),
+        chunks=-(-len(tree) // CHUNK_NODES),
+        chunks_of_coarse_cut=len(np.unique(_coarse_cut(tree, limit) // CHUNK_NODES)),
     )
     if not check:
         return facts, []
@@ -109,11 +107,11 @@ def examine(splats: Splats, tree: LodTree, *, check: bool = True) -> tuple[TreeF
 def _coarse_cut(tree: LodTree, limit: FloatArray) -> NDArray[np.int64]:
     """The nodes of the cut that divides the largest first, as far as it has no more than a chunk's."""
     inner = np.flatnonzero(~tree.is_leaf & (limit > 0))
-    if len(inner) > CHUNK_SPLATS:  # each adds a node at least, so no more than these can be divided
-        inner = inner[limit[inner] >= -np.partition(-limit[inner], CHUNK_SPLATS)[CHUNK_SPLATS]]
+    if len(inner) > CHUNK_NODES:  # each adds a node at least, so no more than these can be divided
+        inner = inner[limit[inner] >= -np.partition(-limit[inner], CHUNK_NODES)[CHUNK_NODES]]
     # Stable, as a node that is larger than its parent has the limit of that, and comes after it.
     inner = inner[np.argsort(-limit[inner], kind="stable")]
-    fits = np.cumsum(tree.child_count[inner].astype(np.int64) - 1) + 1 <= CHUNK_SPLATS
+    fits = np.cumsum(tree.child_count[inner].astype(np.int64) - 1) + 1 <= CHUNK_NODES
     divided = inner[: int(np.argmin(fits)) if not fits.all() else len(inner)]
     count = tree.child_count[divided].astype(np.int64)
     start = tree.child_start[divided].astype(np.int64)

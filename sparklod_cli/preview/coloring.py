@@ -13,7 +13,18 @@ from ..errors import SparklodError
 from ..gaussian import lod_opacity, moved, spark_size
 from ..lod.traversal import CHUNK_NODES
 from ..render.camera import Camera
-from ..render.colors import CLIPPED, MAGMA, PLASMA, Coloring, Mark, smooth, whole_numbers
+from ..render.colors import (
+    CLIPPED,
+    MAGMA,
+    PLASMA,
+    Coloring,
+    log_marks,
+    log_range,
+    smooth,
+    top_opacity,
+    whole_numbers,
+    with_ends,
+)
 from ..render.look import Look
 from ..render.shapes import ticks
 from ..splats import FloatArray
@@ -25,8 +36,8 @@ OF_PIXELS = ("overdraw", "depth")
 #: So many splats and cameras are looked at to find the ends of a scale.
 SAMPLE, CAMERAS = 1 << 18, 64
 
-#: The least span of a logarithmic scale, in powers of ten.
-LEAST_DECADES = 0.1
+#: Marks nearer to an end of a scale than this would touch its own.
+APART = 0.05
 
 
 @dataclass(frozen=True)
@@ -123,29 +134,17 @@ def _whole(title: str, low: int, high: int) -> Scale:
 def _linear(title: str, low: float, high: float, stops: tuple[str, ...], *, ends: bool) -> Scale:
     marks = [((tick - low) / (high - low), text) for tick, text in ticks(low, high, (high - low) / 6)]
     if ends:
-        marks = _with_ends(marks, f"{low:.3g} or less" if low else None, f"{high:.3g} or more")
+        marks = with_ends(marks, f"{low:.3g} or less" if low else None, f"{high:.3g} or more", APART)
     return Scale(smooth(title, np.empty(0), stops, marks), low, high)
 
 
 def _opacities(values: FloatArray) -> Scale:
-    top = max(1.0, math.ceil(10 * float(np.percentile(values, 100 - CLIPPED))) / 10)
+    top = top_opacity(values)
     return _linear("LoD opacity", 0.0, top, MAGMA, ends=bool(values.max() > top))
 
 
 def _sizes(values: FloatArray) -> Scale:
     logs = np.log10(np.clip(values, 1e-30, 1e30).astype(np.float64))
-    low, high = (float(end) for end in np.percentile(logs, [CLIPPED, 100 - CLIPPED]))
-    if high - low < LEAST_DECADES:
-        low, high = (low + high - LEAST_DECADES) / 2, (low + high + LEAST_DECADES) / 2
-    span = high - low
-    factors = (1,) if span > 2.5 else (1, 2, 5) if span > 0.8 else (1, 1.25, 1.5, 2, 2.5, 3, 4, 5, 6, 8)
-    places = [math.log10(factor) + n for n in range(math.floor(low), math.ceil(high) + 1) for factor in factors]
-    marks = [((at - low) / span, f"{10**at:.3g}") for at in places if low <= at <= high]
-    marks = _with_ends(marks, f"{10**low:.2g} or less", f"{10**high:.2g} or more")
+    low, high = log_range(logs)
+    marks = with_ends(log_marks(low, high), f"{10**low:.2g} or less", f"{10**high:.2g} or more", APART)
     return Scale(smooth("feature size", np.empty(0), PLASMA, marks), low, high, log=True)
-
-
-def _with_ends(marks: list[Mark], low: str | None, high: str | None) -> list[Mark]:
-    """The marks of a scale with those of its ends, and without those that would touch them."""
-    ends = [(place, text) for place, text in ((0.0, low), (1.0, high)) if text is not None]
-    return [mark for mark in marks if all(abs(mark[0] - place) > 0.05 for place, _ in ends)] + ends

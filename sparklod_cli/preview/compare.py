@@ -12,7 +12,7 @@ import numpy as np
 
 from ..errors import SparklodError
 from ..limits import MAX_SH_DEGREE
-from ..lod.traversal import Matrix, Traversal, View
+from ..lod.traversal import Matrix, Traversal
 from ..parallel import ordered_map
 from ..progress import Progress, silent
 from ..quantities import parse_count
@@ -24,7 +24,7 @@ from ..render.rasterizer import Image
 from ..render.shown import show
 from ..simulation.columns import COLUMNS as OF_SIMULATION
 from ..simulation.columns import Column, Row
-from ..simulation.simulate import Viewer
+from ..simulation.simulate import Viewer, view_of
 from ..simulation.statistics import numbers, statistic
 from ..splats import Splats
 from ..world import World
@@ -180,7 +180,7 @@ class Comparison:
 
     def _parts(self, camera: Camera, budget: int, traversal: Traversal) -> list[tuple[Splats, Matrix]]:
         """What is drawn of each instance."""
-        view = View(camera.camera_to_world, camera.fov_x, camera.fov_y)
+        view = view_of(camera)
         smallest = self._viewer.smallest(camera)
         if self._continuous is not None:
             assert self._how.width is not None

@@ -18,7 +18,7 @@ from ..progress import Progress, silent
 from ..render.camera import Camera
 from ..scene import Scene
 from ..selection import Selection, describe
-from ..simulation.simulate import Simulation, Viewer
+from ..simulation.simulate import Simulation, Viewer, view_of
 from ..splats import FloatArray, Splats
 from ..world import Placement, read_file, world_of
 from .continuous import ContinuousCuts, faded
@@ -110,7 +110,7 @@ class Scenery:
             return [(nodes.astype(np.int64), None) for nodes in self._simulation.cut(camera).indices()]
         viewer = self._simulation.viewer
         cut = self._continuous.cut(
-            self._simulation.view(camera), budget=viewer.budget, smallest=viewer.smallest(camera), width=self._blend
+            view_of(camera), budget=viewer.budget, smallest=viewer.smallest(camera), width=self._blend
         )
         of_trees = [cut.instance == number for number in range(len(self._simulation.traversal.instances))]
         return [(cut.node[mine].astype(np.int64), cut.weight[mine]) for mine in of_trees]

@@ -21,6 +21,9 @@ CLIPPED = 1
 
 Mark = tuple[float, str]
 
+#: The least span of a logarithmic scale, in powers of ten.
+LEAST_DECADES = 0.1
+
 
 @dataclass(frozen=True)
 class Coloring:
@@ -72,3 +75,31 @@ def smooth(title: str, at: FloatArray, stops: tuple[str, ...], marks: list[Mark]
     """A ramp without steps, for (N,) places on it, 0..1; those beyond have the colour of that end."""
     colors = ramp(stops, 256)
     return Coloring(title, colors[np.rint(255 * np.clip(at, 0, 1)).astype(np.intp)], colors, tuple(marks))
+
+
+def top_opacity(values: FloatArray) -> float:
+    """Where a scale of D ends: at 1, or above it at the next tenth."""
+    return max(1.0, math.ceil(10 * float(np.percentile(values, 100 - CLIPPED))) / 10)
+
+
+def log_range(logs: FloatArray) -> tuple[float, float]:
+    """The ends of a logarithmic scale, in powers of ten: what is as good as all the same gets no more contrast."""
+    low, high = (float(end) for end in np.percentile(logs, [CLIPPED, 100 - CLIPPED]))
+    if high - low < LEAST_DECADES:
+        low, high = (low + high - LEAST_DECADES) / 2, (low + high + LEAST_DECADES) / 2
+    return low, high
+
+
+def log_marks(low: float, high: float) -> list[Mark]:
+    """Round numbers on a scale between two powers of ten."""
+    span = high - low
+    factors = (1,) if span > 2.5 else (1, 2, 5) if span > 0.8 else (1, 1.25, 1.5, 2, 2.5, 3, 4, 5, 6, 8)
+    decades = range(math.floor(low), math.ceil(high) + 1)
+    every = [math.log10(factor) + decade for decade in decades for factor in factors]
+    return [((at - low) / span, f"{10**at:.3g}") for at in every if low <= at <= high]
+
+
+def with_ends(marks: list[Mark], low: str | None, high: str | None, apart: float) -> list[Mark]:
+    """The marks of a scale with those of its ends, and without those that are nearer to them than `apart`."""
+    ends = [(place, text) for place, text in ((0.0, low), (1.0, high)) if text is not None]
+    return [mark for mark in marks if all(abs(mark[0] - place) > apart for place, _ in ends)] + ends

@@ -11,6 +11,7 @@ from ..jit import threads_in_use
 from .camera import Camera
 from .kernels import project, raster
 from .look import BLUR, CLIP, MAX_STD_DEV, MIN_ALPHA, STD_DEV_PER_D, Look
+from .pose import FLIP
 from .shown import Shown
 
 Image = NDArray[np.float32]
@@ -67,5 +68,5 @@ def _buffers(count: int) -> tuple[NDArray[np.float32], NDArray[np.float32], NDAr
 
 def world_to_camera(camera: Camera) -> NDArray[np.float32]:
     """(3, 4): into axes with y down, looking along z."""
-    turned = camera.camera_to_world @ np.diag([1.0, -1.0, -1.0, 1.0])
+    turned = camera.camera_to_world @ FLIP
     return np.linalg.inv(turned)[:3].astype(np.float32)

@@ -80,6 +80,11 @@ class _Found:
     seconds: float
 
 
+def view_of(camera: Camera) -> View:
+    """A camera, as far as the traversal cares."""
+    return View(camera.camera_to_world, camera.fov_x, camera.fov_y)
+
+
 class Simulation:
     """A viewer in a world.
 
@@ -105,7 +110,7 @@ class Simulation:
         self._level = np.concatenate([tree.level for tree in world.trees])
         self._chunks = Chunks(world.chunk_bytes())
         self._names = [place.name for place in world.placements]
-        Stream(self._chunks, viewer.network, capacity=viewer.chunk_cache)
+        Stream(self._chunks, viewer.network, capacity=viewer.chunk_cache)  # refuses what would fail at the first frame
 
     def run(self, path: CameraPath, *, threads: int = 1, progress: Progress = silent) -> Iterator[Frame]:
         """The frames of a path, in order.
@@ -129,7 +134,7 @@ class Simulation:
 
     def _warm_up(self, camera: Camera) -> None:
         """Loads or compiles the kernels, which must not count as the first frame's time."""
-        view = self.view(camera)
+        view = view_of(camera)
         self._traversal.cut(view, budget=len(self._traversal.instances))
 
     @property
@@ -137,16 +142,12 @@ class Simulation:
         """What finds its cuts."""
         return self._traversal
 
-    def view(self, camera: Camera) -> View:
-        """A camera, as far as the traversal cares."""
-        return View(camera.camera_to_world, camera.fov_x, camera.fov_y)
-
     def cut(self, camera: Camera) -> Cut:
         """What a camera would see if all chunks were there."""
         return self._find(camera).cut
 
     def _find(self, camera: Camera, resident: NDArray[np.bool_] | None = None) -> _Found:
-        view = self.view(camera)
+        view = view_of(camera)
         smallest = self.viewer.smallest(camera)
         start = time.perf_counter()
         cut = self._traversal.cut(view, budget=self.viewer.budget, smallest=smallest, resident=resident)

@@ -9,6 +9,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from heapq import heappop, heappush
 
+from ..limits import FETCHERS
 from .chunks import ChunkCache, Chunks
 
 
@@ -27,7 +28,7 @@ class Network:
 
     bandwidth: float = math.inf
     latency: float = 0.0
-    fetchers: int = 3
+    fetchers: int = FETCHERS
 
     def __post_init__(self) -> None:
         if not self.bandwidth > 0:

@@ -92,7 +92,7 @@ def test_facts_of_broken_trees_are_those_of_what_the_root_leads_to(links: Links)
 @pytest.mark.parametrize("most", [1, 2, 5, 16, 64, 200])
 @pytest.mark.parametrize("seed", [0, 1])
 def test_the_coarse_cut_divides_the_largest_first(most: int, seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(facts_of, "CHUNK_SPLATS", most)
+    monkeypatch.setattr(facts_of, "CHUNK_NODES", most)
     nodes, tree = quick.build(random_splats(150, seed=seed), 1.3)
     facts, _ = examine(nodes, tree)
     cut = reference.coarse_cut(tree.child_count, tree.child_start, spark_size(nodes), most)
@@ -129,7 +129,7 @@ def test_the_coarse_cut_is_a_cut_whatever_the_sizes(most: int, seed: int, fallin
     tree = tree_of(links)
     _, limit = walk(tree.child_count, tree.child_start, size)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(facts_of, "CHUNK_SPLATS", most)
+        patch.setattr(facts_of, "CHUNK_NODES", most)
         cut = set(facts_of._coarse_cut(tree, limit).tolist())
     assert is_cut(tree, cut)
     assert len(cut) <= most
