@@ -1,10 +1,15 @@
-// node spark_build.mjs FILE RUNS: seconds that Spark's own builder (its wasm, in Node) takes for a splat file.
-// SPARK_DIR names a folder whose node_modules holds @sparkjsdev/spark. Prints one JSON object a run.
+// node spark_build.mjs FILE [RUNS [BUILDER [FOLDER]]]: seconds that one of Spark's own builders (its wasm, in Node) takes
+// for a splat file. SPARK_DIR names a folder whose node_modules holds @sparkjsdev/spark. Prints one JSON object a run.
+//
+// BUILDER is "tiny" (base 1.5), which is what there is if none is named, or "quality" (the Bhattacharyya builder, base 1.75).
+// In FOLDER it leaves the tree as raw files of uint32, four a node: ext0.u32 and ext1.u32, its ExtSplats, and lod_tree.u32.
 import fs from 'node:fs';
 import path from 'node:path';
 import vm from 'node:vm';
 
-const [file, runs = '3'] = process.argv.slice(2);
+const [file, runs = '3', builder = 'tiny', folder] = process.argv.slice(2);
+const lod = { tiny: true, quality: 'quality' }[builder];
+if (!lod) throw new Error(`Spark has no builder ${builder}`);
 const bundle = path.join(process.env.SPARK_DIR ?? '.', 'node_modules/@sparkjsdev/spark/dist/spark.module.js');
 const source = fs.readFileSync(bundle, 'utf8');
 const wasm = Buffer.from(source.match(/const WASM = decode64\("([^"]+)"\)/)[1], 'base64');
@@ -30,17 +35,23 @@ const send = (data) => handlers.forEach((handler) => handler({ data }));
 send({ name: 'init-wasm', module: await WebAssembly.compile(wasm) });
 await new Promise((resolve) => setTimeout(resolve, 300));
 
+function keep({ numSplats, extArrays, extra }) {
+  for (const [name, words] of Object.entries({ ext0: extArrays[0], ext1: extArrays[1], lod_tree: extra.lodTree }))
+    fs.writeFileSync(path.join(folder, `${name}.u32`), words.subarray(0, 4 * numSplats)); // more rows are allocated
+}
+
 for (let run = 1; run <= Number(runs); run++) {
   const fileBytes = new Uint8Array(fs.readFileSync(file));
   const start = performance.now();
   const { result, error } = await new Promise((resolve) => {
     answers.set(run, resolve);
-    send({ id: run, name: 'loadExtSplats', args: { fileBytes, pathName: file, lod: true } });
+    send({ id: run, name: 'loadExtSplats', args: { fileBytes, pathName: file, lod } });
   });
   if (error !== undefined) throw error;
   const seconds = (performance.now() - start) / 1000;
-  const build = /Tiny LoD: (\d+) -> (\d+) \(([\d.]+) ms\)/.exec(log.join('\n'));
+  const build = /(?:Tiny|Bhatt) LoD: (\d+) -> (\d+) \(([\d.]+) ms\)/.exec(log.join('\n'));
   log.length = 0;
   print(JSON.stringify({ nodes: result.lodSplats.numSplats, build: build && Number(build[3]) / 1000, all: seconds }));
+  if (folder && run === Number(runs)) keep(result.lodSplats);
 }
 process.exit(0);

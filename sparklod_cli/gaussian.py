@@ -18,6 +18,9 @@ MIN_LENGTH, MAX_LENGTH = 1e-15, 1e15
 #: Rows and columns of the six elements that tell a covariance: xx xy xz yy yz zz.
 _ROW, _COLUMN = np.array([0, 0, 0, 1, 1, 2]), np.array([0, 1, 2, 1, 2, 2])
 
+#: How much larger Spark's traversal takes a splat to be for each that its D is above 1.
+SIZE_PER_D = 0.7
+
 #: Exponent of Knud Thomsen's approximation of an ellipsoid's surface, within 1.061 % of the true area.
 THOMSEN_P = 1.6075
 
@@ -116,7 +119,7 @@ def spark_size(splats: Splats) -> FloatArray:
     factor = lod_opacity(splats.opacity)
     factor -= 1
     np.maximum(factor, 0, out=factor)
-    factor *= np.float32(0.7)
+    factor *= np.float32(SIZE_PER_D)
     factor += 1
     factor *= 2
     factor *= mean

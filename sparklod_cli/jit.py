@@ -23,7 +23,8 @@ def _cache_folder() -> Path | None:
     of those that it calls and of constants that it uses. So the folder's name is of all the source there is.
     """
     package = Path(__file__).parent
-    sources = [package / "gaussian.py", package / "jit.py", *sorted(package.glob("*/kernels/*.py"))]
+    named = ("approximations.py", "gaussian.py", "jit.py")
+    sources = [*(package / name for name in named), *sorted(package.glob("*/kernels/*.py"))]
     digest = hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()[:16]
     given = os.environ.get("NUMBA_CACHE_DIR")
     places = [Path(given)] if given else [package / "__pycache__"]

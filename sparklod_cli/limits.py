@@ -3,6 +3,12 @@
 #: Growth of the voxel grid from level to level.
 MIN_BASE, MAX_BASE, DEFAULT_BASE = 1.1, 2.0, 1.5
 
+#: How to build a tree; the first is the default.
+METHODS = ("quick", "quality")
+
+#: Nodes for each leaf that the quality builder may make. Two would keep every node of its binary tree.
+MIN_GROWTH, MAX_GROWTH, DEFAULT_GROWTH = 1.05, 2.0, 1.4
+
 #: Highest degree of spherical harmonics that is kept.
 MAX_SH_DEGREE = 3
 
