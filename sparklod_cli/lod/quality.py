@@ -34,10 +34,19 @@ from .kernels.sort import Nodes, sort_by_key
 BASE = 2.0
 
 #: How far apart on the curve two may be that merge.
-WINDOW = 8
+WINDOW = 12
+
+#: In a round those pairs merge that cost no more than this share of the costs, so that the cheapest of all come first.
+CHEAP = 0.5
+
+#: So many costs are looked at to tell.
+SAMPLE = 1 << 14
+
+#: Where there are no more nodes, all pairs merge.
+FEW = 1000
 
 #: A level ends when a round merges no more than this share of its nodes, or after so many rounds.
-LEAST, MOST_ROUNDS = 0.04, 12
+LEAST, MOST_ROUNDS = 0.02, 8
 
 #: The share of the leaves that the curve's box leaves out on each side: scenes have a few that are far away.
 OUTSIDE = 0.005
@@ -101,7 +110,9 @@ def build(splats: Splats, growth: float = DEFAULT_GROWTH, *, progress: Progress 
     if n == 0:
         raise InvalidSplatsError("no splat is left to build a tree of")
     largest = splats.scale.max(axis=1)
-    if not (np.isfinite(splats.center).all() and np.isfinite(largest).all() and min(largest.min(), splats.opacity.min()) > 0):
+    if not (
+        np.isfinite(splats.center).all() and np.isfinite(largest).all() and min(largest.min(), splats.opacity.min()) > 0
+    ):
         raise InvalidSplatsError("a splat is not finite, or without opacity or scale: see Selection.apply")
     middle = np.median(splats.center, axis=0).astype(np.float64)
     unit = 2.0 ** round(math.log2(float(np.median(largest))))
@@ -160,9 +171,9 @@ def _merge(growing: _Growing, active: Nodes, box: _Box, largest: float, rounds: 
         with threads_for(len(active)) as threads:
             keys = state.curve_keys(growing.state, active, *box.at(growing.rounds))
             _, active = sort_by_key(keys, active, 3 * state.CURVE_BITS, threads)
-            partner, _ = pairs.cheapest(growing.state, active, WINDOW, np.float32(largest))
+            partner, cost = pairs.cheapest(growing.state, active, WINDOW, np.float32(largest))
             before = len(active)
-            found, active = pairs.pair_up(active, partner, growing.used)
+            found, active = pairs.pair_up(active, partner, cost, _limit(cost), growing.used)
             union.unite_pairs(found, growing.used, growing.state, growing.children, growing.size, growing.error)
         growing.used += len(found)
         growing.rounds += 1
@@ -170,6 +181,13 @@ def _merge(growing: _Growing, active: Nodes, box: _Box, largest: float, rounds: 
         if rounds is not None and len(found) <= LEAST * before:
             break
     return active
+
+
+def _limit(cost: FloatArray) -> np.float32:
+    """What a merge may cost this round."""
+    some = cost[:: max(1, len(cost) // SAMPLE)]
+    some = some[np.isfinite(some)]
+    return np.float32(np.quantile(some, CHEAP)) if len(some) > FEW else np.float32(np.inf)
 
 
 def _in_final_order(
@@ -209,7 +227,9 @@ def _by_level(growing: _Growing, level: NDArray[np.int32], box: _Box) -> tuple[N
     """The merged nodes that are kept, level by level along the curve, and where each level ends, from 0."""
     inner = np.flatnonzero(level >= 0).astype(np.uint32)
     own = level[inner]
-    keys = state.curve_keys(growing.state, inner, *box.at(0)) | (own.astype(np.uint64) << np.uint64(3 * state.CURVE_BITS))
+    keys = state.curve_keys(growing.state, inner, *box.at(0)) | (
+        own.astype(np.uint64) << np.uint64(3 * state.CURVE_BITS)
+    )
     inner = inner[np.argsort(keys, kind="stable")]
     return inner, np.concatenate([[0], np.cumsum(np.bincount(own))]).astype(np.int64)
 

@@ -12,7 +12,6 @@ import math
 import numpy as np
 
 from ...jit import kernel
-from ...tree import MAX_CHILDREN
 
 #: Sizes are told apart in so many steps an octave, over octaves of float32.
 STEPS, OCTAVES = 4, 256
@@ -21,11 +20,18 @@ STEPS, OCTAVES = 4, 256
 #: common at its size.
 ERROR_COST = np.float32(0.4)
 
+#: In cuts of less than this share of the leaves errors count less: of so few nodes none can be spared.
+COMMON = 0.2
+
 #: A node that is drawn in cuts of n splats is worth this power of 1/n.
 RARITY = 0.5
 
 #: Dropping in so many rounds is nearly as good as one after the other, the least useful first.
 ROUNDS = 8
+
+#: No node gets more children unless no other can be dropped: where a node is smaller than those below it they are of no use by the rule above, yet a
+#: budget between one and thousands would have nothing to spend on.
+MOST_CHILDREN = 16
 
 #: Useful numbers are told apart by this many of their bits.
 KEY_BITS = 16
@@ -70,15 +76,16 @@ def value_nodes(children, leaves, size, error, log_size, weight, lost):
             parent[children[node, 0]] = parent[children[node, 1]] = node
             inner[step] += 1
             sums[step] += error[node]
-    finer = 0.0
+    finer, rare = 0.0, np.empty(STEPS * OCTAVES)
     for step in range(STEPS * OCTAVES - 1, -1, -1):
         finer += count[step]  # about so many splats are in a cut down to here
+        rare[step] = min(1.0, finer / (COMMON * leaves))
         count[step] = max(min(finer, float(leaves)), 1.0) ** -RARITY
     for node in range(leaves, total):
         step = step_of(math.exp(log_size[node]))
         weight[node] = count[step]
         common = sums[step] / inner[step]
-        lost[node] = ERROR_COST * math.sqrt(error[node] / common) if common > 0 else 0.0
+        lost[node] = ERROR_COST * rare[step] * math.sqrt(error[node] / common) if common > 0 else 0.0
     return parent
 
 
@@ -106,7 +113,10 @@ def drop_nodes(leaves, most, parent, log_size, weight, lost, saved):
     left = total - leaves
     count = np.zeros(1 << KEY_BITS, np.int64)
     turn, before = ROUNDS, 0
-    while most < left != before:  # the last rounds find what became more useful meanwhile
+    children = MOST_CHILDREN
+    while left > most:  # the last rounds find what became more useful meanwhile
+        if left == before:
+            children *= 2
         excess, before = left - most, left
         count[:] = 0
         for node in range(leaves, total - 1):
@@ -120,7 +130,7 @@ def drop_nodes(leaves, most, parent, log_size, weight, lost, saved):
             if left <= most:
                 break
             above = parent[node]
-            if saved[node] > 0 and saved[above] + saved[node] < MAX_CHILDREN:
+            if saved[node] > 0 and saved[above] + saved[node] < children:
                 if key_of(usefulness(node, parent, log_size, weight, lost, saved)) <= threshold:
                     saved[above] += saved[node]
                     lost[above] += lost[node]

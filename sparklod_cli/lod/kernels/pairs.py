@@ -28,7 +28,7 @@ LANES = 14
 BLOCK = 512
 
 #: How much a squared difference of colour (0..1 a channel) costs beside one nat of shape.
-COLOR_COST = f32(5)
+COLOR_COST = f32(4)
 
 #: An axis of an ellipsoid counts as at least this share of the trace, squared: flatter is not cheaper to merge.
 FLATTEST = f32(1e-5)
@@ -141,12 +141,12 @@ def take_lower(cost, count, best, at, here, there):
 
 
 @kernel()
-def pair_up(nodes, partner, made):
+def pair_up(nodes, partner, cost, limit, made):
     """Pairs of nodes that are each other's cheapest, and the list without them but with what they become.
 
     Args:
-        nodes: (n,) uint32.
-        partner: of `cheapest`.
+        nodes: (n,) uint32. partner, cost: of `cheapest`.
+        limit: what a pair may cost.
         made: the node that the first pair becomes, counted up from there.
 
     Returns:
@@ -156,12 +156,12 @@ def pair_up(nodes, partner, made):
     mutual = 0
     for i in range(n):
         j = partner[i]
-        mutual += j > i and partner[j] == i
+        mutual += j > i and partner[j] == i and cost[i] <= limit
     pairs, rest = np.empty((mutual, 2), np.uint32), np.empty(n - mutual, np.uint32)
     found = left = 0
     for i in range(n):
         j = partner[i]
-        if j >= 0 and partner[j] == i:
+        if j >= 0 and partner[j] == i and cost[i] <= limit:
             if j < i:
                 continue
             pairs[found, 0], pairs[found, 1] = nodes[i], nodes[j]

@@ -18,7 +18,7 @@ from .pairs import CENTER, COLOR, COVARIANCE, COVERED, DENSITY, LOG_DET, WEIGHT,
 from .profile import profile_of, size_factor
 
 #: How much opacity counts in the error of a picture beside each channel of colour: on black and on white.
-ALPHA = 0.5
+ALPHA = 1.0
 
 #: Rows and columns of xx yy zz xy xz yz, for the planes xy, xz and yz: first, second, mixed; and their axes.
 PLANES = ((0, 1, 3, 0, 1), (0, 2, 4, 0, 2), (1, 2, 5, 1, 2))
@@ -56,8 +56,16 @@ def product(a, b, plane):
         a, b: rows of state. plane: one of PLANES.
     """
     first, second, mixed, across, along = plane
-    axx, ayy, axy = np.float64(a[COVARIANCE + first]), np.float64(a[COVARIANCE + second]), np.float64(a[COVARIANCE + mixed])
-    bxx, byy, bxy = np.float64(b[COVARIANCE + first]), np.float64(b[COVARIANCE + second]), np.float64(b[COVARIANCE + mixed])
+    axx, ayy, axy = (
+        np.float64(a[COVARIANCE + first]),
+        np.float64(a[COVARIANCE + second]),
+        np.float64(a[COVARIANCE + mixed]),
+    )
+    bxx, byy, bxy = (
+        np.float64(b[COVARIANCE + first]),
+        np.float64(b[COVARIANCE + second]),
+        np.float64(b[COVARIANCE + mixed]),
+    )
     a_det, b_det = max(axx * ayy - axy * axy, 0.0), max(bxx * byy - bxy * bxy, 0.0)
     xx, yy, xy = axx + bxx, ayy + byy, axy + bxy
     det = xx * yy - xy * xy
