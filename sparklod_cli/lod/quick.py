@@ -36,6 +36,10 @@ MAX_CELL = 2.0**61
 #: Bits an axis of the curve that the leaves are sorted along; float32 sizes span 11 bits of levels, all fit a uint64.
 CURVE_BITS = 17
 
+#: Merged splats are drawn so much smaller than their moments say. The profile of one that is more than opaque is wider
+#: than its scale, and tails of neighbours add up; 5 % is the best of what was measured over four scenes.
+SHRINK = np.float32(0.95)
+
 Offsets = NDArray[np.int64]
 
 
@@ -195,7 +199,7 @@ def _in_final_order(forest: _Forest, index: Nodes, rgb: FloatArray, sh: FloatArr
     place = places_of_merged(order, forest.leaves)
     tree = LodTree(np.zeros(total, np.uint16), np.zeros(total, np.uint32))
     out = Splats.empty(total, degree_of(sh.shape[1]))
-    fill_columns(order, forest.geometry, out.center, out.scale, out.quat_xyzw, out.opacity)
+    fill_columns(order, forest.geometry, forest.leaves, SHRINK, out.center, out.scale, out.quat_xyzw, out.opacity)
     forest.geometry = np.empty((0, WIDTH), np.float32)  # the colours want its memory
     flat_sh = out.sh.reshape(total, -1)
     fill_leaf_colors(order, index, rgb, sh.reshape(len(sh), -1), out.rgb, flat_sh)

@@ -14,7 +14,7 @@ from numba import prange
 from ...gaussian import THOMSEN_P
 from ...jit import kernel
 
-CENTER, SCALE, QUAT, OPACITY, SPREAD, WIDTH = 0, 3, 6, 10, 11, 12  # first column of each, and the number of columns
+CENTER, SCALE, QUAT, OPACITY, WIDTH = 0, 3, 6, 10, 11  # first column of each, and the number of columns
 
 BLOCK = 256  # rows that are gathered before they are computed with, so that their cache misses overlap
 AXIS_FLOOR = np.float32(1e-20)
@@ -77,7 +77,6 @@ def fill_leaves(index, center, scale, quat, opacity, geometry, weight):
                 geometry[i, QUAT + k] = quat[index[i], k]
         for i in range(begin, end):
             geometry[i, OPACITY] = opacity[index[i]]
-            geometry[i, SPREAD] = 1
         for i in range(begin, end):
             area = ellipsoid_area(geometry[i, SCALE], geometry[i, SCALE + 1], geometry[i, SCALE + 2])
             weight[i] = geometry[i, OPACITY] * area

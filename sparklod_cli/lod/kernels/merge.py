@@ -11,10 +11,10 @@ import math
 import numpy as np
 from numba import prange
 
+from ...gaussian import MAX_OPACITY, MIN_OPACITY
 from ...jit import kernel
 from .eigen import ROWS, decompose
-from .geometry import CENTER, OPACITY, QUAT, SCALE, SPREAD, WIDTH, ellipsoid_area
-from .profile import hidden_share, profile_of
+from .geometry import CENTER, OPACITY, QUAT, SCALE, WIDTH, ellipsoid_area
 
 SCALE_FLOOR = 1e-30
 BLOCK = 64  # groups that are merged together: gathered, summed, then decomposed side by side
@@ -49,13 +49,12 @@ def sum_moments(row, weight, begin, end, merged, moments, column):
         column: which.
 
     Returns:
-        the sum of the weights, and how even they are: 1 - sum(w^2) / sum(w)^2.
+        the sum of the weights.
     """
-    total = squares = x = y = z = 0.0
+    total = x = y = z = 0.0
     for k in range(begin, end):
         w = weight[k]
         total += w
-        squares += w * w
         x += w * row[k, CENTER]
         y += w * row[k, CENTER + 1]
         z += w * row[k, CENTER + 2]
@@ -72,18 +71,17 @@ def sum_moments(row, weight, begin, end, merged, moments, column):
             np.float64(row[k, QUAT + 3]),
         )
         w = weight[k] / total
-        v = w * row[k, SPREAD]
         dx, dy, dz = row[k, CENTER] - x, row[k, CENTER + 1] - y, row[k, CENTER + 2] - z
-        xx += v * cxx + w * dx * dx
-        yy += v * cyy + w * dy * dy
-        zz += v * czz + w * dz * dz
-        xy += v * cxy + w * dx * dy
-        xz += v * cxz + w * dx * dz
-        yz += v * cyz + w * dy * dz
+        xx += w * (cxx + dx * dx)
+        yy += w * (cyy + dy * dy)
+        zz += w * (czz + dz * dz)
+        xy += w * (cxy + dx * dy)
+        xz += w * (cxz + dx * dz)
+        yz += w * (cyz + dy * dz)
     merged[CENTER], merged[CENTER + 1], merged[CENTER + 2] = x, y, z
     moments[0, column], moments[1, column], moments[2, column] = xx, yy, zz
     moments[3, column], moments[4, column], moments[5, column] = xy, xz, yz
-    return total, 1 - squares / (total * total)
+    return total
 
 
 @kernel(parallel=True)
@@ -110,9 +108,9 @@ def merge_groups(nodes, first, geometry, weight, base):
         for k in range(len(row)):
             row_weight[k] = weight[nodes[offset + k]]
         moments = np.empty((ROWS, BLOCK), np.float64)
-        total_weight, evenness = np.empty(BLOCK, np.float64), np.empty(BLOCK, np.float64)
+        total_weight = np.empty(BLOCK, np.float64)
         for g in range(block_begin, block_end):
-            total_weight[g - block_begin], evenness[g - block_begin] = sum_moments(
+            total_weight[g - block_begin] = sum_moments(
                 row, row_weight, first[g] - offset, first[g + 1] - offset, geometry[base + g], moments, g - block_begin
             )
         decompose(moments, block_end - block_begin)
@@ -121,19 +119,10 @@ def merge_groups(nodes, first, geometry, weight, base):
             a = max(math.sqrt(max(moments[0, k], 0.0)), SCALE_FLOOR)
             b = max(math.sqrt(max(moments[1, k], 0.0)), SCALE_FLOOR)
             c = max(math.sqrt(max(moments[2, k], 0.0)), SCALE_FLOOR)
-            area = ellipsoid_area(a, b, c)
-            hidden = hidden_share(total_weight[k] / area, evenness[k])
-            # What is hidden lies in the middle: a product of two equal profiles has half their variance.
-            wider = (1 - 0.5 * hidden) / (1 - hidden)
-            covered = total_weight[k] * (1 - hidden)
-            opacity, spread = profile_of(covered / (area * wider))
-            shrink = math.sqrt(wider / spread)
-            geometry[made, SCALE], geometry[made, SCALE + 1], geometry[made, SCALE + 2] = (
-                max(a * shrink, SCALE_FLOOR),
-                max(b * shrink, SCALE_FLOOR),
-                max(c * shrink, SCALE_FLOOR),
-            )
+            geometry[made, SCALE], geometry[made, SCALE + 1], geometry[made, SCALE + 2] = a, b, c
             for i in range(4):
                 geometry[made, QUAT + i] = moments[6 + i, k]
-            geometry[made, OPACITY], geometry[made, SPREAD] = opacity, spread
-            weight[made] = covered
+            area = ellipsoid_area(a, b, c)
+            opacity = min(max(total_weight[k] / area, MIN_OPACITY), MAX_OPACITY)
+            geometry[made, OPACITY] = opacity
+            weight[made] = opacity * area

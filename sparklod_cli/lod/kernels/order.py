@@ -20,13 +20,17 @@ def places_of_merged(order, leaves):
 
 
 @kernel(parallel=True)
-def fill_columns(order, geometry, center, scale, quat, opacity):
-    """Columns of splats (arguments after `geometry`) in final order: row i from geometry[order[i]]."""
+def fill_columns(order, geometry, leaves, shrink, center, scale, quat, opacity):
+    """Columns of splats (arguments after `shrink`) in final order: row i from geometry[order[i]].
+
+    Rows from `leaves` on are merged nodes, whose scales are multiplied by `shrink`, float32.
+    """
     for i in prange(len(order)):
         j = order[i]
+        factor = shrink if j >= leaves else np.float32(1)
         for k in range(3):
             center[i, k] = geometry[j, CENTER + k]
-            scale[i, k] = geometry[j, SCALE + k]
+            scale[i, k] = geometry[j, SCALE + k] * factor
         for k in range(4):
             quat[i, k] = geometry[j, QUAT + k]
         opacity[i] = geometry[j, OPACITY]

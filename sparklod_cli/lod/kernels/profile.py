@@ -72,24 +72,6 @@ def profile_of(density):
 
 
 @kernel(inline=True)
-def hidden_share(density, evenness):
-    """The share of what the members of a group cover that others of them cover too.
-
-    Were they scattered like the group's own profile, each pair would overlap by its product, w_i w_j / (2 * area) on
-    average: a share of density / 4 * (1 - sum(w^2) / sum(w)^2), to first order. To all orders, with each place covered
-    by chance, it is 1 - (1 - exp(-x)) / x of twice that.
-
-    Args:
-        density: sum of what they cover, over the area of their joint variance.
-        evenness: 1 - sum(w^2) / sum(w)^2: 0 for one, 1 - 1/n for n equal ones.
-    """
-    x = density * evenness / 2
-    if x < 1e-3:
-        return x / 2
-    return 1 - (1 - math.exp(-x)) / x
-
-
-@kernel(inline=True)
 def size_factor(opacity):
     """How much larger the traversal sees a splat of a linear opacity than one of at most 1, see `gaussian.spark_size`."""
     return 1 + SIZE_PER_D * (math.sqrt(1 + math.e * math.log(opacity)) - 1) if opacity > 1 else 1.0
