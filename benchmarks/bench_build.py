@@ -17,8 +17,9 @@ import numpy as np
 from scenes import load, tiled, write_ply
 
 from sparklod_cli import jit
+from sparklod_cli.bake import BUILDERS
 from sparklod_cli.codecs import spz
-from sparklod_cli.lod import quick
+from sparklod_cli.limits import METHODS
 from sparklod_cli.parallel import processors
 from sparklod_cli.scene import Scene
 
@@ -50,9 +51,10 @@ def machine() -> str:
     )
 
 
-def warm_build(path: Path, runs: int) -> list[float]:
+def warm_build(path: Path, method: str, runs: int) -> list[float]:
     """Seconds of each run of the builder alone, decoded splats to final order, after one that is not counted."""
     splats = load(path)
+    builder, _ = BUILDERS[method]
     jit.use_threads(processors())
     # The first touch of a page is slow on a virtual machine, which may take free pages back; a process that has run for
     # a while has its pages, and those are the builder's own costs.
@@ -60,15 +62,16 @@ def warm_build(path: Path, runs: int) -> list[float]:
     seconds = []
     for run in range(runs + 1):
         start = time.perf_counter()
-        quick.build(splats)
+        builder.build(splats)
         if run:
             seconds.append(time.perf_counter() - start)
     return seconds
 
 
-def whole_command(path: Path, output: Path) -> dict[str, float]:
+def whole_command(path: Path, output: Path, method: str) -> dict[str, float]:
     """One run of the command: its stages, wall time and peak memory of the process."""
-    command = [sys.executable, "-c", MEASURED, "build-lod", str(path), "-o", str(output), "--overwrite", "--json"]
+    options = ["--method", method, "-o", str(output), "--overwrite", "--json"]
+    command = [sys.executable, "-c", MEASURED, "build-lod", str(path), *options]
     start = time.perf_counter()
     result = subprocess.run(command, capture_output=True, text=True, check=True)
     wall = time.perf_counter() - start
@@ -105,6 +108,9 @@ def main() -> None:
     """Prints Markdown tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("scenes", nargs="+", type=Path, help="splat files; the last is also tiled")
+    parser.add_argument(
+        "--method", choices=METHODS, default=METHODS[0], help="the builder; Spark's is always its tiny one"
+    )
     parser.add_argument("--millions", type=float, nargs="*", default=[0.1, 0.5, 1, 2, 5], help="sizes to tile to")
     parser.add_argument("--runs", type=int, default=5, help="runs of each; medians are printed")
     parser.add_argument("--spark-up-to", type=float, default=2, help="millions of splats that Spark is tried on")
@@ -127,10 +133,10 @@ def main() -> None:
 
 def row(path: Path, output: Path, arguments: argparse.Namespace) -> None:
     """Measures one scene and prints its row."""
-    whole_command(path, output)  # fills caches, the operating system's and numba's
-    commands = [whole_command(path, output) for _ in range(arguments.runs)]
+    whole_command(path, output, arguments.method)  # fills caches, the operating system's and numba's
+    commands = [whole_command(path, output, arguments.method) for _ in range(arguments.runs)]
     median = {key: statistics.median(run[key] for run in commands) for key in commands[0]}
-    warm = warm_build(path, arguments.runs)
+    warm = warm_build(path, arguments.method, arguments.runs)
     splats = len(load(path))
     theirs = spark(path, 3) if splats <= arguments.spark_up_to * 1e6 else []
     ratio = median["bytes"] / plain_bytes(path, int(median["bits"]))

@@ -12,12 +12,15 @@ import numpy as np
 from .codecs import dump, spz
 from .errors import FormatError, SparklodError
 from .io import Sink, read_rgba, read_scene
-from .limits import DEFAULT_BASE, MAX_SH_DEGREE
-from .lod import quick
+from .limits import DEFAULT_BASE, DEFAULT_GROWTH, MAX_SH_DEGREE, METHODS
+from .lod import quality, quick
 from .progress import Progress, silent
 from .scene import Scene
 from .selection import Selection
 from .splats import Splats
+
+#: What has `build`, by method, and what of a recipe it takes.
+BUILDERS = {"quick": (quick, "base"), "quality": (quality, "growth")}
 
 
 @dataclass(frozen=True)
@@ -25,7 +28,9 @@ class Recipe:
     """How to bake.
 
     Attributes:
-        base: growth of the cells from level to level, 1.1 to 2.0.
+        method: one of `limits.METHODS`.
+        base: of quick, growth of the cells from level to level, 1.1 to 2.0.
+        growth: of quality, the most nodes a leaf, 1.05 to 2.0.
         max_sh: SH degrees above this are left out.
         selection: which splats to keep.
         rgba: a file of colours and opacities that take the place of the splats' own, see `io.read_rgba`.
@@ -34,7 +39,9 @@ class Recipe:
         spz: how to write SPZ, and on how many threads to work.
     """
 
+    method: str = METHODS[0]
     base: float = DEFAULT_BASE
+    growth: float = DEFAULT_GROWTH
     max_sh: int = MAX_SH_DEGREE
     selection: Selection = field(default_factory=Selection)
     rgba: Path | None = None
@@ -51,6 +58,7 @@ class Baked:
         format: of the input, for people.
         splats, sh_degree: of the input as far as it was kept; `read` counts what was in the file.
         dropped: how many splats were left out, by reason (`selection.REASONS`).
+        method: that built the tree.
         nodes, levels: of the tree; a tree of one node has one level.
         bytes: of the output.
         version, fractional_bits: of an SPZ output, else None.
@@ -65,6 +73,7 @@ class Baked:
     splats: int
     sh_degree: int
     dropped: dict[str, int]
+    method: str
     nodes: int
     levels: int
     bytes: int
@@ -100,12 +109,16 @@ def _bake(source: Path, write: Sink, recipe: Recipe, progress: Progress) -> Bake
     read_done = time.perf_counter()
     antialiased, name, notes = scene.antialiased, scene.format, scene.notes
     count, degree = len(kept), kept.sh_degree
-    # Merged centres stay in the box of the splats, so what fits these fits all nodes, and is known before building.
+    # Before building, so that what does not fit is said at once.
     bits = None if recipe.encoding else spz.fractional_bits(kept, recipe.spz)
     # The builder frees its input as it goes, if nobody else holds it: a third of the peak.
     handed_over = [kept]
     del scene, kept
-    nodes, tree = quick.build(handed_over.pop(), recipe.base, progress=progress)
+    builder, setting = BUILDERS[recipe.method]
+    nodes, tree = builder.build(handed_over.pop(), getattr(recipe, setting), progress=progress)
+    if bits is not None and recipe.spz.fractional_bits is None:
+        # The quality builder's nodes may lie a little outside of the box of the splats.
+        bits = min(bits, spz.largest_fractional_bits(nodes.center))
     levels = int(tree.depths().max()) + 1
     build_done = time.perf_counter()
     output = Scene(nodes, tree, antialiased)
@@ -126,6 +139,7 @@ def _bake(source: Path, write: Sink, recipe: Recipe, progress: Progress) -> Bake
         splats=count,
         sh_degree=degree,
         dropped=dropped,
+        method=recipe.method,
         nodes=len(nodes),
         levels=levels,
         bytes=size,

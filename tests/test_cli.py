@@ -15,8 +15,14 @@ import pytest
 
 from sparklod_cli import __version__
 from sparklod_cli.cli import COMMANDS, run
+from sparklod_cli.codecs import spz
 from sparklod_cli.io import read_scene
-from sparklod_cli.lod import quick
+from sparklod_cli.limits import METHODS
+from sparklod_cli.lod import quality, quick
+from sparklod_cli.progress import Progress
+from sparklod_cli.scene import Scene
+from sparklod_cli.splats import Splats
+from sparklod_cli.tree import LodTree
 
 from .conftest import FIXTURES, ROOT
 
@@ -92,6 +98,61 @@ def test_options_reach_the_file(scene: Path, tmp_path: Path, capsys: pytest.Capt
         assert build(scene, "-o", tmp_path / f"{base}.spz", "--base", base) == 0
         sizes[base] = len(read_scene(tmp_path / f"{base}.spz").splats)
     assert sizes[1.1] > sizes[2.0]
+
+
+def test_quality_builds_a_tree_of_all_splats(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    total = len(read_scene(scene).splats)
+    sizes = {}
+    for growth in (1.05, 1.2, 2.0):
+        output = tmp_path / f"{growth}.spz"
+        assert build(scene, "-o", output, "--method", "quality", "--growth", growth, "--json", "-v") == 0
+        out, err = capsys.readouterr()
+        record, baked = json.loads(out), read_scene(output)
+        assert baked.tree is not None
+        baked.tree.validate()
+        assert baked.tree.is_leaf.sum() == total
+        assert (record["method"], record["nodes"]) == ("quality", len(baked.splats))
+        assert len(baked.splats) <= growth * total
+        assert "PLY -> quality tree -> SPZ 3 LoD" in err
+        sizes[growth] = len(baked.splats)
+    assert sizes[1.05] < sizes[1.2] < sizes[2.0]
+
+
+def test_a_method_is_quick_if_nothing_is_said(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name, arguments in {"a": [], "b": ["--method", "quick"], "c": ["--method", "quality"]}.items():
+        assert build(scene, "-o", tmp_path / f"{name}.spz", "--json", *arguments) == 0
+    records = map(json.loads, capsys.readouterr().out.splitlines())
+    assert [record["method"] for record in records] == ["quick", "quick", "quality"]
+    a, b, c = ((tmp_path / f"{name}.spz").read_bytes() for name in "abc")
+    assert a == b != c
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_threads_do_not_change_the_file(method: str, tmp_path: Path) -> None:
+    for threads in (1, 2):
+        output = tmp_path / f"{threads}.spz"
+        assert build(FIXTURES / "demo.ply", "-o", output, "--method", method, "--threads", threads) == 0
+    assert (tmp_path / "1.spz").read_bytes() == (tmp_path / "2.spz").read_bytes()
+
+
+def test_merged_splats_outside_of_the_box_of_the_leaves(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The quality builder may put them there: they get fewer bits where they would not fit."""
+
+    def moved(splats: Splats, growth: float, *, progress: Progress) -> tuple[Splats, LodTree]:
+        nodes, tree = quick.build(splats)
+        nodes.center[0] = 2.1 * np.abs(splats.center).max()
+        return nodes, tree
+
+    monkeypatch.setattr(quality, "build", moved)
+    splats = read_scene(scene).splats
+    splats.center[:] *= 1e5  # so that it is the extent that bounds the bits
+    far = tmp_path / "far.spz"
+    far.write_bytes(b"".join(spz.encode(Scene(splats), spz.Options())))
+    most = spz.largest_fractional_bits(read_scene(far).splats.center)
+    assert build(far, "-o", tmp_path / "out.spz", "--method", "quality", "--json") == 0
+    assert json.loads(capsys.readouterr().out)["fractional_bits"] < most
 
 
 def test_what_is_dropped_is_said(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -194,6 +255,13 @@ def test_closed_streams(tmp_path: Path) -> None:
         ([], "Missing argument"),
         (["a.ply", "--base", "1.05"], "--base"),
         (["a.ply", "--base", "nan"], "--base"),
+        (["a.ply", "--method", "best"], "--method"),
+        (["a.ply", "--method", "quality", "--growth", "1.04"], "--growth"),
+        (["a.ply", "--method", "quality", "--growth", "2.1"], "--growth"),
+        (["a.ply", "--method", "quality", "--growth", "nan"], "--growth"),
+        (["a.ply", "--method", "quality", "--base", "1.5"], "--base is of --method quick, not of quality"),
+        (["a.ply", "--method", "quick", "--growth", "1.4"], "--growth is of --method quality, not of quick"),
+        (["a.ply", "--growth", "1.4"], "--growth is of --method quality, not of quick"),
         (["a.ply", "--spz-version", "4"], "--spz-version"),
         (["a.ply", "--fractional-bits", "25"], "--fractional-bits"),
         (["a.ply", "--fractional-bits", "many"], "--fractional-bits"),

@@ -23,6 +23,7 @@ import pytest
 from fixtures import by_hand
 from sparklod_cli.cli import run
 from sparklod_cli.io import read_scene
+from sparklod_cli.limits import METHODS
 from sparklod_cli.splats import COLUMNS
 
 from .conftest import FIXTURES
@@ -155,19 +156,23 @@ NUMBERS: dict[str, tuple[Columns, list[str], str]] = {
 }
 
 
+@pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("what", NUMBERS)
-def test_numbers(what: str, bake: Bake) -> None:
+def test_numbers(what: str, method: str, bake: Bake) -> None:
     values, options, expected = NUMBERS[what]
-    (result,) = bake(with_values(**values), options=options)
+    if method != METHODS[0] and "--base" in options:
+        pytest.skip("the base is the other method's")
+    (result,) = bake(with_values(**values), options=[*options, "--method", method])
     assert re.search(expected, result), result
 
 
-def test_a_hundred_thousand_at_one_place(bake: Bake) -> None:
+@pytest.mark.parametrize("method", METHODS)
+def test_a_hundred_thousand_at_one_place(method: str, bake: Bake) -> None:
     columns = splat_columns(100_000)
     for name in "xyz":
         columns[name][:] = 0.25
     start = time.perf_counter()
-    (result,) = bake(by_hand.ply(columns))
+    (result,) = bake(by_hand.ply(columns), options=["--method", method])
     assert "100,000 splats" in result
     assert time.perf_counter() - start < 30
 

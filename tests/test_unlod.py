@@ -93,6 +93,8 @@ def test_what_is_no_tree_is_refused(tmp_path: Path, capsys: pytest.CaptureFixtur
     ("arguments", "message"),
     [
         (["--base", "1.2"], "--base is of no use with --unlod"),
+        (["--method", "quick"], "--method is of no use with --unlod"),
+        (["--growth", "1.2"], "--growth is of no use with --unlod"),
         (["--rgba", "c.npy"], "--rgba is of no use with --unlod"),
         (["--encoding", "ext"], "--encoding is of no use with --unlod"),
         (["-o", "x.sog"], "--unlod writes .spz, .ply, .splat, not .sog"),

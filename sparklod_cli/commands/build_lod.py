@@ -29,8 +29,14 @@ if TYPE_CHECKING:
 STDOUT = Path("-")
 
 #: Options that only mean something for a tree that is built, and for SPZ.
-OF_BAKING = ("base", "max_sh", "min_opacity", "min_box", "max_box", "within", "on_invalid", "rgba", "encoding")
+OF_BAKING = (
+    *("method", "base", "growth", "max_sh", "min_opacity", "min_box", "max_box", "within", "on_invalid", "rgba"),
+    "encoding",
+)
 OF_SPZ = ("spz_version", "fractional_bits", "compression_level")
+
+#: Options of one method only.
+OF_METHOD = {"quick": ("base",), "quality": ("growth",)}
 
 #: Names that promise what a tree is not written as.
 OTHER_SUFFIXES = {".ply", ".splat", ".ksplat", ".sog", ".json"}
@@ -40,6 +46,7 @@ EXAMPLES = """
 Examples:
   sparklod build-lod scene.ply                    # writes scene-lod.spz
   sparklod build-lod scans/*.ply --output-dir web --overwrite
+  sparklod build-lod scene.ply --method quality   # for what is published
   sparklod build-lod scene.ply -o - | aws s3 cp - s3://bucket/scene-lod.spz
   sparklod build-lod scene.ply --within 0,1,0,25 --min-opacity 0.02
   sparklod build-lod scene.ply --json | jq .nodes
@@ -68,11 +75,25 @@ Examples:
 )
 @click.option("--overwrite", is_flag=True, help="Replace outputs that exist.")
 @click.option(
+    "--method",
+    type=click.Choice(limits.METHODS),
+    default=limits.METHODS[0],
+    help="How to merge: quick takes next to no time, cuts of quality are nearer to full detail.",
+)
+@click.option(
     "--base",
     metavar="N",
     type=Real(limits.MIN_BASE, limits.MAX_BASE),
     default=limits.DEFAULT_BASE,
-    help="Growth of the voxel grid from level to level: nearer 1, smoother transitions and more nodes.",
+    help="With --method quick: growth of the voxel grid from level to level; nearer 1, smoother transitions and more"
+    " nodes.",
+)
+@click.option(
+    "--growth",
+    metavar="N",
+    type=Real(limits.MIN_GROWTH, limits.MAX_GROWTH),
+    default=limits.DEFAULT_GROWTH,
+    help="With --method quality: at most so many nodes a leaf.",
 )
 @click.option(
     "--max-sh",
@@ -201,6 +222,9 @@ def _check_usage(ctx: click.Context, inputs: tuple[Path, ...], output: Path | No
         raise click.UsageError(f"{suffix} holds no tree, which is written as SPZ; name the output .spz")
     elif suffix == ".npz":
         raise click.UsageError("a .npz output needs --encoding")
+    for method, names in OF_METHOD.items():
+        if method != settings["method"]:
+            refuse(names, f"is of --method {method}, not of {settings['method']}")
     if settings["rgba"] is not None and len(inputs) > 1:
         raise click.UsageError(f"--rgba takes one input, not {len(inputs)}")
 
@@ -247,7 +271,9 @@ def _bake(settings: dict[str, Any], output: Path | None, console: Console) -> Wo
     jit.use_threads(settings["threads"])
     console.announce_compiling()
     recipe = Recipe(
+        method=settings["method"],
         base=settings["base"],
+        growth=settings["growth"],
         max_sh=settings["max_sh"],
         selection=Selection(
             drop_invalid=settings["on_invalid"] == "drop",

@@ -35,7 +35,7 @@ def report_baked(console: Console, source: Path, target: Path, baked: Baked) -> 
         written = ", ".join(f"{name} uint32{list(shape)}" for name, shape in baked.arrays.items())
     else:
         written = f"SPZ {baked.version} LoD, {baked.fractional_bits} fractional bits"
-    console.detail(f"  {baked.format} -> {written}; {_stages(baked.seconds)}")
+    console.detail(f"  {baked.format} -> {baked.method} tree -> {written}; {_stages(baked.seconds)}")
 
 
 def report_unbaked(console: Console, source: Path, target: Path, unbaked: Unbaked) -> None:

@@ -1,8 +1,8 @@
 """The quality builder: a binary tree of the cheapest pairs, of which the useful nodes are kept.
 
-1. Leaves join from small to large. Those that are there, and what came of them, lie along a Morton curve; each looks for its
-   cheapest partner among its neighbours on the curve (`kernels/pairs.py`), and pairs that chose each other merge, all at once.
-   The curve moves from round to round, so that its seams do.
+1. Leaves join from small to large. Those that are there, and what came of them, lie along a Morton curve; each looks
+   for its cheapest partner among its neighbours on the curve (`kernels/pairs.py`). Of the pairs that chose each other
+   the cheaper ones merge, all at once. The curve moves from round to round, so that its seams do.
 2. A merged node covers what its two cover together (`kernels/union.py`), and is drawn with the profile that covers as
    much (`kernels/profile.py`).
 3. Of the binary tree's nodes those are dropped that are of little use (`kernels/keep.py`).
@@ -18,14 +18,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InvalidSplatsError
-from ..gaussian import spark_size
 from ..jit import threads_for
 from ..limits import DEFAULT_GROWTH, MAX_GROWTH, MIN_GROWTH
 from ..progress import Progress, silent
 from ..sh import degree_of
 from ..splats import FloatArray, Splats
 from ..tree import LodTree
+from .check import Extremes, check
 from .kernels import keep, pairs, state, union
 from .kernels.order import fill_leaf_colors, merge_colors
 from .kernels.sort import Nodes, sort_by_key
@@ -55,6 +54,10 @@ OUTSIDE = 0.005
 SLACK, GOLDEN = 0.3, 0.6180339887
 
 
+#: Nothing is farther away, nor larger, than so many units: float32 holds its square.
+FARTHEST = 1e15
+
+
 @dataclass
 class _Growing:
     """The binary tree while it grows from its leaves: rows, leaves first.
@@ -73,16 +76,40 @@ class _Growing:
 
 
 @dataclass(frozen=True)
-class _Box:
-    """Of the curve: middle half of the scene's slack, in units of the state."""
+class _Space:
+    """Where rows of state are, and the curve through them.
 
+    Attributes:
+        middle: (3,) of the scene, world units. unit: of length, world units.
+        low: (3,) corner of what the curve goes through, in units. extent: its edge.
+    """
+
+    middle: NDArray[np.float64]
+    unit: float
     low: NDArray[np.float64]
     extent: float
 
-    def at(self, turn: int) -> tuple[NDArray[np.float64], float]:
-        """Its corner and its cells' edge in a round."""
+    @classmethod
+    def of(cls, splats: Splats, found: Extremes) -> _Space:
+        """Around most of the splats, in a unit that is a power of two near their size, if what is far away allows."""
+        some = slice(None, None, max(1, len(splats) // SAMPLE))
+        center = splats.center[some].astype(np.float64)
+        middle = np.median(center, axis=0)
+        reach = max(float((found.high - found.low).max()), found.largest) / FARTHEST
+        unit = 2.0 ** round(math.log2(max(float(np.median(splats.scale[some].max(axis=1).astype(np.float64))), reach)))
+        low, high = np.quantile((center - middle) / unit, [OUTSIDE, 1 - OUTSIDE], axis=0)
+        return cls(middle, unit, low, float(max((high - low).max(), 1.0)))
+
+    def sort(self, growing: _Growing, nodes: Nodes, turn: int, threads: int) -> Nodes:
+        """Nodes along the curve, which moves from turn to turn."""
+        _, nodes = sort_by_key(self.places(growing, nodes, turn), nodes.copy(), 3 * state.CURVE_BITS, threads)
+        return nodes
+
+    def places(self, growing: _Growing, nodes: Nodes, turn: int) -> NDArray[np.uint64]:
+        """Where nodes are on the curve."""
         moved = np.modf(np.array([1, 2, 3]) * GOLDEN * turn)[0] * SLACK * self.extent
-        return self.low - moved, (1 + SLACK) * self.extent / (1 << state.CURVE_BITS)
+        step = (1 + SLACK) * self.extent / (1 << state.CURVE_BITS)
+        return state.curve_keys(growing.state, nodes, self.low - moved, step)
 
 
 def build(splats: Splats, growth: float = DEFAULT_GROWTH, *, progress: Progress = silent) -> tuple[Splats, LodTree]:
@@ -106,24 +133,19 @@ def build(splats: Splats, growth: float = DEFAULT_GROWTH, *, progress: Progress 
     """
     if not MIN_GROWTH <= growth <= MAX_GROWTH:
         raise ValueError(f"growth {growth} is not within {MIN_GROWTH} to {MAX_GROWTH}")
+    found = check(splats)
     n = len(splats)
-    if n == 0:
-        raise InvalidSplatsError("no splat is left to build a tree of")
-    largest = splats.scale.max(axis=1)
-    if not (
-        np.isfinite(splats.center).all() and np.isfinite(largest).all() and min(largest.min(), splats.opacity.min()) > 0
-    ):
-        raise InvalidSplatsError("a splat is not finite, or without opacity or scale: see Selection.apply")
-    middle = np.median(splats.center, axis=0).astype(np.float64)
-    unit = 2.0 ** round(math.log2(float(np.median(largest))))
+    if n == 1:
+        return splats, LodTree(np.zeros(1, np.uint16), np.zeros(1, np.uint32))
+    space = _Space.of(splats, found)
     with threads_for(n) as threads:
-        growing, index, box = _leaves(splats, middle, unit, threads)
-        _grow(growing, n, box, progress)
-        return _in_final_order(growing, index, splats, growth, middle, unit, box)
+        growing, index = _leaves(splats, space, threads)
+        _grow(growing, n, space, progress)
+        return _in_final_order(growing, index, splats, growth, space)
 
 
-def _leaves(splats: Splats, middle: NDArray[np.float64], unit: float, threads: int) -> tuple[_Growing, Nodes, _Box]:
-    """Rows of the leaves along the curve, the splat of each, and the curve's box."""
+def _leaves(splats: Splats, space: _Space, threads: int) -> tuple[_Growing, Nodes]:
+    """Rows of the leaves along the curve, and the splat of each."""
     n = len(splats)
     rows = 2 * n - 1
     growing = _Growing(
@@ -135,18 +157,13 @@ def _leaves(splats: Splats, middle: NDArray[np.float64], unit: float, threads: i
     )
     index = np.arange(n, dtype=np.uint32)
     columns = splats.center, splats.scale, splats.quat_xyzw, splats.opacity, splats.rgb
-    state.fill_state(index, *columns, middle, unit, growing.state)
-    sample = growing.state[: n : max(1, n >> 16), :3]
-    low, high = np.quantile(sample, [OUTSIDE, 1 - OUTSIDE], axis=0).astype(np.float64)
-    box = _Box(low, float(max((high - low).max(), 1e-6)))
-    keys = state.curve_keys(growing.state, index, *box.at(0))
-    _, index = sort_by_key(keys, index, 3 * state.CURVE_BITS, threads)
-    state.fill_state(index, *columns, middle, unit, growing.state)
-    growing.size[:n] = spark_size(splats)[index] / np.float32(unit)
-    return growing, index, box
+    state.fill_state(index, *columns, space.middle, space.unit, growing.state, growing.size)
+    index = space.sort(growing, index, 0, threads)
+    state.fill_state(index, *columns, space.middle, space.unit, growing.state, growing.size)
+    return growing, index
 
 
-def _grow(growing: _Growing, leaves: int, box: _Box, progress: Progress) -> None:
+def _grow(growing: _Growing, leaves: int, space: _Space, progress: Progress) -> None:
     """Merges pairs, up to one root."""
     level_of = np.ceil(np.log(growing.size[:leaves].astype(np.float64)) / math.log(BASE)).astype(np.int32)
     lowest = int(np.quantile(level_of, 0.01))
@@ -160,20 +177,24 @@ def _grow(growing: _Growing, leaves: int, box: _Box, progress: Progress) -> None
         progress("building", joined, leaves, "splat")
         # A node's size is about twice the root of a third of its covariance's trace.
         size = BASE ** (lowest + level + 1)
-        active = _merge(growing, active, box, largest=3 * size * size / 4, rounds=MOST_ROUNDS)
-    _merge(growing, active, box, largest=math.inf, rounds=None)
+        active = _merge(growing, active, space, largest=3 * size * size / 4, rounds=MOST_ROUNDS)
+    _merge(growing, active, space, largest=math.inf, rounds=None)
 
 
-def _merge(growing: _Growing, active: Nodes, box: _Box, largest: float, rounds: int | None) -> Nodes:
+def _merge(growing: _Growing, active: Nodes, space: _Space, largest: float, rounds: int | None) -> Nodes:
     """Rounds of merging; returns what is left, which is one node if `rounds` is None."""
     done = 0
     while len(active) > 1 and (rounds is None or done < rounds):
         with threads_for(len(active)) as threads:
-            keys = state.curve_keys(growing.state, active, *box.at(growing.rounds))
-            _, active = sort_by_key(keys, active, 3 * state.CURVE_BITS, threads)
+            active = space.sort(growing, active, growing.rounds, threads)
             partner, cost = pairs.cheapest(growing.state, active, WINDOW, np.float32(largest))
             before = len(active)
-            found, active = pairs.pair_up(active, partner, cost, _limit(cost), growing.used)
+            found, rest = pairs.pair_up(active, partner, cost, _limit(cost), growing.used)
+            if rounds is None and not len(found):  # no cost is a number: what is left is too far apart for float32
+                partner = np.arange(before, dtype=np.int32) ^ 1
+                partner[partner >= before] = -1
+                found, rest = pairs.pair_up(active, partner, np.zeros_like(cost), np.float32(0), growing.used)
+            active = rest
             union.unite_pairs(found, growing.used, growing.state, growing.children, growing.size, growing.error)
         growing.used += len(found)
         growing.rounds += 1
@@ -191,13 +212,7 @@ def _limit(cost: FloatArray) -> np.float32:
 
 
 def _in_final_order(
-    growing: _Growing,
-    index: Nodes,
-    splats: Splats,
-    growth: float,
-    middle: NDArray[np.float64],
-    unit: float,
-    box: _Box,
+    growing: _Growing, index: Nodes, splats: Splats, growth: float, space: _Space
 ) -> tuple[Splats, LodTree]:
     """Keeps the useful nodes, and puts them and their colours in place."""
     n, rows = len(index), growing.used
@@ -205,14 +220,14 @@ def _in_final_order(
     parent = keep.value_nodes(growing.children, n, growing.size, growing.error, log_size, weight, lost)
     saved = np.empty(rows, np.int32)
     keep.drop_nodes(n, max(int(growth * n) - n, 1), parent, log_size, weight, lost, saved)
-    inner, ends = _by_level(growing, keep.levels_of(n, parent, log_size, saved), box)
+    inner, ends = _by_level(growing, keep.levels_of(n, parent, log_size, saved), space)
     total = n + len(inner)
     order = np.empty(total, np.uint32)
     tree = LodTree(np.zeros(total, np.uint16), np.zeros(total, np.uint32))
     place = keep.place_nodes(inner, parent, saved, order, tree.child_start, tree.child_count)
     out = Splats.empty(total, degree_of(splats.sh.shape[1]))
     state.fill_leaves(order, index, splats.center, splats.scale, splats.quat_xyzw, splats.opacity, *_geometry(out))
-    state.fill_merged(order, n, growing.state, middle, unit, *_geometry(out))
+    state.fill_merged(order, n, growing.state, space.middle, space.unit, *_geometry(out))
     flat_sh = out.sh.reshape(total, -1)
     fill_leaf_colors(order, index, splats.rgb, splats.sh.reshape(n, -1), out.rgb, flat_sh)
     weights = growing.state[:, pairs.WEIGHT].astype(np.float64)
@@ -223,13 +238,11 @@ def _in_final_order(
     return out, tree
 
 
-def _by_level(growing: _Growing, level: NDArray[np.int32], box: _Box) -> tuple[Nodes, NDArray[np.int64]]:
+def _by_level(growing: _Growing, level: NDArray[np.int32], space: _Space) -> tuple[Nodes, NDArray[np.int64]]:
     """The merged nodes that are kept, level by level along the curve, and where each level ends, from 0."""
     inner = np.flatnonzero(level >= 0).astype(np.uint32)
     own = level[inner]
-    keys = state.curve_keys(growing.state, inner, *box.at(0)) | (
-        own.astype(np.uint64) << np.uint64(3 * state.CURVE_BITS)
-    )
+    keys = space.places(growing, inner, 0) | (own.astype(np.uint64) << np.uint64(3 * state.CURVE_BITS))
     inner = inner[np.argsort(keys, kind="stable")]
     return inner, np.concatenate([[0], np.cumsum(np.bincount(own))]).astype(np.int64)
 

@@ -17,14 +17,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InvalidSplatsError
 from ..jit import threads_for
 from ..limits import DEFAULT_BASE, MAX_BASE, MIN_BASE
 from ..progress import Progress, silent
 from ..sh import degree_of
 from ..splats import FloatArray, Splats
 from ..tree import MAX_CHILDREN, LodTree
-from .kernels.geometry import CENTER, WIDTH, extremes, fill_leaves
+from .check import check
+from .kernels.geometry import CENTER, WIDTH, fill_leaves
 from .kernels.group import level_keys, split_cells
 from .kernels.merge import merge_groups
 from .kernels.order import fill_columns, fill_leaf_colors, merge_colors, places_of_merged
@@ -115,14 +115,11 @@ def build(splats: Splats, base: float = DEFAULT_BASE, *, progress: Progress = si
     if not MIN_BASE <= base <= MAX_BASE:
         raise ValueError(f"base {base} is not within {MIN_BASE} to {MAX_BASE}")
     n = len(splats)
-    if n == 0:
-        raise InvalidSplatsError("no splat is left to build a tree of")
+    found = check(splats)
+    low, high = found.low, found.high
     with threads_for(n) as threads:
-        low, high, smallest, largest = extremes(splats.center, splats.scale, threads)
-        if not (smallest > 0 and splats.opacity.min() > 0 and np.isfinite([*low, *high, largest]).all()):
-            raise InvalidSplatsError("a splat is not finite, or without opacity or scale: see Selection.apply")
-        finest = math.floor(math.log(max(smallest, np.abs([low, high]).max() / MAX_CELL), base))
-        coarsest = max(finest + 1, math.ceil(math.log(largest, base)) + 1)
+        finest = math.floor(math.log(max(found.smallest, np.abs([low, high]).max() / MAX_CELL), base))
+        coarsest = max(finest + 1, math.ceil(math.log(found.largest, base)) + 1)
         steps = base ** np.arange(finest, coarsest + 1, dtype=np.float64)
         index, joins = _sort_leaves(splats, steps, low, high, threads)
         rows, weight = np.empty((2 * n, WIDTH), np.float32), np.empty(2 * n, np.float64)
@@ -136,7 +133,7 @@ def build(splats: Splats, base: float = DEFAULT_BASE, *, progress: Progress = si
 
 
 def _sort_leaves(
-    splats: Splats, steps: NDArray[np.float64], low: Offsets, high: Offsets, threads: int
+    splats: Splats, steps: NDArray[np.float64], low: NDArray[np.float64], high: NDArray[np.float64], threads: int
 ) -> tuple[Nodes, Offsets]:
     """The order of the leaves, by natural level and then along a curve, and where each level ends in it."""
     grid = max(float((high - low).max()) / (2**CURVE_BITS - 2), float(steps[0]))

@@ -7,8 +7,9 @@ import dataclasses
 import numpy as np
 import pytest
 
+from sparklod_cli.bake import BUILDERS
 from sparklod_cli.codecs import spz
-from sparklod_cli.lod import quick
+from sparklod_cli.limits import METHODS
 from sparklod_cli.scene import Scene
 from sparklod_cli.splats import Splats
 from sparklod_cli.tree import MAX_CHILDREN
@@ -18,8 +19,8 @@ from . import laws
 from .spark import Spark
 
 
-def baked(splats: Splats) -> Scene:
-    return Scene(*quick.build(splats))
+def baked(splats: Splats, method: str = "quick") -> Scene:
+    return Scene(*BUILDERS[method][0].build(splats))
 
 
 def encoded(scene: Scene) -> bytes:
@@ -28,8 +29,9 @@ def encoded(scene: Scene) -> bytes:
 
 @pytest.mark.parametrize("sh_degree", range(4))
 @pytest.mark.parametrize("version", [2, 3])
-def test_tree(spark: Spark, version: int, sh_degree: int) -> None:
-    scene = baked(random_splats(2000, sh_degree=sh_degree))
+@pytest.mark.parametrize("method", METHODS)
+def test_tree(spark: Spark, method: str, version: int, sh_degree: int) -> None:
+    scene = baked(random_splats(2000, sh_degree=sh_degree), method)
     got = laws.check(spark, scene, spz.Options(version=version))
     assert got.sh.shape == scene.splats.sh.shape
     assert got.lod_opacity.max() > 1  # merged splats that are more than opaque were among them

@@ -7,9 +7,9 @@ from functools import cache
 import numpy as np
 import pytest
 
+from sparklod_cli.bake import BUILDERS
 from sparklod_cli.codecs import spz
 from sparklod_cli.io import read_scene
-from sparklod_cli.lod import quick
 from sparklod_cli.scene import Scene
 from tests.conftest import real_scene
 
@@ -18,14 +18,17 @@ from .spark import Spark
 
 
 @cache
-def baked(name: str) -> Scene:
-    return Scene(*quick.build(read_scene(real_scene(name)).splats))
+def baked(name: str, method: str = "quick") -> Scene:
+    return Scene(*BUILDERS[method][0].build(read_scene(real_scene(name)).splats))
 
 
 @pytest.mark.parametrize("version", [2, 3])
-@pytest.mark.parametrize("name", ["biker.ply", "biker.spz", "playbot-125k.ply"])
-def test_tree(spark: Spark, name: str, version: int) -> None:
-    laws.check(spark, baked(name), spz.Options(version=version, threads=2))
+@pytest.mark.parametrize(
+    ("name", "method"),
+    [("biker.ply", "quick"), ("biker.spz", "quick"), ("playbot-125k.ply", "quick"), ("biker.ply", "quality")],
+)
+def test_tree(spark: Spark, name: str, method: str, version: int) -> None:
+    laws.check(spark, baked(name, method), spz.Options(version=version, threads=2))
 
 
 @pytest.mark.parametrize("name", ["biker.ply", "playbot-125k.ply"])

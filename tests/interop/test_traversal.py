@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sparklod_cli.bake import BUILDERS
 from sparklod_cli.codecs import ext_splats, lod_tree
 from sparklod_cli.codecs.lod_tree import Nodes
 from sparklod_cli.io import read_scene
-from sparklod_cli.lod import quick
 from sparklod_cli.lod.traversal import CHUNK_NODES, Cones, Cut, Forest, Instance, Traversal, View, pixel_limit, views_of
 from tests import reference
 from tests.conftest import FIXTURES, real_scene
@@ -58,9 +58,9 @@ class Tree:
 
 
 @cache
-def baked(path: Path) -> Tree:
+def baked(path: Path, method: str = "quick") -> Tree:
     """Our tree of a scene, measured as Spark does: what it holds of the splats, after their coding."""
-    splats, tree = quick.build(read_scene(path).splats)
+    splats, tree = BUILDERS[method][0].build(read_scene(path).splats)
     return Tree.of(lod_tree.pack(ext_splats.unpack(ext_splats.pack(splats)), tree)["lod_tree"])
 
 
@@ -149,9 +149,12 @@ def facing(backward: np.ndarray) -> np.ndarray:
     return np.stack([x, np.cross(z, x), z], axis=1)
 
 
-@pytest.mark.parametrize("name, views", [("demo.ply", 88), ("biker.spz", 88), ("playbot.sog", 48)])
-def test_one_tree(spark: Spark, name: str, views: int) -> None:
-    tree = baked(scene(name))
+@pytest.mark.parametrize(
+    "name, method, views",
+    [("demo.ply", "quick", 88), ("biker.spz", "quick", 88), ("playbot.sog", "quick", 48), ("demo.ply", "quality", 44)],
+)
+def test_one_tree(spark: Spark, name: str, method: str, views: int) -> None:
+    tree = baked(scene(name), method)
     both = Both(spark, [tree])
     reasons = set()
     for number, camera in enumerate(cameras(tree.nodes, views, seed=len(tree.words))):

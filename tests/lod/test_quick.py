@@ -11,40 +11,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sparklod_cli import jit
 from sparklod_cli.errors import InvalidSplatsError
-from sparklod_cli.gaussian import MAX_OPACITY, MIN_OPACITY
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod import quick
-from sparklod_cli.splats import COLUMNS, Splats
+from sparklod_cli.splats import Splats
 from sparklod_cli.tree import MAX_CHILDREN, LodTree
 
 from .. import reference
 from ..conftest import real_scene
 from ..scenes import random_splats
-
-
-def children(tree: LodTree, node: int) -> slice:
-    start = int(tree.child_start[node])
-    return slice(start, start + int(tree.child_count[node]))
-
-
-def sorted_rows(splats: Splats) -> np.ndarray:
-    rows = np.concatenate([getattr(splats, name).reshape(len(splats), -1) for name in COLUMNS], axis=1)
-    return rows[np.lexsort(rows.T)]
-
-
-def check_tree(splats: Splats, nodes: Splats, tree: LodTree) -> None:
-    """What holds for every tree: it is one, its leaves are the input bit for bit, its merges are merges."""
-    tree.validate()
-    assert len(nodes) == len(tree)
-    assert np.array_equal(sorted_rows(nodes.take(tree.is_leaf)), sorted_rows(splats))
-    assert (tree.child_count[~tree.is_leaf] > 1).all()
-    for name in COLUMNS:
-        assert np.isfinite(getattr(nodes, name)).all(), name
-    inner = nodes.take(~tree.is_leaf)
-    assert ((inner.opacity >= np.float32(MIN_OPACITY)) & (inner.opacity <= MAX_OPACITY)).all()
-    assert np.allclose(np.linalg.norm(inner.quat_xyzw, axis=1), 1, atol=1e-6)
+from .trees import check_threads, check_tree, children, coincident, hard_cases, parents
 
 
 def as_merged(nodes: Splats, tree: LodTree) -> Splats:
@@ -119,16 +95,7 @@ def test_the_tree_is_the_one_that_the_method_describes(count: int, base: float, 
 
 
 def test_the_number_of_threads_does_not_change_a_bit() -> None:
-    splats = random_splats(60_000, sh_degree=1, seed=3)
-    results = []
-    for threads in (1, 2, 3):
-        jit.use_threads(threads)
-        results.append(quick.build(splats))
-    jit.use_threads(256)
-    for nodes, tree in results[1:]:
-        for name in COLUMNS:
-            assert getattr(nodes, name).tobytes() == getattr(results[0][0], name).tobytes(), name
-        assert tree.child_start.tobytes() == results[0][1].child_start.tobytes()
+    check_threads(lambda: quick.build(random_splats(60_000, sh_degree=1, seed=3)))
 
 
 def test_a_prefix_is_a_coarser_scene() -> None:
@@ -141,10 +108,7 @@ def test_a_prefix_is_a_coarser_scene() -> None:
     medians = [np.median(part) for part in np.array_split(spread[np.argsort(tree.child_start[inner])], 8)]
     assert all(later < earlier for earlier, later in itertools.pairwise(medians))
     # The parents of the nodes of a prefix are in it.
-    parent = np.zeros(len(tree), np.int64)
-    for node in inner:
-        parent[children(tree, node)] = node
-    assert (parent[1:] < np.arange(1, len(tree))).all()
+    assert (parents(tree)[1:] < np.arange(1, len(tree))).all()
 
 
 def test_one_splat_is_the_root() -> None:
@@ -167,12 +131,7 @@ def test_a_base_out_of_range_is_an_error(base: float) -> None:
 
 @pytest.mark.parametrize("count", [MAX_CHILDREN, MAX_CHILDREN + 1, 3 * MAX_CHILDREN + 5])
 def test_coincident_splats_do_not_wrap_the_child_count(count: int) -> None:
-    splats = random_splats(count + 20, seed=5)
-    center = splats.center.copy()
-    center[:count] = center[0]
-    scale = splats.scale.copy()
-    scale[:count] = 0.01
-    splats = dataclasses.replace(splats, center=center, scale=scale)
+    splats = coincident(count)
     nodes, tree = quick.build(splats)
     check_tree(splats, nodes, tree)
     pieces = -(-count // MAX_CHILDREN)
@@ -182,33 +141,6 @@ def test_coincident_splats_do_not_wrap_the_child_count(count: int) -> None:
         assert counts[:pieces].sum() >= count
     for node in np.flatnonzero(tree.child_count > 1000):
         check_merge(as_merged(nodes, tree), tree, node)
-
-
-def hard_cases() -> dict[str, Splats]:
-    plain = random_splats(500, seed=6)
-    rng = np.random.default_rng(7)
-
-    def scaled(factors: list[float]) -> Splats:
-        return dataclasses.replace(plain, scale=np.ascontiguousarray(plain.scale * np.float32(factors)))
-
-    spread = np.float32(10.0) ** rng.uniform(-12, 12, (500, 1)).astype(np.float32)
-    return {
-        "flat": scaled([1, 1, 0]),
-        "needle": scaled([1, 0, 0]),
-        "almost flat": scaled([1, 1, 1e-12]),
-        "tiny": dataclasses.replace(plain, scale=np.full_like(plain.scale, 1e-30)),
-        "huge": dataclasses.replace(plain, scale=np.full_like(plain.scale, 1e18)),
-        "every scale": dataclasses.replace(plain, scale=np.ascontiguousarray(plain.scale * spread)),
-        "far": dataclasses.replace(plain, center=plain.center + np.float32(1e7)),
-        "far and tiny": dataclasses.replace(
-            plain, center=plain.center * np.float32(1e7), scale=np.full_like(plain.scale, 1e-9)
-        ),
-        "widest": dataclasses.replace(plain, center=plain.center * np.float32(1e37)),
-        "one point": dataclasses.replace(plain, center=np.zeros_like(plain.center)),
-        "on cell edges": dataclasses.replace(plain, center=np.rint(plain.center * 4).astype(np.float32)),
-        "faint": dataclasses.replace(plain, opacity=np.full_like(plain.opacity, 1e-30)),
-        "opaque": dataclasses.replace(plain, opacity=np.ones_like(plain.opacity)),
-    }
 
 
 @pytest.mark.parametrize("name", hard_cases())

@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 from sparklod_cli import jit
 from sparklod_cli.gaussian import normalized_quat
 from sparklod_cli.render.camera import Camera
-from sparklod_cli.render.kernels import raster
 from sparklod_cli.render.look import PROFILES, SORTS, Look
 from sparklod_cli.render.pose import look_at
 from sparklod_cli.render.rasterizer import Image, draw
@@ -290,17 +289,3 @@ def test_stopping_early_costs_no_more_than_it_may() -> None:
     stack = shown(600, seed=14, scale=0.4, spread=0.3)
     stack.lod_opacity[:] = rng.uniform(0.05, 0.6, 600)
     check(stack, camera_at(size=(24, 20)), most=2 * EARLY, unsure=0.5)
-
-
-def test_exp2() -> None:
-    t = -np.concatenate([np.linspace(0, 20, 20_001), np.arange(126), [1e-7, 125.999]]).astype(np.float32)
-    got = np.array([raster.exp2(value) for value in t], np.float64)
-    np.testing.assert_allclose(got, np.exp2(t.astype(np.float64)), rtol=5e-7)
-
-
-def test_log2() -> None:
-    """Near 1 it must be exact relative to what little it is there: it is multiplied by up to 6,836."""
-    v = np.concatenate([np.linspace(0, 1, 20_001)[1:], 1 - np.geomspace(1e-7, 0.5, 500), np.geomspace(1e-30, 1, 2_000)])
-    v = v.astype(np.float32)
-    got = np.array([raster.log2(value) for value in v], np.float64)
-    np.testing.assert_allclose(got, np.log2(v.astype(np.float64)), rtol=4e-7)

@@ -1,7 +1,7 @@
 """Which nodes of a binary tree to keep: a tree of fewer nodes whose cuts are as good.
 
-A node is drawn while the traversal's threshold is between its size and its parent's: over a range of ln(size of parent /
-size). Meanwhile it saves its children but one, and is off by its error. So much of both is what it is good for; the
+A node is drawn while the traversal's threshold is between its size and its parent's, over a range of the logarithm of
+sizes. Meanwhile it saves its children but one, and is off by its error. So much of both is what it is good for; the
 least useful nodes are dropped, and their children become their parents'.
 """
 
@@ -16,8 +16,8 @@ from ...jit import kernel
 #: Sizes are told apart in so many steps an octave, over octaves of float32.
 STEPS, OCTAVES = 4, 256
 
-#: How much the error of a node counts beside the splats that it saves; errors by their square root, beside that of what is
-#: common at its size.
+#: How much the error of a node counts beside the splats that it saves; errors by their square root, beside that of
+#: what is common at its size.
 ERROR_COST = np.float32(0.4)
 
 #: In cuts of less than this share of the leaves errors count less: of so few nodes none can be spared.
@@ -29,8 +29,9 @@ RARITY = 0.5
 #: Dropping in so many rounds is nearly as good as one after the other, the least useful first.
 ROUNDS = 8
 
-#: No node gets more children unless no other can be dropped: where a node is smaller than those below it they are of no use by the rule above, yet a
-#: budget between one and thousands would have nothing to spend on.
+#: No node gets more children unless no other can be dropped: where a node is smaller than
+#: those below it they are of no use by the rule above, yet a budget between one and thousands would have nothing to
+#: spend on.
 MOST_CHILDREN = 16
 
 #: Useful numbers are told apart by this many of their bits.
@@ -130,12 +131,13 @@ def drop_nodes(leaves, most, parent, log_size, weight, lost, saved):
             if left <= most:
                 break
             above = parent[node]
-            if saved[node] > 0 and saved[above] + saved[node] < children:
-                if key_of(usefulness(node, parent, log_size, weight, lost, saved)) <= threshold:
-                    saved[above] += saved[node]
-                    lost[above] += lost[node]
-                    saved[node] = -1
-                    left -= 1
+            if saved[node] < 1 or saved[above] + saved[node] >= children:
+                continue
+            if key_of(usefulness(node, parent, log_size, weight, lost, saved)) <= threshold:
+                saved[above] += saved[node]
+                lost[above] += lost[node]
+                saved[node] = -1
+                left -= 1
         for node in range(total - 2, -1, -1):
             if saved[parent[node]] < 0:
                 parent[node] = parent[parent[node]]
@@ -150,7 +152,7 @@ def usefulness(node, parent, log_size, weight, lost, saved):
 
 @kernel()
 def levels_of(leaves, parent, log_size, saved):
-    """(T,) int32: level of each merged node that is kept, more for smaller ones and more than its parent's; -1 for others."""
+    """(T,) int32 level of each merged node that is kept, the higher the smaller, and above its parent's; else -1."""
     total = len(parent)
     level = np.full(total, -1, np.int32)
     level[total - 1] = 0

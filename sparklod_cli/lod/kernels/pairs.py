@@ -1,7 +1,7 @@
 """Who merges with whom: the cost of pairs of neighbours along a curve through space, and each one's cheapest.
 
-A row of state is a cache line: what is known of a node while the tree grows. Lengths are in a unit near the median scale,
-from the middle of the scene, so that float32 holds squares and products of them.
+A row of state is a cache line: what is known of a node while the tree grows. Lengths are in a unit near the median
+scale, from the middle of the scene, so that float32 holds squares and products of them.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from ...jit import kernel
 f32 = np.float32
 
 #: First column of a row of state: centre, covariance of the profile (xx yy zz xy xz yz), colour, logarithm of the
-#: covariance's determinant, what it covers (opacity * area), the density of that (see `profile.py`), and the weight of its
-#: colour, which is the sum of its leaves'.
+#: covariance's determinant, what it covers (opacity * area), the density of that (see `profile.py`), and the weight of
+#: its colour, which is the sum of its leaves'.
 CENTER, COVARIANCE, COLOR, LOG_DET, COVERED, DENSITY, WEIGHT, WIDTH = 0, 3, 9, 12, 13, 14, 15, 16
 
 #: What the cost reads of a row: all but the last two, side by side for a whole block.
@@ -56,8 +56,9 @@ def log_det(xx, yy, zz, xy, xz, yz):
 def block_costs(lanes, step, count, largest, cost):
     """Cost of merging node i with i + step: Runnalls' bound on the Kullback-Leibler divergence, times what both cover.
 
-    With w for what they cover and P for covariances it is ((w_i + w_j) ln|P_ij| - w_i ln|P_i| - w_j ln|P_j|) / 2 (Runnalls
-    2007), and Ward's variance for their colours. Free of branches, so that the compiler works on several at a time.
+    With w for what they cover and P for covariances it is ((w_i + w_j) ln|P_ij| - w_i ln|P_i| - w_j ln|P_j|) / 2
+    (Runnalls 2007), and Ward's variance for their colours. Free of branches, so that the compiler works on several at
+    a time.
 
     Args:
         lanes: (LANES, at least count + step) float32 columns of state.

@@ -1,9 +1,9 @@
 """What a merged splat covers on the screen: the moments of its opacity's profile, and the profile from the moments.
 
 Spark draws a splat of linear opacity A > 1 with the opacity 1 - (1 - exp(-t)) ** A, t = z^2 / 2, which is what A equal
-splats on top of each other make. Over the plane it sums to 2 pi sigma^2 * H(A), where H(A) is the harmonic number, 1 + 1/2
-+ ... + 1/A, and its variance on an axis is sigma^2 * (H(A) + H2(A) / H(A)) / 2, H2(A) = 1 + 1/4 + ... + 1/A^2. Both come
-from integrating by parts; for A up to 1 they are A and sigma^2.
+splats on top of each other make. Over the plane it sums to 2 pi sigma^2 * H(A), where H(A) is the harmonic number,
+1 + 1/2 + ... + 1/A, and its variance on an axis is sigma^2 * (H(A) + H2(A) / H(A)) / 2, with H2(A) = 1 + 1/4 + ... +
+1/A^2. Both come from integrating by parts; for A up to 1 they are 2 pi sigma^2 * A and sigma^2.
 
 So a splat that is to cover so much with such a variance has an A that follows from the *density* alone, coverage over
 2 pi * variance: A itself up to 1, H / spread above, which tends to 2, that of a disc with a sharp edge.
@@ -73,5 +73,5 @@ def profile_of(density):
 
 @kernel(inline=True)
 def size_factor(opacity):
-    """How much larger the traversal sees a splat of a linear opacity than one of at most 1, see `gaussian.spark_size`."""
+    """How much larger the traversal sees a splat of a linear opacity than one of 1, see `gaussian.spark_size`."""
     return 1 + SIZE_PER_D * (math.sqrt(1 + math.e * math.log(opacity)) - 1) if opacity > 1 else 1.0

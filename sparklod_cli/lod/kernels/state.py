@@ -20,9 +20,13 @@ CURVE_BITS = 13
 
 BLOCK = 64
 
+#: Colours count for the choice of pairs no further than this, and nothing is smaller than LEAST, so that float32 holds
+#: what they make.
+BRIGHTEST, LEAST = np.float32(1e3), np.float32(1e-30)
+
 
 @kernel(parallel=True)
-def fill_state(index, center, scale, quat, opacity, rgb, middle, unit, state):
+def fill_state(index, center, scale, quat, opacity, rgb, middle, unit, state, size):
     """Row i of state from splat index[i].
 
     Args:
@@ -30,6 +34,7 @@ def fill_state(index, center, scale, quat, opacity, rgb, middle, unit, state):
         center, scale, quat, opacity, rgb: columns of the splats.
         middle: (3,) float64 of the scene. unit: of length, float64.
         state: rows of `pairs.py`, the first n are filled.
+        size: (rows,) float32, the first n are filled: how large the traversal sees them, in units.
     """
     for i in prange(len(index)):
         splat = index[i]
@@ -39,15 +44,16 @@ def fill_state(index, center, scale, quat, opacity, rgb, middle, unit, state):
         xx, yy, zz, xy, xz, yz = covariance(a, b, c, x, y, z, np.float64(quat[splat, 3]))
         for k in range(3):
             row[CENTER + k] = (np.float64(center[splat, k]) - middle[k]) / unit
-            row[COLOR + k] = rgb[splat, k]
+            row[COLOR + k] = min(max(rgb[splat, k], -BRIGHTEST), BRIGHTEST)
         row[COVARIANCE], row[COVARIANCE + 1], row[COVARIANCE + 2] = xx, yy, zz
         row[COVARIANCE + 3], row[COVARIANCE + 4], row[COVARIANCE + 5] = xy, xz, yz
         row[LOG_DET] = log_det(
             np.float32(xx), np.float32(yy), np.float32(zz), np.float32(xy), np.float32(xz), np.float32(yz)
         )
         covered = opacity[splat] * ellipsoid_area(a, b, c)
-        row[COVERED] = row[WEIGHT] = covered
+        row[COVERED] = row[WEIGHT] = max(covered, LEAST)
         row[DENSITY] = opacity[splat]
+        size[i] = max(2 * (a + b + c) / 3, LEAST)
 
 
 @kernel(parallel=True)

@@ -1,8 +1,8 @@
 """Merging two nodes into one that covers what they cover together.
 
-What the two cover (coverage: opacity summed over the plane of projection) is what each covers, less what both do. The same
-holds for its first and second moments. How much both cover is a product of Gaussians, on the planes of the three axes; the
-moments of it are those of the product in space.
+What the two cover (coverage: opacity summed over the plane of projection) is what each covers, less what both do. The
+same holds for its first and second moments. How much both cover is a product of Gaussians, on the planes of the three
+axes; the moments of it are those of the product in space.
 """
 
 from __future__ import annotations

@@ -1,0 +1,223 @@
+"""Laws of the quality builder."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+import statistics
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sparklod_cli import jit
+from sparklod_cli.codecs import lod_tree
+from sparklod_cli.errors import InvalidSplatsError
+from sparklod_cli.gaussian import spark_size
+from sparklod_cli.io import read_scene
+from sparklod_cli.lod import quality, quick
+from sparklod_cli.lod.kernels.keep import STEPS
+from sparklod_cli.lod.traversal import Forest, Instance, Traversal
+from sparklod_cli.preview.compare import on_background
+from sparklod_cli.preview.metrics import psnr
+from sparklod_cli.render.camera import Camera
+from sparklod_cli.render.camera_path import GENERATED, cameras_of
+from sparklod_cli.render.frame import DEFAULT_UP, Settings
+from sparklod_cli.render.framing import framing
+from sparklod_cli.render.generate import orbit
+from sparklod_cli.render.look import Look
+from sparklod_cli.render.paths.source import Parsed
+from sparklod_cli.render.rasterizer import Image, draw
+from sparklod_cli.render.shown import show
+from sparklod_cli.selection import Selection
+from sparklod_cli.simulation.simulate import view_of
+from sparklod_cli.splats import Splats
+from sparklod_cli.tree import LodTree
+
+from .. import reference
+from ..conftest import real_scene
+from ..scenes import random_splats
+from .trees import check_threads, check_tree, children, coincident, hard_cases, parents
+
+GROWTHS = [1.05, 1.4, 2.0]
+
+
+def check(splats: Splats, growth: float) -> tuple[Splats, LodTree]:
+    """What holds for every scene."""
+    nodes, tree = quality.build(splats, growth)
+    check_tree(splats, nodes, tree)
+    assert len(nodes) <= max(growth * len(splats), len(splats) + 1)
+    return nodes, tree
+
+
+@pytest.mark.parametrize("growth", GROWTHS)
+@pytest.mark.parametrize("sh_degree", [0, 1, 2, 3])
+def test_leaves_are_the_input_and_nodes_no_more_than_asked_for(growth: float, sh_degree: int) -> None:
+    splats = random_splats(3_000, sh_degree=sh_degree, seed=sh_degree)
+    nodes, tree = check(splats, growth)
+    assert nodes.sh.shape[1:] == splats.sh.shape[1:]
+    assert len(nodes) == min(int(growth * 3_000), 2 * 3_000 - 1)  # and no fewer
+    assert tree.child_count.max() <= 2 or growth < 2
+
+
+@given(
+    st.integers(2, 200), st.floats(1.05, 2.0), st.integers(0, 2**32 - 1), st.sampled_from([1e-6, 1e-3, 1.0, 1e4, 1e9])
+)
+@settings(max_examples=60)
+def test_scenes_of_any_size_make_valid_trees(count: int, growth: float, seed: int, extent: float) -> None:
+    check(random_splats(count, seed=seed, extent=extent), growth)
+
+
+@pytest.mark.parametrize("growth", GROWTHS)
+@pytest.mark.parametrize("name", hard_cases())
+def test_hard_scenes_make_valid_trees(name: str, growth: float) -> None:
+    check(hard_cases()[name], growth)
+
+
+@pytest.mark.parametrize("growth", GROWTHS)
+@pytest.mark.parametrize("count", [65_535, 65_536])
+def test_coincident_splats_do_not_wrap_the_child_count(count: int, growth: float) -> None:
+    _, tree = check(coincident(count), growth)
+    assert tree.child_count.max() < 1000  # where any pair is as good as another, no node has to have many
+
+
+def test_one_splat_many_times_makes_a_shallow_tree() -> None:
+    """Half of what is equal merges in each round, so the tree is not a chain."""
+    _, tree = check(random_splats(1).take(np.zeros(10_000, np.int64)), 2.0)
+    assert tree.depths().max() < 5 * math.log2(10_000)
+
+
+@pytest.mark.parametrize("growth", GROWTHS)
+def test_one_splat_is_the_root(growth: float) -> None:
+    _, tree = check(random_splats(1, sh_degree=2), growth)
+    assert len(tree) == 1
+
+
+@pytest.mark.parametrize("growth", GROWTHS)
+def test_two_splats_have_one_parent(growth: float) -> None:
+    _, tree = check(random_splats(2, sh_degree=1), growth)
+    assert tree.child_count.tolist() == [2, 0, 0]
+
+
+def test_the_number_of_threads_does_not_change_a_bit() -> None:
+    check_threads(lambda: quality.build(random_splats(20_000, sh_degree=1, seed=3)))
+
+
+@pytest.mark.parametrize("growth", GROWTHS)
+def test_a_prefix_is_a_coarser_scene(growth: float) -> None:
+    nodes, tree = quality.build(random_splats(5_000, seed=4), growth)
+    parent = parents(tree)
+    assert (parent[1:] < np.arange(1, len(tree))).all()
+    # Nodes' children come in order of the size from which on the traversal divides a node, in steps; one of the size of
+    # its parent comes a step later.
+    with np.errstate(divide="ignore"):
+        smallness = -STEPS * np.log2(spark_size(nodes).astype(np.float64))
+    level = smallness - smallness[0]
+    for node in range(1, len(tree)):
+        smallness[node] = max(smallness[node], smallness[parent[node]])
+        level[node] = max(smallness[node] - smallness[0], level[parent[node]] + 1)
+    inner = np.flatnonzero(~tree.is_leaf)
+    inner = inner[np.argsort(tree.child_start[inner])]
+    assert (level[inner] >= np.maximum.accumulate(level[inner]) - 1.001).all()
+    medians = [np.median(part) for part in np.array_split(smallness[inner], 8)]
+    assert all(later >= earlier for earlier, later in itertools.pairwise(medians))
+    assert medians[-1] > medians[0] + STEPS
+
+
+@pytest.mark.parametrize("growth", GROWTHS)
+@pytest.mark.parametrize("sh_degree", [0, 3])
+def test_colours_are_means_of_the_leaves_by_what_they_cover(growth: float, sh_degree: int) -> None:
+    nodes, tree = quality.build(random_splats(2_000, sh_degree=sh_degree, seed=8), growth)
+    parent = parents(tree)
+    color = np.concatenate([nodes.rgb, nodes.sh.reshape(len(nodes), -1)], axis=1).astype(np.float64)
+    weight = np.where(tree.is_leaf, nodes.opacity.astype(np.float64) * reference.ellipsoid_area(nodes.scale), 0)
+    total = weight[:, None] * color
+    for node in range(len(tree) - 1, 0, -1):
+        weight[parent[node]] += weight[node]
+        total[parent[node]] += total[node]
+    np.testing.assert_allclose(color, total / weight[:, None], atol=2e-5)
+
+
+def test_merged_nodes_are_where_their_leaves_are() -> None:
+    """Of two that cover the same the merged one may lie beyond their mean, yet by no more than they are wide."""
+    splats = random_splats(3_000, seed=9)
+    nodes, tree = quality.build(splats)
+    low, high = nodes.center.astype(np.float64), nodes.center.astype(np.float64)
+    reach = nodes.scale.max(axis=1).astype(np.float64)
+    for node in np.flatnonzero(~tree.is_leaf)[::-1]:
+        part = children(tree, node)
+        low[node], high[node] = low[part].min(axis=0), high[part].max(axis=0)
+        slack = reach[part].max() + 1e-6
+        assert (nodes.center[node] >= low[node] - slack).all()
+        assert (nodes.center[node] <= high[node] + slack).all()
+
+
+def test_progress_ends_with_all_splats() -> None:
+    told = []
+    quality.build(random_splats(500, seed=1), progress=lambda *state: told.append(state))
+    assert [state[1] for state in told] == sorted(state[1] for state in told)
+    assert told[-1] == ("building", 500, 500, "splat")
+
+
+def test_no_splat_is_an_error() -> None:
+    with pytest.raises(InvalidSplatsError, match="no splat"):
+        quality.build(random_splats(0))
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("name", ["center", "scale"])
+def test_a_splat_that_is_not_finite_is_an_error(name: str, value: float) -> None:
+    splats = random_splats(10)
+    getattr(splats, name)[3, 1] = value
+    with pytest.raises(InvalidSplatsError, match="not finite"):
+        quality.build(splats)
+
+
+@pytest.mark.parametrize("name", ["opacity", "scale"])
+def test_a_splat_that_cannot_be_seen_is_an_error(name: str) -> None:
+    splats = random_splats(10)
+    getattr(splats, name)[3] = 0
+    with pytest.raises(InvalidSplatsError, match="without opacity or scale"):
+        quality.build(splats)
+
+
+@pytest.mark.parametrize("growth", [1.0, 2.01, math.nan])
+def test_a_growth_out_of_range_is_an_error(growth: float) -> None:
+    with pytest.raises(ValueError, match="growth"):
+        quality.build(random_splats(2), growth)
+
+
+def cameras_around(splats: Splats) -> tuple[Camera, ...]:
+    middle, radius = framing(splats.center)
+    frames = orbit(3, middle, 1.6 * radius, math.radians(15), DEFAULT_UP)
+    settings = Settings(size=(240, 135), fov_y=math.radians(60))
+    return cameras_of(Parsed(frames), GENERATED["orbit"], settings).cameras
+
+
+def picture(splats: Splats, camera: Camera) -> Image:
+    return draw(show([(splats, np.eye(4))], camera), camera, Look())
+
+
+def fidelity(splats: Splats, built: tuple[Splats, LodTree], share: float) -> float:
+    """Mean PSNR of cuts of so many of the leaves, in dB."""
+    nodes, tree = built
+    forest = Forest([lod_tree.unpack(lod_tree.pack(nodes, tree, threads=2))])
+    traversal = Traversal(forest, [Instance()])
+    found = []
+    for camera in cameras_around(splats):
+        full = picture(splats, camera)
+        cut = traversal.cut(view_of(camera), budget=int(share * len(splats))).indices()[0]
+        image = picture(nodes.take(cut), camera)
+        found += [psnr(on_background(image, gray), on_background(full, gray)) for gray in (0.0, 1.0)]
+    return statistics.mean(found)
+
+
+def test_cuts_of_a_real_scene_are_closer_to_full_detail_than_those_of_the_quick_builder() -> None:
+    jit.use_threads(2)
+    splats, _ = Selection().apply(read_scene(real_scene("playbot-125k.ply")).splats)
+    splats = dataclasses.replace(splats, sh=splats.sh[:, :0])
+    jit.use_threads(256)
+    ours, quicks = (fidelity(splats, builder.build(splats), 0.1) for builder in (quality, quick))
+    assert ours >= quicks + 1
