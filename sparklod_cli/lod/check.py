@@ -38,6 +38,7 @@ def check(splats: Splats) -> Extremes:
         raise InvalidSplatsError("no splat is left to build a tree of")
     with threads_for(len(splats)) as threads:
         low, high, smallest, largest = extremes(splats.center, splats.scale, threads)
-    if not (smallest > 0 and splats.opacity.min() > 0 and np.isfinite([*low, *high, largest]).all()):
+    columns = splats.center, splats.scale, splats.quat_xyzw, splats.opacity
+    if not (smallest > 0 and splats.opacity.min() > 0 and all(np.isfinite(column).all() for column in columns)):
         raise InvalidSplatsError("a splat is not finite, or without opacity or scale: see Selection.apply")
     return Extremes(low, high, smallest, largest)

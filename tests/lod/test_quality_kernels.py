@@ -129,7 +129,7 @@ def test_the_shared_share_is_that_of_integrals(seed: int) -> None:
     assert union.shared_share(a, b) == pytest.approx(shared / alone, rel=1e-5)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_the_error_of_a_picture_is_an_integral(seed: int) -> None:
     a, b, merged = twin.random_rows(3, seed + 20, spread=0.7)
     total = 0.0
@@ -366,14 +366,6 @@ def test_no_more_are_kept_than_asked_for_and_their_parents_are_nearest_of_them(b
     assert np.array_equal(binary.saved[inner] + 1, children[inner])
 
 
-@given(st.integers(64, 300), st.integers(0, 2**32 - 1), st.booleans())
-@settings(max_examples=40)
-def test_no_node_gets_many_children_where_others_can_be_dropped(leaves: int, seed: int, equal: bool) -> None:
-    binary = Binary(leaves, seed, equal)
-    binary.drop((leaves - 1) // 2)
-    assert binary.saved.max() < keep.MOST_CHILDREN
-
-
 def test_what_saves_most_for_its_error_is_kept() -> None:
     """Of two inner nodes under a root, equal but for their errors, the one with less of it."""
     children = np.array([[0, 0]] * 4 + [[0, 1], [2, 3], [4, 5]], np.uint32)
@@ -445,8 +437,10 @@ def test_rows_of_leaves_are_their_splats_in_units() -> None:
     rows = np.zeros((120, pairs.WIDTH), np.float32)
     middle, unit = np.array([0.5, -1.0, 2.0]), 2.0**-6
     columns = splats.center, splats.scale, splats.quat_xyzw, splats.opacity, splats.rgb
-    state.fill_state(index, *columns, middle, unit, rows)
-    assert not rows[100:].any()
+    size = np.zeros(120, np.float32)
+    state.fill_state(index, *columns, middle, unit, rows, size)
+    assert not rows[100:].any() and not size[100:].any()
+    np.testing.assert_allclose(size[:100] * unit, spark_size(splats)[index], rtol=1e-5)
     for row, i in zip(rows, index, strict=False):
         np.testing.assert_allclose(row[CENTER : CENTER + 3] * unit + middle, splats.center[i], atol=1e-5)
         covariance = reference.covariance(splats.scale[i], splats.quat_xyzw[i]) / unit**2

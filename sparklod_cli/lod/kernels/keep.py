@@ -12,6 +12,7 @@ import math
 import numpy as np
 
 from ...jit import kernel
+from ...tree import MAX_CHILDREN
 
 #: Sizes are told apart in so many steps an octave, over octaves of float32.
 STEPS, OCTAVES = 4, 256
@@ -113,17 +114,20 @@ def drop_nodes(leaves, most, parent, log_size, weight, lost, saved):
     saved[leaves:] = 1
     left = total - leaves
     count = np.zeros(1 << KEY_BITS, np.int64)
-    turn, before = ROUNDS, 0
-    children = MOST_CHILDREN
+    turn, children = ROUNDS, MOST_CHILDREN
     while left > most:  # the last rounds find what became more useful meanwhile
-        if left == before:
-            children *= 2
-        excess, before = left - most, left
         count[:] = 0
+        candidates = 0
         for node in range(leaves, total - 1):
-            if saved[node] > 0:
+            if saved[node] > 0 and saved[parent[node]] + saved[node] < children:
                 count[key_of(usefulness(node, parent, log_size, weight, lost, saved))] += 1
-        wanted, threshold, below = max(excess // turn, 1), 0, 0
+                candidates += 1
+        if candidates == 0:
+            if children == MAX_CHILDREN:
+                break
+            children = min(2 * children, MAX_CHILDREN)
+            continue
+        wanted, threshold, below = min(max((left - most) // turn, 1), candidates), 0, 0
         while below + count[threshold] < wanted:
             below += count[threshold]
             threshold += 1
