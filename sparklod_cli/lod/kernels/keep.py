@@ -30,15 +30,12 @@ RARITY = 0.5
 #: Dropping in so many rounds is nearly as good as one after the other, the least useful first.
 ROUNDS = 8
 
-#: No node gets more children unless no other can be dropped: where a node is smaller than
-#: those below it they are of no use by the rule above, yet a budget between one and thousands would have nothing to
-#: spend on.
+#: No node gets more children unless no other can be dropped: where a node is smaller than those below it they are of no
+#: use by the rule above, yet a budget between one and thousands would have nothing to spend on.
 MOST_CHILDREN = 16
 
 #: Useful numbers are told apart by this many of their bits.
 KEY_BITS = 16
-
-UNUSED = np.uint32(0xFFFFFFFF)
 
 
 @kernel()
@@ -78,11 +75,11 @@ def value_nodes(children, leaves, size, error, log_size, weight, lost):
             parent[children[node, 0]] = parent[children[node, 1]] = node
             inner[step] += 1
             sums[step] += error[node]
-    finer, rare = 0.0, np.empty(STEPS * OCTAVES)
+    drawn, rare = 0.0, np.empty(STEPS * OCTAVES)
     for step in range(STEPS * OCTAVES - 1, -1, -1):
-        finer += count[step]  # about so many splats are in a cut down to here
-        rare[step] = min(1.0, finer / (COMMON * leaves))
-        count[step] = max(min(finer, float(leaves)), 1.0) ** -RARITY
+        drawn += count[step]  # about so many splats are in a cut down to here
+        rare[step] = min(1.0, drawn / (COMMON * leaves))
+        count[step] = max(min(drawn, float(leaves)), 1.0) ** -RARITY
     for node in range(leaves, total):
         step = step_of(math.exp(log_size[node]))
         weight[node] = count[step]

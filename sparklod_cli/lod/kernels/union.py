@@ -20,7 +20,10 @@ from .profile import profile_of, size_factor
 #: How much opacity counts in the error of a picture beside each channel of colour: on black and on white.
 ALPHA = 1.0
 
-#: Rows and columns of xx yy zz xy xz yz, for the planes xy, xz and yz: first, second, mixed; and their axes.
+#: Rows and columns of a matrix for xx yy zz xy xz yz.
+ROW, COLUMN = (0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2)
+
+#: Places among xx yy zz xy xz yz, for the planes xy, xz and yz: first, second, mixed; and their axes.
 PLANES = ((0, 1, 3, 0, 1), (0, 2, 4, 0, 2), (1, 2, 5, 1, 2))
 
 #: No semi-axis is shorter, in the unit of the state.
@@ -127,8 +130,7 @@ def unite(a, b, merged):
     total = np.float64(a[COVERED]) + np.float64(b[COVERED])
     share = np.float64(a[COVERED]) / total
     hidden = shared_share(a, b)
-    offset, p, joint = np.empty(3), np.empty((3, 3)), np.empty((3, 3))
-    q = np.empty((3, 3))
+    offset, p, q, joint = np.empty(3), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     for i in range(3):
         offset[i] = np.float64(b[CENTER + i]) - np.float64(a[CENTER + i])
     fill_matrix(a, p)
@@ -166,9 +168,6 @@ def unite(a, b, merged):
         )
         merged[COVARIANCE + element] = second / left - mean[i] * mean[j]
     merged[COVERED] = total * left
-
-
-ROW, COLUMN = (0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2)
 
 
 @kernel(inline=True)
