@@ -24,6 +24,9 @@ NO_LIMIT = np.float32(np.inf)
 
 # Pairs.
 
+#: Of a place in the order that nobody has taken.
+UNUSED = np.uint32(0xFFFFFFFF)
+
 
 def test_the_logarithm_of_a_determinant_is_numpys() -> None:
     for row in twin.random_rows(200, seed=1):
@@ -320,7 +323,7 @@ class Binary:
         inner = np.flatnonzero(level >= 0).astype(np.uint32)
         inner = inner[np.argsort(level[inner], kind="stable")]
         total = self.leaves + len(inner)
-        order = np.full(total, keep.UNUSED)
+        order = np.full(total, UNUSED)
         tree = LodTree(np.zeros(total, np.uint16), np.zeros(total, np.uint32))
         places = keep.place_nodes(inner, self.parent, self.saved, order, tree.child_start, tree.child_count)
         return order, tree, inner, places
