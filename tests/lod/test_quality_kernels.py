@@ -24,9 +24,6 @@ NO_LIMIT = np.float32(np.inf)
 
 # Pairs.
 
-#: Of a place in the order that nobody has taken.
-UNUSED = np.uint32(0xFFFFFFFF)
-
 
 def test_the_logarithm_of_a_determinant_is_numpys() -> None:
     for row in twin.random_rows(200, seed=1):
@@ -284,6 +281,10 @@ def test_the_size_factor_is_that_of_sparks_size() -> None:
 
 
 # What is kept.
+
+
+#: Of a place in the order that nobody has taken.
+UNUSED = np.uint32(0xFFFFFFFF)
 
 
 class Binary:
