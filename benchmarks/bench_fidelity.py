@@ -24,6 +24,7 @@ from sparklod_cli import jit
 from sparklod_cli.codecs import ext_splats, lod_tree, spz
 from sparklod_cli.codecs.lod_tree import Nodes
 from sparklod_cli.io import read_scene
+from sparklod_cli.limits import DEFAULT_GROWTH
 from sparklod_cli.lod import quality, quick
 from sparklod_cli.lod.traversal import Forest, Instance, Traversal
 from sparklod_cli.parallel import processors
@@ -308,7 +309,7 @@ def parsed() -> argparse.Namespace:
     parser.add_argument("scenes", nargs="+", type=Path, help=f"splat files, or a folder with {', '.join(REAL_SCENES)}")
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS), help="what builds trees")
     parser.add_argument("--budgets", type=parse_budgets, default=BUDGETS, help="shares of the leaves, or counts")
-    parser.add_argument("--growth", type=float, default=1.4, help="of our quality builder")
+    parser.add_argument("--growth", type=float, default=DEFAULT_GROWTH, help="of our quality builder")
     parser.add_argument("--runs", type=int, default=3, help="runs of each builder; medians are printed")
     parser.add_argument("--json", type=Path, help="file for all numbers, with those of each camera")
     parser.add_argument("--plot", type=Path, help="file for the curves, such as fidelity.png; needs matplotlib")

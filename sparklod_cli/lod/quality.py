@@ -22,11 +22,11 @@ from ..jit import threads_for
 from ..limits import DEFAULT_GROWTH, MAX_GROWTH, MIN_GROWTH
 from ..progress import Progress, silent
 from ..sh import degree_of
-from ..splats import FloatArray, Splats
+from ..splats import COLUMNS, FloatArray, Splats
 from ..tree import LodTree
 from .check import Extremes, check
 from .kernels import keep, pairs, state, union
-from .kernels.order import fill_leaf_colors, merge_colors
+from .kernels.order import fill_leaves, merge_colors
 from .kernels.sort import Nodes, sort_by_key
 
 #: Growth from level to level of the size up to which leaves have joined, and nodes merge.
@@ -100,16 +100,20 @@ class _Space:
         low, high = np.quantile((center - middle) / unit, [OUTSIDE, 1 - OUTSIDE], axis=0)
         return cls(middle, unit, low, float(max((high - low).max(), 1.0)))
 
-    def sort(self, growing: _Growing, nodes: Nodes, turn: int, threads: int) -> Nodes:
+    def centers(self, splats: Splats) -> FloatArray:
+        """(N, 3) where splats are, in units from the middle: the first columns of their rows of state."""
+        return ((splats.center.astype(np.float64) - self.middle) / self.unit).astype(np.float32)
+
+    def sort(self, rows: FloatArray, nodes: Nodes, turn: int, threads: int) -> Nodes:
         """Nodes along the curve, which moves from turn to turn."""
-        _, nodes = sort_by_key(self.places(growing, nodes, turn), nodes.copy(), 3 * state.CURVE_BITS, threads)
+        _, nodes = sort_by_key(self.places(rows, nodes, turn), nodes.copy(), 3 * state.CURVE_BITS, threads)
         return nodes
 
-    def places(self, growing: _Growing, nodes: Nodes, turn: int) -> NDArray[np.uint64]:
+    def places(self, rows: FloatArray, nodes: Nodes, turn: int) -> NDArray[np.uint64]:
         """Where nodes are on the curve."""
         moved = np.modf(np.array([1, 2, 3]) * GOLDEN * turn)[0] * SLACK * self.extent
         step = (1 + SLACK) * self.extent / (1 << state.CURVE_BITS)
-        return state.curve_keys(growing.state, nodes, self.low - moved, step)
+        return state.curve_keys(rows, nodes, self.low - moved, step)
 
 
 def build(splats: Splats, growth: float = DEFAULT_GROWTH, *, progress: Progress = silent) -> tuple[Splats, LodTree]:
@@ -155,10 +159,8 @@ def _leaves(splats: Splats, space: _Space, threads: int) -> tuple[_Growing, Node
         np.zeros(rows, np.float32),
         n,
     )
-    index = np.arange(n, dtype=np.uint32)
+    index = space.sort(space.centers(splats), np.arange(n, dtype=np.uint32), 0, threads)
     columns = splats.center, splats.scale, splats.quat_xyzw, splats.opacity, splats.rgb
-    state.fill_state(index, *columns, space.middle, space.unit, growing.state, growing.size)
-    index = space.sort(growing, index, 0, threads)
     state.fill_state(index, *columns, space.middle, space.unit, growing.state, growing.size)
     return growing, index
 
@@ -186,7 +188,7 @@ def _merge(growing: _Growing, active: Nodes, space: _Space, largest: float, roun
     done = 0
     while len(active) > 1 and (rounds is None or done < rounds):
         with threads_for(len(active)) as threads:
-            active = space.sort(growing, active, growing.rounds, threads)
+            active = space.sort(growing.state, active, growing.rounds, threads)
             partner, cost = pairs.cheapest(growing.state, active, WINDOW, np.float32(largest))
             before = len(active)
             found, rest = pairs.pair_up(active, partner, cost, _limit(cost), growing.used)
@@ -226,14 +228,14 @@ def _in_final_order(
     tree = LodTree(np.zeros(total, np.uint16), np.zeros(total, np.uint32))
     place = keep.place_nodes(inner, parent, saved, order, tree.child_start, tree.child_count)
     out = Splats.empty(total, degree_of(splats.sh.shape[1]))
-    state.fill_leaves(order, index, splats.center, splats.scale, splats.quat_xyzw, splats.opacity, *_geometry(out))
-    state.fill_merged(order, n, growing.state, space.middle, space.unit, *_geometry(out))
-    flat_sh = out.sh.reshape(total, -1)
-    fill_leaf_colors(order, index, splats.rgb, splats.sh.reshape(n, -1), out.rgb, flat_sh)
+    for name in COLUMNS:
+        fill_leaves(order, index, getattr(splats, name).reshape(n, -1), getattr(out, name).reshape(total, -1))
+    geometry = out.center, out.scale, out.quat_xyzw, out.opacity
+    state.fill_merged(order, n, growing.state, space.middle, space.unit, *geometry)
     weights = growing.state[:, pairs.WEIGHT].astype(np.float64)
     for begin, end in zip(ends[-2::-1], ends[:0:-1], strict=True):
         with threads_for(int(end - begin)) as threads:
-            for color in (out.rgb, flat_sh):
+            for color in (out.rgb, out.sh.reshape(total, -1)):
                 merge_colors(place[begin:end], tree.child_start, tree.child_count, order, weights, color, threads)
     return out, tree
 
@@ -242,10 +244,7 @@ def _by_level(growing: _Growing, level: NDArray[np.int32], space: _Space) -> tup
     """The merged nodes that are kept, level by level along the curve, and where each level ends, from 0."""
     inner = np.flatnonzero(level >= 0).astype(np.uint32)
     own = level[inner]
-    keys = space.places(growing, inner, 0) | (own.astype(np.uint64) << np.uint64(3 * state.CURVE_BITS))
-    inner = inner[np.argsort(keys, kind="stable")]
+    keys = space.places(growing.state, inner, 0) | (own.astype(np.uint64) << np.uint64(3 * state.CURVE_BITS))
+    with threads_for(len(inner)) as threads:
+        _, inner = sort_by_key(keys, inner, 3 * state.CURVE_BITS + int(own.max()).bit_length(), threads)
     return inner, np.concatenate([[0], np.cumsum(np.bincount(own))]).astype(np.int64)
-
-
-def _geometry(splats: Splats) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    return splats.center, splats.scale, splats.quat_xyzw, splats.opacity

@@ -24,10 +24,10 @@ from ..sh import degree_of
 from ..splats import FloatArray, Splats
 from ..tree import MAX_CHILDREN, LodTree
 from .check import check
-from .kernels.geometry import CENTER, WIDTH, fill_leaves
+from .kernels.geometry import CENTER, WIDTH, fill_rows
 from .kernels.group import level_keys, split_cells
 from .kernels.merge import merge_groups
-from .kernels.order import fill_columns, fill_leaf_colors, merge_colors, places_of_merged
+from .kernels.order import fill_columns, fill_leaves, merge_colors, places_of_merged
 from .kernels.sort import Nodes, sort_by_cell, sort_by_key
 
 #: Cells count in int64; the finest level is the first at which the scene's coordinates stay below this.
@@ -123,7 +123,7 @@ def build(splats: Splats, base: float = DEFAULT_BASE, *, progress: Progress = si
         steps = base ** np.arange(finest, coarsest + 1, dtype=np.float64)
         index, joins = _sort_leaves(splats, steps, low, high, threads)
         rows, weight = np.empty((2 * n, WIDTH), np.float32), np.empty(2 * n, np.float64)
-        fill_leaves(index, splats.center, splats.scale, splats.quat_xyzw, splats.opacity, rows, weight)
+        fill_rows(index, splats.center, splats.scale, splats.quat_xyzw, splats.opacity, rows, weight)
         rgb, sh = splats.rgb, splats.sh
         del splats  # from here on the rows have the rest; frees it where the caller has let go of it too
         forest = _Forest(rows, weight, n, n, [])
@@ -199,7 +199,8 @@ def _in_final_order(forest: _Forest, index: Nodes, rgb: FloatArray, sh: FloatArr
     fill_columns(order, forest.geometry, forest.leaves, SHRINK, out.center, out.scale, out.quat_xyzw, out.opacity)
     forest.geometry = np.empty((0, WIDTH), np.float32)  # the colours want its memory
     flat_sh = out.sh.reshape(total, -1)
-    fill_leaf_colors(order, index, rgb, sh.reshape(len(sh), -1), out.rgb, flat_sh)
+    fill_leaves(order, index, rgb, out.rgb)
+    fill_leaves(order, index, sh.reshape(len(sh), -1), flat_sh)
     end = total
     for row, members, first in forest.batches:
         parents = place[row - forest.leaves :][: len(first) - 1]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from ..render.labels import BACKGROUND, FAINT, write_title
-from ..simulation.charts import BLUE, DPI, GREEN, INDIGO, ORANGE, PINK, WIDTH, YELLOW, Frames, load_matplotlib, style
+from ..simulation.charts import BLUE, DPI, GREEN, INDIGO, ORANGE, PINK, WIDTH, YELLOW, Frames, load_matplotlib, styled
 from ..simulation.columns import Row
 from ..simulation.statistics import numbers
 from .compare import Budget, rows_of
@@ -38,9 +38,7 @@ def plot(rows: Sequence[Row], budgets: Sequence[Budget], title: str) -> bytes:
         SparklodError: matplotlib is not installed.
     """
     matplotlib = load_matplotlib()
-    with matplotlib.rc_context():
-        matplotlib.rcdefaults()  # whatever a matplotlibrc says
-        matplotlib.rcParams.update(style())
+    with styled(matplotlib):
         charts = _charts(matplotlib, rows_of(rows, budgets), budgets)
     head = Image.new("RGB", (WIDTH, HEAD), BACKGROUND)
     frames = len(rows) // len(budgets)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
@@ -240,10 +241,17 @@ def draw(rows: Sequence[Row]) -> NDArray[np.uint8]:
         SparklodError: matplotlib is not installed.
     """
     matplotlib = load_matplotlib()
-    with matplotlib.rc_context():
-        matplotlib.rcdefaults()  # whatever a matplotlibrc says
-        matplotlib.rcParams.update(style())
+    with styled(matplotlib):
         return _draw(matplotlib, rows)
+
+
+@contextlib.contextmanager
+def styled(matplotlib: ModuleType) -> Iterator[None]:
+    """Draws inside in the style of charts that go with the pictures of scenes, whatever a matplotlibrc says."""
+    with matplotlib.rc_context():
+        matplotlib.rcdefaults()
+        matplotlib.rcParams.update(style())
+        yield
 
 
 def style() -> dict[str, Any]:

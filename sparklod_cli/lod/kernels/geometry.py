@@ -61,7 +61,7 @@ def extremes(center, scale, chunks):
 
 
 @kernel(parallel=True)
-def fill_leaves(index, center, scale, quat, opacity, geometry, weight):
+def fill_rows(index, center, scale, quat, opacity, geometry, weight):
     """Row i of geometry and weight from splat index[i]; a weight is opacity * area, float64."""
     n = len(index)
     for block in prange((n + BLOCK - 1) // BLOCK):

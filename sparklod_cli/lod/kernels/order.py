@@ -37,15 +37,13 @@ def fill_columns(order, geometry, leaves, shrink, center, scale, quat, opacity):
 
 
 @kernel(parallel=True)
-def fill_leaf_colors(order, index, rgb, sh, rgb_out, sh_out):
-    """Colours of the leaves in final order: row i from splat index[order[i]]; rows of merged nodes are left alone."""
+def fill_leaves(order, index, column, out):
+    """A column of the leaves in final order: row i from splat index[order[i]]; rows of merged nodes are left alone."""
     for i in prange(len(order)):
         if order[i] < len(index):
             j = index[order[i]]
-            for k in range(3):
-                rgb_out[i, k] = rgb[j, k]
-            for k in range(sh.shape[1]):
-                sh_out[i, k] = sh[j, k]
+            for k in range(column.shape[1]):
+                out[i, k] = column[j, k]
 
 
 @kernel(parallel=True)

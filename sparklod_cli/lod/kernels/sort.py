@@ -31,12 +31,18 @@ def spread_bits(x):
 
 
 @kernel()
+def interleave(i, j, k):
+    """Bits of three uint64 in turn, the first's lowest; 21 of each."""
+    return spread_bits(i) | (spread_bits(j) << np.uint64(1)) | (spread_bits(k) << np.uint64(2))
+
+
+@kernel()
 def morton_code(x, y, z, step, low, shift):
     """Interleaved bits shift .. shift + 20 of floor(centre / step) - low on each axis."""
     i = np.uint64(np.int64(math.floor(x / step)) - low[0]) >> shift
     j = np.uint64(np.int64(math.floor(y / step)) - low[1]) >> shift
     k = np.uint64(np.int64(math.floor(z / step)) - low[2]) >> shift
-    return spread_bits(i) | (spread_bits(j) << np.uint64(1)) | (spread_bits(k) << np.uint64(2))
+    return interleave(i, j, k)
 
 
 @kernel(parallel=True)

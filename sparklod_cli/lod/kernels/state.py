@@ -13,7 +13,7 @@ from .geometry import ellipsoid_area
 from .merge import covariance
 from .pairs import CENTER, COLOR, COVARIANCE, COVERED, DENSITY, LOG_DET, WEIGHT, log_det
 from .profile import profile_of
-from .sort import spread_bits
+from .sort import interleave
 
 #: Bits an axis of the curve.
 CURVE_BITS = 13
@@ -74,7 +74,7 @@ def curve_keys(state, nodes, low, step):
         x = np.uint64(min(max((row[CENTER] - low[0]) / step, 0.0), most))
         y = np.uint64(min(max((row[CENTER + 1] - low[1]) / step, 0.0), most))
         z = np.uint64(min(max((row[CENTER + 2] - low[2]) / step, 0.0), most))
-        keys[i] = spread_bits(x) | (spread_bits(y) << np.uint64(1)) | (spread_bits(z) << np.uint64(2))
+        keys[i] = interleave(x, y, z)
     return keys
 
 
@@ -110,17 +110,3 @@ def fill_merged(order, leaves, state, middle, unit, center, scale, quat, opacity
                 scale[i, axis] = max(math.sqrt(max(moments[axis, k], 0.0) / spread) * unit, 1e-30)
             for part in range(4):
                 quat[i, part] = moments[6 + part, k]
-
-
-@kernel(parallel=True)
-def fill_leaves(order, index, center, scale, quat, opacity, center_out, scale_out, quat_out, opacity_out):
-    """Columns of the leaves in final order: row i from splat index[order[i]]; rows of merged nodes are left alone."""
-    for i in prange(len(order)):
-        if order[i] < len(index):
-            splat = index[order[i]]
-            for k in range(3):
-                center_out[i, k] = center[splat, k]
-                scale_out[i, k] = scale[splat, k]
-            for k in range(4):
-                quat_out[i, k] = quat[splat, k]
-            opacity_out[i] = opacity[splat]
