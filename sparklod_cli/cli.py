@@ -3,23 +3,18 @@
 from __future__ import annotations
 
 import os
-import signal
 import sys
 from importlib import import_module
-from types import FrameType
 from typing import NoReturn
 
 import click
 
-from . import __version__
+from . import __version__, interrupts
 from .commands.console import say, say_error
 from .errors import SparklodError
 
 #: Sub-commands, each a module of `commands` with a function of its name; imported when it is called for.
-COMMANDS = {"build-lod": "build_lod", "inspect": "inspect", "traverse": "traverse", "render": "render"}
-
-#: Signals that end a run: Ctrl-C, a polite kill, a terminal that is closed.
-ENDING = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+COMMANDS = {name: name.replace("-", "_") for name in ("build-lod", "inspect", "traverse", "render", "warmup")}
 
 EPILOG = """
 \b
@@ -58,9 +53,11 @@ def run(arguments: list[str] | None = None) -> int:
     except SparklodError as error:
         say_error(str(error))
         return 1
-    except (click.Abort, KeyboardInterrupt):
+    except (click.Abort, KeyboardInterrupt) as error:
+        if isinstance(error.__cause__, EOFError):  # which click takes for the end of what somebody types
+            raise error.__cause__ from None
         say("interrupted")
-        return 130
+        return interrupts.INTERRUPTED
     except BrokenPipeError:
         # Whoever read standard output has gone; pointing it elsewhere keeps the interpreter's last flush quiet.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -72,32 +69,9 @@ def run(arguments: list[str] | None = None) -> int:
     return code if isinstance(code, int) else 0
 
 
-def _interrupt(signum: int, frame: FrameType | None) -> None:
-    """Raises `KeyboardInterrupt`, but not inside numba.
-
-    LLVM calls back into Python there; an exception in such a call is lost, and what LLVM gets instead of an answer can
-    crash the process. So the signal is tried again a moment later.
-    """
-    at = frame if hasattr(signal, "setitimer") else None
-    while at is not None:
-        if at.f_globals.get("__name__", "").partition(".")[0] in ("numba", "llvmlite"):
-            signal.signal(signal.SIGALRM, _interrupt)
-            signal.setitimer(signal.ITIMER_REAL, 0.005)
-            return
-        at = at.f_back
-    for number in ENDING:
-        signal.signal(number, signal.SIG_DFL)  # a second one does not wait for the cleaning up
-    raise KeyboardInterrupt
-
-
 def main() -> NoReturn:
     """Entry point of the script; cleans up on a polite kill as on Ctrl-C."""
-    for number in ENDING:
-        if signal.getsignal(number) != signal.SIG_IGN:  # nohup and the like stay in force
-            signal.signal(number, _interrupt)
+    interrupts.handle()
     code = run()
-    for number in ENDING:
-        signal.signal(number, signal.SIG_IGN)  # what there was to do is done
-    if hasattr(signal, "setitimer"):
-        signal.setitimer(signal.ITIMER_REAL, 0)
+    interrupts.ignore()
     sys.exit(code)

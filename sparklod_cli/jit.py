@@ -3,17 +3,50 @@
 from __future__ import annotations
 
 import contextlib
-import functools
 import hashlib
 import os
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import numba
-from numba.core import event
+# Threads of OpenMP wait for one another at the end of every parallel loop. By default they spin for milliseconds, which
+# on a busy machine takes the processor from the very thread that they wait for: four bakes at once then take twice as
+# long as one after another. These are read when numba first starts its threads; docs/performance.md has what was
+# measured. Whoever sets one of them keeps it.
+WAITING = {
+    "GOMP_SPINCOUNT": "1000",  # GNU's: looks that often, some 20 microseconds, then sleeps
+    "KMP_BLOCKTIME": "0",  # LLVM's and Intel's: milliseconds
+}
+if "OMP_WAIT_POLICY" not in os.environ:
+    for _name, _value in WAITING.items():
+        os.environ.setdefault(_name, _value)
+
+import numba  # noqa: E402
+from numba.core import event  # noqa: E402
+
+from .jit_cache import SUFFIX, KernelCache, Trouble, stem_of  # noqa: E402
+
+#: Is told the name of a kernel that is being compiled, and how many seconds that took.
+Begun = Callable[[str], None]
+Done = Callable[[float], None]
 
 SMALL = 4096  # rows that one thread works through before another would have woken up
+
+#: All that compiled code is made of: kernels, and the modules whose constants and functions they use.
+SOURCES = (
+    "approximations.py",
+    "gaussian.py",
+    "jit.py",
+    "jit_cache.py",
+    "limits.py",
+    "sh.py",
+    "splats.py",
+    "tree.py",
+    "errors.py",
+    "lod/kernels/*.py",
+    "render/kernels/*.py",
+)
 
 
 def _cache_folder() -> Path | None:
@@ -23,8 +56,7 @@ def _cache_folder() -> Path | None:
     of those that it calls and of constants that it uses. So the folder's name is of all the source there is.
     """
     package = Path(__file__).parent
-    named = ("approximations.py", "gaussian.py", "jit.py")
-    sources = [*(package / name for name in named), *sorted(package.glob("*/kernels/*.py"))]
+    sources = [path for pattern in SOURCES for path in sorted(package.glob(pattern))]
     digest = hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()[:16]
     given = os.environ.get("NUMBA_CACHE_DIR")
     places = [Path(given)] if given else [package / "__pycache__"]
@@ -68,15 +100,15 @@ def kernel(
             fastmath={"contract"} if contract else False,
         )(function)
         if CACHE_FOLDER is not None and hasattr(compiled, "enable_caching"):  # not with NUMBA_DISABLE_JIT
-            theirs = numba.config.CACHE_DIR
-            numba.config.CACHE_DIR = str(CACHE_FOLDER)
-            try:
-                compiled.enable_caching()
-            finally:
-                numba.config.CACHE_DIR = theirs
+            compiled._cache = KernelCache(function, CACHE_FOLDER, _tell_trouble)
         return compiled
 
     return decorate
+
+
+def is_cached(name: str) -> bool:
+    """Whether compiled code of a kernel is there, named as its module in `kernels`, a point, and its own name."""
+    return CACHE_FOLDER is not None and any(CACHE_FOLDER.glob(f"{name}-*{SUFFIX}"))
 
 
 def use_threads(count: int) -> None:
@@ -99,28 +131,54 @@ def threads_for(rows: int) -> Iterator[int]:
         use_threads(threads)
 
 
+#: Who is told of what keeps the cache from working.
+_troubled: list[Trouble] = []
+
+
+def _tell_trouble(text: str) -> None:
+    for tell in _troubled:
+        tell(text)
+
+
 class _OnCompile(event.Listener):
-    def __init__(self, callback: Callable[[], None]) -> None:
-        self._callback: Callable[[], None] | None = callback
+    """Tells of kernels that Python calls, not of those that they are made of."""
+
+    def __init__(self, begun: Begun, done: Done) -> None:
+        self._begun, self._done = begun, done
+        self._depth, self._since = 0, 0.0
 
     def on_start(self, event: event.Event) -> None:
-        callback, self._callback = self._callback, None
-        if callback:
-            callback()
+        self._depth += 1  # one thread at a time compiles
+        if self._depth == 1:
+            self._since = time.perf_counter()
+            self._begun(stem_of(event.data["dispatcher"].py_func))
 
     def on_end(self, event: event.Event) -> None:
-        pass
+        self._depth -= 1
+        if self._depth == 0:
+            self._done(time.perf_counter() - self._since)
 
 
-def on_first_compile(callback: Callable[[], None]) -> Callable[[], None]:
-    """Calls back when a kernel is compiled because no cache has it, the first time only.
+def listen(begun: Begun, done: Done, trouble: Trouble) -> Callable[[], None]:
+    """Listens to what happens when kernels are called for the first time.
+
+    Args:
+        begun: called with the name of each kernel that is compiled because no cache has it, see `is_cached`.
+        done: called when it is compiled, with the seconds that took.
+        trouble: called with a line on what keeps the cache from working.
 
     Returns:
         what ends that.
     """
-    listener = _OnCompile(callback)
+    listener = _OnCompile(begun, done)
     event.register("numba:compile", listener)
-    return functools.partial(event.unregister, "numba:compile", listener)
+    _troubled.append(trouble)
+
+    def stop() -> None:
+        event.unregister("numba:compile", listener)
+        _troubled.remove(trouble)
+
+    return stop
 
 
 def threads_in_use() -> int:

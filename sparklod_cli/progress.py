@@ -6,7 +6,7 @@ from typing import Protocol
 
 
 class Progress(Protocol):
-    """Called now and then with a stage ("reading", "building", "writing") and how much of it is done."""
+    """Called now and then with a stage ("reading", "building", "encoding") and how much of it is done."""
 
     def __call__(self, stage: str, done: int, total: int, unit: str) -> None: ...
 

@@ -269,7 +269,7 @@ def _bake(settings: dict[str, Any], output: Path | None, console: Console) -> Wo
     from ..selection import Selection
 
     jit.use_threads(settings["threads"])
-    console.announce_compiling()
+    console.announce_compiling(settings["method"])
     recipe = Recipe(
         method=settings["method"],
         base=settings["base"],

@@ -89,12 +89,12 @@ class Console:
             self._bar = tqdm(total=total, desc=stage, leave=False, file=sys.stderr, dynamic_ncols=True, **scaled)
         self._bar.update(done - self._bar.n)
 
-    def announce_compiling(self) -> None:
-        """Says so when kernels are compiled, until this console ends."""
-        from .. import jit
+    def announce_compiling(self, *jobs: str) -> None:
+        """Says what is compiled, until this console ends, with a bar, and how long it took.
 
-        often = "once" if jit.CACHE_FOLDER else "every time, as no cache can be written"
-        stop = jit.on_first_compile(
-            lambda: self.say(f"Compiling for this machine, which takes some 10 seconds; this happens {often} ...")
-        )
-        self._ended.callback(stop)
+        Args:
+            jobs: of `warmup.JOBS` that are about to be done.
+        """
+        from .compiling import Reporter
+
+        self._ended.callback(Reporter(self, jobs).listen())

@@ -113,6 +113,7 @@ def inspect(
         from ..io import check_writable
 
         jit.use_threads(settings["threads"])
+        console.announce_compiling("inspect")
         for target in (settings["plot"], settings["html"]):
             if target is not None:
                 check_writable(target, overwrite=settings["overwrite"])

@@ -127,7 +127,7 @@ def render(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, **s
         from ..preview.pictures import Painter
         from .render_job import Job, Wanted
 
-        console.announce_compiling()
+        console.announce_compiling("render")
         _use_threads(settings["threads"])
 
         start = time.perf_counter()
@@ -215,7 +215,7 @@ def _compare(ctx: click.Context, settings: dict[str, Any], console: Console, *, 
         placements = placements_from(settings)
         inputs = [settings["scene"], settings["camera_path"], *(place.file for place in placements)]
         keep_apart([wanted.output, wanted.plot], inputs)
-        console.announce_compiling()
+        console.announce_compiling("render")
         _use_threads(settings["threads"])
         world = read_world(
             placements,

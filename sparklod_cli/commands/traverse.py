@@ -111,7 +111,7 @@ def traverse(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, *
     with Console(quiet=quiet, verbose=verbose) as console:
         from ..splats import COLUMNS
 
-        console.announce_compiling()
+        console.announce_compiling("traverse")
         wanted.check()
         world = read_world(
             placements,

@@ -126,7 +126,7 @@ def build(splats: Splats, growth: float = DEFAULT_GROWTH, *, progress: Progress 
     Args:
         splats: N splats, finite, with positive opacity and at least one positive scale each.
         growth: the tree has at most so many nodes a leaf, 1.05 to 2.
-        progress: told how many splats have joined the tree.
+        progress: told of three stages, building, pruning and ordering, how many nodes are done.
 
     Returns:
         M >= N splats and their tree.
@@ -145,7 +145,7 @@ def build(splats: Splats, growth: float = DEFAULT_GROWTH, *, progress: Progress 
     with threads_for(n) as threads:
         growing, index = _leaves(splats, space, threads)
         _grow(growing, n, space, progress)
-        return _in_final_order(growing, index, splats, growth, space)
+        return _in_final_order(growing, index, splats, growth, space, progress)
 
 
 def _leaves(splats: Splats, space: _Space, threads: int) -> tuple[_Growing, Nodes]:
@@ -176,16 +176,17 @@ def _grow(growing: _Growing, leaves: int, space: _Space, progress: Progress) -> 
     joined = 0
     for level in range(len(ends)):
         active, joined = np.concatenate([active, by_level[joined : ends[level]]]), int(ends[level])
-        progress("building", joined, leaves, "splat")
         # A node's size is about twice the root of a third of its covariance's trace.
         size = BASE ** (lowest + level + 1)
-        active = _merge(growing, active, space, largest=3 * size * size / 4, rounds=MOST_ROUNDS)
-    _merge(growing, active, space, largest=math.inf, rounds=None)
+        active = _merge(growing, active, space, 3 * size * size / 4, MOST_ROUNDS, progress)
+    _merge(growing, active, space, math.inf, None, progress)
 
 
-def _merge(growing: _Growing, active: Nodes, space: _Space, largest: float, rounds: int | None) -> Nodes:
+def _merge(
+    growing: _Growing, active: Nodes, space: _Space, largest: float, rounds: int | None, progress: Progress
+) -> Nodes:
     """Rounds of merging; returns what is left, which is one node if `rounds` is None."""
-    done = 0
+    done, rows = 0, len(growing.state)
     while len(active) > 1 and (rounds is None or done < rounds):
         with threads_for(len(active)) as threads:
             active = space.sort(growing.state, active, growing.rounds, threads)
@@ -200,6 +201,7 @@ def _merge(growing: _Growing, active: Nodes, space: _Space, largest: float, roun
             union.unite_pairs(found, growing.used, growing.state, growing.children, growing.size, growing.error)
         growing.used += len(found)
         growing.rounds += 1
+        progress("building", growing.used, rows, "node")
         done += 1
         if rounds is not None and len(found) <= LEAST * before:
             break
@@ -214,16 +216,18 @@ def _limit(cost: FloatArray) -> np.float32:
 
 
 def _in_final_order(
-    growing: _Growing, index: Nodes, splats: Splats, growth: float, space: _Space
+    growing: _Growing, index: Nodes, splats: Splats, growth: float, space: _Space, progress: Progress
 ) -> tuple[Splats, LodTree]:
     """Keeps the useful nodes, and puts them and their colours in place."""
     n, rows = len(index), growing.used
+    progress("pruning", 0, rows, "node")
     log_size, weight, lost = (np.empty(rows, np.float32) for _ in range(3))
     parent = keep.value_nodes(growing.children, n, growing.size, growing.error, log_size, weight, lost)
     saved = np.empty(rows, np.int32)
     keep.drop_nodes(n, max(int(growth * n) - n, 1), parent, log_size, weight, lost, saved)
     inner, ends = _by_level(growing, keep.levels_of(n, parent, log_size, saved), space)
     total = n + len(inner)
+    progress("ordering", 0, total, "node")
     order = np.empty(total, np.uint32)
     tree = LodTree(np.zeros(total, np.uint16), np.zeros(total, np.uint32))
     place = keep.place_nodes(inner, parent, saved, order, tree.child_start, tree.child_count)
@@ -237,6 +241,7 @@ def _in_final_order(
         with threads_for(int(end - begin)) as threads:
             for color in (out.rgb, out.sh.reshape(total, -1)):
                 merge_colors(place[begin:end], tree.child_start, tree.child_count, order, weights, color, threads)
+        progress("ordering", total - int(begin), total, "node")
     return out, tree
 
 

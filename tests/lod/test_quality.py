@@ -155,11 +155,16 @@ def test_merged_nodes_are_where_their_leaves_are() -> None:
         assert (nodes.center[node] <= high[node] + slack).all()
 
 
-def test_progress_ends_with_all_splats() -> None:
+def test_progress_tells_stage_by_stage_and_is_full_only_at_the_end_of_each() -> None:
     told = []
-    quality.build(random_splats(500, seed=1), progress=lambda *state: told.append(state))
-    assert [state[1] for state in told] == sorted(state[1] for state in told)
-    assert told[-1] == ("building", 500, 500, "splat")
+    nodes, _ = quality.build(random_splats(500, seed=1), progress=lambda *state: told.append(state))
+    stages = {name: [state[1:3] for state in told if state[0] == name] for name, *_ in told}
+    assert list(stages) == ["building", "pruning", "ordering"]
+    for states in stages.values():
+        assert [done for done, _ in states] == sorted(done for done, _ in states)
+        assert all(done < total for done, total in states[:-1])
+    assert stages["building"][-1] == (999, 999)
+    assert told[-1] == ("ordering", len(nodes), len(nodes), "node")
 
 
 def test_no_splat_is_an_error() -> None:

@@ -199,9 +199,9 @@ def find_cut(
         pending,
         wanted,
         cut,
-        count,
-        runs,
-        low,
+        np.int64(count),  # never literals, for which it would be compiled as well
+        np.int64(runs),
+        np.int64(low),
     )
 
 

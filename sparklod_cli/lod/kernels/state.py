@@ -99,7 +99,7 @@ def fill_merged(order, leaves, state, middle, unit, center, scale, quat, opacity
                     moments[element, count] = state[order[i], COVARIANCE + element]
                 found[count] = i
                 count += 1
-        decompose(moments, count)
+        decompose(moments, np.int64(count))  # not as the literal 0, for which it would be compiled as well
         for k in range(count):
             i = found[k]
             row = state[order[i]]

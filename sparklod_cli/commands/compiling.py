@@ -1,0 +1,61 @@
+"""What commands say while kernels are compiled, which happens once on a machine."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+from .console import count_of
+
+if TYPE_CHECKING:
+    from .console import Console
+
+#: Seconds that a kernel takes, as a rule: on a fast machine and on a slow one. docs/performance.md has all of them.
+SECONDS = (1, 3)
+
+
+class Reporter:
+    """Announces the first kernel that is compiled, shows a bar, and says at the end how long all of them took.
+
+    Args:
+        console: to say it on.
+        jobs: of `warmup.JOBS` that are about to be done, which tells how many kernels there will be.
+    """
+
+    def __init__(self, console: Console, jobs: Sequence[str]) -> None:
+        self._console, self._jobs = console, jobs
+        self._total = self._done = 0
+        self._seconds = 0.0
+
+    def listen(self) -> Callable[[], None]:
+        """Begins; returns what ends it."""
+        from .. import jit
+
+        stop = jit.listen(self._begin, self._end, self._console.say)
+
+        def close() -> None:
+            stop()
+            if self._done:
+                self._console.say(f"compiled {count_of(self._done, 'kernel')} in {self._seconds:.1f} s")
+
+        return close
+
+    def _begin(self, name: str) -> None:
+        if not self._total:
+            self._announce(name)
+        self._total = max(self._total, self._done + 1)
+        self._console.progress("compiling", self._done, self._total, "kernel")
+
+    def _announce(self, name: str) -> None:
+        from .. import jit
+        from ..warmup import missing
+
+        self._total = len({name, *missing(self._jobs)})
+        about = " to ".join(f"{max(1, round(self._total * seconds))}" for seconds in SECONDS)
+        often = "once; sparklod warmup does it ahead" if jit.CACHE_FOLDER else "every time, as no cache can be written"
+        self._console.say(f"Compiling {count_of(self._total, 'kernel')} for this machine, some {about} s ({often}) ...")
+
+    def _end(self, seconds: float) -> None:
+        self._done += 1
+        self._seconds += seconds
+        self._console.progress("compiling", self._done, max(self._total, self._done), "kernel")

@@ -1,0 +1,55 @@
+"""`sparklod warmup`: compiles all kernels ahead."""
+
+from __future__ import annotations
+
+import json
+import time
+
+import click
+
+from .. import __version__
+from ..parallel import processors
+from .console import Console, count_of
+
+EXAMPLES = """
+\b
+Examples:
+  sparklod warmup                                  # once, after pip install
+  RUN pip install sparklod && sparklod warmup      # in a Dockerfile
+  NUMBA_CACHE_DIR=.cache/numba sparklod warmup     # in CI, with that folder cached
+"""
+
+
+@click.command("warmup", epilog=EXAMPLES, context_settings={"show_default": True})
+@click.option(
+    "--jobs",
+    metavar="N",
+    type=click.IntRange(1, 64),
+    default=lambda: min(processors(), 4),
+    show_default="processors, up to 4",
+    help="Processes to compile in.",
+)
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object on standard output.")
+@click.option("-q", "--quiet", is_flag=True, help="Say nothing but errors.")
+@click.version_option(__version__, package_name="sparklod")
+def warmup(jobs: int, as_json: bool, quiet: bool) -> None:
+    """Compile all inner loops for this machine, so that no later command has to.
+
+    sparklod is Python whose inner loops are compiled for the processor that they run on, when they are first called.
+    This does all of it at once and keeps the result in the cache that later commands read: beside the package or, where
+    that is read-only, in your cache directory; NUMBA_CACHE_DIR names another. What is there already is left alone.
+    """
+    with Console(quiet=quiet, verbose=False) as console:
+        from .. import jit
+        from ..warmup import warm_up
+
+        start = time.perf_counter()
+        compiled = warm_up(processes=jobs, progress=console.progress)
+        seconds = time.perf_counter() - start
+        console.say(
+            f"compiled {count_of(compiled, 'kernel')} in {seconds:.1f} s, kept in {jit.CACHE_FOLDER}"
+            if compiled
+            else f"all kernels are in {jit.CACHE_FOLDER}"
+        )
+        if as_json:
+            click.echo(json.dumps({"compiled": compiled, "seconds": round(seconds, 2), "cache": str(jit.CACHE_FOLDER)}))

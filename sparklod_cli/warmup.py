@@ -1,0 +1,168 @@
+"""Compiling ahead: what each job needs of kernels, and how to have them all in the cache before anybody waits for them.
+
+What `sparklod warmup` calls, and a program can call.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from . import jit
+from .codecs import ply, spz
+from .errors import SparklodError
+from .io import write_whole
+from .progress import Progress, silent
+from .scene import Scene
+from .splats import Splats
+from .tree import LodTree
+
+#: Seconds from look to look at what has been compiled.
+PATIENCE = 0.1
+
+
+@dataclass(frozen=True)
+class Job:
+    """Something that needs kernels.
+
+    Attributes:
+        kernels: that Python calls meanwhile, as `jit.is_cached` names them.
+        commands: that call them all, of files that `_write_inputs` makes.
+    """
+
+    kernels: tuple[str, ...]
+    commands: tuple[str, ...]
+
+
+#: By what it is, in the order in which several processes share least of the work.
+JOBS = {
+    "quick": Job(
+        (
+            *("geometry.extremes", "geometry.fill_rows", "group.level_keys", "group.split_cells"),
+            *("merge.merge_groups", "order.fill_columns", "order.fill_leaves", "order.merge_colors"),
+            *("order.places_of_merged", "sort.cell_words", "sort.sort_pass"),
+        ),
+        ("build-lod scene.ply -o quick.spz",),
+    ),
+    "traverse": Job(
+        ("cut.find_cut", "measure.exchange", "measure.measure"),
+        ("traverse tree.spz --orbit 2 -o frames.csv",),
+    ),
+    "inspect": Job(
+        ("walk.find_cycles", "walk.find_parents", "walk.sum_levels", "walk.walk"),
+        ("inspect tree.spz --check",),
+    ),
+    "quality": Job(
+        (
+            *("geometry.extremes", "keep.drop_nodes", "keep.levels_of", "keep.place_nodes", "keep.value_nodes"),
+            *("order.fill_leaves", "order.merge_colors", "pairs.cheapest", "pairs.pair_up", "sort.sort_pass"),
+            *("state.curve_keys", "state.fill_merged", "state.fill_state", "union.unite_pairs"),
+        ),
+        ("build-lod scene.ply --method quality -o quality.spz",),
+    ),
+    "render": Job(
+        (
+            *("bands.count_fragments", "bands.draw_discs", "cut.find_cut", "measure.measure", "project.arrange"),
+            *("project.project", "raster.draw_tiles", "raster.sort_into_tiles"),
+        ),
+        (
+            "render tree.spz --size 64x64 -o cut.png",
+            "render scene.ply --size 64x64 --style billboards -o billboards.png",
+            "render scene.ply --size 64x64 --color-by overdraw -o overdraw.png",
+        ),
+    ),
+}
+
+
+def missing(jobs: Iterable[str]) -> set[str]:
+    """The kernels of some of `JOBS` that no cache has."""
+    return {name for job in jobs for name in JOBS[job].kernels if not jit.is_cached(name)}
+
+
+def warm_up(*, processes: int, progress: Progress = silent) -> int:
+    """Compiles all kernels that are missing, and returns how many those were.
+
+    Args:
+        processes: to do it in, each of which takes a job at a time.
+        progress: is told how many there are.
+
+    Raises:
+        SparklodError: no cache can be written, or a job failed.
+    """
+    if jit.CACHE_FOLDER is None:
+        raise SparklodError("no cache can be written; set NUMBA_CACHE_DIR to a folder where it can")
+    wanted = missing(JOBS)
+    if not wanted:
+        return 0
+    started: list[subprocess.Popen[str]] = []
+    with tempfile.TemporaryDirectory(prefix="sparklod-") as name, ThreadPoolExecutor(processes) as pool:
+        _write_inputs(Path(name))
+        running = [pool.submit(_do, job, Path(name), started) for job in JOBS if missing([job])]
+        try:
+            while not all(map(Future.done, running)):
+                progress("compiling", len(wanted) - len(missing(JOBS)), len(wanted), "kernel")
+                time.sleep(PATIENCE)
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in started:
+                process.terminate()
+            raise
+        for job in running:
+            job.result()
+    left = missing(JOBS)
+    if left:
+        raise SparklodError(f"{len(left)} of {len(wanted)} kernels did not reach the cache in {jit.CACHE_FOLDER}")
+    return len(wanted)
+
+
+def _do(job: str, folder: Path, started: list[subprocess.Popen[str]]) -> None:
+    """Runs the commands of a job in processes of their own, since numba compiles one kernel at a time.
+
+    Raises:
+        SparklodError: one failed.
+    """
+    package = Path(__file__).parent
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(package.parent), os.environ.get("PYTHONPATH", "")])}
+    if "NUMBA_CACHE_DIR" in environment:  # which may be relative to where we are
+        environment["NUMBA_CACHE_DIR"] = str(Path(environment["NUMBA_CACHE_DIR"]).resolve())
+    quiet: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
+    for command in JOBS[job].commands:
+        line = [sys.executable, "-m", package.name, *command.split(), "--quiet"]
+        process = subprocess.Popen(line, cwd=folder, env=environment, text=True, **quiet)
+        started.append(process)
+        said = process.communicate()[1].strip()
+        if process.returncode:
+            last = said.rpartition("\n")[2] or f"exit status {process.returncode}"
+            raise SparklodError(f"sparklod {command.partition(' ')[0]} failed while it compiled: {last}")
+
+
+def _write_inputs(folder: Path) -> None:
+    """A scene of a few splats, and a tree of them that no builder made, since that would take kernels."""
+    rng = np.random.default_rng(0)
+    count = 64
+    leaves = Splats(
+        center=rng.normal(size=(count, 3)).astype(np.float32),
+        scale=np.full((count, 3), 0.1, np.float32),
+        quat_xyzw=np.tile(np.array([0, 0, 0, 1], np.float32), (count, 1)),
+        opacity=np.full(count, 0.9, np.float32),
+        rgb=rng.uniform(size=(count, 3)).astype(np.float32),
+        sh=np.zeros((count, 0, 3), np.float32),
+    )
+    root = Splats.concat([leaves.take(slice(0, 1)), leaves])
+    root.scale[0] = 1
+    children = np.zeros(count + 1, np.uint16)
+    starts = np.zeros(count + 1, np.uint32)
+    children[0], starts[0] = count, 1
+    tree = Scene(root, LodTree(children, starts))
+    write_whole(folder / "scene.ply", ply.encode(Scene(leaves)), overwrite=True)
+    write_whole(folder / "tree.spz", spz.encode(tree, spz.Options()), overwrite=True)

@@ -1,0 +1,50 @@
+"""Signals end a run, whatever it is doing."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from sparklod_cli.jit_cache import SUFFIX, is_whole
+from sparklod_cli.warmup import JOBS
+
+from .conftest import FIXTURES, ROOT
+
+pytestmark = pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+
+
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_a_compilation_at_once_and_leaves_a_whole_cache(tmp_path: Path, how: signal.Signals) -> None:
+    cache = tmp_path / "cache"
+    command = [sys.executable, "-m", "sparklod_cli", "build-lod", str(FIXTURES / "demo.ply"), "--method", "quality"]
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(cache)}
+    process = subprocess.Popen(
+        [*command, "-o", str(tmp_path / "tree.spz")], cwd=ROOT, env=environment, stderr=subprocess.PIPE, text=True
+    )
+    assert process.stderr is not None
+    assert "Compiling" in process.stderr.readline()
+    time.sleep(1)
+    process.send_signal(how)
+    rest = process.stderr.read()
+    assert (process.wait(), rest) == (130, "interrupted\n")
+    assert not (tmp_path / "tree.spz").exists()
+    kept = list(cache.rglob(f"*{SUFFIX}"))
+    assert len(kept) < len(JOBS["quality"].kernels) / 2  # it did not go on to the end
+    assert all(is_whole(path.read_bytes()) for path in kept)
+
+
+def test_only_a_signal_is_called_an_interruption(monkeypatch: pytest.MonkeyPatch) -> None:
+    from sparklod_cli import cli
+
+    def at_an_end(*arguments: object, **how: object) -> None:
+        raise cli.click.Abort from EOFError("a cache ends early")
+
+    monkeypatch.setattr(cli.cli, "main", at_an_end)
+    with pytest.raises(EOFError):
+        cli.run(["inspect", "a.spz"])
