@@ -5,15 +5,18 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import traceback
 from importlib import import_module
 from types import FrameType
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import click
 
 from . import __version__
 from .commands.console import say, say_error
-from .errors import SparklodError
+from .commands.options import Verbosity
+from .errors import SparklodError, out_of_memory
+from .untrusted import one_line
 
 #: Sub-commands, each a module of `commands` with a function of its name; imported when it is called for.
 COMMANDS = {"build-lod": "build_lod", "inspect": "inspect", "traverse": "traverse", "render": "render"}
@@ -28,8 +31,18 @@ Shell completion: eval "$(_SPARKLOD_COMPLETE=bash_source sparklod)", or zsh_sour
 """
 
 
+class _EndOfFile(Exception):
+    """Carries an `EOFError` past click, which takes it for Ctrl-D and says that a person interrupted."""
+
+
 class LazyGroup(click.Group):
     """A group that imports a command when it is asked for."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        try:
+            return super().invoke(ctx)
+        except EOFError as error:
+            raise _EndOfFile from error
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(COMMANDS)
@@ -50,8 +63,9 @@ def cli() -> None:
 
 def run(arguments: list[str] | None = None) -> int:
     """Runs the command line and returns its exit code; arguments are those of the process unless given."""
+    verbosity = Verbosity()
     try:
-        code = cli.main(arguments, prog_name="sparklod", standalone_mode=False)
+        code = cli.main(arguments, prog_name="sparklod", standalone_mode=False, obj=verbosity)
     except click.ClickException as error:
         error.show()
         return error.exit_code
@@ -69,7 +83,27 @@ def run(arguments: list[str] | None = None) -> int:
         say_error(f"cannot write standard output: {(error.strerror or str(error)).lower()}")
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
+    except Exception as error:
+        return _failed(error.__cause__ if isinstance(error, _EndOfFile) and error.__cause__ else error, verbosity)
     return code if isinstance(code, int) else 0
+
+
+def _failed(error: BaseException, verbosity: Verbosity) -> int:
+    """Says in one line what nobody foresaw, or that memory ran out, and returns the exit code.
+
+    This is the last guard: whatever gets here is ours to mend, but a person has no use for a traceback.
+    """
+    if verbosity.verbose and sys.stderr is not None:
+        traceback.print_exception(error)
+    told = out_of_memory(error)
+    if told is None:
+        told = (
+            f"sparklod failed in a way that it should not: {one_line(f'{type(error).__name__}: {error}')};"
+            " please report this command, with its input if you can"
+        )
+        told += "" if verbosity.verbose else " (-v shows where it happened)"
+    say_error(told)
+    return 1
 
 
 def _interrupt(signum: int, frame: FrameType | None) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -15,6 +16,13 @@ from ..limits import MAX_THREADS
 from ..parallel import processors
 
 Command = TypeVar("Command", bound=Callable[..., Any])
+
+
+@dataclass
+class Verbosity:
+    """Whether -v was given, for who ends a run after its command is gone; `cli.run` hands one to click."""
+
+    verbose: bool = False
 
 
 def is_given(ctx: click.Context, name: str) -> bool:
@@ -110,11 +118,24 @@ class Quantity(click.ParamType):
         return self.name
 
 
+def _note_verbosity(ctx: click.Context, param: click.Parameter, value: bool) -> bool:
+    verbosity = ctx.find_object(Verbosity)
+    if verbosity is not None:
+        verbosity.verbose = value
+    return value
+
+
 def common_options(command: Command, *, json: str = "Print one JSON object a file on standard output.") -> Command:
     """`--threads`, `--json`, `-q`, `-v`, `--version`; `json` is the help of the second."""
     for option in (
         click.version_option(__version__, package_name="sparklod"),
-        click.option("-v", "--verbose", is_flag=True, help="Say how long each stage took, and what was chosen."),
+        click.option(
+            "-v",
+            "--verbose",
+            is_flag=True,
+            callback=_note_verbosity,
+            help="Say how long each stage took, and what was chosen.",
+        ),
         click.option("-q", "--quiet", is_flag=True, help="Say nothing but errors."),
         click.option("--json", "as_json", is_flag=True, help=json),
         click.option(
