@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from ..errors import OutOfMemoryError, SparklodError, memory_told
 from .console import Console, count_of
 from .inspect_text import finding_line, lines
 
@@ -39,8 +40,15 @@ class Job:
         return bool(self.settings["check"]) or self.expected is not None or self.original is not None
 
     def inspect(self, file: Path) -> int:
-        """Looks at a file and says what is asked for; its exit status."""
-        from ..errors import SparklodError
+        """Looks at a file and says what is asked for; its exit status. One too large for memory stops no others."""
+        try:
+            with memory_told():
+                return self._inspect(file)
+        except OutOfMemoryError as error:
+            self.console.error(f"{file}: {error}")
+            return 1
+
+    def _inspect(self, file: Path) -> int:
         from ..inspection import report as reports
 
         start = time.perf_counter()
@@ -106,7 +114,6 @@ class Job:
         plot, html = self.settings["plot"], self.settings["html"]
         if plot is None and html is None:
             return
-        from ..errors import SparklodError
         from ..inspection import histograms, values
         from ..inspection import html as pages
         from ..inspection import plot as plots
