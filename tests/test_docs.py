@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import re
+import shlex
 from pathlib import Path
 
 import click
 import pytest
 
 from sparklod_cli.cli import COMMANDS, cli
+from sparklod_cli.cli import run as cli_run
 
 from .conftest import FIXTURES, ROOT
 
@@ -26,6 +28,19 @@ def test_the_readmes_program_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.chdir(tmp_path)
     exec(code[1], {})
     assert (tmp_path / "scene-lod.spz").exists()
+
+
+def test_the_readmes_first_line_can_be_run_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its last command at least, in a folder that has our fixtures; what it writes is no news to git."""
+    block = re.search(r"## Try it\n.*?```sh\n(.*?)\n```", (ROOT / "README.md").read_text(), re.DOTALL)
+    assert block
+    command = shlex.split(block[1].rpartition("&&")[2])
+    assert command.pop(0).endswith("/sparklod")
+    (tmp_path / "fixtures").symlink_to(FIXTURES)
+    monkeypatch.chdir(tmp_path)
+    assert [cli_run(command), cli_run(command)] == [0, 0]
+    (written,) = (path.name for path in tmp_path.iterdir() if path.name != "fixtures")
+    assert f"/{written}" in (ROOT / ".gitignore").read_text().splitlines()
 
 
 def test_the_readme_quotes_the_help() -> None:

@@ -58,6 +58,11 @@ class Console:
         self.clear()
         self._ended.close()
 
+    @property
+    def quiet(self) -> bool:
+        """Whether a person wants to hear of errors alone."""
+        return self._quiet
+
     def clear(self) -> None:
         """Takes the bar away."""
         if self._bar is not None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ..errors import OutOfMemoryError, SparklodError, memory_told
-from .console import Console, count_of
+from .console import Console, count_of, size_of
 from .inspect_text import finding_line, lines
 
 if TYPE_CHECKING:
@@ -104,7 +104,7 @@ class Job:
             if not report.findings:
                 noun = "node" if report.tree is not None else "splat"
                 self.console.say(f"{report.file}: nothing is wrong with its {count_of(report.splats or 0, noun)}")
-        elif report.format is not None:
+        elif report.format is not None and not self.console.quiet:
             click.echo("\n".join(lines(plain)))
         if scene is not None and self.settings["histogram"]:
             _print_histograms(scene, self.settings["histogram"])
@@ -128,7 +128,8 @@ class Job:
                     raise
                 self.console.say(f"{report.file}: no picture on the page: {error}")
         if plot is not None and picture is not None:
-            write_whole(plot, [picture.png], overwrite=self.settings["overwrite"])
+            size = write_whole(plot, [picture.png], overwrite=self.settings["overwrite"])
+            self.console.say(f"{plot}  {picture.description.partition(';')[0]}, {size_of(size)}")
         if html is not None:
             drawn = {}
             if scene is not None and len(scene.splats):
@@ -143,7 +144,9 @@ class Job:
         from ..inspection.html import page
         from ..io import write_whole
 
-        write_whole(self.settings["html"], [page(self.sections).encode()], overwrite=self.settings["overwrite"])
+        target, content = self.settings["html"], page(self.sections).encode()
+        size = write_whole(target, [content], overwrite=self.settings["overwrite"])
+        self.console.say(f"{target}  page of {count_of(len(self.sections), 'file')}, {size_of(size)}")
 
 
 def _fails(findings: list[Finding], fail_on: str) -> bool:

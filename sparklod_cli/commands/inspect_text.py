@@ -44,7 +44,7 @@ def _row(name: str, text: str) -> str:
 
 def _tree(tree: dict[str, Any]) -> Iterator[str]:
     inner = count_of(tree["inner"], "inner node")
-    yield _row("tree", f"{_leaves(tree['leaves'])}, {inner}, growth {tree['growth']:.3f}, {len(tree['levels'])} levels")
+    yield _row("tree", f"{_leaves(tree['leaves'])}, {inner}, growth {tree['growth']:.3f}, {count_of(tree['depth'] + 1, 'level')}")
     yield _row("", f"{100 * tree['more_than_opaque']:.1f} % of the nodes are more than opaque")
     chunks = count_of(tree["chunks"], "chunk")
     yield _row("", f"{chunks} of 65,536 nodes, the coarsest cut of as many nodes needs {tree['chunks_of_coarse_cut']}")
@@ -57,8 +57,8 @@ def _tree(tree: dict[str, Any]) -> Iterator[str]:
     for depth, level in enumerate(tree["levels"][:MOST_LEVELS]):
         size = "" if level["size"] is None else f"{level['size']:.4g}"
         yield _row("", f"{depth:>5} {level['nodes']:>12,} {level['leaves']:>12,} {size:>10}")
-    if len(tree["levels"]) > MOST_LEVELS:
-        yield _row("", f"and {len(tree['levels']) - MOST_LEVELS:,} more")
+    if tree["depth"] >= MOST_LEVELS:
+        yield _row("", f"and {tree['depth'] + 1 - MOST_LEVELS:,} more")
 
 
 def _leaves(count: int) -> str:
