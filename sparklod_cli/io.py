@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import itertools
 import os
 import secrets
 import stat
@@ -16,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .codecs.formats import FORMATS, HEAD, Format, sniff
+from .codecs.sog_files import MAX_META, META, names_beside
 from .errors import FormatError, OutputError, UnknownFormatError, UnreadableError
 from .progress import Progress, silent
 from .scene import Scene
@@ -132,6 +134,31 @@ def read_together(path: Path, sets: Collection[Collection[str]], limit: int) -> 
         raise UnreadableError(f"{path} cannot be read: {_reason(error)}") from None
 
 
+def companions(path: Path, sets: Collection[Collection[str]]) -> list[Path]:
+    """The files that are read together with one, as far as can be told; nothing is raised.
+
+    Args:
+        path: of a file, or of a folder.
+        sets: as for `read_together`.
+    """
+    try:
+        folder = path if path.is_dir() else path.parent
+        meta = folder / META if path.is_dir() else path
+        if path.is_dir():
+            names = [META, *itertools.chain(*sets)]
+        else:
+            names = list(itertools.chain(*(names for names in sets if path.name in names)))
+        if meta.is_file() and meta.stat().st_size <= MAX_META:
+            with meta.open("rb") as file:
+                if file.read(HEAD).lstrip().startswith(b"{"):
+                    file.seek(0)
+                    names += names_beside(file.read())
+        beside = [folder / name for name in names if not _leads_away(name)]
+        return [file for file in beside if file.is_file()]
+    except (OSError, ValueError):
+        return []
+
+
 def _read_up_to(path: Path, limit: int) -> bytes:
     if path.exists() and not path.is_file():
         raise UnreadableError(f"{path} cannot be read: it is a pipe or a device; save it to a file first")
@@ -141,15 +168,20 @@ def _read_up_to(path: Path, limit: int) -> bytes:
 
 
 def _in_folder(folder: Path) -> Path:
-    path = folder / "meta.json"
+    path = folder / META
     if not path.is_file():
         raise UnreadableError("cannot be read: is a directory, without the meta.json of an unpacked SOG")
     return path
 
 
+def _leads_away(name: str) -> bool:
+    """Whether a name could be that of something else than a file in the same folder."""
+    return name in ("", ".", "..") or any(mark in name for mark in "/\\:\0")
+
+
 def _open_beside(folder: Path, name: str) -> BinaryIO:
     """Opens a file that another one names; `FormatError` where the name could lead out of their folder."""
-    if name in ("", ".", "..") or any(mark in name for mark in "/\\:\0"):
+    if _leads_away(name):
         raise FormatError(f"it names {name!r}, which is not a file beside it")
     path = folder / name
     try:

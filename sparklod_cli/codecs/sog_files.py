@@ -36,18 +36,18 @@ class Meta:
 
     def __init__(self, data: bytes) -> None:
         try:
-            self._root = json.loads(data)
+            self.root = json.loads(data)
         except (ValueError, RecursionError) as error:
             raise FormatError(f"{META} is not JSON: {error}") from None
-        if not isinstance(self._root, dict):
+        if not isinstance(self.root, dict):
             raise NotSplatsError(f"{META} is not that of a SOG")
 
     def has(self, key: str) -> bool:
         """Whether there is such a key at the top, and not null."""
-        return self._root.get(key) is not None
+        return self.root.get(key) is not None
 
     def _get(self, *way: str | int) -> Any:
-        value = self._root
+        value = self.root
         try:
             for key in way:
                 value = value[key]
@@ -102,6 +102,16 @@ def _finite(value: Any, way: tuple[str | int, ...]) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < 1e38:
         raise FormatError(f"{_spell(way)} of {META} has {str(value)[:20]!r}, which is not a finite number")
     return float(value)
+
+
+def names_beside(data: bytes) -> list[str]:
+    """The files that a meta.json names, as far as it can be understood; none for anything else."""
+    try:
+        root = Meta(data).root
+    except FormatError:
+        return []
+    lists = (value.get("files") for value in root.values() if isinstance(value, dict))
+    return [name for names in lists if isinstance(names, list) for name in names if isinstance(name, str)]
 
 
 class Files:
