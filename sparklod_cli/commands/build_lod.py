@@ -171,8 +171,8 @@ def build_lod(
     A file that fails does not stop the others; the exit status is 1 if any did.
     """
     outputs = _outputs(inputs, output, output_dir, settings)
-    _check_usage(ctx, inputs, output, settings)
     keep_apart(ctx, {"output" if output_dir is None else "output_dir": outputs})
+    _check_usage(ctx, inputs, output, settings)
     if output == STDOUT and as_json:
         raise click.UsageError("--json and -o - both want standard output")
     if output == STDOUT and is_terminal(sys.stdout):
