@@ -6,8 +6,6 @@ import contextlib
 import functools
 import itertools
 import os
-import secrets
-import stat
 import sys
 from collections.abc import Callable, Collection, Iterable, Iterator
 from pathlib import Path
@@ -16,6 +14,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from . import whole
 from .codecs.formats import FORMATS, HEAD, Format, sniff
 from .codecs.sog_files import MAX_META, META, names_beside
 from .errors import FormatError, OutputError, UnknownFormatError, UnreadableError
@@ -254,7 +253,7 @@ def check_writable(path: Path, *, overwrite: bool, make_parent: bool = False) ->
 def write_whole(path: Path, pieces: Iterable[bytes], *, overwrite: bool) -> int:
     """Writes a file so that it appears complete or not at all, and returns its size.
 
-    A temporary file beside it is filled, synced and renamed; an interruption leaves nothing behind.
+    It gets its name when it is filled and synced, see `whole`; an interruption leaves nothing behind.
 
     Raises:
         OutputError: it exists and `overwrite` is not set, or the file system refused something.
@@ -264,41 +263,11 @@ def write_whole(path: Path, pieces: Iterable[bytes], *, overwrite: bool) -> int:
         if path.exists() and not path.is_file():  # a pipe or a device is written to, never replaced
             with path.open("wb") as file:
                 return sum(map(file.write, pieces))
-        return _write_and_rename(Path(os.path.realpath(path)), pieces, overwrite)
+        return whole.write(Path(os.path.realpath(path)), pieces, overwrite=overwrite)
     except FileExistsError:
         raise OutputError(f"{path} exists, add --overwrite to replace it") from None
     except OSError as error:
         raise OutputError(f"cannot write {path}: {_reason(error)}") from None
-
-
-def _write_and_rename(target: Path, pieces: Iterable[bytes], overwrite: bool) -> int:
-    temporary = target.with_name(f".sparklod-{secrets.token_hex(8)}.part")
-    try:
-        with temporary.open("xb") as file:
-            size = sum(map(file.write, pieces))
-            file.flush()
-            os.fsync(file.fileno())
-        _publish(temporary, target, overwrite)
-    finally:
-        temporary.unlink(missing_ok=True)
-    return size
-
-
-def _publish(temporary: Path, target: Path, overwrite: bool) -> None:
-    """Gives a complete file its name; `FileExistsError` where somebody took that meanwhile."""
-    if overwrite:
-        with contextlib.suppress(FileNotFoundError):
-            temporary.chmod(stat.S_IMODE(target.stat().st_mode))  # what was private stays private
-        temporary.replace(target)
-        return
-    try:
-        os.link(temporary, target)  # fails where the name is taken; a rename would replace it
-    except FileExistsError:
-        raise
-    except OSError:  # a file system without links
-        if target.exists():
-            raise FileExistsError from None
-        temporary.replace(target)
 
 
 def write_stdout(pieces: Iterable[bytes]) -> int:
