@@ -11,8 +11,8 @@ from typing import NoReturn
 
 import click
 
-from . import __version__
-from .commands.console import say, say_error
+from . import __version__, stdout
+from .commands.console import say, say_error, say_usage_error
 from .errors import SparklodError
 
 #: Sub-commands, each a module of `commands` with a function of its name; imported when it is called for.
@@ -50,10 +50,15 @@ def cli() -> None:
 
 def run(arguments: list[str] | None = None) -> int:
     """Runs the command line and returns its exit code; arguments are those of the process unless given."""
+    with stdout.told():
+        return _run(arguments)
+
+
+def _run(arguments: list[str] | None) -> int:
     try:
         code = cli.main(arguments, prog_name="sparklod", standalone_mode=False)
     except click.ClickException as error:
-        error.show()
+        say_usage_error(error)
         return error.exit_code
     except SparklodError as error:
         say_error(str(error))
@@ -61,13 +66,11 @@ def run(arguments: list[str] | None = None) -> int:
     except (click.Abort, KeyboardInterrupt):
         say("interrupted")
         return 130
-    except BrokenPipeError:
-        # Whoever read standard output has gone; pointing it elsewhere keeps the interpreter's last flush quiet.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except stdout.ReaderGoneError:
         return 1
-    except OSError as error:  # all files are opened elsewhere, and their errors told: this is standard output
-        say_error(f"cannot write standard output: {(error.strerror or str(error)).lower()}")
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except OSError as error:  # of neither a file that was named nor standard output: those are told where they occur
+        where = f"{os.fsdecode(error.filename)}: " if isinstance(error.filename, (str, bytes, os.PathLike)) else ""
+        say_error(f"cannot go on: {where}{(error.strerror or str(error)).lower()}")
         return 1
     return code if isinstance(code, int) else 0
 

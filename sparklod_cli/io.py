@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 from . import whole
 from .codecs.formats import FORMATS, HEAD, Format, sniff
 from .codecs.sog_files import MAX_META, META, names_beside
-from .errors import FormatError, OutputError, UnknownFormatError, UnreadableError
+from .errors import FormatError, OutputError, StdoutError, UnknownFormatError, UnreadableError
 from .progress import Progress, silent
 from .scene import Scene
 from .splats import COLUMNS, FloatArray
+from .stdout import ReaderGoneError, told
 
 #: Writes the pieces of an output and returns how many bytes it wrote.
 Sink = Callable[[Iterable[bytes]], int]
@@ -271,14 +272,15 @@ def write_whole(path: Path, pieces: Iterable[bytes], *, overwrite: bool) -> int:
 
 
 def write_stdout(pieces: Iterable[bytes]) -> int:
-    """Writes to standard output and returns how many bytes; raises `OutputError` where nobody reads them."""
-    if sys.stdout is None:
-        raise OutputError("standard output is closed")
-    try:
-        size = sum(map(sys.stdout.buffer.write, pieces))
-        sys.stdout.buffer.flush()
-    except OSError as error:
-        raise OutputError(f"cannot write standard output: {_reason(error)}") from None
+    """Writes to standard output and returns how many bytes; raises `StdoutError` where nobody reads them."""
+    size = 0
+    with told():
+        try:
+            for piece in pieces:
+                size += sys.stdout.buffer.write(piece)
+            sys.stdout.buffer.flush()
+        except ReaderGoneError as error:
+            raise StdoutError(f"cannot write standard output: {error.strerror}") from None
     return size
 
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from .. import limits
+from ..printable import MOST, shortened
 from .console import Console, is_terminal
 from .options import AutoOr, Ball, Numbers, Real, common_options
 from .paths import InputPath, OutputPath, keep_apart
@@ -194,7 +195,7 @@ def build_lod(
             except SparklodError as error:
                 failed = True
                 console.error(f"{source}: {error}")
-                record: dict[str, Any] = {"input": str(source), "error": str(error)}
+                record: dict[str, Any] = {"input": str(source), "error": shortened(str(error), MOST)}
             else:
                 record = {"input": str(source), "output": str(target), **dataclasses.asdict(result)}
             if as_json:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from ..printable import printable
 from .console import Console, count_of
 from .inspect_text import finding_line, lines
 
@@ -40,7 +41,7 @@ class Job:
 
     def inspect(self, file: Path) -> int:
         """Looks at a file and says what is asked for; its exit status."""
-        from ..errors import SparklodError
+        from ..errors import SparklodError, StdoutError
         from ..inspection import report as reports
 
         start = time.perf_counter()
@@ -57,6 +58,8 @@ class Job:
                 self.console.error(f"{file}: {found.message}")
         try:
             self._print(report, scene)
+        except StdoutError:
+            raise  # of no file
         except SparklodError as error:
             self.console.error(f"{file}: {error}")
             status = 1
@@ -89,7 +92,7 @@ class Job:
                 from ..inspection.expectations import value_at
 
                 value = value_at(plain, self.settings["field"])
-                click.echo(value if isinstance(value, str) else json.dumps(value))
+                click.echo(printable(value) if isinstance(value, str) else json.dumps(value))
         elif self.holds:
             for found in report.findings or []:
                 click.echo(finding_line(report.file, found, self.settings["style"]))

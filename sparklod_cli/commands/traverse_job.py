@@ -16,7 +16,7 @@ import numpy as np
 
 from ..io import check_writable, write_stdout, write_whole
 from ..progress import Progress, silent
-from .console import Console, is_terminal
+from .console import Console, for_screen, is_terminal
 from .traverse_text import lines
 
 if TYPE_CHECKING:
@@ -101,7 +101,8 @@ class Job:
             for _ in rows:
                 pass
         else:
-            write_stdout(encode(rows, wanted.columns, wanted.form))
+            table = encode(rows, wanted.columns, wanted.form)
+            write_stdout(for_screen(table) if screen and wanted.form != "parquet" else table)
         self.console.clear()
         self.console.detail(
             f"  {len(self.path.cameras):,} frames of {self.path.format}, {time.perf_counter() - start:.2f} s"
