@@ -85,6 +85,10 @@ class OutputError(SparklodError):
     """An output cannot be written: it exists already, or the file system refused it."""
 
 
+class StdoutError(OutputError):
+    """Standard output is closed, or cannot be written; not the fault of the file that is being worked on."""
+
+
 class CameraPathError(SparklodError):
     """A camera path cannot be read or made: its file is broken or of no known format, or a camera makes no sense."""
 

@@ -8,6 +8,8 @@ import reprlib
 import sys
 from typing import Any
 
+from .printable import printable
+
 #: Files that people and tools write are nested a handful deep. Whatever walks through values may recurse so far.
 MAX_DEPTH = 64
 
@@ -97,13 +99,6 @@ def well_formed(text: str) -> str:
     return _SURROGATE.sub("\ufffd", text)
 
 
-def one_line(text: str, limit: int = 2 * QUOTED) -> str:
-    """A text on one line of at most `limit` characters, whose control characters are escaped."""
-    short = text[: limit + 1]
-    plain = "".join(mark if mark.isprintable() else repr(mark)[1:-1] for mark in short)
-    return plain if len(text) <= limit and len(plain) <= limit else f"{plain[: limit - 3]}..."
-
-
 def shown(value: Any) -> str:
     """A value as it may be quoted: on one line, and not too much of it, however deep it is."""
-    return one_line(reprlib.repr(value), QUOTED)
+    return printable(reprlib.repr(value), QUOTED)

@@ -30,6 +30,7 @@ LARGEST = 1e12
 #: Degrees of a whole cone.
 WIDEST = 180
 
+
 class WorldFileError(SparklodError):
     """A file of instances cannot be understood."""
 

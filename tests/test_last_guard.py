@@ -32,7 +32,8 @@ def broken(monkeypatch: pytest.MonkeyPatch) -> Break:
 
 @pytest.mark.parametrize("command", ["build-lod", "build-lod --unlod", "inspect", "inspect --check", "render"])
 @pytest.mark.parametrize(
-    "error", [ZeroDivisionError("division\nby zero"), EOFError("cut"), AssertionError(), KeyError("x"), StopIteration(1)]
+    "error",
+    [ZeroDivisionError("division\nby zero"), EOFError("cut"), AssertionError(), KeyError("x"), StopIteration(1)],
 )
 def test_a_bug_is_one_line_that_asks_for_a_report(
     command: str, error: Exception, broken: Break, tmp_path: Path, capsys: Said

@@ -108,7 +108,6 @@ def test_a_picture_that_is_too_large_is_said_to_be(tmp_path: Path) -> None:
     assert "it does not fit into memory: 8,000 x 8,000 x" in lines[0]
 
 
-
 def test_one_file_that_is_too_large_does_not_stop_the_others(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import re
 import tempfile
 from pathlib import Path
 
@@ -194,5 +195,7 @@ def test_floats_that_are_no_colours(value: float, tmp_path: Path) -> None:
 
 def test_what_is_no_file_is_not_read() -> None:
     for path in (Path("/dev/zero"), Path("/dev/null"), FIXTURES):
-        with pytest.raises(FormatError, match=f"{path} cannot be read: it is a directory, a pipe or a device"):
+        with pytest.raises(
+            FormatError, match=re.escape(f"{path} cannot be read: it is a directory, a pipe or a device")
+        ):
             read_rgba(path, COUNT)

@@ -10,7 +10,7 @@ import numpy as np
 from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
 
 from ..errors import FormatError, TruncatedError
-from ..untrusted import one_line
+from ..printable import MOST, printable
 
 MAX_HEADER = 1 << 20
 
@@ -92,6 +92,6 @@ def read_header(file: BinaryIO) -> Header:
     try:
         parsed = PlyData.read(io.BytesIO(b"\n".join(lines) + b"\n"))
     except (PlyParseError, ValueError) as error:
-        raise FormatError(f"bad PLY header: {one_line(str(error))}") from None
+        raise FormatError(f"bad PLY header: {printable(str(error), MOST)}") from None
     elements = {element.name: (element, count) for element, count in zip(parsed, counts, strict=True)}
     return Header(elements, parsed.text, parsed.byte_order, len(text))

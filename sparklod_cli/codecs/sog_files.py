@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from PIL.WebPImagePlugin import WebPImageFile
 
 from ..errors import ChecksumError, FormatError, NotSplatsError
-from ..untrusted import one_line, parse_json, shown
+from ..printable import MOST, printable
+from ..untrusted import parse_json, shown
 from .compression import check_promise
 from .stream import size_of
 
@@ -39,18 +40,18 @@ class Meta:
 
     def __init__(self, data: bytes) -> None:
         try:
-            self._root = parse_json(data)
+            self.root = parse_json(data)
         except ValueError as error:
             raise FormatError(f"{META} is not JSON: {error}") from None
-        if not isinstance(self._root, dict):
+        if not isinstance(self.root, dict):
             raise NotSplatsError(f"{META} is not that of a SOG")
 
     def has(self, key: str) -> bool:
         """Whether there is such a key at the top, and not null."""
-        return self._root.get(key) is not None
+        return self.root.get(key) is not None
 
     def _get(self, *way: str | int) -> Any:
-        value = self._root
+        value = self.root
         try:
             for key in way:
                 value = value[key]
@@ -105,6 +106,16 @@ def _finite(value: Any, way: tuple[str | int, ...]) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < 1e38:
         raise FormatError(f"{_spell(way)} of {META} has {str(value)[:20]!r}, which is not a finite number")
     return float(value)
+
+
+def names_beside(data: bytes) -> list[str]:
+    """The files that a meta.json names, as far as it can be understood; none for anything else."""
+    try:
+        root = Meta(data).root
+    except FormatError:
+        return []
+    lists = (value.get("files") for value in root.values() if isinstance(value, dict))
+    return [name for names in lists if isinstance(names, list) for name in names if isinstance(name, str)]
 
 
 class Files:
@@ -176,7 +187,7 @@ class _Archive:
         try:
             self._zip = zipfile.ZipFile(file)
         except _ZIP_ERRORS as error:
-            raise FormatError(f"not a whole zip archive: {one_line(str(error))}") from None
+            raise FormatError(f"not a whole zip archive: {printable(str(error), MOST)}") from None
         names = [name for name in self._zip.namelist() if name == META or name.endswith("/" + META)]
         if not names:
             raise NotSplatsError(f"a zip archive without {META} is not a SOG")
@@ -195,7 +206,7 @@ class _Archive:
                 return file.read(member.file_size)  # without a size it would unfold all there is before it counts
         except _ZIP_ERRORS as error:
             kind = ChecksumError if "CRC" in str(error) else FormatError
-            raise kind(f"{shown(name)} cannot be unpacked: {one_line(str(error))}") from None
+            raise kind(f"{shown(name)} cannot be unpacked: {printable(str(error), MOST)}") from None
 
 
 def _webp_size(data: bytes, name: str) -> tuple[int, int]:

@@ -12,6 +12,7 @@ from ..limits import MAX_SH_DEGREE, PLOT_BY
 from .console import Console
 from .inspect_job import Job
 from .options import Real, common_options
+from .paths import InputPath, OutputPath, keep_apart
 
 if TYPE_CHECKING:
     from ..inspection.expectations import Expectations
@@ -45,7 +46,7 @@ def _print_schema(ctx: click.Context, param: click.Parameter, value: bool) -> No
 
 
 @click.command("inspect", epilog=EXAMPLES, context_settings={"show_default": True})
-@click.argument("files", metavar="FILE...", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.argument("files", metavar="FILE...", nargs=-1, required=True, type=InputPath())
 @click.option("--stats", is_flag=True, help="Statistics of all quantities, not only of the main ones.")
 @click.option("--histogram", metavar="NAME", multiple=True, help="Text bars of a quantity that --stats names.")
 @click.option("--field", metavar="NAME", help="Print one value of the JSON report, such as tree.leaves.")
@@ -63,7 +64,7 @@ def _print_schema(ctx: click.Context, param: click.Parameter, value: bool) -> No
     default="text",
     help="How findings are printed; github makes annotations of GitHub Actions.",
 )
-@click.option("--expect", metavar="FILE", type=click.Path(path_type=Path), help="Expectations as .json or .toml.")
+@click.option("--expect", metavar="FILE", type=InputPath(), help="Expectations as .json or .toml.")
 @click.option("--max-bytes", metavar="N", type=click.IntRange(0), help="Expect a file of at most so many bytes.")
 @click.option("--min-splats", metavar="N", type=click.IntRange(0), help="Expect so many splats, or leaves, at least.")
 @click.option("--max-splats", metavar="N", type=click.IntRange(0), help="Expect so many splats, or leaves, at most.")
@@ -73,13 +74,13 @@ def _print_schema(ctx: click.Context, param: click.Parameter, value: bool) -> No
 @click.option(
     "--leaves-of",
     metavar="FILE",
-    type=click.Path(path_type=Path),
+    type=InputPath(),
     help="Expect the leaves to be exactly the splats of this file, within the steps of the coding.",
 )
-@click.option("--plot", metavar="FILE", type=click.Path(path_type=Path), help="Draw a .png, with pyvista.")
+@click.option("--plot", metavar="FILE", type=OutputPath(), help="Draw a .png, with pyvista.")
 @click.option("--plot-level", metavar="N", type=click.IntRange(0), help="Draw the nodes so many edges from the root.")
 @click.option("--plot-by", type=click.Choice(PLOT_BY), default=PLOT_BY[0], help="What colours mean in the picture.")
-@click.option("--html", metavar="FILE", type=click.Path(path_type=Path), help="Write the reports as one page.")
+@click.option("--html", metavar="FILE", type=OutputPath(), help="Write the reports as one page.")
 @click.option("--overwrite", is_flag=True, help="Replace pictures and pages that exist.")
 @click.option(
     "--json-schema",
@@ -131,7 +132,8 @@ def inspect(
 
 
 def _check_usage(ctx: click.Context, files: tuple[Path, ...], settings: dict[str, Any], as_json: bool) -> None:
-    """A usage error where options exclude each other or would do nothing."""
+    """A usage error where options exclude each other or would do nothing, or an output would replace an input."""
+    keep_apart(ctx)
     if settings["plot"] is not None and len(files) > 1:
         raise click.UsageError(f"--plot takes one file, not {len(files)}")
     if settings["field"] and as_json:

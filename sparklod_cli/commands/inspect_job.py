@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..errors import OutOfMemoryError, SparklodError, memory_told
+from ..errors import OutOfMemoryError, SparklodError, StdoutError, memory_told
+from ..printable import printable
 from .console import Console, count_of, size_of
 from .inspect_text import finding_line, lines
 
@@ -65,6 +66,8 @@ class Job:
                 self.console.error(f"{file}: {found.message}")
         try:
             self._print(report, scene)
+        except StdoutError:
+            raise  # of no file
         except SparklodError as error:
             self.console.error(f"{file}: {error}")
             status = 1
@@ -97,7 +100,7 @@ class Job:
                 from ..inspection.expectations import value_at
 
                 value = value_at(plain, self.settings["field"])
-                click.echo(value if isinstance(value, str) else json.dumps(value))
+                click.echo(printable(value) if isinstance(value, str) else json.dumps(value))
         elif self.holds:
             for found in report.findings or []:
                 click.echo(finding_line(report.file, found, self.settings["style"]))

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, TypeVar
 
 import click
@@ -28,18 +26,6 @@ class Verbosity:
 def is_given(ctx: click.Context, name: str) -> bool:
     """Whether a parameter is not what it is by default because somebody said so."""
     return ctx.get_parameter_source(name) not in (None, click.core.ParameterSource.DEFAULT)
-
-
-def keep_apart(outputs: Iterable[Path | None], inputs: Iterable[Path | None]) -> None:
-    """Raises a `click.UsageError` where an output would replace an input, or another output."""
-    taken = {os.path.realpath(path): "an input" for path in inputs if path is not None}
-    for path in outputs:
-        if path is None or str(path) == "-":
-            continue
-        place = os.path.realpath(path)
-        if place in taken:
-            raise click.UsageError(f"{path} is {taken[place]}; write elsewhere")
-        taken[place] = "an output already"
 
 
 class Numbers(click.ParamType):

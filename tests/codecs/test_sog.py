@@ -337,7 +337,9 @@ def test_a_folder_without_its_files_is_refused(tmp_path: Path) -> None:
         read_scene(tmp_path)
 
 
-@pytest.mark.parametrize("name", ["\ud800.webp", "\udcff.webp", "\0.webp", "\x1b[2J\n.webp", "x" * 3000, "../a.webp", "", "."])
+@pytest.mark.parametrize(
+    "name", ["\ud800.webp", "\udcff.webp", "\0.webp", "\x1b[2J\n.webp", "x" * 3000, "../a.webp", "", "."]
+)
 def test_names_that_no_file_beside_it_has_are_told_in_a_line(name: str, tmp_path: Path) -> None:
     meta = json.loads(FILES["meta.json"])
     meta["quats"]["files"] = [name]

@@ -258,7 +258,9 @@ def test_hostile_toml_is_an_error_of_a_line(text: str, tmp_path: Path, capsys: p
     assert len(line) < len(str(path)) + 600
 
 
-@pytest.mark.parametrize("wanted", ["9" * 5000, "1" + "0" * 4000, "1e999", "NaN", '"\\ud800"', '["' + "x" * 10**5 + '"]'])
+@pytest.mark.parametrize(
+    "wanted", ["9" * 5000, "1" + "0" * 4000, "1e999", "NaN", '"\\ud800"', '["' + "x" * 10**5 + '"]']
+)
 def test_odd_values_are_only_not_met(wanted: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for text in (f'{{"values": {{"splats": {wanted}}}}}', f'{{"values": {{"tree.levels": {wanted}}}}}'):
         assert run(["inspect", str(TREE), "--expect", str(written(tmp_path, text)), "-q"]) == 3
