@@ -111,8 +111,13 @@ def _note_verbosity(ctx: click.Context, param: click.Parameter, value: bool) -> 
     return value
 
 
-def common_options(command: Command, *, json: str = "Print one JSON object a file on standard output.") -> Command:
-    """`--threads`, `--json`, `-q`, `-v`, `--version`; `json` is the help of the second."""
+def common_options(
+    command: Command,
+    *,
+    json: str = "Print one JSON object a file on standard output.",
+    quiet: str = "Say nothing but errors.",
+) -> Command:
+    """`--threads`, `--json`, `-q`, `-v`, `--version`; `json` and `quiet` are the help of theirs."""
     for option in (
         click.version_option(__version__, package_name="sparklod"),
         click.option(
@@ -122,7 +127,7 @@ def common_options(command: Command, *, json: str = "Print one JSON object a fil
             callback=_note_verbosity,
             help="Say how long each stage took, and what was chosen.",
         ),
-        click.option("-q", "--quiet", is_flag=True, help="Say nothing but errors."),
+        click.option("-q", "--quiet", is_flag=True, help=quiet),
         click.option("--json", "as_json", is_flag=True, help=json),
         click.option(
             "--threads",
