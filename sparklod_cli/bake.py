@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from .codecs import dump, spz
-from .errors import FormatError, SparklodError
+from .errors import FormatError, memory_told
 from .io import Sink, read_rgba, read_scene
 from .limits import DEFAULT_BASE, DEFAULT_GROWTH, MAX_SH_DEGREE, METHODS
 from .lod import quality, quick
@@ -90,12 +90,10 @@ def bake(source: Path, write: Sink, recipe: Recipe, *, progress: Progress = sile
 
     Raises:
         FormatError, InvalidSplatsError, OutputError: see `io.read_scene`, `Selection.apply` and `write`.
-        SparklodError: it does not fit into memory.
+        OutOfMemoryError: it does not fit into memory.
     """
-    try:
+    with memory_told():
         return _bake(source, write, recipe, progress)
-    except MemoryError:
-        raise SparklodError("it does not fit into memory") from None
 
 
 def _bake(source: Path, write: Sink, recipe: Recipe, progress: Progress) -> Baked:

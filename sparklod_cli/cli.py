@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import os
 import sys
+import traceback
 from importlib import import_module
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import click
 
-from . import __version__, interrupts
-from .commands.console import say, say_error
-from .errors import SparklodError
+from . import __version__, interrupts, stdout
+from .commands.console import say, say_error, say_usage_error
+from .commands.options import Verbosity
+from .errors import SparklodError, out_of_memory
+from .printable import printable
+
+#: Characters that are quoted of an error that nobody foresaw.
+QUOTED = 200
 
 #: Sub-commands, each a module of `commands` with a function of its name; imported when it is called for.
 COMMANDS = {name: name.replace("-", "_") for name in ("build-lod", "inspect", "traverse", "render", "warmup")}
@@ -23,8 +29,18 @@ Shell completion: eval "$(_SPARKLOD_COMPLETE=bash_source sparklod)", or zsh_sour
 """
 
 
+class _EndOfFileError(Exception):
+    """Carries an `EOFError` past click, which takes it for Ctrl-D and says that a person interrupted."""
+
+
 class LazyGroup(click.Group):
     """A group that imports a command when it is asked for."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        try:
+            return super().invoke(ctx)
+        except EOFError as error:
+            raise _EndOfFileError from error
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(COMMANDS)
@@ -45,28 +61,53 @@ def cli() -> None:
 
 def run(arguments: list[str] | None = None) -> int:
     """Runs the command line and returns its exit code; arguments are those of the process unless given."""
+    with stdout.told():
+        return _run(arguments)
+
+
+def _run(arguments: list[str] | None) -> int:
+    verbosity = Verbosity()
     try:
-        code = cli.main(arguments, prog_name="sparklod", standalone_mode=False)
+        code = cli.main(arguments, prog_name="sparklod", standalone_mode=False, obj=verbosity)
     except click.ClickException as error:
-        error.show()
+        say_usage_error(error)
         return error.exit_code
     except SparklodError as error:
         say_error(str(error))
         return 1
-    except (click.Abort, KeyboardInterrupt) as error:
-        if isinstance(error.__cause__, EOFError):  # which click takes for the end of what somebody types
-            raise error.__cause__ from None
+    except (click.Abort, KeyboardInterrupt):
         say("interrupted")
         return interrupts.INTERRUPTED
-    except BrokenPipeError:
-        # Whoever read standard output has gone; pointing it elsewhere keeps the interpreter's last flush quiet.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except stdout.ReaderGoneError:
         return 1
-    except OSError as error:  # all files are opened elsewhere, and their errors told: this is standard output
-        say_error(f"cannot write standard output: {(error.strerror or str(error)).lower()}")
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except OSError as error:  # of neither a file that was named nor standard output: those are told where they occur
+        if out_of_memory(error):
+            return _failed(error, verbosity)
+        where = f"{os.fsdecode(error.filename)}: " if isinstance(error.filename, (str, bytes, os.PathLike)) else ""
+        say_error(f"cannot go on: {where}{(error.strerror or str(error)).lower()}")
         return 1
+    except Exception as error:
+        return _failed(error.__cause__ if isinstance(error, _EndOfFileError) and error.__cause__ else error, verbosity)
     return code if isinstance(code, int) else 0
+
+
+def _failed(error: BaseException, verbosity: Verbosity) -> int:
+    """Says in one line what nobody foresaw, or that memory ran out, and returns the exit code.
+
+    This is the last guard: whatever gets here is ours to mend, but a person has no use for a traceback.
+    """
+    if verbosity.verbose:
+        for line in "".join(traceback.format_exception(error)).splitlines():
+            say(line)
+    told = out_of_memory(error)
+    if told is None:
+        told = (
+            f"sparklod failed in a way that it should not: {printable(f'{type(error).__name__}: {error}', QUOTED)};"
+            " please report this command, with its input if you can"
+        )
+        told += "" if verbosity.verbose else " (-v shows where it happened)"
+    say_error(told)
+    return 1
 
 
 def main() -> NoReturn:

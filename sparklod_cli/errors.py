@@ -1,5 +1,13 @@
 """The errors that sparklod raises on purpose. The command line turns each into one line and an exit code."""
 
+from __future__ import annotations
+
+import contextlib
+import errno
+import math
+from collections.abc import Iterator
+from typing import Any
+
 
 class SparklodError(Exception):
     """Base of every error that tells the user something; its text is one line that says what to do."""
@@ -77,5 +85,49 @@ class OutputError(SparklodError):
     """An output cannot be written: it exists already, or the file system refused it."""
 
 
+class StdoutError(OutputError):
+    """Standard output is closed, or cannot be written; not the fault of the file that is being worked on."""
+
+
 class CameraPathError(SparklodError):
     """A camera path cannot be read or made: its file is broken or of no known format, or a camera makes no sense."""
+
+
+class OutOfMemoryError(SparklodError):
+    """What was asked for does not fit into memory."""
+
+
+@contextlib.contextmanager
+def memory_told() -> Iterator[None]:
+    """Makes an `OutOfMemoryError`, which says what did not fit, of every way in which memory runs out inside."""
+    try:
+        yield
+    except Exception as error:
+        reason = out_of_memory(error)
+        if reason is None:
+            raise
+        raise OutOfMemoryError(reason) from None
+
+
+def out_of_memory(error: BaseException) -> str | None:
+    """What did not fit into memory, for people; None where the error is about something else."""
+    text = str(error).lower()
+    starved = (
+        isinstance(error, MemoryError)
+        or (isinstance(error, OSError) and error.errno == errno.ENOMEM)
+        or (isinstance(error, ImportError) and ("cannot allocate memory" in text or "failed to map segment" in text))
+        or (isinstance(error, RuntimeError) and "can't start new thread" in text)  # there is no room for its stack
+    )
+    if not starved:
+        return None
+    return f"it does not fit into memory{_array_of(error)}; free some, or ask for less at a time"
+
+
+def _array_of(error: Any) -> str:
+    """The array that numpy had no room for, as its `MemoryError` has it; empty for others."""
+    shape, dtype = getattr(error, "shape", None), getattr(error, "dtype", None)
+    if not shape or dtype is None:
+        return ""
+    size = math.prod(shape) * dtype.itemsize
+    amount = f"{size / 1e9:,.1f} GB" if size >= 1e9 else f"{size / 1e6:,.1f} MB"
+    return f": {' x '.join(f'{side:,}' for side in shape)} numbers ({dtype}) take {amount}"

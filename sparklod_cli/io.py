@@ -4,22 +4,28 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import itertools
 import os
-import secrets
-import stat
 import sys
 from collections.abc import Callable, Collection, Iterable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 
+from . import whole
+from .codecs import npy
 from .codecs.formats import FORMATS, HEAD, Format, sniff
-from .errors import FormatError, OutputError, UnknownFormatError, UnreadableError
+from .codecs.sog_files import MAX_META, META, names_beside
+from .errors import FormatError, OutputError, StdoutError, UnknownFormatError, UnreadableError
 from .progress import Progress, silent
 from .scene import Scene
 from .splats import COLUMNS, FloatArray
+from .stdout import ReaderGoneError, told
+from .untrusted import shown
+
+#: Bytes of a text that is read whole: instances, expectations, matrices. Parsed it may take thirty times as much.
+MAX_TEXT = 1 << 24
 
 #: Writes the pieces of an output and returns how many bytes it wrote.
 Sink = Callable[[Iterable[bytes]], int]
@@ -99,7 +105,7 @@ def size_on_disk(path: Path) -> int | None:
 def read_text(path: Path) -> str:
     """A small text file; `UnreadableError`, naming it, where that cannot be."""
     try:
-        return path.read_text(encoding="utf-8-sig")
+        return str(_read_up_to(path, MAX_TEXT), "utf-8-sig")
     except (OSError, ValueError) as error:
         reason = _reason(error) if isinstance(error, OSError) else "it is not text"
         raise UnreadableError(f"{path} cannot be read: {reason}") from None
@@ -132,7 +138,34 @@ def read_together(path: Path, sets: Collection[Collection[str]], limit: int) -> 
         raise UnreadableError(f"{path} cannot be read: {_reason(error)}") from None
 
 
+def companions(path: Path, sets: Collection[Collection[str]]) -> list[Path]:
+    """The files that are read together with one, as far as can be told; nothing is raised.
+
+    Args:
+        path: of a file, or of a folder.
+        sets: as for `read_together`.
+    """
+    try:
+        folder = path if path.is_dir() else path.parent
+        meta = folder / META if path.is_dir() else path
+        if path.is_dir():
+            names = [META, *itertools.chain(*sets)]
+        else:
+            names = list(itertools.chain(*(names for names in sets if path.name in names)))
+        if meta.is_file() and meta.stat().st_size <= MAX_META:
+            with meta.open("rb") as file:
+                if file.read(HEAD).lstrip().startswith(b"{"):
+                    file.seek(0)
+                    names += names_beside(file.read())
+        beside = [folder / name for name in names if not _leads_away(name)]
+        return [file for file in beside if file.is_file()]
+    except (OSError, ValueError):
+        return []
+
+
 def _read_up_to(path: Path, limit: int) -> bytes:
+    if path.is_dir():
+        raise UnreadableError(f"{path} cannot be read: is a directory")
     if path.exists() and not path.is_file():
         raise UnreadableError(f"{path} cannot be read: it is a pipe or a device; save it to a file first")
     if path.stat().st_size > limit:
@@ -141,23 +174,36 @@ def _read_up_to(path: Path, limit: int) -> bytes:
 
 
 def _in_folder(folder: Path) -> Path:
-    path = folder / "meta.json"
+    path = folder / META
     if not path.is_file():
         raise UnreadableError("cannot be read: is a directory, without the meta.json of an unpacked SOG")
     return path
 
 
+def _leads_away(name: str) -> bool:
+    """Whether a name could be that of something else than a file in the same folder."""
+    return name in ("", ".", "..") or any(mark in name for mark in "/\\:") or not is_file_name(name)
+
+
 def _open_beside(folder: Path, name: str) -> BinaryIO:
     """Opens a file that another one names; `FormatError` where the name could lead out of their folder."""
-    if name in ("", ".", "..") or any(mark in name for mark in "/\\:\0"):
-        raise FormatError(f"it names {name!r}, which is not a file beside it")
+    if _leads_away(name):
+        raise FormatError(f"it names {shown(name)}, which is not a file beside it")
     path = folder / name
     try:
         if path.exists() and not path.is_file():
-            raise FormatError(f"{name!r}, which it names, is not a file")
+            raise FormatError(f"{shown(name)}, which it names, is not a file")
         return path.open("rb")
     except OSError as error:
-        raise FormatError(f"{name!r}, which it names, cannot be read: {_reason(error)}") from None
+        raise FormatError(f"{shown(name)}, which it names, cannot be read: {_reason(error)}") from None
+
+
+def is_file_name(text: str) -> bool:
+    """Whether a file can be called so; no system takes the byte 0, nor half of a surrogate pair."""
+    try:
+        return b"\0" not in os.fsencode(text)
+    except UnicodeEncodeError:
+        return False
 
 
 def read_rgba(path: Path, count: int) -> FloatArray:
@@ -169,30 +215,33 @@ def read_rgba(path: Path, count: int) -> FloatArray:
         FormatError: it is neither, of another length, or has values that are not 0..1; names the file.
     """
     try:
+        if path.exists() and not path.is_file():
+            raise FormatError("cannot be read: it is a directory, a pipe or a device")
         with path.open("rb") as file:
-            npy = file.read(6) == b"\x93NUMPY"
-        values = np.load(path, mmap_mode="r", allow_pickle=False) if npy else _raw_rgba(path, count)
+            layout = npy.read_layout(file) or _raw_layout(path.stat().st_size, count)
+            shape, dtype = layout.shape, layout.dtype
+            if len(shape) != 2 or shape[1] != 4 or (dtype != np.uint8 and dtype.kind != "f"):
+                raise FormatError(f"has {dtype}{list(shape)}, expected uint8 or floats [{count}, 4]")
+            if shape[0] != count:
+                raise FormatError(f"has colours for {shape[0]:,} splats, the scene has {count:,}")
+            values = npy.read_values(file, layout)
     except OSError as error:
         raise FormatError(f"{path} cannot be read: {_reason(error)}") from None
-    except (ValueError, EOFError, SyntaxError) as error:
-        raise FormatError(f"{path} is not a .npy file: {error}") from None
-    if values.ndim != 2 or values.shape[1] != 4 or (values.dtype != np.uint8 and values.dtype.kind != "f"):
-        raise FormatError(f"{path} has {values.dtype}{list(values.shape)}, expected uint8 or floats [{count}, 4]")
-    if len(values) != count:
-        raise FormatError(f"{path} has colours for {len(values):,} splats, the scene has {count:,}")
-    rgba = np.array(values, np.float32) / np.float32(255 if values.dtype == np.uint8 else 1)
-    if not ((rgba >= 0) & (rgba <= 1)).all():
+    except FormatError as error:
+        raise type(error)(f"{path} {error}") from None
+    most = 255 if values.dtype == np.uint8 else 1
+    if not ((values >= 0) & (values <= most)).all():
         raise FormatError(f"{path} has values that are not 0..1")
-    return rgba
+    return np.ascontiguousarray(values, np.float32) / np.float32(most)
 
 
-def _raw_rgba(path: Path, count: int) -> NDArray[Any]:
-    values: NDArray[Any] = np.fromfile(path, np.uint8)
-    if values.size == 16 * count:
-        values = values.view("<f4")
-    if values.size % 4:
-        raise FormatError(f"{path} has {values.size:,} bytes, which are not four a splat")
-    return values.reshape(-1, 4)
+def _raw_layout(size: int, count: int) -> npy.Layout:
+    """What a file without a header has, told by its bytes."""
+    if size == 16 * count:
+        return npy.Layout((count, 4), np.dtype("<f4"))
+    if size % 4:
+        raise FormatError(f"has {size:,} bytes, which are not four a splat")
+    return npy.Layout((size // 4, 4), np.dtype(np.uint8))
 
 
 def check_writable(path: Path, *, overwrite: bool, make_parent: bool = False) -> None:
@@ -222,7 +271,7 @@ def check_writable(path: Path, *, overwrite: bool, make_parent: bool = False) ->
 def write_whole(path: Path, pieces: Iterable[bytes], *, overwrite: bool) -> int:
     """Writes a file so that it appears complete or not at all, and returns its size.
 
-    A temporary file beside it is filled, synced and renamed; an interruption leaves nothing behind.
+    It gets its name when it is filled and synced, see `whole`; an interruption leaves nothing behind.
 
     Raises:
         OutputError: it exists and `overwrite` is not set, or the file system refused something.
@@ -232,52 +281,23 @@ def write_whole(path: Path, pieces: Iterable[bytes], *, overwrite: bool) -> int:
         if path.exists() and not path.is_file():  # a pipe or a device is written to, never replaced
             with path.open("wb") as file:
                 return sum(map(file.write, pieces))
-        return _write_and_rename(Path(os.path.realpath(path)), pieces, overwrite)
+        return whole.write(Path(os.path.realpath(path)), pieces, overwrite=overwrite)
     except FileExistsError:
         raise OutputError(f"{path} exists, add --overwrite to replace it") from None
     except OSError as error:
         raise OutputError(f"cannot write {path}: {_reason(error)}") from None
 
 
-def _write_and_rename(target: Path, pieces: Iterable[bytes], overwrite: bool) -> int:
-    temporary = target.with_name(f".sparklod-{secrets.token_hex(8)}.part")
-    try:
-        with temporary.open("xb") as file:
-            size = sum(map(file.write, pieces))
-            file.flush()
-            os.fsync(file.fileno())
-        _publish(temporary, target, overwrite)
-    finally:
-        temporary.unlink(missing_ok=True)
-    return size
-
-
-def _publish(temporary: Path, target: Path, overwrite: bool) -> None:
-    """Gives a complete file its name; `FileExistsError` where somebody took that meanwhile."""
-    if overwrite:
-        with contextlib.suppress(FileNotFoundError):
-            temporary.chmod(stat.S_IMODE(target.stat().st_mode))  # what was private stays private
-        temporary.replace(target)
-        return
-    try:
-        os.link(temporary, target)  # fails where the name is taken; a rename would replace it
-    except FileExistsError:
-        raise
-    except OSError:  # a file system without links
-        if target.exists():
-            raise FileExistsError from None
-        temporary.replace(target)
-
-
 def write_stdout(pieces: Iterable[bytes]) -> int:
-    """Writes to standard output and returns how many bytes; raises `OutputError` where nobody reads them."""
-    if sys.stdout is None:
-        raise OutputError("standard output is closed")
-    try:
-        size = sum(map(sys.stdout.buffer.write, pieces))
-        sys.stdout.buffer.flush()
-    except OSError as error:
-        raise OutputError(f"cannot write standard output: {_reason(error)}") from None
+    """Writes to standard output and returns how many bytes; raises `StdoutError` where nobody reads them."""
+    size = 0
+    with told():
+        try:
+            for piece in pieces:
+                size += sys.stdout.buffer.write(piece)
+            sys.stdout.buffer.flush()
+        except ReaderGoneError as error:
+            raise StdoutError(f"cannot write standard output: {error.strerror}") from None
     return size
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from .codecs import ply, splat, spz
-from .errors import FormatError
+from .errors import FormatError, memory_told
 from .io import Sink, read_scene
 from .limits import DEFAULT_COMPRESSION, PLAIN_SUFFIXES, SPZ_VERSIONS
 from .progress import Progress, silent
@@ -61,7 +61,13 @@ def unlod(source: Path, write: Sink, target: Target, *, progress: Progress = sil
 
     Raises:
         FormatError, OutputError: see `io.read_scene` and `write`; the file has no tree.
+        OutOfMemoryError: it does not fit into memory.
     """
+    with memory_told():
+        return _unlod(source, write, target, progress)
+
+
+def _unlod(source: Path, write: Sink, target: Target, progress: Progress) -> Unbaked:
     start = time.perf_counter()
     scene = read_scene(source, threads=target.threads, progress=progress)
     if scene.tree is None:

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import math
-import os
-import reprlib
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
@@ -15,9 +12,10 @@ from typing import Any
 import numpy as np
 
 from .errors import SparklodError
-from .io import read_text
+from .io import is_file_name, read_text
 from .lod.traversal import Cones, Frustum, Matrix
 from .render.pose import rotation_of
+from .untrusted import parse_json, shown, well_formed
 from .world import TOTAL, Placement, names_of
 
 #: What an instance may say, and how many numbers that is; 0 for something else.
@@ -32,9 +30,6 @@ LARGEST = 1e12
 #: Degrees of a whole cone.
 WIDEST = 180
 
-#: As much is said of something that is wrong.
-SHOWN = 100
-
 
 class WorldFileError(SparklodError):
     """A file of instances cannot be understood."""
@@ -48,8 +43,8 @@ def read_placements(path: Path) -> list[Placement]:
         FormatError: it cannot be read.
     """
     try:
-        data = json.loads(read_text(path))
-    except (ValueError, RecursionError) as error:
+        data = parse_json(read_text(path), keep_surrogates=True)  # files may be called so
+    except ValueError as error:
         raise WorldFileError(f"{path} is not JSON: {error}") from None
     instances = data.get("instances") if isinstance(data, dict) else None
     if not isinstance(instances, list) or not instances:
@@ -70,21 +65,21 @@ def read_placements(path: Path) -> list[Placement]:
 def _placement(data: Any, folder: Path) -> Placement:
     """One instance, its name empty where it has none; `ValueError` where it is none."""
     if not isinstance(data, dict):
-        raise ValueError(f"is {_shown(data)}, not an object")
+        raise ValueError(f"is {shown(data)}, not an object")
     for key in data:
         if key not in KEYS:
-            raise ValueError(f"has {_shown(key)}, which is not one of {', '.join(KEYS)}")
+            raise ValueError(f"has {shown(key)}, which is not one of {', '.join(KEYS)}")
     file, name = data.get("file"), data.get("name", "")
     if not isinstance(file, str) or not file:
         raise ValueError("names no file")
-    if not _is_path(file):
-        raise ValueError(f"names the file {_shown(file)}, which no file can be called")
+    if not is_file_name(file):
+        raise ValueError(f"names the file {shown(file)}, which no file can be called")
     if not isinstance(name, str) or name == TOTAL:
-        raise ValueError(f"cannot be called {_shown(name)}")
+        raise ValueError(f"cannot be called {shown(name)}")
     lod_scale = _numbers(data, "lod_scale", [1.0])[0]
     if lod_scale < 0:
         raise ValueError(f"has a lod_scale of {lod_scale:g}")
-    return Placement(folder / file, name, _matrix(data), lod_scale, _foveation(data.get("foveation")))
+    return Placement(folder / file, well_formed(name), _matrix(data), lod_scale, _foveation(data.get("foveation")))
 
 
 def _matrix(data: Mapping[str, Any]) -> Matrix:
@@ -114,7 +109,7 @@ def _foveation(data: Any) -> Cones | Frustum | None:
     if data is None:
         return None
     if not isinstance(data, dict):
-        raise ValueError(f"has a foveation of {_shown(data)}")
+        raise ValueError(f"has a foveation of {shown(data)}")
     kinds: dict[type[Cones | Frustum], dict[str, str]] = {
         Frustum: {"outside_foveate": "outside", "behind_foveate": "behind"},
         Cones: {"cone_fov0": "fov0", "cone_fov": "fov", "cone_foveate": "foveate", "behind_foveate": "behind"},
@@ -122,7 +117,7 @@ def _foveation(data: Any) -> Cones | Frustum | None:
     kind = Frustum if "outside_foveate" in data else Cones
     for key in data:
         if key not in kinds[kind]:
-            raise ValueError(f"has {_shown(key)} in its foveation, which is not one of {', '.join(kinds[kind])}")
+            raise ValueError(f"has {shown(key)} in its foveation, which is not one of {', '.join(kinds[kind])}")
     values = {field: _numbers(data, key, [0.0])[0] for key, field in kinds[kind].items() if key in data}
     if any(value < 0 for value in values.values()):
         raise ValueError("has a negative foveation")
@@ -140,21 +135,7 @@ def _numbers(data: Mapping[str, Any], key: str, default: list[float]) -> list[fl
     count = KEYS.get(key, 1)
     plain = all(isinstance(number, (int, float)) and not isinstance(number, bool) for number in flat)
     if len(flat) != count or not plain or not all(-math.inf < number < math.inf for number in flat):
-        raise ValueError(f"has {key} {_shown(value)}, which is not {count} finite number{'s' * (count > 1)}")
+        raise ValueError(f"has {key} {shown(value)}, which is not {count} finite number{'s' * (count > 1)}")
     if any(abs(number) > LARGEST for number in flat):
-        raise ValueError(f"has {key} {_shown(value)}, which is beyond {LARGEST:g}")
+        raise ValueError(f"has {key} {shown(value)}, which is beyond {LARGEST:g}")
     return [float(number) for number in flat]
-
-
-def _is_path(text: str) -> bool:
-    """Whether a file can be called so; no system takes the byte 0, nor half of a surrogate pair."""
-    try:
-        return b"\0" not in os.fsencode(text)
-    except UnicodeEncodeError:
-        return False
-
-
-def _shown(value: Any) -> str:
-    """A value in a message: on one line, and not too much of it, however deep it is."""
-    text = reprlib.repr(value)
-    return text if len(text) <= SHOWN else f"{text[: SHOWN - 3]}..."

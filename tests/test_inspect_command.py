@@ -10,11 +10,17 @@ import weakref
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from sparklod_cli.cli import run
+from sparklod_cli.codecs import spz
+from sparklod_cli.inspection import plot
 from sparklod_cli.inspection import report as reports
 from sparklod_cli.inspection.findings import CODES, Finding
+from sparklod_cli.scene import Scene
+from sparklod_cli.splats import Splats
+from sparklod_cli.tree import LodTree
 
 from .conftest import FIXTURES, ROOT
 
@@ -94,7 +100,12 @@ def test_exit_codes(file: Path, without: int, with_check: int, capsys: Said) -> 
         ([TREE, "--format", "github"], "--format needs --check or an expectation"),
         ([TREE, "--json", "--histogram", "scale"], "--histogram is for a person"),
         ([TREE, "--field", "splats", "--histogram", "scale"], "--histogram is for a person"),
-        ([TREE, "--check", "--stats"], "--stats only as --json"),
+        ([TREE, "--check", "--stats"], "--check prints findings; with --stats that is possible only as --json"),
+        ([TREE, "--sh", "0", "--stats"], "expectations print findings; with --stats that is possible only as --json"),
+        ([TREE, "--check", "--json", "--format", "github"], "--format is of findings in lines"),
+        ([TREE, "--check", "--field", "splats", "--format", "text"], "--format is of findings in lines"),
+        ([TREE, "--plot-level", "3"], "--plot-level needs --plot or --html"),
+        ([TREE, "--plot-by", "size"], "--plot-by needs --plot or --html"),
         ([TREE, "--plot-by", "taste"], "--plot-by"),
         ([TREE, "--plot-level", "-1"], "--plot-level"),
         ([TREE, "--max-bytes", "-1"], "--max-bytes"),
@@ -136,14 +147,23 @@ def test_findings_are_data_and_what_is_good_is_talk(capsys: Said) -> None:
     assert err == f"{TREE}: nothing is wrong with its 9 nodes\n"
 
 
-def test_quiet_prints_the_data_only(capsys: Said) -> None:
+def test_quiet_prints_what_is_asked_for_by_name_only(capsys: Said) -> None:
     assert inspect("--check", "-q", TREE, BROKEN) == 3
     out, err = capsys.readouterr()
     assert (out.count("\n"), err) == (1, "")
     assert inspect("--check", "-q", TREE) == 0
     assert capsys.readouterr() == ("", "")
     assert inspect("-q", TREE) == 0
-    assert capsys.readouterr().out.startswith(f"{TREE}  SPZ 3 LoD")
+    assert inspect("-q", TREE, "--stats") == 0
+    assert capsys.readouterr() == ("", "")
+    assert inspect("-q", TREE, "--field", "tree.leaves") == 0
+    assert capsys.readouterr() == ("6\n", "")
+    assert inspect("-q", TREE, "--json") == 0
+    out, err = capsys.readouterr()
+    assert (len(records(out)), err) == (1, "")
+    assert inspect("-q", TREE, "--histogram", "opacity") == 0
+    out, err = capsys.readouterr()
+    assert (out.split()[0], err) == ("opacity", "")
     assert inspect("-q", CORRUPT) == 1  # errors are said whatever is asked for
     assert capsys.readouterr().err.startswith(f"error: {CORRUPT}")
 
@@ -331,3 +351,51 @@ def test_as_a_process() -> None:
     assert "Traceback" not in done.stderr
     done = sparklod(TREE, "--field", "tree.leaves", "--check", "--require-lod")
     assert (done.returncode, done.stdout, done.stderr) == (0, "6\n", "")
+
+
+def chain(nodes: int) -> bytes:
+    """A tree of nodes with a single child each: a file of bytes that are all alike, and as many levels as nodes."""
+    splats = Splats.empty(nodes, 0)
+    for name, value in (("center", 1), ("scale", 0.1), ("quat_xyzw", 0.5), ("opacity", 0.5), ("rgb", 0.5)):
+        getattr(splats, name)[:] = value
+    count, start = np.ones(nodes, np.uint16), np.arange(1, nodes + 1, dtype=np.uint32)
+    count[-1] = start[-1] = 0
+    return b"".join(spz.encode(Scene(splats, LodTree(count, start)), spz.Options(compression_level=1)))
+
+
+@pytest.mark.parametrize("nodes", [999, 1000, 1001, 50_000])
+def test_a_chain_is_told_of_in_bounds(nodes: int, tmp_path: Path, capsys: Said) -> None:
+    """Reports do not grow with the levels of a tree, and say how many they leave out."""
+    path, page = tmp_path / "chain.spz", tmp_path / "page.html"
+    path.write_bytes(chain(nodes))
+    left_out = max(0, nodes - 1000)
+    assert inspect(path, "--html", page) == 0
+    text = capsys.readouterr().out
+    assert f"{nodes:,} levels" in text
+    assert f"and {nodes - 64:,} more" in text
+    assert len(text) < 10_000
+    html = page.read_text()
+    assert len(html) < 600_000
+    assert (f"{left_out:,} more levels are left out" in html) == bool(left_out)
+    assert f"<dt>Levels</dt><dd>{nodes:,}<" in html
+    assert inspect(path, "--json") == 0
+    out = capsys.readouterr().out
+    tree = json.loads(out)["tree"]
+    assert (tree["depth"], len(tree["levels"]), tree["levels_left_out"]) == (nodes - 1, min(nodes, 1000), left_out)
+    assert len(out) < 100_000
+
+
+def test_a_page_and_a_picture_are_said(tmp_path: Path, capsys: Said, monkeypatch: pytest.MonkeyPatch) -> None:
+    def drawn(*args: object, **kwargs: object) -> plot.Picture:
+        return plot.Picture(b"\x89PNG" * 100, "all leaves: 6 nodes; coloured by level")
+
+    monkeypatch.setattr(plot, "plot", drawn)
+    page, picture = tmp_path / "page.html", tmp_path / "picture.png"
+    assert inspect(TREE, "--plot", picture, "--html", page) == 0
+    first, second = capsys.readouterr().err.splitlines()
+    assert first == f"{picture}  all leaves: 6 nodes, 0.4 kB"
+    assert second == f"{page}  page of 1 file, {page.stat().st_size / 1e3:.1f} kB"
+    assert inspect(TREE, TREE, "--html", page, "--overwrite") == 0
+    assert f"{page}  page of 2 files, " in capsys.readouterr().err
+    assert inspect(TREE, "--plot", picture, "--html", page, "--overwrite", "-q") == 0
+    assert capsys.readouterr() == ("", "")

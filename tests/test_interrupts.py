@@ -37,14 +37,3 @@ def test_a_signal_ends_a_compilation_at_once_and_leaves_a_whole_cache(tmp_path: 
     kept = list(cache.rglob(f"*{SUFFIX}"))
     assert len(kept) < len(JOBS["quality"].kernels) / 2  # it did not go on to the end
     assert all(is_whole(path.read_bytes()) for path in kept)
-
-
-def test_only_a_signal_is_called_an_interruption(monkeypatch: pytest.MonkeyPatch) -> None:
-    from sparklod_cli import cli
-
-    def at_an_end(*arguments: object, **how: object) -> None:
-        raise cli.click.Abort from EOFError("a cache ends early")
-
-    monkeypatch.setattr(cli.cli, "main", at_an_end)
-    with pytest.raises(EOFError):
-        cli.run(["inspect", "a.spz"])

@@ -11,11 +11,13 @@ from pathlib import Path
 
 import pytest
 
+from sparklod_cli import whole
 from sparklod_cli.codecs.formats import FORMATS
 from sparklod_cli.errors import FormatError, OutputError
 from sparklod_cli.io import check_writable, read_scene, write_stdout, write_whole
 
 from .conftest import FIXTURES
+from .test_whole import has_unnamed_files
 
 IS_ROOT = hasattr(os, "geteuid") and os.geteuid() == 0
 posix = pytest.mark.skipif(os.name != "posix", reason="POSIX only")
@@ -128,7 +130,12 @@ def test_an_interruption_leaves_nothing_and_spoils_nothing(
         assert target.read_bytes() == b"old"
 
 
-def test_the_file_is_not_there_before_it_is_whole(tmp_path: Path) -> None:
+@pytest.mark.parametrize("named", [False, True])
+def test_the_file_is_not_there_before_it_is_whole(named: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    if named:
+        monkeypatch.setattr(whole, "UNNAMED", None)
+    elif not has_unnamed_files(tmp_path):
+        pytest.skip("no files without names here")
     target = tmp_path / "out.spz"
     seen: list[list[str]] = []
 
@@ -138,9 +145,10 @@ def test_the_file_is_not_there_before_it_is_whole(tmp_path: Path) -> None:
             yield b"x"
 
     write_whole(target, pieces(), overwrite=False)
-    assert [len(files) for files in seen] == [1, 1]
+    assert [len(files) for files in seen] == [int(named)] * 2
     assert all("out.spz" not in files for files in seen)
-    assert seen[0][0].startswith(".sparklod-")  # hidden, and beside the target: a rename does not cross file systems
+    if named:  # hidden, and beside the target: a rename does not cross file systems
+        assert seen[0][0].startswith(".sparklod-")
 
 
 def test_two_at_once_do_not_share_a_temporary_file(tmp_path: Path) -> None:

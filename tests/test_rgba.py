@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import re
+import tempfile
 from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from sparklod_cli.cli import run
 from sparklod_cli.errors import FormatError
@@ -94,3 +99,103 @@ def test_a_missing_file_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[s
 def test_one_file_of_colours_is_for_one_scene(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["build-lod", str(SCENE), str(FIXTURES / "sh1.ply"), "--rgba", "a.npy"]) == 2
     assert "--rgba takes one input, not 2" in capsys.readouterr().err
+
+
+def npy(header: str, data: bytes = b"", version: int = 1) -> bytes:
+    """A .npy file of which the header says anything."""
+    size = len(header).to_bytes(2 if version == 1 else 4, "little")
+    return b"\x93NUMPY" + bytes([version, 0]) + size + header.encode("latin-1") + data
+
+
+GOOD = f"{{'descr': '<f4', 'fortran_order': False, 'shape': ({COUNT}, 4), }}"
+HEADERS = {
+    "misspelt": GOOD.replace("fortran_order': False", "fortran_oder':F(lse"),
+    "not a dictionary": "[]",
+    "empty": "",
+    "a program": "__import__('os').abort()",
+    "deep": "(" * 4000,
+    "minuses": "-" * 4000 + "1",
+    "long": GOOD + " " * 60_000,
+    "a negative side": GOOD.replace("4)", "-4)"),
+    "a huge side": GOOD.replace("4)", "9" * 190 + ")"),
+    "huge sides": GOOD.replace(f"({COUNT}", "(" + "9" * 190),
+    "a side of letters": GOOD.replace("4)", "four)"),
+    "no sides": GOOD.replace(f"({COUNT}, 4)", "()"),
+    "many sides": GOOD.replace(f"({COUNT}, 4)", "(" + "1," * 99 + ")"),
+    "no shape": GOOD.replace("'shape'", "'shap'"),
+    "an order of bytes": GOOD.replace("False", "b''"),
+    "no type": GOOD.replace("<f4", ""),
+    "a type that is none": GOOD.replace("<f4", "<f3"),
+    "a type of nothing": GOOD.replace("<f4", "|V0"),
+    "objects": GOOD.replace("<f4", "|O8"),
+    "texts": GOOD.replace("<f4", "<U4"),
+    "dates": GOOD.replace("<f4", "<M8"),
+    "complex numbers": GOOD.replace("<f4", "<c8"),
+    "a record": GOOD.replace("'<f4'", "[('a', '<f4')]"),
+    "control characters": GOOD.replace("<f4", "\x1b[31m\n"),
+}
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("header", HEADERS.values(), ids=HEADERS)
+def test_a_header_that_says_anything_is_refused_in_a_line(header: str, tmp_path: Path) -> None:
+    for version in (1, 2, 3):
+        path = tmp_path / f"{version}.npy"
+        path.write_bytes(npy(header, bytes(16 * COUNT), version))
+        with pytest.raises(FormatError) as caught:
+            read_rgba(path, COUNT)
+        assert str(caught.value).startswith(f"{path} ")
+        assert str(caught.value).isprintable()
+        assert len(str(caught.value)) < len(str(path)) + 500
+
+
+@pytest.mark.parametrize("version", [1, 2, 3])
+def test_headers_as_others_write_them(version: int, tmp_path: Path) -> None:
+    values = (bytes_of() / 255).astype("<f4")
+    rows, columns = values.tobytes(), values.tobytes(order="F")
+    for header, data in {
+        GOOD: rows,
+        GOOD + " " * 20 + "\n": rows,
+        GOOD.replace(", }", "}").replace(" ", "").replace("'", '"'): rows,
+        f"{{'shape': ({COUNT}, 4), 'fortran_order': True, 'descr': '<f4'}}": columns,
+    }.items():
+        path = tmp_path / "a.npy"
+        path.write_bytes(npy(header, data, version))
+        np.testing.assert_array_equal(read_rgba(path, COUNT), values)
+
+
+@pytest.mark.parametrize("kind", ["<f2", "<f8", ">f4", ">f8"])
+def test_floats_of_every_size(kind: str, tmp_path: Path) -> None:
+    values = np.asfortranarray(bytes_of() / 255).astype(kind)
+    np.testing.assert_allclose(read_rgba(save(tmp_path / "a.npy", values), COUNT), values, atol=1e-7)
+
+
+@given(st.data())
+@settings(max_examples=300)
+def test_bytes_that_are_changed(data: st.DataObject) -> None:
+    """Colours or a `FormatError`, whatever is done to a file."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = save(Path(folder) / "a.npy", bytes_of())
+        content = bytearray(path.read_bytes())
+        for _ in range(data.draw(st.integers(1, 4))):
+            content[data.draw(st.integers(6, 130))] = data.draw(st.integers(0, 255))
+        path.write_bytes(content)
+        with contextlib.suppress(FormatError):
+            assert read_rgba(path, COUNT).shape == (COUNT, 4)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("value", [1e300, -1e300, np.inf, -np.inf, np.nan, -1e-30])
+def test_floats_that_are_no_colours(value: float, tmp_path: Path) -> None:
+    values = np.full((COUNT, 4), 0.5)
+    values[3, 2] = value
+    with pytest.raises(FormatError, match="values that are not 0..1"):
+        read_rgba(save(tmp_path / "a.npy", values), COUNT)
+
+
+def test_what_is_no_file_is_not_read() -> None:
+    for path in (Path("/dev/zero"), Path("/dev/null"), FIXTURES):
+        with pytest.raises(
+            FormatError, match=re.escape(f"{path} cannot be read: it is a directory, a pipe or a device")
+        ):
+            read_rgba(path, COUNT)

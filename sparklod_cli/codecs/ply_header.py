@@ -10,6 +10,8 @@ import numpy as np
 from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
 
 from ..errors import FormatError, TruncatedError
+from ..printable import printable
+from ..untrusted import QUOTED
 
 MAX_HEADER = 1 << 20
 
@@ -91,6 +93,6 @@ def read_header(file: BinaryIO) -> Header:
     try:
         parsed = PlyData.read(io.BytesIO(b"\n".join(lines) + b"\n"))
     except (PlyParseError, ValueError) as error:
-        raise FormatError(f"bad PLY header: {error}") from None
+        raise FormatError(f"bad PLY header: {printable(str(error), 2 * QUOTED)}") from None
     elements = {element.name: (element, count) for element, count in zip(parsed, counts, strict=True)}
     return Header(elements, parsed.text, parsed.byte_order, len(text))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import struct
 import zipfile
 import zlib
@@ -15,6 +14,8 @@ from numpy.typing import NDArray
 from PIL.WebPImagePlugin import WebPImageFile
 
 from ..errors import ChecksumError, FormatError, NotSplatsError
+from ..printable import printable
+from ..untrusted import QUOTED, parse_json, shown
 from .compression import check_promise
 from .stream import size_of
 
@@ -24,6 +25,9 @@ META = "meta.json"
 MAX_META = 1 << 22  # bytes; codebooks take 15,000
 METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 ENCRYPTED = 1
+
+#: Flag of a WebP file's extended header.
+ANIMATED = 2
 
 #: Writers make images square, or of sides that are powers of two: so many more texels than splats are taken.
 SPARE_FACTOR, SPARE_TEXELS = 4, 1 << 16
@@ -36,18 +40,18 @@ class Meta:
 
     def __init__(self, data: bytes) -> None:
         try:
-            self._root = json.loads(data)
-        except (ValueError, RecursionError) as error:
+            self.root = parse_json(data)
+        except ValueError as error:
             raise FormatError(f"{META} is not JSON: {error}") from None
-        if not isinstance(self._root, dict):
+        if not isinstance(self.root, dict):
             raise NotSplatsError(f"{META} is not that of a SOG")
 
     def has(self, key: str) -> bool:
         """Whether there is such a key at the top, and not null."""
-        return self._root.get(key) is not None
+        return self.root.get(key) is not None
 
     def _get(self, *way: str | int) -> Any:
-        value = self._root
+        value = self.root
         try:
             for key in way:
                 value = value[key]
@@ -104,6 +108,16 @@ def _finite(value: Any, way: tuple[str | int, ...]) -> float:
     return float(value)
 
 
+def names_beside(data: bytes) -> list[str]:
+    """The files that a meta.json names, as far as it can be understood; none for anything else."""
+    try:
+        root = Meta(data).root
+    except FormatError:
+        return []
+    lists = (value.get("files") for value in root.values() if isinstance(value, dict))
+    return [name for names in lists if isinstance(names, list) for name in names if isinstance(name, str)]
+
+
 class Files:
     """The files of a SOG scene.
 
@@ -133,7 +147,7 @@ class Files:
 
     def _open_beside(self, name: str) -> BinaryIO:
         if self._beside is None:
-            raise FormatError(f"{META} names {name!r}, which cannot be had here")
+            raise FormatError(f"{META} names {shown(name)}, which cannot be had here")
         return self._beside(name)
 
     def _size_beside(self, name: str) -> int:
@@ -152,7 +166,7 @@ class Files:
         data = self._read(name)
         width, height = _webp_size(data, name)
         if width * height > most:
-            raise FormatError(f"{name!r} has {width} x {height} texels, far more than are needed")
+            raise FormatError(f"{shown(name)} has {width} x {height} texels, far more than are needed")
         check_promise(4 * width * height, self.size)
         return _decode_webp(data, name)
 
@@ -161,7 +175,7 @@ class Files:
         texels = self.image(texture, index, SPARE_FACTOR * count + SPARE_TEXELS).reshape(-1, 4)
         if len(texels) < count:
             name = self.meta.name(texture, "files", index)
-            raise FormatError(f"{name!r} has {len(texels):,} texels for {count:,} splats")
+            raise FormatError(f"{shown(name)} has {len(texels):,} texels for {count:,} splats")
         return texels[:count]
 
 
@@ -173,7 +187,7 @@ class _Archive:
         try:
             self._zip = zipfile.ZipFile(file)
         except _ZIP_ERRORS as error:
-            raise FormatError(f"not a whole zip archive: {error}") from None
+            raise FormatError(f"not a whole zip archive: {printable(str(error), 2 * QUOTED)}") from None
         names = [name for name in self._zip.namelist() if name == META or name.endswith("/" + META)]
         if not names:
             raise NotSplatsError(f"a zip archive without {META} is not a SOG")
@@ -183,22 +197,24 @@ class _Archive:
         try:
             member = self._zip.getinfo(self._folder + name)
         except KeyError:
-            raise FormatError(f"{META} names {name!r}, which is not in the archive") from None
+            raise FormatError(f"{META} names {shown(name)}, which is not in the archive") from None
         if member.compress_type not in METHODS or member.flag_bits & ENCRYPTED:
-            raise FormatError(f"{name!r} is packed in a way that SOG has not")
+            raise FormatError(f"{shown(name)} is packed in a way that SOG has not")
         check_promise(member.file_size, self._size)
         try:
             with self._zip.open(member) as file:
                 return file.read(member.file_size)  # without a size it would unfold all there is before it counts
         except _ZIP_ERRORS as error:
             kind = ChecksumError if "CRC" in str(error) else FormatError
-            raise kind(f"{name!r} cannot be unpacked: {error}") from None
+            raise kind(f"{shown(name)} cannot be unpacked: {printable(str(error), 2 * QUOTED)}") from None
 
 
 def _webp_size(data: bytes, name: str) -> tuple[int, int]:
     """Width and height that the header of a WebP file tells: its first chunk, of whichever kind of the three."""
     kind = data[12:16] if data[:4] == b"RIFF" and data[8:12] == b"WEBP" and len(data) >= 30 else b""
     if kind == b"VP8X":  # 24 bits each, less one
+        if data[20] & ANIMATED:
+            raise FormatError(f"{shown(name)} is an animation, of which no frame is the one that SOG means")
         return 1 + int.from_bytes(data[24:27], "little"), 1 + int.from_bytes(data[27:30], "little")
     if kind == b"VP8L":  # 14 bits each, less one, behind a byte of signature
         bits = int.from_bytes(data[21:25], "little")
@@ -206,7 +222,7 @@ def _webp_size(data: bytes, name: str) -> tuple[int, int]:
     if kind == b"VP8 ":  # 14 bits each, behind a frame tag and a start code
         width, height = struct.unpack_from("<HH", data, 26)
         return width & 0x3FFF, height & 0x3FFF
-    raise FormatError(f"{name!r} is not a WebP image")
+    raise FormatError(f"{shown(name)} is not a WebP image")
 
 
 def _decode_webp(data: bytes, name: str) -> Texels:
@@ -215,4 +231,4 @@ def _decode_webp(data: bytes, name: str) -> Texels:
         with WebPImageFile(io.BytesIO(data)) as image:
             return np.asarray(image if image.mode == "RGBA" else image.convert("RGBA"))
     except (OSError, ValueError, SyntaxError, EOFError) as error:
-        raise FormatError(f"{name!r} is a corrupt WebP image: {error}") from None
+        raise FormatError(f"{shown(name)} is a corrupt WebP image: {error}") from None

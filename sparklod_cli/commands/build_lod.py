@@ -14,8 +14,10 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from .. import limits
+from ..printable import MOST, shortened
 from .console import Console, is_terminal
 from .options import AutoOr, Ball, Numbers, Real, common_options
+from .paths import InputPath, OutputPath, keep_apart
 from .reports import report_baked, report_unbaked
 
 if TYPE_CHECKING:
@@ -56,12 +58,12 @@ Examples:
 
 
 @click.command("build-lod", epilog=EXAMPLES, context_settings={"show_default": True})
-@click.argument("inputs", metavar="INPUT...", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.argument("inputs", metavar="INPUT...", nargs=-1, required=True, type=InputPath())
 @click.option(
     "-o",
     "--output",
     metavar="FILE",
-    type=click.Path(path_type=Path),
+    type=OutputPath(),
     help="Output of a single input; - is standard output.  [default: NAME-lod.spz beside the input;"
     " NAME-lod.npz with --encoding, NAME-unlod.spz with --unlod]",
     show_default=False,
@@ -69,7 +71,7 @@ Examples:
 @click.option(
     "--output-dir",
     metavar="DIR",
-    type=click.Path(path_type=Path, file_okay=False),
+    type=OutputPath(folder=True),
     help="Directory for the outputs; made if it is not there.",
     show_default=False,
 )
@@ -115,7 +117,7 @@ Examples:
 @click.option(
     "--rgba",
     metavar="FILE",
-    type=click.Path(path_type=Path, dir_okay=False),
+    type=InputPath(),
     help="Take colours and opacities from a .npy or raw file of (N, 4) bytes or floats 0..1; alpha 0 drops a splat.",
 )
 @click.option(
@@ -170,6 +172,7 @@ def build_lod(
     A file that fails does not stop the others; the exit status is 1 if any did.
     """
     outputs = _outputs(inputs, output, output_dir, settings)
+    keep_apart(ctx, {"output" if output_dir is None else "output_dir": outputs})
     _check_usage(ctx, inputs, output, settings)
     if output == STDOUT and as_json:
         raise click.UsageError("--json and -o - both want standard output")
@@ -192,7 +195,7 @@ def build_lod(
             except SparklodError as error:
                 failed = True
                 console.error(f"{source}: {error}")
-                record: dict[str, Any] = {"input": str(source), "error": str(error)}
+                record: dict[str, Any] = {"input": str(source), "error": shortened(str(error), MOST)}
             else:
                 record = {"input": str(source), "output": str(target), **dataclasses.asdict(result)}
             if as_json:
@@ -241,12 +244,9 @@ def _outputs(
         outputs = [output]
     else:
         outputs = [(output_dir or source.parent) / _output_name(source, settings) for source in inputs]
-    sources = {os.path.realpath(source) for source in inputs}
     first: dict[str, Path] = {}
     for source, target in zip(inputs, outputs, strict=True):
         place = os.path.realpath(target)
-        if place in sources and target != STDOUT:
-            raise click.UsageError(f"{target} is an input; write elsewhere")
         if place in first:
             raise click.UsageError(f"{first[place]} and {source} would both be written to {target}")
         first[place] = source

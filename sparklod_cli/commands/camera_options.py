@@ -14,6 +14,7 @@ from ..render.axes import Axes
 from ..render.paths.formats import FORMATS, NAMES
 from .camera_values import Size, View, Views
 from .options import Command, Numbers, Real
+from .paths import InputPath
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -68,7 +69,7 @@ def camera_options(command: Command, *, orbit: int = DEFAULT_ORBIT) -> Command:
             click.option(
                 "--camera-path",
                 metavar="FILE",
-                type=click.Path(path_type=Path),
+                type=InputPath(),
                 help="Cameras of a file, or of a folder that COLMAP wrote.",
             ),
             click.option(

@@ -5,10 +5,14 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
+from collections.abc import Iterable, Iterator
 from types import TracebackType
 from typing import Any, TextIO
 
 import click
+
+from ..printable import MOST, printable
+from ..stdout import silence
 
 
 def count_of(count: int, noun: str) -> str:
@@ -27,16 +31,57 @@ def is_terminal(stream: TextIO | None) -> bool:
 
 
 def say(text: str) -> None:
-    """One line on standard error, if that is not closed."""
-    if sys.stderr is not None:
-        click.echo(text, err=True)
+    """One line on standard error, if that is not closed; shortened, and without what a terminal would act on."""
+    _echo(printable(text, MOST))
 
 
 def say_error(text: str) -> None:
     """One line on standard error, in colour where that is a terminal that wants it (no-color.org)."""
     plain = os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb"
     prefix = "error:" if plain else click.style("error:", fg="red", bold=True)
-    say(f"{prefix} {text}")
+    _echo(f"{prefix} {printable(text, MOST)}")
+
+
+def say_usage_error(error: click.ClickException) -> None:
+    """What is wrong with a command line, as click says it."""
+    command = error.ctx.command if isinstance(error, click.UsageError) and error.ctx is not None else None
+    text = error.format_message()
+    if isinstance(error, click.NoSuchOption) and command is not None:
+        text = _chosen_otherwise(command, error.option_name) or text
+    if sys.stderr is None:
+        return
+    shown = click.UsageError(printable(text, MOST), getattr(error, "ctx", None))
+    with _unheard():
+        shown.show()
+
+
+def _chosen_otherwise(command: click.Command, option: str) -> str | None:
+    """What to say of an option that there is not, where its name is a value of another, as in --quality."""
+    value = option.lstrip("-")
+    for param in command.params:
+        if isinstance(param.type, click.Choice) and value in param.type.choices:
+            return f"there is no option {option}; did you mean {param.opts[0]} {value}?"
+    return None
+
+
+def for_screen(pieces: Iterable[bytes]) -> Iterator[bytes]:
+    """The lines of a table as a terminal may be shown them, a piece at a time."""
+    for piece in pieces:
+        yield "\n".join(printable(line) for line in piece.decode("utf-8", "replace").split("\n")).encode()
+
+
+def _echo(text: str) -> None:
+    with _unheard():
+        click.echo(text, err=True)
+
+
+@contextlib.contextmanager
+def _unheard() -> Iterator[None]:
+    """Work goes on where nobody hears of it: standard error may be closed, gone or full."""
+    try:
+        yield
+    except OSError:
+        silence(sys.stderr)
 
 
 class Console:
@@ -57,6 +102,11 @@ class Console:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         self.clear()
         self._ended.close()
+
+    @property
+    def quiet(self) -> bool:
+        """Whether a person wants to hear of errors alone."""
+        return self._quiet
 
     def clear(self) -> None:
         """Takes the bar away."""

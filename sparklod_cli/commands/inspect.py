@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,7 +12,8 @@ import click
 from ..limits import MAX_SH_DEGREE, PLOT_BY
 from .console import Console
 from .inspect_job import Job
-from .options import Real, common_options
+from .options import Real, common_options, is_given
+from .paths import InputPath, OutputPath, keep_apart
 
 if TYPE_CHECKING:
     from ..inspection.expectations import Expectations
@@ -22,7 +24,7 @@ if TYPE_CHECKING:
 EXPECTED = ("max_bytes", "min_splats", "max_splats", "sh", "max_growth")
 
 #: Options that have another name here.
-NAMES = {"style": "format", "fail_on": "fail-on"}
+NAMES = {"style": "format", "fail_on": "fail-on", "plot_level": "plot-level", "plot_by": "plot-by"}
 
 EXAMPLES = """
 \b
@@ -45,7 +47,7 @@ def _print_schema(ctx: click.Context, param: click.Parameter, value: bool) -> No
 
 
 @click.command("inspect", epilog=EXAMPLES, context_settings={"show_default": True})
-@click.argument("files", metavar="FILE...", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.argument("files", metavar="FILE...", nargs=-1, required=True, type=InputPath())
 @click.option("--stats", is_flag=True, help="Statistics of all quantities, not only of the main ones.")
 @click.option("--histogram", metavar="NAME", multiple=True, help="Text bars of a quantity that --stats names.")
 @click.option("--field", metavar="NAME", help="Print one value of the JSON report, such as tree.leaves.")
@@ -63,7 +65,7 @@ def _print_schema(ctx: click.Context, param: click.Parameter, value: bool) -> No
     default="text",
     help="How findings are printed; github makes annotations of GitHub Actions.",
 )
-@click.option("--expect", metavar="FILE", type=click.Path(path_type=Path), help="Expectations as .json or .toml.")
+@click.option("--expect", metavar="FILE", type=InputPath(), help="Expectations as .json or .toml.")
 @click.option("--max-bytes", metavar="N", type=click.IntRange(0), help="Expect a file of at most so many bytes.")
 @click.option("--min-splats", metavar="N", type=click.IntRange(0), help="Expect so many splats, or leaves, at least.")
 @click.option("--max-splats", metavar="N", type=click.IntRange(0), help="Expect so many splats, or leaves, at most.")
@@ -73,13 +75,13 @@ def _print_schema(ctx: click.Context, param: click.Parameter, value: bool) -> No
 @click.option(
     "--leaves-of",
     metavar="FILE",
-    type=click.Path(path_type=Path),
+    type=InputPath(),
     help="Expect the leaves to be exactly the splats of this file, within the steps of the coding.",
 )
-@click.option("--plot", metavar="FILE", type=click.Path(path_type=Path), help="Draw a .png, with pyvista.")
+@click.option("--plot", metavar="FILE", type=OutputPath(), help="Draw a .png, with pyvista.")
 @click.option("--plot-level", metavar="N", type=click.IntRange(0), help="Draw the nodes so many edges from the root.")
 @click.option("--plot-by", type=click.Choice(PLOT_BY), default=PLOT_BY[0], help="What colours mean in the picture.")
-@click.option("--html", metavar="FILE", type=click.Path(path_type=Path), help="Write the reports as one page.")
+@click.option("--html", metavar="FILE", type=OutputPath(), help="Write the reports as one HTML page.")
 @click.option("--overwrite", is_flag=True, help="Replace pictures and pages that exist.")
 @click.option(
     "--json-schema",
@@ -89,7 +91,7 @@ def _print_schema(ctx: click.Context, param: click.Parameter, value: bool) -> No
     callback=_print_schema,
     help="Print the JSON Schema of --json and exit.",
 )
-@common_options
+@functools.partial(common_options, quiet="Print what is asked for by name, and errors, but no report for a person.")
 @click.pass_context
 def inspect(
     ctx: click.Context,
@@ -104,6 +106,7 @@ def inspect(
 
     Reads every format that build-lod reads. Without --check a report is printed; with it, and with expectations, a line
     for each finding, and the exit status is 3 if there is one of level error (or warning, with --fail-on warning).
+    With -q, only what --json, --field, --histogram, --check or an expectation asks for is printed.
 
     A file that cannot be read is a finding, too; it does not stop the others.
     """
@@ -132,7 +135,8 @@ def inspect(
 
 
 def _check_usage(ctx: click.Context, files: tuple[Path, ...], settings: dict[str, Any], as_json: bool) -> None:
-    """A usage error where options exclude each other or would do nothing."""
+    """A usage error where options exclude each other or would do nothing, or an output would replace an input."""
+    keep_apart(ctx)
     if settings["plot"] is not None and len(files) > 1:
         raise click.UsageError(f"--plot takes one file, not {len(files)}")
     if settings["field"] and as_json:
@@ -144,12 +148,22 @@ def _check_usage(ctx: click.Context, files: tuple[Path, ...], settings: dict[str
             raise click.UsageError(f"--histogram knows {', '.join((*QUANTITIES, *SH_QUANTITIES))}, not {name}")
     if settings["histogram"] and (settings["field"] or as_json):
         raise click.UsageError("--histogram is for a person, it goes with neither --json nor --field")
-    if settings["stats"] and settings["check"] and not as_json:
-        raise click.UsageError("--check prints findings, it goes with --stats only as --json")
-    if not (settings["check"] or _asserts(settings)):
-        for name in ("style", "fail_on"):
-            if ctx.get_parameter_source(name) != click.core.ParameterSource.DEFAULT:
-                raise click.UsageError(f"--{NAMES.get(name, name)} needs --check or an expectation")
+    holds = settings["check"] or _asserts(settings)
+    if settings["stats"] and holds and not as_json:
+        what = "--check prints" if settings["check"] else "expectations print"
+        raise click.UsageError(f"{what} findings; with --stats that is possible only as --json")
+
+    def refuse(names: tuple[str, ...], why: str) -> None:
+        for name in names:
+            if is_given(ctx, name):
+                raise click.UsageError(f"--{NAMES.get(name, name)} {why}")
+
+    if not holds:
+        refuse(("style", "fail_on"), "needs --check or an expectation")
+    if settings["field"] or as_json:
+        refuse(("style",), "is of findings in lines, which neither --json nor --field prints")
+    if settings["plot"] is None and settings["html"] is None:
+        refuse(("plot_level", "plot_by"), "needs --plot or --html")
 
 
 def _asserts(settings: dict[str, Any]) -> bool:

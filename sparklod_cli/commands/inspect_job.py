@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from .console import Console, count_of
+from ..errors import OutOfMemoryError, SparklodError, StdoutError, memory_told
+from ..printable import printable
+from .console import Console, count_of, size_of
 from .inspect_text import finding_line, lines
 
 if TYPE_CHECKING:
@@ -39,8 +41,15 @@ class Job:
         return bool(self.settings["check"]) or self.expected is not None or self.original is not None
 
     def inspect(self, file: Path) -> int:
-        """Looks at a file and says what is asked for; its exit status."""
-        from ..errors import SparklodError
+        """Looks at a file and says what is asked for; its exit status. One too large for memory stops no others."""
+        try:
+            with memory_told():
+                return self._inspect(file)
+        except OutOfMemoryError as error:
+            self.console.error(f"{file}: {error}")
+            return 1
+
+    def _inspect(self, file: Path) -> int:
         from ..inspection import report as reports
 
         start = time.perf_counter()
@@ -57,6 +66,8 @@ class Job:
                 self.console.error(f"{file}: {found.message}")
         try:
             self._print(report, scene)
+        except StdoutError:
+            raise  # of no file
         except SparklodError as error:
             self.console.error(f"{file}: {error}")
             status = 1
@@ -89,14 +100,14 @@ class Job:
                 from ..inspection.expectations import value_at
 
                 value = value_at(plain, self.settings["field"])
-                click.echo(value if isinstance(value, str) else json.dumps(value))
+                click.echo(printable(value) if isinstance(value, str) else json.dumps(value))
         elif self.holds:
             for found in report.findings or []:
                 click.echo(finding_line(report.file, found, self.settings["style"]))
             if not report.findings:
                 noun = "node" if report.tree is not None else "splat"
                 self.console.say(f"{report.file}: nothing is wrong with its {count_of(report.splats or 0, noun)}")
-        elif report.format is not None:
+        elif report.format is not None and not self.console.quiet:
             click.echo("\n".join(lines(plain)))
         if scene is not None and self.settings["histogram"]:
             _print_histograms(scene, self.settings["histogram"])
@@ -106,7 +117,6 @@ class Job:
         plot, html = self.settings["plot"], self.settings["html"]
         if plot is None and html is None:
             return
-        from ..errors import SparklodError
         from ..inspection import histograms, values
         from ..inspection import html as pages
         from ..inspection import plot as plots
@@ -121,7 +131,8 @@ class Job:
                     raise
                 self.console.say(f"{report.file}: no picture on the page: {error}")
         if plot is not None and picture is not None:
-            write_whole(plot, [picture.png], overwrite=self.settings["overwrite"])
+            size = write_whole(plot, [picture.png], overwrite=self.settings["overwrite"])
+            self.console.say(f"{plot}  {picture.description.partition(';')[0]}, {size_of(size)}")
         if html is not None:
             drawn = {}
             if scene is not None and len(scene.splats):
@@ -136,7 +147,9 @@ class Job:
         from ..inspection.html import page
         from ..io import write_whole
 
-        write_whole(self.settings["html"], [page(self.sections).encode()], overwrite=self.settings["overwrite"])
+        target, content = self.settings["html"], page(self.sections).encode()
+        size = write_whole(target, [content], overwrite=self.settings["overwrite"])
+        self.console.say(f"{target}  page of {count_of(len(self.sections), 'file')}, {size_of(size)}")
 
 
 def _fails(findings: list[Finding], fail_on: str) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
+from ..printable import MOST, printable
 from .console import count_of, size_of
 
 if TYPE_CHECKING:
@@ -21,7 +22,7 @@ def lines(report: dict[str, Any]) -> Iterator[str]:
     """The lines of a report, given as its JSON."""
     tree, values = report["tree"], report["values"]
     noun = "node" if tree else "splat"
-    yield f"{report['file']}  {report['format']}, {size_of(report['bytes'])}"
+    yield f"{printable(report['file'])}  {report['format']}, {size_of(report['bytes'])}"
     about = [count_of(report["splats"], noun), f"SH {report['sh_degree']}"]
     about += ["antialiased"] * bool(report["antialiased"])
     if "fractional_bits" in report["header"]:
@@ -39,12 +40,15 @@ def lines(report: dict[str, Any]) -> Iterator[str]:
 
 
 def _row(name: str, text: str) -> str:
-    return f"  {name:<10} {text}"
+    return f"  {name:<10} {printable(text, MOST)}"
 
 
 def _tree(tree: dict[str, Any]) -> Iterator[str]:
     inner = count_of(tree["inner"], "inner node")
-    yield _row("tree", f"{_leaves(tree['leaves'])}, {inner}, growth {tree['growth']:.3f}, {len(tree['levels'])} levels")
+    yield _row(
+        "tree",
+        f"{_leaves(tree['leaves'])}, {inner}, growth {tree['growth']:.3f}, {count_of(tree['depth'] + 1, 'level')}",
+    )
     yield _row("", f"{100 * tree['more_than_opaque']:.1f} % of the nodes are more than opaque")
     chunks = count_of(tree["chunks"], "chunk")
     yield _row("", f"{chunks} of 65,536 nodes, the coarsest cut of as many nodes needs {tree['chunks_of_coarse_cut']}")
@@ -57,8 +61,8 @@ def _tree(tree: dict[str, Any]) -> Iterator[str]:
     for depth, level in enumerate(tree["levels"][:MOST_LEVELS]):
         size = "" if level["size"] is None else f"{level['size']:.4g}"
         yield _row("", f"{depth:>5} {level['nodes']:>12,} {level['leaves']:>12,} {size:>10}")
-    if len(tree["levels"]) > MOST_LEVELS:
-        yield _row("", f"and {len(tree['levels']) - MOST_LEVELS:,} more")
+    if tree["depth"] >= MOST_LEVELS:
+        yield _row("", f"and {tree['depth'] + 1 - MOST_LEVELS:,} more")
 
 
 def _leaves(count: int) -> str:
@@ -89,17 +93,14 @@ def _values(values: dict[str, Any]) -> Iterator[str]:
 def finding_line(file: str, found: Finding, style: str) -> str:
     """A finding in a line, as text or as an annotation of GitHub Actions."""
     if style == "text":
-        return f"{_one_line(file)}: {found.severity}: {found.code}: {_one_line(found.message)}"
+        return f"{printable(file)}: {found.severity}: {found.code}: {printable(found.message, MOST)}"
     kind = {"note": "notice"}.get(found.severity, found.severity)
-    return f"::{kind} file={_escaped(file, ':,')},title={found.code}::{_escaped(found.message)}"
-
-
-def _one_line(text: str) -> str:
-    return text.replace("\r", "\\r").replace("\n", "\\n")
+    return f"::{kind} file={_escaped(file, ':,')},title={found.code}::{_escaped(printable(found.message, MOST))}"
 
 
 def _escaped(text: str, more: str = "") -> str:
-    """As workflow commands of GitHub Actions want it."""
+    """As workflow commands of GitHub Actions want it, which keep line ends; other marks cannot stay."""
+    text = "".join(mark if mark in "\r\n" else printable(mark) for mark in text)
     for mark in "%\r\n" + more:
         text = text.replace(mark, f"%{ord(mark):02X}")
     return text

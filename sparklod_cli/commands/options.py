@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-import os
-from collections.abc import Callable, Iterable
-from pathlib import Path
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import click
@@ -17,21 +16,16 @@ from ..parallel import processors
 Command = TypeVar("Command", bound=Callable[..., Any])
 
 
+@dataclass
+class Verbosity:
+    """Whether -v was given, for who ends a run after its command is gone; `cli.run` hands one to click."""
+
+    verbose: bool = False
+
+
 def is_given(ctx: click.Context, name: str) -> bool:
     """Whether a parameter is not what it is by default because somebody said so."""
     return ctx.get_parameter_source(name) not in (None, click.core.ParameterSource.DEFAULT)
-
-
-def keep_apart(outputs: Iterable[Path | None], inputs: Iterable[Path | None]) -> None:
-    """Raises a `click.UsageError` where an output would replace an input, or another output."""
-    taken = {os.path.realpath(path): "an input" for path in inputs if path is not None}
-    for path in outputs:
-        if path is None or str(path) == "-":
-            continue
-        place = os.path.realpath(path)
-        if place in taken:
-            raise click.UsageError(f"{path} is {taken[place]}; write elsewhere")
-        taken[place] = "an output already"
 
 
 class Numbers(click.ParamType):
@@ -110,12 +104,30 @@ class Quantity(click.ParamType):
         return self.name
 
 
-def common_options(command: Command, *, json: str = "Print one JSON object a file on standard output.") -> Command:
-    """`--threads`, `--json`, `-q`, `-v`, `--version`; `json` is the help of the second."""
+def _note_verbosity(ctx: click.Context, param: click.Parameter, value: bool) -> bool:
+    verbosity = ctx.find_object(Verbosity)
+    if verbosity is not None:
+        verbosity.verbose = value
+    return value
+
+
+def common_options(
+    command: Command,
+    *,
+    json: str = "Print one JSON object a file on standard output.",
+    quiet: str = "Say nothing but errors.",
+) -> Command:
+    """`--threads`, `--json`, `-q`, `-v`, `--version`; `json` and `quiet` are the help of theirs."""
     for option in (
         click.version_option(__version__, package_name="sparklod"),
-        click.option("-v", "--verbose", is_flag=True, help="Say how long each stage took, and what was chosen."),
-        click.option("-q", "--quiet", is_flag=True, help="Say nothing but errors."),
+        click.option(
+            "-v",
+            "--verbose",
+            is_flag=True,
+            callback=_note_verbosity,
+            help="Say how long each stage took, and what was chosen.",
+        ),
+        click.option("-q", "--quiet", is_flag=True, help=quiet),
         click.option("--json", "as_json", is_flag=True, help=json),
         click.option(
             "--threads",

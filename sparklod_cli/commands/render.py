@@ -6,7 +6,6 @@ import dataclasses
 import functools
 import time
 from collections.abc import Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -14,11 +13,12 @@ import click
 from .camera_options import SOURCES, camera_options
 from .camera_values import View
 from .console import Console
-from .options import Real, common_options, is_given, keep_apart
+from .options import Real, common_options, is_given
+from .paths import InputPath, OutputPath, keep_apart
 from .render_cameras import cameras, is_free, least_cameras
 from .render_compare import BUDGETS, compare_options
 from .render_options import GAIN, background_from, blend_from, check_size, look_options, manner_from
-from .world_options import cut_options, placements_from, viewer_from, world_options
+from .world_options import cut_options, files_meant, placements_from, viewer_from, world_options
 
 if TYPE_CHECKING:
     from ..preview.scenery import Scenery
@@ -74,7 +74,7 @@ Examples:
 @click.option(
     "--diff",
     metavar="FILE",
-    type=click.Path(path_type=Path),
+    type=InputPath(),
     help="Draw how far the picture is from that of another file, and say its PSNR.",
 )
 @click.option(
@@ -84,7 +84,7 @@ Examples:
     "-o",
     "--output",
     metavar="FILE",
-    type=click.Path(path_type=Path),
+    type=OutputPath(),
     help="A .png, .webp or .npy (floats), or out.%04d.png for many; .mp4, .gif or .webp for an animation; - for a PNG"
     " on standard output.  [default: NAME.png, here]",
 )
@@ -149,8 +149,7 @@ def render(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, **s
             raise click.UsageError(
                 f"the cameras have pictures of several sizes, which no {output.kind} has; see --size"
             )
-        inputs = [settings["scene"], settings["camera_path"], settings["diff"], *(place.file for place in placements)]
-        keep_apart(output.paths(path.numbers), inputs)
+        keep_apart(ctx, {**files_meant(settings, placements), "output": output.paths(path.numbers)})
         output.check(path.numbers, overwrite=settings["overwrite"])
         if output.kind == "animation":
             animation.check(output.form)
@@ -213,8 +212,7 @@ def _compare(ctx: click.Context, settings: dict[str, Any], console: Console, *, 
 
         wanted = wanted_from(settings, settings["budget"], output=settings["output"], as_json=as_json)
         placements = placements_from(settings)
-        inputs = [settings["scene"], settings["camera_path"], *(place.file for place in placements)]
-        keep_apart([wanted.output, wanted.plot], inputs)
+        keep_apart(ctx, files_meant(settings, placements))
         console.announce_compiling("render")
         _use_threads(settings["threads"])
         world = read_world(

@@ -15,6 +15,7 @@ import click
 from .. import limits
 from .console import Console, count_of
 from .options import Command, Quantity
+from .paths import OutputPath
 
 if TYPE_CHECKING:
     from ..preview.compare import Budget, Comparison, How, OfBudget
@@ -61,7 +62,7 @@ def compare_options(command: Command) -> Command:
             click.option(
                 "--plot",
                 metavar="FILE",
-                type=click.Path(path_type=Path),
+                type=OutputPath(),
                 help="With --compare: draw the table as a .png.",
             ),
             click.option(

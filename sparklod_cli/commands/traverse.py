@@ -11,8 +11,9 @@ import click
 from .. import limits
 from .camera_options import camera_options, cameras_from
 from .console import Console
-from .options import common_options, keep_apart
-from .world_options import placements_from, viewer_from, viewer_options, world_options
+from .options import common_options
+from .paths import OutputPath, keep_apart
+from .world_options import files_meant, placements_from, viewer_from, viewer_options, world_options
 
 #: Below this share of splats in front of the cameras, path and scene probably do not share their axes.
 LEAST_IN_FRONT = 0.05
@@ -33,9 +34,7 @@ Examples:
 @world_options
 @camera_options
 @viewer_options
-@click.option(
-    "-o", "--output", metavar="FILE", type=click.Path(path_type=Path), help="Of the table.  [default: standard output]"
-)
+@click.option("-o", "--output", metavar="FILE", type=OutputPath(), help="Of the table.  [default: standard output]")
 @click.option("--overwrite", is_flag=True, help="Replace outputs that exist.")
 @click.option(
     "--format",
@@ -57,11 +56,11 @@ Examples:
     multiple=True,
     help="What must hold, such as 'churn_p95<0.2'; the exit status is 3 if it does not.",
 )
-@click.option("--plot", metavar="FILE", type=click.Path(path_type=Path), help="Draw the table and the path as a .png.")
+@click.option("--plot", metavar="FILE", type=OutputPath(), help="Draw the table and the path as a .png.")
 @click.option(
     "--indices-out",
     metavar="DIR",
-    type=click.Path(path_type=Path, file_okay=False),
+    type=OutputPath(folder=True),
     help="Write the nodes of every cut as .npy of uint32.",
 )
 @click.option("--padded", is_flag=True, help="Fill them up to rows of 16,384, as Spark's index texture has them.")
@@ -104,10 +103,7 @@ def traverse(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, *
     if wanted.padded and wanted.indices is None:
         raise click.UsageError("--padded only means something with --indices-out")
     placements = placements_from(settings)
-    keep_apart(
-        [wanted.output, wanted.plot],
-        [settings["scene"], settings["camera_path"], *(place.file for place in placements)],
-    )
+    keep_apart(ctx, files_meant(settings, placements))
     with Console(quiet=quiet, verbose=verbose) as console:
         from ..splats import COLUMNS
 
@@ -128,6 +124,7 @@ def traverse(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, *
         for note in path.notes:
             console.say(note)
         job = Job(console, wanted, simulation, path)
+        keep_apart(ctx, {**files_meant(settings, placements), "indices_out": job.index_files()})
         job.run(settings["threads"])
         if job.in_front < LEAST_IN_FRONT:
             console.say(

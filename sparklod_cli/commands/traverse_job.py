@@ -16,7 +16,7 @@ import numpy as np
 
 from ..io import check_writable, write_stdout, write_whole
 from ..progress import Progress, silent
-from .console import Console, is_terminal
+from .console import Console, for_screen, is_terminal
 from .traverse_text import lines
 
 if TYPE_CHECKING:
@@ -101,7 +101,8 @@ class Job:
             for _ in rows:
                 pass
         else:
-            write_stdout(encode(rows, wanted.columns, wanted.form))
+            table = encode(rows, wanted.columns, wanted.form)
+            write_stdout(for_screen(table) if screen and wanted.form != "parquet" else table)
         self.console.clear()
         self.console.detail(
             f"  {len(self.path.cameras):,} frames of {self.path.format}, {time.perf_counter() - start:.2f} s"
@@ -144,15 +145,20 @@ class Job:
             yield from frame.rows
         self.in_front = float(np.mean(shares))
 
+    def index_files(self) -> Iterator[Path]:
+        """The files of --indices-out, all that will be written."""
+        if self.wanted.indices is not None:
+            for number in self.path.numbers:
+                yield from _index_files(self.wanted.indices, number, len(self.simulation.world.instances))
+
     def _write_indices(self, frame: Frame, folder: Path) -> None:
         parts = frame.cut.indices()
-        for number, nodes in enumerate(parts):
+        for nodes, file in zip(parts, _index_files(folder, frame.number, len(parts)), strict=True):
             if self.wanted.padded:
                 nodes = np.concatenate([nodes, np.zeros(-len(nodes) % ROW, np.uint32)]).reshape(-1, ROW)
-            name = f"{frame.number:06d}" if len(parts) == 1 else f"{frame.number:06d}.{number}"
             out = io.BytesIO()
             np.save(out, nodes)
-            write_whole(folder / f"{name}.npy", [out.getvalue()], overwrite=self.wanted.overwrite)
+            write_whole(file, [out.getvalue()], overwrite=self.wanted.overwrite)
 
     def _plot(self, target: Path) -> None:
         """Draws the charts, and the path over the cut of the frame that is most worth looking at."""
@@ -179,3 +185,10 @@ class Job:
         if drawn.note:
             self.console.say(f"{target}: {drawn.note}")
         write_whole(target, [drawn.png], overwrite=self.wanted.overwrite)
+
+
+def _index_files(folder: Path, frame: int, instances: int) -> list[Path]:
+    """Where the nodes of a frame go, a file an instance."""
+    if instances == 1:
+        return [folder / f"{frame:06d}.npy"]
+    return [folder / f"{frame:06d}.{instance}.npy" for instance in range(instances)]

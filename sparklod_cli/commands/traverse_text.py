@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
+from ..printable import printable
 from .console import count_of, size_of
 
 if TYPE_CHECKING:
@@ -78,7 +79,7 @@ def _quantity(quantity: Quantity) -> str:
 def _moment(moment: Moment) -> str:
     text, style = MOMENTS[moment.what]
     time = "" if moment.time_s is None else f"{moment.time_s:.3f} s"
-    name = f"  {_one_line(moment.name)}" if moment.name else ""
+    name = f"  {printable(moment.name, WIDTH)}" if moment.name else ""
     return f"{moment.frame:>7,} {time:>11}  {text.format(_said(moment.value, style))}{name}"
 
 
@@ -99,10 +100,6 @@ def _said(value: float, style: str) -> str:
 
 def _share(value: float) -> str:
     return f"{100 * value:.1f} %"
-
-
-def _one_line(text: str) -> str:
-    return "".join(mark if mark.isprintable() else "\N{REPLACEMENT CHARACTER}" for mark in text)
 
 
 def _cut(line: str) -> str:

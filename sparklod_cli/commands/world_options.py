@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +11,7 @@ import click
 from .. import limits
 from ..quantities import parse_bandwidth, parse_count, parse_latency
 from .options import Command, Quantity, Real, is_given
+from .paths import InputPath, file_of
 
 if TYPE_CHECKING:
     from ..simulation.simulate import Viewer
@@ -42,10 +43,10 @@ def world_options(command: Command) -> Command:
         click.option(
             "--scene",
             metavar="FILE",
-            type=click.Path(path_type=Path),
+            type=InputPath(),
             help="Files and where they stand, as JSON; see docs/traverse.md.",
         ),
-        click.argument("files", metavar="[FILE]...", nargs=-1, type=click.Path(path_type=Path)),
+        click.argument("files", metavar="[FILE]...", nargs=-1, type=InputPath()),
     ):
         command = option(command)
     return command
@@ -64,6 +65,12 @@ def placements_from(settings: Mapping[str, Any]) -> list[Placement]:
     if scene is not None:
         return read_placements(scene)
     return [Placement(file, name) for file, name in zip(files, names_of(files), strict=True)]
+
+
+def files_meant(settings: Mapping[str, Any], placements: Sequence[Placement]) -> dict[str, list[Path]]:
+    """For `paths.keep_apart`, files that are read without being parameters themselves."""
+    matrix = settings["world_transform"] and file_of(settings["world_transform"])
+    return {"scene": [place.file for place in placements], "world_transform": [matrix] if matrix else []}
 
 
 def viewer_options(command: Command) -> Command:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -12,13 +11,10 @@ from typing import Any
 
 from ..errors import SparklodError
 from ..io import read_text
+from ..printable import printable
+from ..untrusted import QUOTED, parse_json, parse_toml, shown
 from .findings import Finding
 from .report import Report
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
 
 
 class ExpectationError(SparklodError):
@@ -56,20 +52,20 @@ def read(path: Path) -> Expectations:
     """
     try:
         text = read_text(path)
-        data = tomllib.loads(text) if path.suffix.lower() == ".toml" else json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise ExpectationError(f"{path} is not what it is called: {error}") from None
+        data = parse_toml(text) if path.suffix.lower() == ".toml" else parse_json(text)
+    except ValueError as error:
+        raise ExpectationError(f"{path} is not what it is called: {printable(str(error), 2 * QUOTED)}") from None
     if not isinstance(data, dict):
         raise ExpectationError(f"{path} is not a table of expectations")
     types: dict[str, tuple[type, ...]] = {each.name: (int,) for each in fields(Expectations)}
     types |= {"lod": (bool,), "max_growth": (int, float), "values": (dict,)}
     for name, value in data.items():
         if name not in types:
-            raise ExpectationError(f"{path}: {name} is not one of {', '.join(types)}")
+            raise ExpectationError(f"{path}: {printable(name, QUOTED)} is not one of {', '.join(types)}")
         if not isinstance(value, types[name]) or (isinstance(value, bool) and name != "lod"):
-            raise ExpectationError(f"{path}: {name} cannot be {value!r}")
+            raise ExpectationError(f"{path}: {name} cannot be {shown(value)}")
         if isinstance(value, (int, float)) and not 0 <= value < math.inf:
-            raise ExpectationError(f"{path}: {name} cannot be {value!r}")
+            raise ExpectationError(f"{path}: {name} cannot be {shown(value)}")
     values = dict(_flat(data.get("values", {}), str(path)))
     return Expectations(**data | {"values": values})
 
@@ -82,13 +78,17 @@ def _flat(table: dict[str, Any], path: str, prefix: str = "") -> Iterator[tuple[
             yield from _flat(wanted, path, f"{way}.")
             continue
         if isinstance(wanted, dict) and not (wanted and wanted.keys() <= {"min", "max"}):
-            raise ExpectationError(f"{path}: {way} is to have min and max, not {wanted!r}")
+            raise ExpectationError(f"{path}: {printable(way, QUOTED)} is to have min and max, not {shown(wanted)}")
         if isinstance(wanted, dict) and not all(map(_is_number, wanted.values())):
-            raise ExpectationError(f"{path}: min and max of {way} are to be numbers, not {wanted!r}")
+            raise ExpectationError(
+                f"{path}: min and max of {printable(way, QUOTED)} are to be numbers, not {shown(wanted)}"
+            )
         try:
             json.dumps(wanted)
         except TypeError:
-            raise ExpectationError(f"{path}: {way} cannot be {wanted!r}, no report has such a value") from None
+            raise ExpectationError(
+                f"{path}: {printable(way, QUOTED)} cannot be {shown(wanted)}, no report has such a value"
+            ) from None
         yield way, wanted
 
 
@@ -107,7 +107,7 @@ def value_at(report: dict[str, Any], way: str) -> Any:
         for key in way.split("."):
             value = value[int(key)] if isinstance(value, list) else value[key]
     except (KeyError, IndexError, TypeError, ValueError):
-        raise ExpectationError(f"the report has no {way}") from None
+        raise ExpectationError(f"the report has no {printable(way, QUOTED)}") from None
     return value
 
 
@@ -143,11 +143,18 @@ def _values(report: dict[str, Any], expected: dict[str, Any]) -> list[Finding]:
         try:
             value = value_at(report, way)
         except ExpectationError as error:
-            found.append(Finding("expect.value", f"{error}, expected {json.dumps(wanted)}"))
+            found.append(Finding("expect.value", f"{error}, expected {_as_json(wanted)}"))
             continue
         if not _fits(value, wanted):
-            found.append(Finding("expect.value", f"{way} is {json.dumps(value)}, expected {json.dumps(wanted)}"))
+            found.append(
+                Finding("expect.value", f"{printable(way, QUOTED)} is {_as_json(value)}, expected {_as_json(wanted)}")
+            )
     return found
+
+
+def _as_json(value: Any) -> str:
+    """As the report and its expectations are written, and no longer than a line of a log."""
+    return printable(json.dumps(value), QUOTED)
 
 
 def _fits(value: Any, wanted: Any) -> bool:

@@ -188,7 +188,7 @@ def _figures(report: Mapping[str, Any]) -> str:
             ("Leaves", _number(tree.get("leaves")), "splats that it is made of"),
             ("Inner nodes", _number(tree.get("inner")), f"{opaque:.1f} % of all have D &gt; 1"),
             ("Growth", _number(tree.get("growth")), "nodes a leaf"),
-            ("Levels", _number(len(tree.get("levels") or ())), f"depth {_number(tree.get('depth'))}"),
+            ("Levels", _number(_levels_of(tree)), f"depth {_number(tree.get('depth'))}"),
             ("Chunks", _number(tree.get("chunks")), f"{needed} for the coarsest cut"),
         ]
     if report.get("sh_degree") is not None:
@@ -201,6 +201,10 @@ def _figures(report: Mapping[str, Any]) -> str:
         more = f"<small>{small}</small>" if small else ""
         items.append(f"<div><dt>{title}</dt><dd>{value}{more}</dd></div>")
     return f'<dl class="figures">{"".join(items)}</dl>' if cards else ""
+
+
+def _levels_of(tree: Mapping[str, Any]) -> int:
+    return len(tree.get("levels") or ()) + int(tree.get("levels_left_out") or 0)
 
 
 def _findings(report: Mapping[str, Any]) -> str:
@@ -234,6 +238,8 @@ def _tree(tree: Mapping[str, Any]) -> str:
         rows.append([f"{number}", *(_number(level[name]) for name in ("nodes", "leaves", "size")), bars])
     key = '<span class="key">inner</span> <span class="key soft">leaves</span>'
     caption = "By edges from the root. Size: geometric mean of the feature sizes, world units."
+    if tree.get("levels_left_out"):
+        caption += f" {_number(tree['levels_left_out'])} more levels are left out."
     table = _table(("Level", "Nodes", "Leaves", "Size", key), rows, caption) if rows else ""
     groups = children_groups(tree.get("children") or {})
     most = max((count for _, count in groups), default=0) or 1

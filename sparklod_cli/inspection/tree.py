@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +22,9 @@ LEAST_RATIO = 1 / 3
 #: Coarse before fine: nodes are wanted when their parent has become too coarse. Of so many parts of a file, none may be
 #: wanted, by the median, more than so many times earlier than one before it; of fewer nodes chance decides.
 PARTS, MOST_RISE, LEAST_NODES = 16, 1.6, 1024
+
+#: Levels that are told of, from the root on. A good tree has some twenty; a chain could have one a node.
+MOST_LEVELS = 1000
 
 Mask = NDArray[np.bool_]
 
@@ -47,7 +51,8 @@ class TreeFacts:
         leaves, inner: nodes without and with children.
         growth: nodes over leaves.
         depth: edges to the deepest node.
-        levels: by the number of edges from the root.
+        levels: by the number of edges from the root, the first `MOST_LEVELS` of them.
+        levels_left_out: how many come after those.
         children: how many inner nodes have so many children, by that number as text.
         more_than_opaque: the share of nodes with D > 1.
         chunks: of `CHUNK_NODES` nodes.
@@ -60,6 +65,7 @@ class TreeFacts:
     growth: float
     depth: int
     levels: list[Level]
+    levels_left_out: int
     children: dict[str, int]
     more_than_opaque: float
     chunks: int
@@ -87,8 +93,9 @@ def examine(splats: Splats, tree: LodTree, *, check: bool = True) -> tuple[TreeF
         depth=len(nodes) - 1,
         levels=[
             Level(int(count), int(end), float(f"{mean:.4g}") if 0 < mean < np.inf else None)
-            for count, end, mean in zip(nodes, ends, means, strict=True)
+            for count, end, mean in itertools.islice(zip(nodes, ends, means, strict=True), MOST_LEVELS)
         ],
+        levels_left_out=max(0, len(nodes) - MOST_LEVELS),
         children={str(number): int(children[number]) for number in np.flatnonzero(children) if number},
         more_than_opaque=round(float(np.count_nonzero(splats.opacity > 1)) / len(tree), 4),
         chunks=-(-len(tree) // CHUNK_NODES),

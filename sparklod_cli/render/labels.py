@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+from ..printable import printable
 from .colors import Coloring
 from .shapes import Points, ticks
 from .viewpoint import Viewpoint
@@ -18,6 +19,9 @@ BACKGROUND, INK, FAINT, LINE = "#0f141b", "#e6edf3", "#9aa7b4", "#7d8996"
 
 #: Least distance of the labels of an axis, in thousandths of the picture's height.
 LABEL_DISTANCE = 62
+
+#: Characters of a title; more do not fit.
+MOST_TITLE = 120
 
 Font = Any
 
@@ -64,7 +68,7 @@ def write_title(draw: ImageDraw.ImageDraw, unit: float, title: str, lines: Seque
         title, lines: in words that fit into its width.
     """
     left, top = 40 * unit, 30 * unit
-    draw.text((left, top), title, INK, _font(unit, 32))
+    draw.text((left, top), printable(title, MOST_TITLE), INK, _font(unit, 32))
     for number, (line, color) in enumerate(lines):
         draw.text((left, top + (46 + 26 * number) * unit), line, color, _font(unit, 19))
 

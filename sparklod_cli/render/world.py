@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import re
 
 import numpy as np
 
 from ..errors import CameraPathError
+from ..untrusted import parse_json
 from .camera import Matrix
 from .paths.source import Json, finite
 from .pose import rigid
@@ -25,10 +25,10 @@ def similarity(text: str) -> Matrix:
     words = re.split(r"[\s,;]+", text.strip())
     try:
         if text.lstrip().startswith("["):
-            numbers = Json(json.loads(text), "matrix").matrix(4)
+            numbers = Json(parse_json(text), "matrix").matrix(4)
         else:
             numbers = [finite(word, "matrix") for word in words]
-    except (ValueError, RecursionError):
+    except ValueError:
         raise CameraPathError("is not JSON") from None
     if len(numbers) != 16:
         raise CameraPathError(f"has {len(numbers)} numbers, not 16")

@@ -24,6 +24,9 @@ TYPES = {int: "integer", float: "number", str: "string"}
 #: A text with one of these is quoted in CSV (RFC 4180).
 QUOTED = ',"\r\n'
 
+#: How texts begin that spreadsheets run, or skip to what they run.
+FORMULAS = ("=", "+", "-", "@", "\t", "\r", "\n")
+
 
 class UnknownColumnError(SparklodError):
     """There is no column of such a name."""
@@ -56,7 +59,8 @@ def near(name: str, known: Iterable[str], *, cutoff: float = 0.6) -> str:
 def encode(rows: Iterable[Row], columns: Sequence[Column], form: str) -> Iterator[bytes]:
     """The pieces of a file of rows. CSV and JSON are made row by row, so that endless paths take no memory.
 
-    An empty text is an empty cell, as no CSV can tell them apart; what UTF-8 cannot hold becomes "?".
+    An empty text is an empty cell, as no CSV can tell them apart; what UTF-8 cannot hold becomes "?". In CSV, a text
+    that a spreadsheet would run begins with a ' more.
 
     Args:
         rows: with a cell for each column; cells beyond them are left out.
@@ -103,7 +107,13 @@ def _cell(column: Column, row: Row) -> Cell:
 def _csv(rows: Iterable[Row], columns: Sequence[Column]) -> Iterator[bytes]:
     yield (",".join(column.name for column in columns) + "\n").encode()
     for row in rows:
-        yield (",".join(_quoted(column.text(_cell(column, row))) for column in columns) + "\n").encode()
+        yield (",".join(_field(column, row) for column in columns) + "\n").encode()
+
+
+def _field(column: Column, row: Row) -> str:
+    """A field of CSV; a text that a spreadsheet would take for a formula gets a mark that makes it a text."""
+    text = column.text(_cell(column, row))
+    return _quoted("'" + text if column.kind is str and text.startswith(FORMULAS) else text)
 
 
 def _quoted(text: str) -> str:

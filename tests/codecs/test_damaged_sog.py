@@ -22,7 +22,23 @@ META = FILES["meta.json"]
 pytestmark = pytest.mark.filterwarnings("error")  # they would go to standard error
 
 VALUES = (
-    *(None, True, "", "1", "means_l.webp", "two\nlines", {}, [], [[]], [None], ["a", "b"], {"0": 1}),
+    *(
+        None,
+        True,
+        "",
+        "1",
+        "means_l.webp",
+        "two\nlines",
+        "\ud800.webp",
+        "\0",
+        "x" * 3000,
+        {},
+        [],
+        [[]],
+        [None],
+        ["a", "b"],
+        {"0": 1},
+    ),
     *(0, -1, 1, 2, 3, 0.5, -3e37, 3e37, -1e300, 1e300, 2**31, 2**64, 10**40, float("nan"), float("inf"), float("-inf")),
 )
 

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from fixtures import by_hand_sog
 from sparklod_cli.codecs import sog
@@ -271,6 +272,18 @@ def without(name: str) -> Files:
 
 
 SMALL = image((0, 0, 0, 252))
+
+
+def animation(frames: int) -> bytes:
+    """The image of quaternions, and others after it."""
+    out = io.BytesIO()
+    first = Image.open(io.BytesIO(FILES["quats.webp"])).convert("RGBA")
+    more = [Image.eval(first, lambda byte, by=number: byte ^ by) for number in range(1, frames)]
+    first.save(out, "WEBP", lossless=True, exact=True, save_all=True, append_images=more)
+    assert getattr(Image.open(io.BytesIO(out.getvalue())), "n_frames", 1) == frames
+    return out.getvalue()
+
+
 REFUSED: dict[str, tuple[Callable[[], Files], str]] = {
     "version 3": (lambda: changed("version", value=3), "SOG version 3 is not known"),
     "no splats": (lambda: changed("count", value=0), "0 splats"),
@@ -296,6 +309,7 @@ REFUSED: dict[str, tuple[Callable[[], Files], str]] = {
     "no meta": (lambda: without("meta.json"), "without meta.json"),
     "text": (lambda: FILES | {"quats.webp": b"something else that is long enough"}, "'quats.webp' is not a WebP image"),
     "half an image": (lambda: FILES | {"quats.webp": FILES["quats.webp"][:150]}, "is a corrupt WebP image"),
+    "an animation": (lambda: FILES | {"quats.webp": animation(3)}, "'quats.webp' is an animation"),
     "a small image": (lambda: FILES | {"quats.webp": SMALL}, "'quats.webp' has 16 texels for 60 splats"),
     "a small image of labels": (lambda: FILES | {"shN_labels.webp": SMALL}, "has 16 texels for 60 splats"),
     "centroids of another width": (
@@ -321,3 +335,20 @@ def test_a_folder_without_its_files_is_refused(tmp_path: Path) -> None:
     (tmp_path / "meta.json").write_bytes(FILES["meta.json"])
     with pytest.raises(FormatError, match=r"means_l\.webp.*no such file"):
         read_scene(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "name", ["\ud800.webp", "\udcff.webp", "\0.webp", "\x1b[2J\n.webp", "x" * 3000, "../a.webp", "", "."]
+)
+def test_names_that_no_file_beside_it_has_are_told_in_a_line(name: str, tmp_path: Path) -> None:
+    meta = json.loads(FILES["meta.json"])
+    meta["quats"]["files"] = [name]
+    for file, data in (FILES | {"meta.json": json.dumps(meta).encode()}).items():
+        (tmp_path / file).write_bytes(data)
+    for source in (tmp_path, tmp_path / "zipped.sog"):
+        if source != tmp_path:
+            source.write_bytes(by_hand_sog.zipped(FILES | {"meta.json": json.dumps(meta).encode()}))
+        with pytest.raises(FormatError, match=r"names|which it names") as caught:
+            read_scene(source)
+        assert str(caught.value).isprintable()
+        assert len(str(caught.value)) < 250

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -202,6 +203,15 @@ def test_tables_of_toml_lead_to_values_as_dots_do(tmp_path: Path, tree: Report) 
         ("{", "is not what it is called"),
         ("max_bytes = 3", "is not what it is called"),
         ("[" * 100_000, "is not what it is called"),
+        (f'{{"max_bytes": {"9" * 5000}}}', "max_bytes cannot be 1.79"),
+        (f'{{"max_growth": -1{"0" * 4000}}}', "max_growth cannot be -1.79"),
+        ('{"max_growth": 1e999}', "max_growth cannot be inf"),
+        (f'{{"sh": 1{"0" * 400}}}', "sh cannot be 1.79"),
+        ('{"values": ' + '{"a":' * 3000 + "1" + "}" * 3001, "nested more than"),
+        ('{"values": ' + '{"a":' * 900 + "1" + "}" * 901, "nested more than"),
+        ('{"values": {"' + "x" * 100_000 + '": {}}}', "xxx"),
+        (f'{{"{"x" * 100_000}": 1}}', "xxx"),
+        ('{"sh": "' + "\\u001b" * 100_000 + '"}', "sh cannot be"),
     ],
 )
 def test_what_is_no_expectation_is_an_error_that_names_the_file(tmp_path: Path, text: str, message: str) -> None:
@@ -210,7 +220,8 @@ def test_what_is_no_expectation_is_an_error_that_names_the_file(tmp_path: Path, 
         read(path)
     assert str(caught.value).startswith(str(path))
     assert message in str(caught.value)
-    assert "\n" not in str(caught.value)
+    assert str(caught.value).isprintable()
+    assert len(str(caught.value)) < len(str(path)) + 600
 
 
 @pytest.mark.parametrize("content", [b"\xff\xfe\x00", None])
@@ -226,6 +237,45 @@ def test_a_file_that_cannot_be_read_is_an_error_that_names_it(tmp_path: Path, co
 def test_bad_toml_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(ExpectationError, match="not what it is called"):
         read(written(tmp_path, '{"max_bytes": 1}', "expect.toml"))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"max_bytes = {'9' * 5000}",
+        f"max_bytes = 0x{'f' * 5000}",
+        "[values]\n" + ".".join("a" * 3000) + " = 1",
+        "values = " + "[" * 3000 + "]" * 3000,
+        f"max_growth = 1{'0' * 4000}",
+        f"max_growth = {'9' * 4000}.5",
+    ],
+)
+def test_hostile_toml_is_an_error_of_a_line(text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = written(tmp_path, text, "expect.toml")
+    assert run(["inspect", str(TREE), "--expect", str(path)]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"error: {path}")
+    assert len(line) < len(str(path)) + 600
+
+
+@pytest.mark.parametrize(
+    "wanted", ["9" * 5000, "1" + "0" * 4000, "1e999", "NaN", '"\\ud800"', '["' + "x" * 10**5 + '"]']
+)
+def test_odd_values_are_only_not_met(wanted: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for text in (f'{{"values": {{"splats": {wanted}}}}}', f'{{"values": {{"tree.levels": {wanted}}}}}'):
+        assert run(["inspect", str(TREE), "--expect", str(written(tmp_path, text)), "-q"]) == 3
+        (line,) = capsys.readouterr().out.splitlines()
+        assert ": error: expect.value: " in line
+        assert len(line) < len(str(TREE)) + 600
+
+
+@pytest.mark.parametrize("source", ["/dev/zero", "/dev/null", "/proc/kcore", "."])
+def test_expectations_are_a_file_of_some_size(source: str, capsys: pytest.CaptureFixture[str]) -> None:
+    if not Path(source).exists():
+        pytest.skip(f"there is no {source}")
+    assert run(["inspect", str(TREE), "--expect", source]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert re.match(f"error: {source} (cannot be read: (it is a pipe|is a directory)|is larger than 16 MiB)", line)
 
 
 def test_a_date_is_not_what_a_value_is(tmp_path: Path, tree: Report) -> None:

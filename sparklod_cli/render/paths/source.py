@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -11,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ...errors import CameraPathError
+from ...untrusted import parse_json
 from ..camera import Matrix
 from ..frame import Frame
 from ..pose import pose, rotation_of
@@ -49,8 +49,8 @@ class Files:
     def json(self) -> Json | None:
         """The first file as JSON; None where it is something else."""
         try:
-            return Json(json.loads(self.text or ""))
-        except (ValueError, RecursionError):
+            return Json(parse_json(self.text or ""))
+        except ValueError:
             return None
 
     def lines(self) -> list[str]:

@@ -1,0 +1,89 @@
+"""numpy's .npy files of plain numbers, whose header is matched, not evaluated: it may say anything."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import FormatError, TruncatedError
+
+MAGIC = b"\x93NUMPY"
+
+#: Bytes that the length of a header takes, by major version.
+LENGTH_BYTES = {1: 2, 2: 4, 3: 4}
+
+#: Bytes of a header; that of two dimensions takes 118.
+MAX_HEADER = 1 << 12
+
+#: Each key of a header and what it may say, as Python spells that.
+KEYS = {
+    "descr": r"""['"]([<>|=]?[a-zA-Z]\d{1,2})['"]""",
+    "fortran_order": r"(True|False)",
+    "shape": r"\(([\d,\s]{0,200})\)",
+}
+_HEADER = re.compile(
+    r"\{" + "".join(rf"(?=[^{{}}]*['\"]{key}['\"]\s*:\s*{value})" for key, value in KEYS.items()) + r"[^{}]*\}\s*"
+)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What numbers follow, and how.
+
+    Attributes:
+        shape: of the array.
+        dtype: of its numbers.
+        fortran_order: the first dimension runs fastest.
+    """
+
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+    fortran_order: bool = False
+
+
+def read_layout(file: BinaryIO) -> Layout | None:
+    """The layout of a .npy file, which is left at its numbers; None, at the beginning, where it is something else.
+
+    Raises:
+        FormatError: the header is not one of an array of plain numbers; its text goes on a sentence about the file.
+    """
+    file.seek(0)
+    if file.read(len(MAGIC)) != MAGIC:
+        file.seek(0)
+        return None
+    version = file.read(2)
+    size = LENGTH_BYTES.get(version[0]) if len(version) == 2 else None
+    if size is None:
+        raise FormatError("is not a .npy file of a version that is known")
+    length = int.from_bytes(file.read(size), "little")
+    header = file.read(min(length, MAX_HEADER))
+    found = _HEADER.fullmatch(header.decode("latin-1")) if length <= MAX_HEADER else None
+    if found is None:
+        raise FormatError("is not a .npy file of plain numbers: its header says something else")
+    try:
+        dtype = np.dtype(found[1])
+        shape = tuple(int(side) for side in found[3].replace(",", " ").split())
+    except (TypeError, ValueError):
+        raise FormatError(f"is not a .npy file of plain numbers: its header says {found[1]!r}") from None
+    if dtype.hasobject or not dtype.itemsize:
+        raise FormatError(f"is not a .npy file of plain numbers: its header says {found[1]!r}")
+    return Layout(shape, dtype, found[2] == "True")
+
+
+def read_values(file: BinaryIO, layout: Layout) -> NDArray[Any]:
+    """The array that begins where a file is; who calls has found its shape to be what was expected.
+
+    Raises:
+        TruncatedError: the file ends before; its text goes on a sentence about the file.
+    """
+    size = math.prod(layout.shape) * layout.dtype.itemsize
+    data = file.read(size)
+    if len(data) < size:
+        raise TruncatedError(f"ends {size - len(data):,} bytes before its last number")
+    values: NDArray[Any] = np.frombuffer(data, layout.dtype)
+    return values.reshape(layout.shape, order="F" if layout.fortran_order else "C")

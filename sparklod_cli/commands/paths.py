@@ -1,0 +1,143 @@
+"""Parameters that name files, and the one check that no output of a command replaces what it reads."""
+
+from __future__ import annotations
+
+import functools
+import os
+import re
+import stat
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import click
+
+#: Standard input or output, where a command takes those.
+DASH = Path("-")
+
+#: How addresses begin. A letter and a colon alone are a drive of Windows.
+URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+://")
+
+
+class _NamedPath(click.Path):
+    """A path as it was written. Whether it can be opened is for those to tell who open it, file by file."""
+
+    _to_do = ""
+
+    def __init__(self, *, folder: bool = False) -> None:
+        super().__init__(path_type=Path, file_okay=not folder, readable=False)
+        self.folder = folder
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        text = os.fsdecode(value)
+        if not text:
+            self.fail("the name is empty", param, ctx)
+        if URL.match(text):
+            self.fail(f"{text!r} is an address on a network, not a path; {self._to_do}", param, ctx)
+        return super().convert(value, param, ctx)
+
+
+class InputPath(_NamedPath):
+    """A file or folder that a command reads."""
+
+    _to_do = "download it first"
+
+
+class OutputPath(_NamedPath):
+    """A file that a command writes, or with `folder` a folder that it fills."""
+
+    _to_do = "write a file and upload that"
+
+
+def keep_apart(ctx: click.Context, stands_for: Mapping[str, Iterable[Path]] | None = None) -> None:
+    """Raises a `click.UsageError` where an output of a command would replace an input of it, or another output.
+
+    Files are told by what they are, so by links and by names in other letters, too. What a pipe or a device is given
+    replaces nothing.
+
+    Args:
+        ctx: of the command, whose parameters of `InputPath` and `OutputPath` are looked at.
+        stands_for: by the name of a parameter, the files that are meant by it: which an input names besides itself, and
+            which an output is filled with in place of itself.
+    """
+    stands_for = stands_for or {}
+    inputs: list[Path] = []
+    outputs: list[Path] = []
+    for parameter in ctx.command.params:
+        kind, value, more = parameter.type, ctx.params.get(parameter.name or ""), stands_for.get(parameter.name or "")
+        values = [] if value is None else list(value) if isinstance(value, tuple) else [value]
+        if isinstance(kind, OutputPath):
+            outputs += more if more is not None else [] if kind.folder else values
+        else:
+            inputs += [*(values if isinstance(kind, InputPath) else []), *(more or ())]
+    _keep_apart(outputs, inputs)
+
+
+def _keep_apart(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:
+    files = set[tuple[int, int]]()
+    places = dict[str, str]()
+    for path in _all_read(inputs):
+        places[_place(path)] = "an input"
+        found = _identity(path)
+        if found is not None:
+            files.add(found)
+    for path in outputs:
+        if path == DASH or _is_stream(path):
+            continue
+        place = _place(path)
+        taken = "an input" if _identity(path) in files else places.get(place)
+        if taken is not None:
+            raise click.UsageError(f"{path} is {taken}; write elsewhere")
+        places[place] = "an output already"
+
+
+def _all_read(paths: Iterable[Path]) -> Iterator[Path]:
+    """Each path, and the files that are read with it."""
+    from ..io import companions
+    from ..render.paths.formats import NAMES
+
+    for path in dict.fromkeys(paths):
+        yield path
+        yield from companions(path, NAMES)
+
+
+def _identity(path: Path) -> tuple[int, int] | None:
+    """What a file is, whatever it is called; None where there is none."""
+    try:
+        found = path.stat()
+    except (OSError, ValueError):
+        return None
+    return found.st_dev, found.st_ino
+
+
+def _is_stream(path: Path) -> bool:
+    try:
+        mode = path.stat().st_mode
+    except (OSError, ValueError):
+        return False
+    return not (stat.S_ISREG(mode) or stat.S_ISDIR(mode))
+
+
+def _place(path: Path) -> str:
+    """Where a file is, or would be: the same for all ways to it, whether or not it is there."""
+    place = os.path.realpath(path)
+    folder = os.path.dirname(place)  # noqa: PTH120
+    return os.path.join(folder, os.path.basename(place).casefold()) if _folds_case(folder) else place  # noqa: PTH118, PTH119
+
+
+@functools.lru_cache(256)
+def _folds_case(folder: str) -> bool:
+    """Whether names in a folder are the same in large and small letters, as far as its own name tells."""
+    path = Path(folder)
+    try:
+        return path.name.swapcase() != path.name and path.samefile(path.with_name(path.name.swapcase()))
+    except (OSError, ValueError):
+        return False
+
+
+def file_of(text: str) -> Path | None:
+    """The file that an option names which takes other texts, too; None where there is none of that name."""
+    try:
+        return Path(text) if Path(text).is_file() else None
+    except (OSError, ValueError):
+        return None
