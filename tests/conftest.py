@@ -24,3 +24,12 @@ def real_scene(name: str) -> Path:
     if not path.is_file():
         pytest.skip(f"no real scene {name}; SPARKLOD_SCENES names the folder of real scenes")
     return path
+
+
+@pytest.fixture(scope="session", autouse=True)
+def compiled() -> None:
+    """All kernels are in the cache, so that no test meets a notice of compiling, or waits for one of its own."""
+    from sparklod_cli import jit, warmup
+
+    if jit.CACHE_FOLDER is not None:
+        warmup.warm_up(processes=2)

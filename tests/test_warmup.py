@@ -28,15 +28,6 @@ print(json.dumps([code, sorted(stem_of(kernel.py_func) for kernel in kernels)]))
 """
 
 
-@pytest.fixture(scope="module")
-def warm() -> None:
-    """Everything is compiled, in the cache that all tests use."""
-    if jit.CACHE_FOLDER is None:
-        pytest.skip("no cache can be written here")
-    warmup.warm_up(processes=2)
-
-
-@pytest.mark.usefixtures("warm")
 @pytest.mark.parametrize("job", warmup.JOBS)
 def test_the_table_has_just_the_kernels_that_a_job_calls(job: str, tmp_path: Path) -> None:
     warmup._write_inputs(tmp_path)
@@ -53,7 +44,6 @@ def test_the_table_has_just_the_kernels_that_a_job_calls(job: str, tmp_path: Pat
     assert called == set(warmup.JOBS[job].kernels)
 
 
-@pytest.mark.usefixtures("warm")
 def test_a_second_time_there_is_nothing_to_do(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["warmup", "--json"]) == 0
     captured = capsys.readouterr()
