@@ -19,6 +19,7 @@ from .codecs.formats import FORMATS, HEAD, Format, sniff
 from .codecs.sog_files import MAX_META, META, names_beside
 from .errors import FormatError, OutputError, StdoutError, UnknownFormatError, UnreadableError
 from .progress import Progress, silent
+from .quantities import count_of
 from .scene import Scene
 from .splats import COLUMNS, FloatArray
 from .stdout import ReaderGoneError, told
@@ -211,7 +212,7 @@ def read_rgba(path: Path, count: int) -> FloatArray:
     if values.ndim != 2 or values.shape[1] != 4 or (values.dtype != np.uint8 and values.dtype.kind != "f"):
         raise FormatError(f"{path} has {values.dtype}{list(values.shape)}, expected uint8 or floats [{count}, 4]")
     if len(values) != count:
-        raise FormatError(f"{path} has colours for {len(values):,} splats, the scene has {count:,}")
+        raise FormatError(f"{path} has colours for {count_of(len(values), 'splat')}, the scene has {count:,}")
     rgba = np.array(values, np.float32) / np.float32(255 if values.dtype == np.uint8 else 1)
     if not ((rgba >= 0) & (rgba <= 1)).all():
         raise FormatError(f"{path} has values that are not 0..1")

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from PIL.WebPImagePlugin import WebPImageFile
 
 from ..errors import ChecksumError, FormatError, NotSplatsError
+from ..quantities import count_of
 from .compression import check_promise
 from .stream import size_of
 
@@ -171,7 +172,7 @@ class Files:
         texels = self.image(texture, index, SPARE_FACTOR * count + SPARE_TEXELS).reshape(-1, 4)
         if len(texels) < count:
             name = self.meta.name(texture, "files", index)
-            raise FormatError(f"{name!r} has {len(texels):,} texels for {count:,} splats")
+            raise FormatError(f"{name!r} has {count_of(len(texels), 'texel')} for {count_of(count, 'splat')}")
         return texels[:count]
 
 

@@ -222,8 +222,8 @@ def _check_usage(ctx: click.Context, inputs: tuple[Path, ...], output: Path | No
     elif settings["encoding"]:
         refuse(OF_SPZ, "is of SPZ, not of --encoding")
         if suffix not in ("", ".npz", *limits.RAW_SUFFIXES):
-            names = ", ".join((".npz", *limits.RAW_SUFFIXES))
-            raise click.UsageError(f"--encoding writes {names}, not {suffix}")
+            known = ", ".join((".npz", *limits.RAW_SUFFIXES))
+            raise click.UsageError(f"--encoding writes {known}, not {suffix}")
     elif suffix in OTHER_SUFFIXES:
         raise click.UsageError(f"{suffix} holds no tree, which is written as SPZ; name the output .spz")
     elif suffix in (".npz", *limits.RAW_SUFFIXES):
