@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from .. import limits
-from .console import Console, count_of
+from .console import Console, count_of, for_screen, is_terminal
 from .options import Command, Quantity
 from .paths import OutputPath
 
@@ -181,7 +182,7 @@ def run(
     else:  # at once, for a bar and a table do not go together on one screen
         table = list(encode(kept(), COLUMNS, wanted.form))
         console.clear()
-        write_stdout(iter(table))
+        write_stdout(for_screen(table) if is_terminal(sys.stdout) else iter(table))
     console.clear()
     console.detail(f"  {len(rows):,} pictures, {time.perf_counter() - start:.2f} s")
     if wanted.plot is not None:
