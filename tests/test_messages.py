@@ -26,9 +26,10 @@ ONES = re.compile(r"(?<![\d.,])1 (?:\w+ )?(splats|nodes|levels|leaves|frames|cam
 @pytest.mark.parametrize(
     ("size", "said"),
     [
-        ("100000x100000", "is too large; a picture has at most 65,536 pixels along a side"),
+        ("100000x100000", "is too large; give at most 65,536 pixels along a side, such as 1280x720"),
         (f"8x{'9' * 5000}", "is too large"),
         ("8x65537", "is too large"),
+        ("8x" + "0" * 5000, "is not a width and a height"),
         ("0x8", "is not a width and a height in pixels, such as 1280x720"),
         ("8", "is not a width and a height"),
         ("8x-8", "is not a width and a height"),

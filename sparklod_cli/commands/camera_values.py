@@ -50,12 +50,13 @@ class Size(click.ParamType):
     name = "WxH"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, int]:
-        parts = value.lower().split("x")
-        if len(parts) != 2 or not all(part.isascii() and part.isdigit() and part.strip("0") for part in parts):
+        sides = [side.lstrip("0") for side in value.lower().split("x")]
+        if len(sides) != 2 or not all(side.isascii() and side.isdigit() for side in sides):
             self.fail(f"{value!r} is not a width and a height in pixels, such as 1280x720", param, ctx)
-        if any(len(part.lstrip("0")) > DIGITS or int(part) > MAX_SIDE for part in parts):
-            self.fail(f"{value!r} is too large; a picture has at most {MAX_SIDE:,} pixels along a side", param, ctx)
-        return int(parts[0]), int(parts[1])
+        if any(len(side) > DIGITS or int(side) > MAX_SIDE for side in sides):
+            most = f"{MAX_SIDE:,} pixels along a side"
+            self.fail(f"{value!r} is too large; give at most {most}, such as 1280x720", param, ctx)
+        return int(sides[0]), int(sides[1])
 
     def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:
         return self.name
