@@ -115,4 +115,7 @@ def main() -> NoReturn:
     interrupts.handle()
     code = run()
     interrupts.ignore()
+    # An interrupt that came while Python ran a string, as dataclasses does, would otherwise make it end by that signal,
+    # whatever the status: it remembers the last one until another string has run.
+    exec("")
     sys.exit(code)

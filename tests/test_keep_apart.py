@@ -156,6 +156,16 @@ def test_frames_and_indices_do_not_replace_inputs(tmp_path: Path, capsys: pytest
     assert frame.read_bytes() == indices.read_bytes() == LOD.read_bytes()
 
 
+def test_a_folder_is_not_filled_with_inputs_replaced(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    plain, other = tmp_path / "a.ply", tmp_path / "a-lod.spz"
+    for file in (plain, other):
+        file.write_bytes(PLAIN.read_bytes())
+    for options in ([], ["--output-dir", str(tmp_path)]):
+        assert run(["build-lod", str(plain), str(other), *options, "--overwrite"]) == 2
+        assert f"{other} is an input" in capsys.readouterr().err
+    assert other.read_bytes() == PLAIN.read_bytes()
+
+
 def test_names_in_other_letters_where_those_are_the_same(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

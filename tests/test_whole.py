@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import os
 import random
@@ -194,3 +195,29 @@ def test_a_part_that_is_swept_before_it_is_locked(tmp_path: Path, monkeypatch: p
     whole.write(tmp_path / "out", [b"x"], overwrite=False)
     assert len(rounds) == 2
     assert (tmp_path / "out").read_bytes() == b"x"
+
+
+#: Modules that write files, and what: outputs (whole or to a device), the cache of kernels, what Open3D's process says.
+WRITERS = {"io.py", "whole.py", "jit.py", "render/open3d_process.py"}
+
+
+def writes(call: ast.Call) -> bool:
+    name = call.func.attr if isinstance(call.func, ast.Attribute) else getattr(call.func, "id", "")
+    modes = [
+        value.value
+        for value in [*call.args, *(each.value for each in call.keywords)]
+        if isinstance(value, ast.Constant)
+    ]
+    return name in ("write_bytes", "write_text", "touch", "NamedTemporaryFile", "mkstemp") or (
+        name == "open" and any(isinstance(mode, str) and set(mode) & set("wxa") for mode in modes)
+    )
+
+
+def test_files_are_written_in_one_way() -> None:
+    found = set()
+    for path in (ROOT / "sparklod_cli").rglob("*.py"):
+        calls = (node for node in ast.walk(ast.parse(path.read_text("utf-8"))) if isinstance(node, ast.Call))
+        if any(map(writes, calls)):
+            found.add(path.relative_to(ROOT / "sparklod_cli").as_posix())
+    assert found <= WRITERS
+    assert "io.py" in found  # so it finds what there is

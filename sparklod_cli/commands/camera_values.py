@@ -8,6 +8,9 @@ import click
 
 from .options import Numbers
 
+#: Pixels along a side of a picture, and digits of no more than a few times that.
+MAX_SIDE, DIGITS = 1 << 16, 6
+
 
 class View(click.ParamType):
     """Where a camera is and what it looks at, as (eye, target), two tuples of three numbers."""
@@ -47,10 +50,13 @@ class Size(click.ParamType):
     name = "WxH"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, int]:
-        parts = value.lower().split("x")
-        if len(parts) != 2 or not all(part.isascii() and part.isdigit() and 0 < int(part) <= 65536 for part in parts):
+        sides = [side.lstrip("0") for side in value.lower().split("x")]
+        if len(sides) != 2 or not all(side.isascii() and side.isdigit() for side in sides):
             self.fail(f"{value!r} is not a width and a height in pixels, such as 1280x720", param, ctx)
-        return int(parts[0]), int(parts[1])
+        if any(len(side) > DIGITS or int(side) > MAX_SIDE for side in sides):
+            most = f"{MAX_SIDE:,} pixels along a side"
+            self.fail(f"{value!r} is too large; give at most {most}, such as 1280x720", param, ctx)
+        return int(sides[0]), int(sides[1])
 
     def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:
         return self.name

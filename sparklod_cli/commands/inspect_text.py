@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
-from ..printable import MOST, printable
+from ..printable import MOST, printable, shortened
 from .console import count_of, size_of
 
 if TYPE_CHECKING:
@@ -44,11 +44,9 @@ def _row(name: str, text: str) -> str:
 
 
 def _tree(tree: dict[str, Any]) -> Iterator[str]:
-    inner = count_of(tree["inner"], "inner node")
-    yield _row(
-        "tree",
-        f"{_leaves(tree['leaves'])}, {inner}, growth {tree['growth']:.3f}, {count_of(tree['depth'] + 1, 'level')}",
-    )
+    inner, levels = count_of(tree["inner"], "inner node"), count_of(tree["depth"] + 1, "level")
+    leaves = count_of(tree["leaves"], "leaf", "leaves")
+    yield _row("tree", f"{leaves}, {inner}, growth {tree['growth']:.3f}, {levels}")
     yield _row("", f"{100 * tree['more_than_opaque']:.1f} % of the nodes are more than opaque")
     chunks = count_of(tree["chunks"], "chunk")
     yield _row("", f"{chunks} of 65,536 nodes, the coarsest cut of as many nodes needs {tree['chunks_of_coarse_cut']}")
@@ -63,10 +61,6 @@ def _tree(tree: dict[str, Any]) -> Iterator[str]:
         yield _row("", f"{depth:>5} {level['nodes']:>12,} {level['leaves']:>12,} {size:>10}")
     if tree["depth"] >= MOST_LEVELS:
         yield _row("", f"and {tree['depth'] + 1 - MOST_LEVELS:,} more")
-
-
-def _leaves(count: int) -> str:
-    return "1 leaf" if count == 1 else f"{count:,} leaves"
 
 
 def _values(values: dict[str, Any]) -> Iterator[str]:
@@ -95,7 +89,7 @@ def finding_line(file: str, found: Finding, style: str) -> str:
     if style == "text":
         return f"{printable(file)}: {found.severity}: {found.code}: {printable(found.message, MOST)}"
     kind = {"note": "notice"}.get(found.severity, found.severity)
-    return f"::{kind} file={_escaped(file, ':,')},title={found.code}::{_escaped(printable(found.message, MOST))}"
+    return f"::{kind} file={_escaped(file, ':,')},title={found.code}::{_escaped(shortened(found.message, MOST))}"
 
 
 def _escaped(text: str, more: str = "") -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from .. import limits
-from .console import Console, count_of
+from .console import Console, count_of, for_screen, is_terminal
 from .options import Command, Quantity
 from .paths import OutputPath
 
@@ -181,7 +182,7 @@ def run(
     else:  # at once, for a bar and a table do not go together on one screen
         table = list(encode(kept(), COLUMNS, wanted.form))
         console.clear()
-        write_stdout(iter(table))
+        write_stdout(for_screen(table) if is_terminal(sys.stdout) else iter(table))
     console.clear()
     console.detail(f"  {len(rows):,} pictures, {time.perf_counter() - start:.2f} s")
     if wanted.plot is not None:
@@ -223,7 +224,7 @@ def lines(summary: Sequence[OfBudget], path: CameraPath, leaves: int) -> Iterato
     """The summary as a person reads it."""
     sizes = list(dict.fromkeys((camera.width, camera.height) for camera in path.cameras))
     size = f"{sizes[0][0]} x {sizes[0][1]}" + (" and others" if len(sizes) > 1 else "")
-    yield f"  {count_of(len(path.cameras), 'frame')} of {size}, against {leaves:,} splats, on black and white"
+    yield f"  {count_of(len(path.cameras), 'frame')} of {size}, against {count_of(leaves, 'splat')}, on black and white"
     yield f"  {'budget':>8} {'splats':>11} {'PSNR':>7} {'least':>7} {'SSIM':>7} {'least':>7}   worst tile"
     for each in summary:
         yield (
