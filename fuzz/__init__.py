@@ -1,1 +1,1 @@
-"""Fuzzers: inputs that nobody would make on purpose, and laws that hold for whatever comes of them. See docs/fuzzing.md."""
+"""Inputs that nobody would make on purpose, and laws that hold for whatever comes of them; see docs/fuzzing.md."""

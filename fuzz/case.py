@@ -20,9 +20,7 @@ Rng = np.random.Generator
 SEED = 1
 
 #: Targets, each a module of `fuzz.targets`.
-TARGETS = (
-    *("decoders", "trees", "builds", "cameras", "instances", "expectations", "assertions", "rgba", "options"),
-)
+TARGETS = ("decoders", "trees", "builds", "cameras", "instances", "expectations", "assertions", "rgba", "options")
 
 
 class LawError(Exception):

@@ -20,7 +20,7 @@ from .oracle import Finding
 
 ROOT = Path(__file__).resolve().parents[1]
 
-#: Seconds that a case may take; and the first one of a process, or one that is tried again, as they may compile kernels.
+#: Seconds that a case may take; and the first of a process, or one that is tried again: these may compile kernels.
 LIMIT, PATIENCE = 10.0, 180.0
 
 

@@ -7,6 +7,7 @@ import gzip
 import io
 import struct
 import zipfile
+import zlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
@@ -27,6 +28,9 @@ LARGEST = 32_000
 
 #: Bytes that say what the others mean, at most.
 HEADER = 120
+
+#: What reading a broken container raises.
+BROKEN = (EOFError, OSError, ValueError, struct.error, zipfile.BadZipFile, zlib.error, zstandard.ZstdError)
 
 Parts = Mapping[str, bytes]
 
@@ -61,7 +65,7 @@ def opened(data: bytes) -> tuple[Parts, Callable[[Parts], bytes]]:
         if data[:4] == b"PK\x03\x04":
             with zipfile.ZipFile(io.BytesIO(data)) as archive:
                 return {name: archive.read(name) for name in archive.namelist()}, by_hand_sog.zipped
-    except (EOFError, OSError, ValueError, KeyError, struct.error, zipfile.BadZipFile, zstandard.ZstdError, gzip.zlib.error):
+    except BROKEN:
         return {"file": data}, _joined  # it is broken already
     end = data.find(b"end_header\n") + 11 if data[:3] == b"ply" else 0
     return ({"text": data[:end], "payload": data[end:]} if end > 11 else {"file": data}), _joined

@@ -26,7 +26,18 @@ FLOATS = (
 )
 WORDS = (
     *("0", "-1", "1", "2", "nan", "NaN", "inf", "-Infinity", "1e38", "-1e38", "1e308", "1e999", "1e-320", "0.0", "-0"),
-    *("99999999999999999999", "4294967295", "4294967296", "65536", "9" * 500, "9" * 5000, "0x10", "1_000", "１", "½"),
+    *(
+        "99999999999999999999",
+        "4294967295",
+        "4294967296",
+        "65536",
+        "9" * 500,
+        "9" * 5000,
+        "0x10",
+        "1_000",
+        "\uff11",
+        "\u00bd",
+    ),
     *("", " ", "\t", "\n", "\r", "\0", "\x1b[31m", "\x07", "\u2028", "\u202e", "::error::oops", "=1+1", "é", "\ufeff"),
     *("null", "true", "{", "}", "[", "]", ",", ":", ";", '"', "'", "#", "//", "a" * 8000, "../../x", "/dev/zero", "%s"),
     *("element vertex 3\n", "property float x\n", "property list uchar int v\n", "format ascii 1.0\n", "end_header\n"),
@@ -149,7 +160,7 @@ def text_mutated(rng: Rng, text: str) -> str:
         else:
             lines = text.splitlines(keepends=True) or [""]
             at = int(rng.integers(len(lines)))
-            lines[at : at + 1] = pick(rng, ([], [lines[at]] * 2, [lines[at]] * 200, lines[at : at + 1] + ["\n"]))
+            lines[at : at + 1] = pick(rng, ([], [lines[at]] * 2, [lines[at]] * 200, [lines[at], "\n"]))
             text = "".join(lines)
     return text
 

@@ -133,9 +133,7 @@ def run(target: Target, case: Case, folder: Path, watched: Watched) -> Result:
     return Result(finding, outcome, seconds)
 
 
-def _all_faults(
-    case: Case, folder: Path, warned: list[warnings.WarningMessage], watched: Watched
-) -> Iterator[Finding]:
+def _all_faults(case: Case, folder: Path, warned: list[warnings.WarningMessage], watched: Watched) -> Iterator[Finding]:
     for each in warned:
         text = f"{each.category.__name__}: {each.message}"
         yield Finding("warning", text[:300], f"{text[:60]} at {Path(each.filename).name}:{each.lineno}")
@@ -200,7 +198,7 @@ class Watched:
         if self._folder is None:
             return
         if event == "open":
-            path, mode, flags = args
+            path, _, flags = args
             writes = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
             if not (flags or 0) & writes:
                 return

@@ -144,10 +144,11 @@ def table(tallies: Sequence[Tally]) -> str:
         )
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = [
-        "  ".join([row[0].ljust(widths[0]), *(cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True))])
+        "  ".join(
+            [row[0].ljust(widths[0]), *(cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True))]
+        )
         for row in rows
     ]
     for tally in tallies:
-        for group in tally.by_fault().values():
-            lines.append(f"{len(group):,} x {group[0].line()}")
+        lines += [f"{len(group):,} x {group[0].line()}" for group in tally.by_fault().values()]
     return "\n".join(lines)

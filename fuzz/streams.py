@@ -18,9 +18,8 @@ class Streams:
         """From now on they are files; standard input is empty."""
         os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
         for number in (1, 2):
-            descriptor, path = tempfile.mkstemp()
-            os.unlink(path)
-            self._files[number] = descriptor
+            with tempfile.TemporaryFile() as file:
+                self._files[number] = os.dup(file.fileno())
         self.begin()
 
     def begin(self) -> None:
@@ -34,9 +33,7 @@ class Streams:
     def take(self) -> tuple[bytes, bytes]:
         """What was written, which is forgotten."""
         self._flush()
-        out, err = (
-            os.pread(descriptor, 1 << 26, 0) for descriptor in (self._files.get(1, -1), self._files.get(2, -1))
-        )
+        out, err = (os.pread(descriptor, 1 << 26, 0) for descriptor in (self._files.get(1, -1), self._files.get(2, -1)))
         self.begin()
         return out, err
 

@@ -1,7 +1,7 @@
 """The process in which cases run; `fuzz.child` starts it, and another one when it dies.
 
-It reads requests, a JSON object a line, from one pipe and writes results to another. What kills it, and where it was when
-it was told to say so (SIGUSR1), goes to a log.
+It reads requests, a JSON object a line, from one pipe and writes results to another. What kills it, and where it was
+when it was told to say so (SIGUSR1), goes to a log.
 """
 
 from __future__ import annotations

@@ -15,7 +15,9 @@ from ..mutate import pick
 def make(rng: Rng) -> Case:
     """A scene and how to bake it."""
     columns = scenes.extreme(rng)
-    file, data = ("scene.splat", scenes.splat_of(columns)) if rng.integers(4) == 0 else ("scene.ply", scenes.ply_of(columns))
+    file, data = (
+        ("scene.splat", scenes.splat_of(columns)) if rng.integers(4) == 0 else ("scene.ply", scenes.ply_of(columns))
+    )
     method = pick(rng, METHODS)
     options = ["--method", method, "--on-invalid", pick(rng, ("error", "drop")), "--threads", str(pick(rng, (1, 2)))]
     if rng.integers(3) == 0:

@@ -42,5 +42,5 @@ def check(case: Case, folder: Path) -> None:
         command([arguments[0], "--scene", "scene.json", *arguments[1:]])
         return
     for place in read_placements(Path("scene.json")):
-        if not np.isfinite(place.object_to_world).all() or not place.name.isprintable() and len(place.name) > 10**6:
+        if not np.isfinite(place.object_to_world).all():
             raise LawError(f"an instance that cannot be drawn: {place!r:.200}")

@@ -36,7 +36,7 @@ FOLDERS = ("new", "new/er", ".", "tree.spz", "")
 
 #: Values by the name of an option; sizes and numbers of frames are small, since much work is no fault.
 VALUES: dict[str, Sequence[str]] = {
-    "size": ("16x12", "16x12", "1x1", "33x7", "0x5", "-1x5", "16", "16x12x3", "1e3x4", "９x９"),
+    "size": ("16x12", "16x12", "1x1", "33x7", "0x5", "-1x5", "16", "16x12x3", "1e3x4", "\uff19x\uff19"),
     "orbit": ("1", "2", "3", "0", "-1"),
     "every": ("1", "7", "20", "1000000", "0"),
     "seconds": ("0.1", "0.05", "1e-300", "0", "nan"),
