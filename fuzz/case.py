@@ -24,7 +24,16 @@ TARGETS = ("decoders", "trees", "builds", "cameras", "instances", "expectations"
 
 
 class LawError(Exception):
-    """What the project promises was not kept; the text says what came instead."""
+    """What the project promises was not kept.
+
+    Args:
+        text: what came instead; its first line for the table.
+        fault: tells this fault from others; by the text unless given.
+    """
+
+    def __init__(self, text: str, fault: str = "") -> None:
+        super().__init__(text)
+        self.fault = fault
 
 
 @dataclass(frozen=True)

@@ -87,14 +87,19 @@ class Child:
 
     def _start(self) -> None:
         shutil.rmtree(self.scratch, ignore_errors=True)
-        for name in ("case", "home", "tmp"):
+        for name in ("case", "home", "tmp", "matplotlib"):
             (self.scratch / name).mkdir(parents=True)
         requests, answers = os.pipe(), os.pipe()
         self._log = self.scratch / "log"
         log = os.open(self._log, os.O_RDWR | os.O_CREAT | os.O_TRUNC)
         home = str(self.scratch / "home")
         environment = {**os.environ, "PYTHONPATH": str(ROOT), "HOME": home, "XDG_CACHE_HOME": _cache()}
-        environment |= {"MPLBACKEND": "agg", "MPLCONFIGDIR": home, "NO_COLOR": "1", "PYTHONDONTWRITEBYTECODE": "1"}
+        environment |= {
+            "MPLBACKEND": "agg",
+            "MPLCONFIGDIR": str(self.scratch / "matplotlib"),
+            "NO_COLOR": "1",
+            "PYTHONDONTWRITEBYTECODE": "1",
+        }
         command = [sys.executable, "-m", "fuzz.worker", f"--requests={requests[0]}", f"--results={answers[1]}"]
         command += [f"--log={log}", f"--scratch={self.scratch}"]
         inherited = (requests[0], answers[1], log)

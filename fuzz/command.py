@@ -41,22 +41,24 @@ def command(arguments: Sequence[str]) -> Done:
     done = Done(code, out, err.decode("utf-8", "backslashreplace"))
     if caught:
         kind, where = caught[0]
-        raise LawError(f"{kind} reached the last guard, from {where}\n{arguments}\n{done.err}")
+        raise LawError(
+            f"{kind} reached the last guard\n{arguments}\n{done.err}", f"{kind.partition(':')[0]} in {where}"
+        )
     if code not in CODES:
         raise LawError(f"exit code {code}\n{arguments}\n{done.err}")
-    for fault in _faults(done):
-        raise LawError(f"{fault}\n{arguments}\n{done.err}")
+    for fault, text in _faults(done):
+        raise LawError(f"{text}\n{arguments}\n{done.err}", f"{fault}, of {arguments[0]}")
     return done
 
 
-def _faults(done: Done) -> Iterator[str]:
-    fault = lines_fault(done.err)
+def _faults(done: Done) -> Iterator[tuple[str, str]]:
+    fault, text = lines_fault(done.err)
     if fault:
-        yield fault
+        yield fault, text
     if done.code == 1 and not done.err.strip():
-        yield "exit code 1 without a word"
+        yield "silence", "exit code 1 without a word"
     if done.code == 2 and "Error:" not in done.err:
-        yield f"exit code 2 without an error: {done.err[:100]!r}"
+        yield "silence", f"exit code 2 without an error: {done.err[:100]!r}"
 
 
 @contextmanager

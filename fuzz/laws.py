@@ -48,9 +48,9 @@ def report_holds(path: Path) -> None:
     except ValueError as error:
         raise LawError(f"the report is not JSON: {error}") from None
     for finding in found.findings or []:
-        fault = lines_fault(finding_line(str(path), finding, "text"))
+        fault, text = lines_fault(finding_line(str(path), finding, "text"))
         if fault:
-            raise LawError(f"of a finding, {fault}")
+            raise LawError(f"of a finding, {text}", f"{fault}, of {finding.code}")
 
 
 def output_holds(path: Path) -> None:
@@ -72,4 +72,4 @@ def output_holds(path: Path) -> None:
         elif path.suffix == ".csv" and not data.endswith(b"\n"):
             raise LawError("the table ends in the middle of a line")
     except (FormatError, OSError, ValueError, EOFError) as error:
-        raise LawError(f"what was written is not whole: {path.name}: {error}") from None
+        raise LawError(f"what was written is not whole: {path.name!r:.60}: {error}", f"output {path.suffix}") from None

@@ -75,18 +75,23 @@ class Result:
     seconds: float
 
 
-def lines_fault(text: str) -> str:
-    """What is wrong with what was said on standard error, if anything is."""
+def lines_fault(text: str) -> tuple[str, str]:
+    """What is wrong with what was said on standard error, in general and in full; empty where nothing is."""
     for line in text.split("\n"):
-        if line.startswith("Traceback") or "Warning:" in line:
-            return f"on standard error: {line[:200]!r}"
-        if line and not line.isprintable():
-            return f"control characters on standard error: {line[:200]!r}"
-        if len(line) > LONGEST:
-            return f"a line of {len(line):,} characters on standard error: {line[:100]!r}..."
-        if line.startswith("::"):
-            return f"what a CI would take for a command, on standard error: {line[:200]!r}"
-    return ""
+        fault = ""
+        if line.startswith("Traceback"):
+            fault = "a traceback"
+        elif "Warning:" in line:
+            fault = "a warning"
+        elif line and not line.isprintable():
+            fault = "control characters"
+        elif len(line) > LONGEST:
+            fault = "a long line"
+        elif line.startswith("::"):
+            fault = "what a CI takes for a command"
+        if fault:
+            return f"{fault} on standard error", f"{fault} on standard error, {len(line):,} characters: {line[:200]!r}"
+    return "", ""
 
 
 def error_fault(error: SparklodError) -> str:
@@ -95,7 +100,7 @@ def error_fault(error: SparklodError) -> str:
     said = STREAMS.take()[1].decode("utf-8", "backslashreplace").removesuffix("\n")
     if not str(error).strip():
         return "the message is empty"
-    return f"more than a line on standard error: {said!r:.300}" if "\n" in said else lines_fault(said)
+    return f"more than a line on standard error: {said!r:.300}" if "\n" in said else lines_fault(said)[1]
 
 
 def run(target: Target, case: Case, folder: Path, watched: Watched) -> Result:
@@ -118,7 +123,7 @@ def run(target: Target, case: Case, folder: Path, watched: Watched) -> Result:
             elif "memory" in str(error):
                 finding = Finding("memory", str(error), where_of(error.__traceback__), traceback.format_exc())
         except LawError as error:
-            finding = Finding("law", str(error).splitlines()[0][:300], "", str(error))
+            finding = Finding("law", str(error).splitlines()[0][:300], error.fault, str(error))
         except BaseException as error:
             text = f"{type(error).__name__}: {error}".splitlines()[0][:300]
             where = f"{type(error).__name__} in {where_of(error.__traceback__)}"

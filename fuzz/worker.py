@@ -47,7 +47,7 @@ def main() -> None:
 
     STREAMS.redirect()
     caches = [Path(os.environ["XDG_CACHE_HOME"]) / "sparklod", Path(os.environ.get("NUMBA_CACHE_DIR") or temporary)]
-    watched = Watched([temporary, Path("/dev"), Path("/proc"), *caches])
+    watched = Watched([temporary, given.scratch / "matplotlib", Path("/dev"), Path("/proc"), *caches])
     limited = False
     with os.fdopen(given.requests) as requests, os.fdopen(given.results, "w") as results:
         for line in requests:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 from sparklod_cli.limits import ENCODINGS, MAX_BASE, MAX_GROWTH, METHODS, MIN_BASE, MIN_GROWTH
@@ -48,5 +49,8 @@ def check(case: Case, folder: Path) -> None:
         checked = command(["inspect", output.name, "--check", "--leaves-of", file])
         if checked.code:
             findings = checked.out.decode(errors="replace") + checked.err
-            first = (findings.splitlines() or ["nothing"])[0]
-            raise LawError(f"our own check of our own bake: {first}\n{case.what}\n{findings}")
+            lines = findings.splitlines() or ["nothing"]
+            first = next((line for line in lines if "error:" in line), lines[0])
+            code = re.search(r"(error|warning): ([\w.-]+):", first)
+            text = f"our own check of our own bake: {first}\n{case.what}\n{findings}"
+            raise LawError(text, f"a bake fails its check: {code[2] if code else first}")

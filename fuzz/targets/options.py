@@ -32,6 +32,8 @@ OUTPUTS = (
     *("out.json", "out.html", "out.%04d.png", "out", "new/out.spz", "-", "", ".", "/dev/null", "tree.spz", "scene.ply"),
     *("out\x1b[31m.spz", "out\n::error::.spz", "n" * 300, "scene.json", "out.parquet", "out.xlsx", "out.%d.%d.png"),
 )
+PAGES = ("out.html", "out.html", "-", "", ".", "new/out.html", "/dev/null", "tree.spz", "expect.toml", "out\n.html")
+PLOTS = ("out.png", "out.png", "-", "", ".", "new/out.png", "/dev/null", "tree.spz", "path.csv", "out\x1b[31m.png")
 FOLDERS = ("new", "new/er", ".", "tree.spz", "")
 
 #: Values by the name of an option; sizes and numbers of frames are small, since much work is no fault.
@@ -62,8 +64,8 @@ VALUES: dict[str, Sequence[str]] = {
     "rgba": FILES,
     "diff": FILES,
     "output": OUTPUTS,
-    "html": OUTPUTS,
-    "plot": OUTPUTS,
+    "html": PAGES,
+    "plot": PLOTS,
     "output_dir": FOLDERS,
     "indices_out": FOLDERS,
 }
@@ -99,7 +101,7 @@ def make(rng: Rng) -> Case:
     files |= {"tree.spz": tree(), "scene.json": SCENE, "expect.toml": EXPECT}
     files |= {path: data for group in groups().values() for path, data in group.items()}
     files["path.csv"] = (FIXTURES / "cameras" / "sparklod.csv").read_bytes()
-    return Case(" ".join(line)[:300], files, {"arguments": line})
+    return Case(" ".join(word[:40] for word in line)[:300], files, {"arguments": line})
 
 
 def _option(rng: Rng, option: click.Option) -> list[str]:
