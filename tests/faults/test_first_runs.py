@@ -9,7 +9,7 @@ from pathlib import Path
 from ..conftest import ROOT
 from .runs import ENVIRONMENT
 
-#: A small set of kernels, one of them parallel and all of them cached; says how many were compiled, and what came of it.
+#: A small set of kernels, called from one another; says how many were compiled, and what came of it.
 SCRIPT = """
 import numpy as np
 from numba.core import event

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import random
 import subprocess
 import sys
@@ -64,7 +63,7 @@ def is_writing(process: int, folder: Path) -> bool:
     with contextlib.suppress(OSError):
         for descriptor in Path(f"/proc/{process}/fd").iterdir():
             with contextlib.suppress(OSError):
-                if os.readlink(descriptor).startswith(f"{folder}/"):
+                if str(descriptor.readlink()).startswith(f"{folder}/"):
                     return True
     return False
 
