@@ -1,9 +1,10 @@
-"""The decoders under atheris, which follows the branches that an input takes (pip install atheris; Linux, CPython 3.11+).
+"""The decoders under atheris, which follows the branches that an input takes.
 
     python -m fuzz.atheris_decoders -max_total_time=600 corpus/
 
-The first byte of an input chooses the format, so that sniffing is no obstacle; `--seeds DIR` writes the seeds of the other
-fuzzers in this form and ends. Numba's kernels are compiled, and not followed.
+`pip install atheris` first, which is there for Linux. The first byte of an input chooses the format, so that sniffing is
+no obstacle; `--seeds DIR` writes the seeds of the other fuzzers in this form and ends. Kernels are compiled, and not
+followed.
 """
 
 from __future__ import annotations

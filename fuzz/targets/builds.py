@@ -37,7 +37,7 @@ def make(rng: Rng) -> Case:
 
 
 def check(case: Case, folder: Path) -> None:
-    """What is written with exit code 0 passes `inspect --check --leaves-of`, without so much as a warning of its tree."""
+    """What is written with exit code 0 passes `inspect --check --leaves-of`, without a warning of its tree."""
     file, output = case.run["file"], folder / case.run["output"]
     done = command(["build-lod", file, "-o", output.name, *case.run["options"]])
     if done.code:
