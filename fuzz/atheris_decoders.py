@@ -1,6 +1,6 @@
 """The decoders under atheris, which follows the branches that an input takes.
 
-    python -m fuzz.atheris_decoders -max_total_time=600 corpus/
+    python -m fuzz.atheris_decoders -max_total_time=600 corpus
 
 `pip install atheris` first, which is there for Linux. The first byte of an input chooses the format, so that sniffing is
 no obstacle; `--seeds DIR` writes the seeds of the other fuzzers in this form and ends. Kernels are compiled, and not
@@ -60,7 +60,7 @@ def main() -> None:
         write_seeds(Path(sys.argv[sys.argv.index("--seeds") + 1]))
         return
     try:
-        import atheris  # type: ignore[import-not-found]
+        import atheris
     except ImportError:
         sys.exit("atheris is not installed: pip install atheris")
     for form in FORMATS:

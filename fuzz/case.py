@@ -101,7 +101,7 @@ class Target(Protocol):
 def target_of(name: str) -> Target:
     """A target's module; a name with a dot is that of any module, for one that is only tried out."""
     module: Any = import_module(name if "." in name else f"fuzz.targets.{name}")
-    return module  # type: ignore[no-any-return]
+    return module
 
 
 def case_of(name: str, seed: int, number: int) -> Case:

@@ -133,7 +133,8 @@ def _picture(rng: Rng, data: bytes) -> bytes:
     if kind == 0:
         pixels = pixels[: int(rng.integers(1, len(pixels) + 1)), : int(rng.integers(1, pixels.shape[1] + 1))]
     elif kind == 1:
-        return by_hand_sog.flat_webp(*(int(pick(rng, [n for n in INTEGERS if 1 <= n <= 16384])) for _ in range(2)))
+        sides = [number for number in INTEGERS if 1 <= number <= 16384]
+        return by_hand_sog.flat_webp(pick(rng, sides), pick(rng, sides))
     elif kind == 2:
         pixels[..., int(rng.integers(4))] = int(rng.integers(256))
     elif kind == 3:

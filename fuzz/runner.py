@@ -132,16 +132,10 @@ def _one(process: Child, tally: Tally, seed: int, number: int, keep: Path | None
 
 def table(tallies: Sequence[Tally]) -> str:
     """For people: a line a target, and one for each fault."""
-    rows = [("target", "cases", "refused", "findings", "faults", "seconds")]
+    rows = [["target", "cases", "refused", "findings", "faults", "seconds"]]
     for tally in tallies:
-        faults = len(tally.by_fault())
-        rows.append(
-            (
-                tally.target,
-                *(f"{number:,}" for number in (tally.cases, tally.refused, len(tally.found), faults)),
-                f"{tally.seconds:.1f}",
-            )
-        )
+        numbers = (tally.cases, tally.refused, len(tally.found), len(tally.by_fault()))
+        rows.append([tally.target, *(f"{number:,}" for number in numbers), f"{tally.seconds:.1f}"])
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = [
         "  ".join(

@@ -25,14 +25,14 @@ def extreme(rng: Rng) -> Columns:
     """Columns of splats as `by_hand.ply_columns` takes them, from one splat to two hundred."""
     count = int(pick(rng, (1, 2, 3, 5, 17, 60, 200)))
     sh = int(pick(rng, (0, 0, 3, 8, 15)))
-    center = rng.normal(size=(count, 3)) * pick(rng, EXTENTS)
+    center: NDArray[np.float64] = rng.normal(size=(count, 3)) * pick(rng, EXTENTS)
     layout = int(rng.integers(7))
     if layout == 0:
         center[:, int(rng.integers(3))] = pick(rng, EXTENTS)
     elif layout == 1:
         center[:] = center[0]
     elif layout == 2:
-        center = rng.integers(-1, 2, (count, 3)) * pick(rng, EXTENTS)
+        center[:] = rng.integers(-1, 2, (count, 3)) * pick(rng, EXTENTS)
     elif layout == 3:
         center[: count // 2] *= 1e-6
     values = {

@@ -6,6 +6,7 @@ import functools
 from collections import defaultdict
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -48,7 +49,7 @@ def make(rng: Rng) -> Case:
     name = pick(rng, list(files))
     files[name] = changed(rng, name, files[name])
     names = [form.name for form in FORMATS]
-    run = {
+    run: dict[str, Any] = {
         "path": path,
         "format": pick(rng, (None, None, None, pick(rng, names))),
         "every": int(pick(rng, (1, 1, 2, 1000))),

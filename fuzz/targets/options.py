@@ -85,6 +85,7 @@ def make(rng: Rng) -> Case:
     """A command, one or more files, and up to six options."""
     name = pick(rng, list(cli.COMMANDS))
     wanted = cli.cli.get_command(click.Context(cli.cli), name)
+    assert wanted is not None
     options = [each for each in wanted.params if isinstance(each, click.Option) and each.name not in LEFT_OUT]
     line = [name]
     for _ in range(int(rng.integers(7))):

@@ -29,7 +29,7 @@ WRITERS: dict[str, tuple[Sequence[object], str]] = {
     "build-lod": (["build-lod", DEMO, "-o"], "demo.spz"),
     "traverse": (["traverse", TREE, "--orbit", "300", "--no-timing", "-o"], "table.csv"),
     "render": (["render", TREE, "--size", "320x200", "-o"], "picture.png"),
-    "inspect": (["inspect", TREE, "--html"], "page.html"),
+    "inspect": (["inspect", TREE, "-q", "--html"], "page.html"),
 }
 
 
