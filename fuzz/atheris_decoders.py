@@ -2,8 +2,8 @@
 
     python -m fuzz.atheris_decoders -max_total_time=600 corpus
 
-`pip install atheris` first, which is there for Linux. The first byte of an input chooses the format, so that sniffing is
-no obstacle; `--seeds DIR` writes the seeds of the other fuzzers in this form and ends. Kernels are compiled, and not
+`pip install atheris` first, which is there for Linux. The first byte of an input chooses the format, so that sniffing
+is no obstacle; `--seeds DIR` writes the seeds of the other fuzzers in this form and ends. Kernels are compiled, and not
 followed.
 """
 
