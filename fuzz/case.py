@@ -43,7 +43,8 @@ class Case:
     Attributes:
         what: how it was made, for people.
         files: bytes by the name in the case's folder, with / between folders.
-        run: what else the target's `check` must know; plain values, as JSON has them.
+        run: what else the target's `check` must know; plain values, as JSON has them. `replaced` names files that a
+            command may replace; all others keep their bytes.
     """
 
     what: str

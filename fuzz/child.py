@@ -21,7 +21,7 @@ from .oracle import Finding
 ROOT = Path(__file__).resolve().parents[1]
 
 #: Seconds that a case may take; and the first of a process, or one that is tried again: these may compile kernels.
-LIMIT, PATIENCE = 10.0, 180.0
+LIMIT, PATIENCE = 10.0, 300.0
 
 
 class Child:

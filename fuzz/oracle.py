@@ -146,11 +146,12 @@ def _all_faults(case: Case, folder: Path, warned: list[warnings.WarningMessage],
         yield Finding("stream", f"said on its own: {text!r:.300}")
     for text in watched.outside:
         yield Finding("files", text)
+    replaced = case.run.get("replaced", ())
     for path in sorted(folder.rglob("*")):
         name = str(path.relative_to(folder))
         if TEMPORARY.fullmatch(path.name):
             yield Finding("files", f"a temporary file is left: {name!r}", "a temporary file is left")
-        elif path.is_file() and name in case.files and path.read_bytes() != case.files[name]:
+        elif path.is_file() and name in case.files and name not in replaced and path.read_bytes() != case.files[name]:
             yield Finding("files", f"an input was changed: {name!r}", "an input was changed")
         elif path.is_file() and path.stat().st_size > OUTPUT + OUTPUT_A_BYTE * case.size:
             yield Finding("files", f"{name!r} has {path.stat().st_size:,} bytes, of {case.size:,}", "a large output")

@@ -77,6 +77,8 @@ NUMBERS = (
 SCENE = json.dumps({"instances": [{"file": "tree.spz"}, {"file": "tree.spz", "translation": [3, 0, 0]}]}).encode()
 EXPECT = b'lod = true\nmax_growth = 1.5\n[values]\n"tree.leaves" = 5\n'
 
+OUTPUT_OPTIONS = ("-o", "--output", "--html", "--plot")
+
 #: What ends a run before anything is tried.
 LEFT_OUT = {"version", "help"}
 
@@ -102,7 +104,17 @@ def make(rng: Rng) -> Case:
     files |= {"tree.spz": tree(), "scene.json": SCENE, "expect.toml": EXPECT}
     files |= {path: data for group in groups().values() for path, data in group.items()}
     files["path.csv"] = (FIXTURES / "cameras" / "sparklod.csv").read_bytes()
-    return Case(" ".join(word[:40] for word in line)[:300], files, {"arguments": line})
+    what = " ".join(word[:40] for word in line)[:300]
+    return Case(what, files, {"arguments": line, "replaced": _replaced(line, list(files))})
+
+
+def _replaced(line: list[str], files: list[str]) -> list[str]:
+    """Files that --overwrite may replace: named as an output, and nothing that is read."""
+    if "--overwrite" not in line:
+        return []
+    read = {"tree.spz"} if "scene.json" in line else set()
+    outputs = {word for option, word in zip(line, line[1:], strict=False) if option in OUTPUT_OPTIONS}
+    return [name for name in files if name in outputs and line.count(name) == 1 and name not in read]
 
 
 def _option(rng: Rng, option: click.Option) -> list[str]:
