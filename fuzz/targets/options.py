@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -113,7 +114,7 @@ def _replaced(line: list[str], files: list[str]) -> list[str]:
     if "--overwrite" not in line:
         return []
     read = {"tree.spz"} if "scene.json" in line else set()
-    outputs = {word for option, word in zip(line, line[1:], strict=False) if option in OUTPUT_OPTIONS}
+    outputs = {word for option, word in itertools.pairwise(line) if option in OUTPUT_OPTIONS}
     return [name for name in files if name in outputs and line.count(name) == 1 and name not in read]
 
 
