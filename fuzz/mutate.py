@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import math
 import re
@@ -195,22 +196,27 @@ def _below(value: Any) -> Iterator[tuple[Any, Any]]:
     return ((value, key) for key in keys)
 
 
+def _value(rng: Rng) -> Any:
+    """A copy: what a case changes must not be there for the next."""
+    return copy.deepcopy(pick(rng, VALUES))
+
+
 def _change(rng: Rng, holder: Any, key: Any) -> None:
     kind, value = int(rng.integers(10)), holder[key]
     if kind <= 3:
-        holder[key] = pick(rng, VALUES)
+        holder[key] = _value(rng)
     elif kind == 4:
         if isinstance(holder, list) or key:
             del holder[key]
     elif kind == 5:
-        holder[key] = pick(rng, ([value], {"a": value}, [value, value]))
+        holder[key] = pick(rng, ([value], {"a": value}, [value, copy.deepcopy(value)]))
     elif kind == 6 and isinstance(value, list):
         holder[key] = pick(rng, (value[:1], value[1:], value * 2, value[::-1], value * 50))
     elif kind == 7 and type(value) in (int, float) and abs(value) < 1e300:
         holder[key] = pick(rng, (-value, value * 1e30, value * 1e-30, value + 1, str(value), 0))
     elif kind == 8 and isinstance(value, dict):
-        value[str(pick(rng, WORDS))] = pick(rng, VALUES)
+        value[str(pick(rng, WORDS))] = _value(rng)
     elif kind == 9 and isinstance(holder, dict) and key:
         holder[str(pick(rng, WORDS))] = holder.pop(key)
     else:
-        holder[key] = pick(rng, VALUES)
+        holder[key] = _value(rng)

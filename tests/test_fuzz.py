@@ -105,6 +105,13 @@ def test_a_case_is_the_same_whenever_it_is_asked_for(target: str) -> None:
     assert digest(case_of(target, 7, 4)) != digest(case_of(target, 7, 3)) != digest(case_of(target, 8, 3))
 
 
+@pytest.mark.parametrize("target", TARGETS)
+def test_cases_do_not_depend_on_those_before(target: str) -> None:
+    forwards = {number: digest(case_of(target, 1, number)) for number in range(150)}
+    backwards = {number: digest(case_of(target, 1, number)) for number in reversed(range(150))}
+    assert forwards == backwards
+
+
 def digest(case: Case) -> str:
     text = json.dumps([case.what, sorted((name, data.hex()) for name, data in case.files.items()), dict(case.run)])
     return hashlib.sha256(text.encode()).hexdigest()
