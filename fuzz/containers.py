@@ -1,0 +1,145 @@
+"""What lies under the compression of splat files, part by part, and the way back: faults that no checksum finds."""
+
+from __future__ import annotations
+
+import functools
+import gzip
+import io
+import struct
+import zipfile
+import zlib
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+import zstandard
+from PIL import Image
+
+from fixtures import by_hand, by_hand_sog
+
+from .case import Rng
+from .mutate import INTEGERS, json_mutated, mutated, pick, text_mutated
+
+FIXTURES = Path(__file__).resolve().parents[1] / "fixtures"
+
+#: Small files of every format: good ones, and some that are broken already, whose changes lead elsewhere.
+PATTERNS = ("one.ply", "sh[0-3]*.ply", "flat.ply", "golden/*.*", "faults/*.*")
+LARGEST = 32_000
+
+#: Bytes that say what the others mean, at most.
+HEADER = 120
+
+#: What reading a broken container raises.
+BROKEN = (EOFError, OSError, ValueError, struct.error, zipfile.BadZipFile, zlib.error, zstandard.ZstdError)
+
+Parts = Mapping[str, bytes]
+
+
+@functools.cache
+def seeds() -> Mapping[str, bytes]:
+    """Files to begin with, by name."""
+    paths = sorted({path for pattern in PATTERNS for path in FIXTURES.glob(pattern) if path.is_file()})
+    files = {str(path.relative_to(FIXTURES)): path.read_bytes() for path in paths}
+    return {name: data for name, data in files.items() if len(data) <= LARGEST}
+
+
+@functools.cache
+def good() -> tuple[str, ...]:
+    """Names of the seeds that nothing is wrong with."""
+    return tuple(name for name in seeds() if not name.startswith("faults/"))
+
+
+def folder_seed() -> dict[str, bytes]:
+    """The files of an unpacked SOG."""
+    return {path.name: path.read_bytes() for path in sorted((FIXTURES / "golden" / "sh1-sog").iterdir())}
+
+
+def opened(data: bytes) -> tuple[Parts, Callable[[Parts], bytes]]:
+    """The parts of a file, and what puts it together again around others."""
+    try:
+        if data[:2] == b"\x1f\x8b":
+            raw = gzip.decompress(data)
+            return {"header": raw[:16], "payload": raw[16:]}, _gzipped
+        if data[:4] == b"NGSP":
+            return _spz_4(data)
+        if data[:4] == b"PK\x03\x04":
+            with zipfile.ZipFile(io.BytesIO(data)) as archive:
+                return {name: archive.read(name) for name in archive.namelist()}, by_hand_sog.zipped
+    except BROKEN:
+        return {"file": data}, _joined  # it is broken already
+    end = data.find(b"end_header\n") + 11 if data[:3] == b"ply" else 0
+    return ({"text": data[:end], "payload": data[end:]} if end > 11 else {"file": data}), _joined
+
+
+def _joined(parts: Parts) -> bytes:
+    return b"".join(parts.values())
+
+
+def _gzipped(parts: Parts) -> bytes:
+    return gzip.compress(_joined(parts), 1, mtime=0)
+
+
+def _spz_4(data: bytes) -> tuple[Parts, Callable[[Parts], bytes]]:
+    count, at = data[15], struct.unpack_from("<I", data, 16)[0]
+    parts, end = {"header": data[:at]}, at + 16 * count
+    for index in range(count):
+        packed, size = struct.unpack_from("<QQ", data, at + 16 * index)
+        frame = zstandard.ZstdDecompressor().decompress(data[end : end + packed], max_output_size=min(size, 1 << 20))
+        parts[f"stream {index}"] = frame
+        end += packed
+
+    def joined(parts: Parts) -> bytes:
+        header, *streams = parts.values()
+        frames = [by_hand.zstd_stored(stream[: 1 << 17]) for stream in streams]
+        table = b"".join(
+            struct.pack("<QQ", len(frame), len(stream)) for frame, stream in zip(frames, streams, strict=True)
+        )
+        return b"".join([header, table, *frames])
+
+    return parts, joined
+
+
+def mutated_scene(rng: Rng, data: bytes, other: bytes) -> tuple[str, bytes]:
+    """A splat file after changes to its bytes, or to what lies under its compression; and which of the two."""
+    parts, joined = opened(data)
+    if len(parts) == 1 or rng.integers(3) == 0:
+        return "bytes", mutated(rng, data, other=other, header=HEADER)
+    changed = dict(parts)
+    long = [name for name in parts if name not in ("header", "text", "meta.json")]
+    for _ in range(int(pick(rng, (1, 1, 2)))):
+        name = pick(rng, long if rng.integers(2) else list(parts))
+        changed[name] = mutated_part(rng, name, parts[name])
+    return "inside", joined(changed)
+
+
+def mutated_part(rng: Rng, name: str, data: bytes) -> bytes:
+    """A part of a splat file after changes that suit it: a header's text, a JSON's structure, an image's pixels."""
+    if name.endswith(".json") and rng.integers(4):
+        return json_mutated(rng, data)
+    if name.endswith(".webp") and rng.integers(3):
+        return _picture(rng, data)
+    if name == "text" and rng.integers(3):
+        return text_mutated(rng, data.decode("utf-8", "replace")).encode("utf-8", "replace")
+    return mutated(rng, data, header=16 if name == "header" else 0)
+
+
+def _picture(rng: Rng, data: bytes) -> bytes:
+    try:
+        with Image.open(io.BytesIO(data)) as image:
+            pixels = np.asarray(image.convert("RGBA")).copy()
+    except (OSError, ValueError, Image.DecompressionBombError):
+        return mutated(rng, data)
+    kind = int(rng.integers(6))
+    if kind == 0:
+        pixels = pixels[: int(rng.integers(1, len(pixels) + 1)), : int(rng.integers(1, pixels.shape[1] + 1))]
+    elif kind == 1:
+        sides = [number for number in INTEGERS if 1 <= number <= 16384]
+        return by_hand_sog.flat_webp(pick(rng, sides), pick(rng, sides))
+    elif kind == 2:
+        pixels[..., int(rng.integers(4))] = int(rng.integers(256))
+    elif kind == 3:
+        return by_hand_sog.webp(np.ascontiguousarray(pixels[..., :3]))
+    else:
+        flat = pixels.reshape(-1)
+        flat[rng.integers(len(flat), size=20)] = rng.integers(0, 256, 20)
+    return by_hand_sog.webp(np.ascontiguousarray(pixels))

@@ -1,0 +1,75 @@
+"""Laws about what sparklod gives, whatever it was given."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from sparklod_cli.commands.inspect_text import finding_line
+from sparklod_cli.errors import FormatError, InvalidSplatsError
+from sparklod_cli.inspection import report
+from sparklod_cli.io import read_scene
+from sparklod_cli.scene import Scene
+from sparklod_cli.selection import Selection
+from sparklod_cli.splats import COLUMNS
+
+from .case import LawError
+from .oracle import lines_fault
+
+
+def scene_holds(scene: Scene) -> None:
+    """What was read can be drawn, after what cannot is left out; `Splats` itself checks shapes and types."""
+    if scene.tree is not None:
+        scene.tree.validate()
+        if len(scene.tree) != len(scene.splats):
+            raise LawError("the tree has other nodes than there are splats")
+    try:
+        kept, _ = Selection(drop_invalid=True).apply(scene.splats)
+    except InvalidSplatsError:
+        return
+    for column in COLUMNS:
+        if not np.isfinite(getattr(kept, column)).all():
+            raise LawError(f"{column} has values that are not finite after --on-invalid drop")
+    if not (kept.scale >= 0).all():
+        raise LawError("negative scales are left after --on-invalid drop")
+    if not (kept.opacity >= 0).all():
+        raise LawError("negative opacities are left after --on-invalid drop")
+
+
+def report_holds(path: Path) -> None:
+    """Whatever a file is, there is a report of it, which is JSON, and its findings are lines that can be shown."""
+    found, _ = report.inspect(path, report.Wanted(True, True, True), threads=2)
+    try:
+        json.dumps(found.as_dict(), allow_nan=False)
+    except ValueError as error:
+        raise LawError(f"the report is not JSON: {error}") from None
+    for finding in found.findings or []:
+        fault, text = lines_fault(finding_line(str(path), finding, "text"))
+        if fault:
+            raise LawError(f"of a finding, {text}", f"{fault}, of {finding.code}")
+
+
+def output_holds(path: Path) -> None:
+    """A file that a command wrote is whole, as its name says what it is."""
+    data = path.read_bytes()
+    try:
+        if path.suffix == ".spz":
+            scene_holds(read_scene(path))
+        elif path.suffix in (".png", ".webp", ".gif"):
+            Image.open(io.BytesIO(data)).load()
+        elif path.suffix in (".npy", ".npz"):
+            arrays = np.load(io.BytesIO(data))
+            for array in arrays.values() if path.suffix == ".npz" else [arrays]:
+                assert array.size >= 0
+        elif path.suffix == ".json":
+            json.loads(data)
+        elif path.suffix == ".html" and not data.rstrip().endswith(b"</html>"):
+            raise LawError("the page ends early")
+        elif path.suffix == ".csv" and not data.endswith(b"\n"):
+            raise LawError("the table ends in the middle of a line")
+    except (FormatError, OSError, ValueError, EOFError) as error:
+        raise LawError(f"what was written is not whole: {path.name!r:.60}: {error}", f"output {path.suffix}") from None

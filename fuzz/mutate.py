@@ -1,0 +1,222 @@
+"""Changes to bytes, texts and JSON, from a flipped bit to what no writer would write."""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+import re
+import struct
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, TypeVar
+
+from .case import Rng
+
+T = TypeVar("T")
+
+#: How many changes, most often one: what is changed a lot is refused for the first of them.
+CHANGES = (1, 1, 1, 1, 2, 2, 3, 4)
+INTEGERS = (
+    *(0, 1, 2, 3, 4, 5, 7, 8, 15, 16, 24, 31, 32, 64, 127, 128, 255, 256, 1000, 4095, 4096, 32767, 32768, 65535, 65536),
+    *(65537, 1 << 20, (1 << 24) - 1, 1 << 24, (1 << 31) - 1, 1 << 31, (1 << 32) - 2, (1 << 32) - 1, 1 << 32, 1 << 40),
+    *((1 << 63) - 1, (1 << 64) - 1),
+)
+FLOATS = (
+    *(math.nan, math.inf, -math.inf, 0.0, -0.0, -1.0, 1.0, 0.5, 1e-45, 1e-30, 1e30, 1e38, -1e38, 3.4e38, -3.4e38),
+    *(-0.02, 65504.0, 8388607.0, -8388607.0, 8388608.0, 1e7),
+)
+WORDS = (
+    *("0", "-1", "1", "2", "nan", "NaN", "inf", "-Infinity", "1e38", "-1e38", "1e308", "1e999", "1e-320", "0.0", "-0"),
+    *(
+        "99999999999999999999",
+        "4294967295",
+        "4294967296",
+        "65536",
+        "9" * 500,
+        "9" * 5000,
+        "0x10",
+        "1_000",
+        "\uff11",
+        "\u00bd",
+    ),
+    *("", " ", "\t", "\n", "\r", "\0", "\x1b[31m", "\x07", "\u2028", "\u202e", "::error::oops", "=1+1", "é", "\ufeff"),
+    *("null", "true", "{", "}", "[", "]", ",", ":", ";", '"', "'", "#", "//", "a" * 8000, "../../x", "/dev/zero", "%s"),
+    *("element vertex 3\n", "property float x\n", "property list uchar int v\n", "format ascii 1.0\n", "end_header\n"),
+)
+#: Takes the place of what `json.dumps` cannot write.
+DEEP, DIGITS, LONE = "@deep@", "@digits@", "@lone@"
+VALUES: tuple[Any, ...] = (
+    *(None, True, False, 0, 1, -1, 2, 0.5, -0.02, 1e-300, 1e12, 1e38, -1e38, 1e300, 1e308, -1e308, math.nan, math.inf),
+    *(1 << 31, 1 << 32, 1 << 53, 1 << 64, 10**400, 65536, 255, 256, 1000, 1e7),
+    *("", "0", "1e5", "nan", "a", "x\ny", "\x1b]0;x\x07", "::error::x", "=cmd|'/C calc'!A0", "é" * 300, "a" * 8000),
+    *("../up", "/etc/passwd", ".", "..", "a\0b", "C:x", DEEP, DIGITS, LONE),
+    *([], {}, [[]], [0] * 3, [0] * 16, [1, 2], [None], {"": 0}, [math.nan] * 3, [1e308] * 4),
+)
+
+
+def pick(rng: Rng, options: Sequence[T]) -> T:
+    """One of them."""
+    return options[int(rng.integers(len(options)))]
+
+
+def place(rng: Rng, length: int, header: int) -> int:
+    """Somewhere in a file, half of the time in its header."""
+    reach = min(header, length) if header and rng.integers(2) else length
+    return int(rng.integers(reach + 1))
+
+
+def mutated(rng: Rng, data: bytes, *, other: bytes = b"", header: int = 0) -> bytes:
+    """The bytes after one to four changes.
+
+    Args:
+        rng: of the case.
+        data: what to change.
+        other: what to splice in.
+        header: how many of the first bytes say what the others mean.
+    """
+    changed = bytearray(data)
+    for _ in range(int(pick(rng, CHANGES))):
+        pick(rng, BYTES)(rng, changed, other or data, place(rng, len(changed), header))
+    return bytes(changed)
+
+
+def _flip(rng: Rng, data: bytearray, other: bytes, at: int) -> None:
+    if at < len(data):
+        data[at] ^= 1 << int(rng.integers(8))
+
+
+def _byte(rng: Rng, data: bytearray, other: bytes, at: int) -> None:
+    data[at : at + 1] = bytes([pick(rng, (0, 1, 2, 3, 4, 7, 9, 127, 128, 255, int(rng.integers(256))))])
+
+
+def _integer(rng: Rng, data: bytearray, other: bytes, at: int) -> None:
+    form = pick(rng, ("<H", "<I", "<I", "<Q", ">I"))
+    size = struct.calcsize(form)
+    at -= at % size * int(rng.integers(2))
+    value = pick(rng, INTEGERS)
+    if at + size <= len(data):
+        if rng.integers(3) == 0:
+            value = struct.unpack_from(form, data, at)[0] + int(rng.integers(-2, 3))
+        struct.pack_into(form, data, at, value & ((1 << 8 * size) - 1))
+
+
+def _float(rng: Rng, data: bytearray, other: bytes, at: int) -> None:
+    at -= at % 4 * int(rng.integers(4) > 0)
+    step = 4 * int(rng.integers(1, 20))
+    value = struct.pack("<f", pick(rng, FLOATS))
+    for index in range(int(pick(rng, (1, 1, 1, 3, 20)))):
+        if at + index * step + 4 <= len(data):
+            data[at + index * step : at + index * step + 4] = value
+
+
+def _delete(rng: Rng, data: bytearray, other: bytes, at: int) -> None:
+    del data[at : at + int(pick(rng, (1, 2, 4, 8, 16, 32, 100)))]
+
+
+def _truncate(rng: Rng, data: bytearray, other: bytes, at: int) -> None:
+    if rng.integers(3) == 0:
+        del data[at:]
+
+
+def _extend(rng: Rng, data: bytearray, other: bytes, at: int) -> None:
+    data += rng.bytes(int(pick(rng, (1, 4, 32, 1000)))) if rng.integers(2) else bytes(data)
+
+
+def _insert(rng: Rng, data: bytearray, other: bytes, at: int) -> None:
+    data[at:at] = pick(rng, WORDS).encode() if rng.integers(2) else rng.bytes(int(rng.integers(1, 40)))
+
+
+def _copy(rng: Rng, data: bytearray, other: bytes, at: int) -> None:
+    start, width = int(rng.integers(len(data) + 1)), int(pick(rng, (1, 4, 16, 32, 200)))
+    data[at : at + width] = data[start : start + width]
+
+
+def _splice(rng: Rng, data: bytearray, other: bytes, at: int) -> None:
+    start = int(rng.integers(len(other) + 1))
+    if rng.integers(2):
+        data[at:] = other[start:]
+    else:
+        data[at : at + 64] = other[start : start + 64]
+
+
+BYTES: tuple[Callable[[Rng, bytearray, bytes, int], None], ...] = (
+    *(_flip, _flip, _byte, _byte, _integer, _integer, _integer, _float, _float),
+    *(_delete, _truncate, _extend, _insert, _copy, _splice),
+)
+
+
+def text_mutated(rng: Rng, text: str) -> str:
+    """A text after one to four changes to its words, numbers and lines."""
+    for _ in range(int(pick(rng, CHANGES))):
+        words = [(found.start(), found.end()) for found in re.finditer(r"[\w.+-]+|[^\w\s]", text)]
+        start, end = pick(rng, words) if words else (0, 0)
+        kind = int(rng.integers(6))
+        if kind <= 2:
+            text = text[:start] + pick(rng, WORDS) + text[end:]
+        elif kind == 3:
+            text = text[:start] + text[end:]
+        elif kind == 4:
+            again, last = pick(rng, words) if words else (0, 0)
+            text = text[:start] + text[again:last] + text[start:]
+        else:
+            lines = text.splitlines(keepends=True) or [""]
+            at = int(rng.integers(len(lines)))
+            lines[at : at + 1] = pick(rng, ([], [lines[at]] * 2, [lines[at]] * 200, [lines[at], "\n"]))
+            text = "".join(lines)
+    return text
+
+
+def json_mutated(rng: Rng, data: bytes) -> bytes:
+    """JSON after one to four changes of its structure; now and then of its text, too."""
+    root = {"": json.loads(data)}
+    for _ in range(int(pick(rng, CHANGES))):
+        # Not all of a long list alike: what is near the root is rarer and matters more.
+        way = [(root, "")]
+        while True:
+            holder, key = way[-1]
+            below = list(_below(holder[key]))
+            if not below or rng.integers(5) == 0:
+                break
+            way.append(pick(rng, below))
+        _change(rng, *pick(rng, way[-2:]))
+    return json_text(rng, root.get(""))
+
+
+def json_text(rng: Rng, value: Any) -> bytes:
+    """JSON of a value, with what `json.dumps` cannot write in the place of `DEEP` and the like."""
+    text = json.dumps(value)
+    deep = int(pick(rng, (100, 900, 3000, 100_000)))
+    text = text.replace(f'"{DEEP}"', "[" * deep + "]" * deep).replace(f'"{DIGITS}"', "9" * 5000)
+    text = text.replace(LONE, "x\\ud800")
+    return mutated(rng, text.encode()) if rng.integers(12) == 0 else text.encode()
+
+
+def _below(value: Any) -> Iterator[tuple[Any, Any]]:
+    keys = value.keys() if isinstance(value, dict) else range(len(value)) if isinstance(value, list) else ()
+    return ((value, key) for key in keys)
+
+
+def _value(rng: Rng) -> Any:
+    """A copy: what a case changes must not be there for the next."""
+    return copy.deepcopy(pick(rng, VALUES))
+
+
+def _change(rng: Rng, holder: Any, key: Any) -> None:
+    kind, value = int(rng.integers(10)), holder[key]
+    if kind <= 3:
+        holder[key] = _value(rng)
+    elif kind == 4:
+        if isinstance(holder, list) or key:
+            del holder[key]
+    elif kind == 5:
+        holder[key] = pick(rng, ([value], {"a": value}, [value, copy.deepcopy(value)]))
+    elif kind == 6 and isinstance(value, list):
+        holder[key] = pick(rng, (value[:1], value[1:], value * 2, value[::-1], value * 50))
+    elif kind == 7 and type(value) in (int, float) and abs(value) < 1e300:
+        holder[key] = pick(rng, (-value, value * 1e30, value * 1e-30, value + 1, str(value), 0))
+    elif kind == 8 and isinstance(value, dict):
+        value[str(pick(rng, WORDS))] = _value(rng)
+    elif kind == 9 and isinstance(holder, dict) and key:
+        holder[str(pick(rng, WORDS))] = holder.pop(key)
+    else:
+        holder[key] = _value(rng)

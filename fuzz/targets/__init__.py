@@ -1,0 +1,1 @@
+"""What is fuzzed: a module a target, see `fuzz.case.Target`."""

@@ -1,0 +1,100 @@
+"""The process in which cases run; `fuzz.child` starts it, and another one when it dies.
+
+It reads requests, a JSON object a line, from one pipe and writes results to another. What kills it, and where it was
+when it was told to say so (SIGUSR1), goes to a log.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import faulthandler
+import json
+import os
+import re
+import resource
+import shutil
+import signal
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+#: Address space beyond what the process has at first: no case takes the whole machine.
+ADDRESS_SPACE = 4 << 30
+
+#: Packages that are not there for cases: slow to load, and they call into drivers.
+BLOCKED = ("pyvista", "open3d")
+
+
+def main() -> None:
+    """Runs cases until there are no more requests."""
+    parser = argparse.ArgumentParser()
+    for name in ("requests", "results", "log"):
+        parser.add_argument(f"--{name}", type=int)
+    parser.add_argument("--scratch", type=Path)
+    given = parser.parse_args()
+    log = os.fdopen(given.log, "w")
+    faulthandler.enable(log)
+    faulthandler.register(signal.SIGUSR1, log, all_threads=True)
+    sys.modules.update(dict.fromkeys(BLOCKED))  # type: ignore[arg-type]
+    temporary = given.scratch / "tmp"
+    temporary.mkdir(parents=True, exist_ok=True)
+    tempfile.tempdir = str(temporary)
+
+    from .oracle import Watched
+    from .streams import STREAMS
+
+    STREAMS.redirect()
+    caches = [Path(os.environ["XDG_CACHE_HOME"]) / "sparklod", Path(os.environ.get("NUMBA_CACHE_DIR") or temporary)]
+    watched = Watched([temporary, given.scratch / "matplotlib", Path("/dev"), Path("/proc"), *caches])
+    limited = False
+    with os.fdopen(given.requests) as requests, os.fdopen(given.results, "w") as results:
+        for line in requests:
+            answer = attempt(json.loads(line), given.scratch, watched)
+            results.write(json.dumps(answer) + "\n")
+            results.flush()
+            if not limited:  # what is large, such as LLVM, is there after the first
+                limited = True
+                _limit()
+
+
+def attempt(request: dict[str, Any], scratch: Path, watched: Any) -> dict[str, Any]:
+    """What came of one request."""
+    from .case import case_of, target_of, unpacked
+    from .oracle import Finding, run
+
+    folder = scratch / "case"
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    if "replay" in request:
+        name, case = unpacked(Path(request["replay"]))
+    else:
+        name = request["target"]
+        case = case_of(name, request["seed"], request["case"])
+    result = run(target_of(name), case, folder, watched)
+    os.chdir(scratch)
+    left = [path.name for path in (scratch / "tmp").iterdir()]
+    finding = result.finding
+    if left and finding is None:
+        finding = Finding("files", f"temporary files are left: {left[:3]}", "temporary files are left")
+        for path in (scratch / "tmp").iterdir():
+            shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink()
+    return {
+        "finding": finding and finding.plain(),
+        "outcome": result.outcome,
+        "seconds": result.seconds,
+        "what": case.what,
+    }
+
+
+def _limit() -> None:
+    with contextlib.suppress(OSError, ValueError):
+        found = re.search(r"VmSize:\s*(\d+) kB", Path("/proc/self/status").read_text())
+        if found:
+            most = (int(found[1]) << 10) + ADDRESS_SPACE
+            resource.setrlimit(resource.RLIMIT_AS, (most, resource.getrlimit(resource.RLIMIT_AS)[1]))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,115 @@
+"""Disks that are full and folders that cannot be written: an error of one line, and nothing under the final name."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+
+from .runs import DEMO, SMALL, TREE, WRITERS, mounted, said_one_error, shell, sparklod
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="Windows has other file systems")
+
+FULL = Path("/dev/full")
+needs_full = pytest.mark.skipif(not FULL.exists(), reason="there is no /dev/full here")
+
+#: Writers whose output is larger than a page of memory, the least that such a disk has.
+LARGE = {
+    "build-lod": WRITERS["build-lod"],
+    "traverse": WRITERS["traverse"],
+    "render": (["render", TREE, "--size", "320x200", "-o"], "picture.npy"),
+    "inspect": WRITERS["inspect"],
+}
+
+
+@pytest.mark.parametrize("name", LARGE)
+def test_a_full_disk(name: str, tmp_path: Path) -> None:
+    arguments, output = LARGE[name]
+    with mounted(tmp_path / "disk", "size=8k") as disk:
+        done = sparklod(*arguments, disk / output)
+        assert done.returncode == 1
+        line = said_one_error(done.stderr)
+        assert "no space left" in line
+        assert str(disk / output) in line
+        assert list(disk.iterdir()) == []
+
+
+def test_a_disk_that_fills_up_keeps_what_was_there(tmp_path: Path) -> None:
+    with mounted(tmp_path / "disk", "size=16k") as disk:
+        target = disk / "demo.spz"
+        shutil.copy(TREE, target)
+        done = sparklod("build-lod", DEMO, "-o", target, "--overwrite")
+        assert done.returncode == 1
+        assert "no space left" in said_one_error(done.stderr)
+        assert target.read_bytes() == TREE.read_bytes()
+        assert list(disk.iterdir()) == [target]
+
+
+def test_what_is_written_before_the_disk_is_full_is_whole(tmp_path: Path) -> None:
+    with mounted(tmp_path / "disk", "size=64k") as disk:
+        done = sparklod("render", TREE, "--orbit", "40", "--size", "160x120", "-o", disk / "out.%04d.npy")
+        assert done.returncode == 1
+        assert "no space left" in said_one_error(done.stderr)
+        sizes = {path.stat().st_size for path in disk.iterdir()}
+        assert all(path.name.startswith("out.") for path in disk.iterdir())
+        assert len(sizes) <= 1
+
+
+@needs_full
+@pytest.mark.parametrize("name", ["build-lod", "inspect", "traverse"])
+def test_a_full_device(name: str) -> None:
+    arguments, _ = LARGE[name]
+    done = sparklod(*arguments, FULL)
+    assert done.returncode == 1
+    line = said_one_error(done.stderr)
+    assert "no space left" in line
+    assert str(FULL) in line
+
+
+#: What goes to standard output.
+PRINTERS = {
+    "build-lod": ["build-lod", SMALL, "-o", "-"],
+    "build-lod --json": ["build-lod", SMALL, "-o", "/dev/null", "--overwrite", "--json"],
+    "traverse": ["traverse", TREE, "--orbit", "3"],
+    "render": ["render", TREE, "--size", "16x12", "-o", "-"],
+    "inspect": ["inspect", TREE],
+    "inspect --json": ["inspect", TREE, "--json"],
+}
+
+
+@needs_full
+@pytest.mark.parametrize("name", PRINTERS)
+def test_standard_output_on_a_full_device(name: str) -> None:
+    done = shell('"$@" > /dev/full', *PRINTERS[name])
+    assert done.returncode == 1
+    errors = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
+    assert len(errors) == 1
+    assert "standard output" in errors[0]
+    assert "no space left" in errors[0]
+    assert "Traceback" not in done.stderr
+    assert "Exception ignored" not in done.stderr
+
+
+@pytest.mark.parametrize("name", ["build-lod", "traverse"])
+def test_a_folder_that_cannot_be_written(name: str, tmp_path: Path) -> None:
+    arguments, output = WRITERS[name]
+    with mounted(tmp_path / "disk", "size=64k,ro") as disk:
+        done = sparklod(*arguments, disk / output)
+        assert done.returncode == 1
+        line = said_one_error(done.stderr)
+        assert "read-only" in line
+        assert str(disk) in line
+        assert list(disk.iterdir()) == []
+
+
+def test_folders_of_outputs_that_cannot_be_made(tmp_path: Path) -> None:
+    with mounted(tmp_path / "disk", "size=64k,ro") as disk:
+        for arguments in (
+            ["build-lod", SMALL, "--output-dir", disk / "new"],
+            ["traverse", TREE, "--orbit", "2", "-o", tmp_path / "t.csv", "--overwrite", "--indices-out", disk / "new"],
+        ):
+            done = sparklod(*arguments)
+            assert done.returncode == 1
+            assert "read-only" in said_one_error(done.stderr)

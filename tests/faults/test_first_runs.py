@@ -1,0 +1,60 @@
+"""Processes that start at once, with a cache of kernels that they share and that is empty."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+from ..conftest import ROOT
+from .runs import ENVIRONMENT
+
+#: A small set of kernels, called from one another; says how many were compiled, and what came of it.
+SCRIPT = """
+import numpy as np
+from numba.core import event
+from sparklod_cli import jit
+from sparklod_cli.lod.kernels.geometry import ellipsoid_area
+from sparklod_cli.lod.kernels import sort
+
+class Counted(event.Listener):
+    count = 0
+    def on_start(self, event): self.count += 1
+    def on_end(self, event): pass
+
+counted = Counted()
+event.register("numba:compile", counted)
+area = ellipsoid_area(1.0, 2.0, 3.0)
+code = sort.morton_code(1.0, 2.0, 3.0, 0.5, np.zeros(3, np.int64), np.uint64(0))
+print(jit.CACHE_FOLDER, counted.count, area, code)
+"""
+
+
+def start(cache: Path) -> subprocess.Popen[str]:
+    environment = {**ENVIRONMENT, "NUMBA_CACHE_DIR": str(cache)}
+    return subprocess.Popen(
+        [sys.executable, "-c", SCRIPT],
+        cwd=ROOT,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def finish(process: subprocess.Popen[str]) -> tuple[str, int, str]:
+    """Folder of the cache, kernels that were compiled, and results."""
+    out, err = process.communicate(timeout=300)
+    assert (process.returncode, err) == (0, "")
+    folder, count, results = out.strip().split(" ", 2)
+    return folder, int(count), results
+
+
+def test_first_runs_side_by_side_share_an_empty_cache(tmp_path: Path) -> None:
+    cache = tmp_path / "cache"
+    ends = [finish(process) for process in [start(cache) for _ in range(4)]]
+    assert len({(folder, results) for folder, _, results in ends}) == 1
+    assert Path(ends[0][0]).parent == cache
+    assert any(count for _, count, _ in ends)
+    assert finish(start(cache)) == (ends[0][0], 0, ends[0][2])  # what they left is whole
+    assert not [path for path in cache.rglob("*") if path.suffix not in (".nbi", ".nbc", "") and path.is_file()]
