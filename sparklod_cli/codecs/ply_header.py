@@ -9,11 +9,14 @@ from typing import Any, BinaryIO
 import numpy as np
 from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
 
-from ..errors import FormatError, TruncatedError
+from ..errors import FormatError, PromiseError, TruncatedError
 from ..printable import printable
 from ..untrusted import QUOTED
 
 MAX_HEADER = 1 << 20
+
+#: Digits of a count; what has more is larger than any file, and than Python makes a number of.
+MAX_DIGITS = 18
 
 
 @dataclass(frozen=True)
@@ -86,6 +89,8 @@ def read_header(file: BinaryIO) -> Header:
         if words[:1] == [b"element"]:
             if len(words) != 3 or not words[2].isdigit():
                 raise FormatError("bad PLY header: expected element, a name and a count")
+            if len(words[2]) > MAX_DIGITS:
+                raise PromiseError(f"the header promises a count of {len(words[2]):,} digits")
             counts.append(int(words[2]))
             words[2] = b"0"
         if words and words[0] not in (b"comment", b"obj_info"):
