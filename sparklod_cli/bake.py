@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .codecs import dump, spz
+from .codecs import clamps, dump, spz
 from .errors import FormatError, memory_told
 from .io import Sink, read_rgba, read_scene
 from .limits import DEFAULT_BASE, DEFAULT_GROWTH, MAX_SH_DEGREE, METHODS
@@ -64,6 +64,7 @@ class Baked:
         version, fractional_bits: of an SPZ output, else None.
         arrays: shapes of the arrays of another output, in its order.
         clamped: nodes with a value that the output cannot hold, by the column of `Splats` where there are any.
+        clamps: at which ends, and how far beyond.
         notes: what the reader had to leave out, for people.
         seconds: by stage (read, build, write).
     """
@@ -81,6 +82,7 @@ class Baked:
     fractional_bits: int | None
     arrays: dict[str, tuple[int, ...]]
     clamped: dict[str, int]
+    clamps: tuple[clamps.Clamp, ...]
     notes: tuple[str, ...]
     seconds: dict[str, float]
 
@@ -126,6 +128,7 @@ def _bake(source: Path, write: Sink, recipe: Recipe, progress: Progress) -> Bake
     else:
         size = write(spz.encode(output, dataclasses.replace(recipe.spz, fractional_bits=bits), progress=progress))
     clamped = {} if arrays else spz.clamped(nodes, threads)
+    ends = tuple(clamps.clamps(nodes, clamped))
     seconds = {
         "read": read_done - start,
         "build": build_done - read_done,
@@ -145,6 +148,7 @@ def _bake(source: Path, write: Sink, recipe: Recipe, progress: Progress) -> Bake
         fractional_bits=bits,
         arrays={array: words.shape for array, words in arrays.items()},
         clamped=clamped,
+        clamps=ends,
         notes=notes,
         seconds={stage: round(value, 4) for stage, value in seconds.items()},
     )

@@ -19,6 +19,7 @@ from .codecs.formats import FORMATS, HEAD, Format, sniff
 from .codecs.sog_files import MAX_META, META, names_beside
 from .errors import FormatError, OutputError, StdoutError, UnknownFormatError, UnreadableError
 from .progress import Progress, silent
+from .quantities import count_of
 from .scene import Scene
 from .splats import COLUMNS, FloatArray
 from .stdout import ReaderGoneError, told
@@ -223,7 +224,7 @@ def read_rgba(path: Path, count: int) -> FloatArray:
             if len(shape) != 2 or shape[1] != 4 or (dtype != np.uint8 and dtype.kind != "f"):
                 raise FormatError(f"has {dtype}{list(shape)}, expected uint8 or floats [{count}, 4]")
             if shape[0] != count:
-                raise FormatError(f"has colours for {shape[0]:,} splats, the scene has {count:,}")
+                raise FormatError(f"has colours for {count_of(shape[0], 'splat')}, the scene has {count:,}")
             values = npy.read_values(file, layout)
     except OSError as error:
         raise FormatError(f"{path} cannot be read: {_reason(error)}") from None

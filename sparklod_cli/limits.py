@@ -27,6 +27,9 @@ MIN_COMPRESSION, MAX_COMPRESSION, DEFAULT_COMPRESSION = 1, 9, 5
 #: What files of plain splats can be written as, by suffix.
 PLAIN_SUFFIXES = (".spz", ".ply", ".splat")
 
+#: What files of nothing but words are called, besides those without a suffix.
+RAW_SUFFIXES = (".bin", ".raw")
+
 #: In-memory layouts of viewers that a tree can be dumped in.
 ENCODINGS = ("packed", "ext", "lodtree", "texture")
 

@@ -37,7 +37,7 @@ def shortened(text: str, most: int | None) -> str:
     """A text of at most so many characters: beginning and end of a longer one."""
     if most is None or len(text) <= most:
         return text
-    end = (most - len(GAP)) // 3
+    end = (most - len(GAP)) // 4
     return text[: most - len(GAP) - end] + GAP + text[len(text) - end :]
 
 

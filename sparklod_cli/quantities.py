@@ -1,7 +1,8 @@
-"""Quantities as people write them: bandwidths, times and counts with units."""
+"""Quantities as people write them: bandwidths, times, sizes and counts with units, and counts as they read them."""
 
 from __future__ import annotations
 
+import math
 import re
 from fractions import Fraction
 
@@ -10,8 +11,14 @@ PREFIXES = {"": 1, "k": 10**3, "m": 10**6, "g": 10**9}
 
 NUMBER = r"(?P<number>(?:[0-9]{1,30}(?:\.[0-9]{0,30})?|\.[0-9]{1,30})(?:[eE][+-]?[0-9]{1,2})?)"
 COUNT = re.compile(rf"{NUMBER}\s*(?P<prefix>[kKmMgG]?)")
+SIZE = re.compile(rf"{NUMBER}\s*(?:(?P<prefix>[kKmMgG]?)(?P<binary>i?)(?:B|(?i:bytes?))?)")
 LATENCY = re.compile(rf"{NUMBER}\s*(?P<unit>ms|s)")
 BANDWIDTH = re.compile(rf"{NUMBER}\s*(?P<prefix>[kKmMgG]?)(?P<unit>(?i:bits?|bytes?)|b|B)(?:/s|ps)?")
+
+
+def count_of(count: int, noun: str, plural: str | None = None) -> str:
+    """ "1 node", "1,234 nodes"; "2 leaves" with a plural of its own."""
+    return f"{count:,} {noun if count == 1 else plural or noun + 's'}"
 
 
 def parse_bandwidth(text: str) -> float:
@@ -59,4 +66,22 @@ def parse_count(text: str) -> int:
     value = Fraction(match["number"]) * PREFIXES[match["prefix"].lower()] if match else Fraction(-1, 2)
     if value.denominator != 1:
         raise ValueError(f"{text!r} is not a count: a whole number, such as 500000, 500k or 1.5M")
+    return int(value)
+
+
+def parse_size(text: str) -> int:
+    """Bytes of a text such as 3000000, 3M, 3MB or 3MiB: k, M and G are powers of 1000, with an i of 1024.
+
+    Raises:
+        ValueError: it is none.
+    """
+    match = SIZE.fullmatch(text.strip())
+    value = Fraction(-1, 2)
+    if match is not None and (match["prefix"] or not match["binary"]):
+        power = PREFIXES[match["prefix"].lower()]
+        if match["binary"]:
+            power = 1024 ** round(math.log(power, 1000))
+        value = Fraction(match["number"]) * power
+    if value.denominator != 1:
+        raise ValueError(f"{text!r} is not a size: whole bytes, such as 3000000, 3MB or 3MiB")
     return int(value)

@@ -225,6 +225,36 @@ def test_what_does_not_fit_into_memory_does_not_stop_the_others(
     assert err.count("it does not fit into memory") == 2
 
 
+@pytest.mark.parametrize("options", [[], ["--encoding", "ext"], ["--unlod"]])
+def test_a_name_without_a_suffix_promises_nothing(options: list[str], scene: Path, tmp_path: Path) -> None:
+    source = FIXTURES / "golden" / "tree-v3.spz" if options == ["--unlod"] else scene
+    assert build(source, "-o", tmp_path / "out", *options) == 0
+    assert (tmp_path / "out").stat().st_size
+
+
+def test_a_file_that_may_not_be_read_does_not_stop_the_others(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    closed = tmp_path / "closed.ply"
+    closed.write_bytes(SMALL.read_bytes())
+    opened, access = Path.open, os.access
+
+    def refused(path: Path, *args: object, **kwargs: object) -> object:
+        if path == closed:
+            raise PermissionError(13, "Permission denied")
+        return opened(path, *args, **kwargs)  # type: ignore[call-overload]
+
+    # As for anybody but root, whom a test may be run by.
+    monkeypatch.setattr(Path, "open", refused)
+    monkeypatch.setattr(os, "access", lambda path, *args, **how: Path(path) != closed and access(path, *args, **how))
+    assert build(scene, closed, ONE, "--output-dir", tmp_path / "web") == 1
+    assert f"error: {closed}: cannot be read: permission denied\n" in capsys.readouterr().err
+    assert sorted(path.name for path in (tmp_path / "web").iterdir()) == ["one-lod.spz", "scene-lod.spz"]
+    assert run(["inspect", str(closed), str(ONE), "--check"]) == 3
+    assert f"{closed}: error: file.unreadable: cannot be read: permission denied\n" in capsys.readouterr().out
+    assert run(["inspect", str(ONE), str(closed)]) == 1
+
+
 def test_an_input_is_never_an_output(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = scene.read_bytes()
     assert build(scene, "-o", scene, "--overwrite") == 2
@@ -274,6 +304,17 @@ def test_closed_streams(tmp_path: Path) -> None:
         (["x/a.ply", "y/a.ply", "--output-dir", "d"], "would both be written to"),
         (["a.ply", "-o", "-", "--json"], "standard output"),
         (["a.ply", "--threads", "0"], "--threads"),
+        (["a.ply", "-o", "out.glb"], "a tree is written as SPZ, not as .glb; name the output .spz"),
+        (["a.ply", "-o", "out.RAD"], "a tree is written as SPZ, not as .rad"),
+        (["a.ply", "-o", "out.spz.gz"], "a tree is written as SPZ, not as .gz"),
+        (["a.ply", "-o", "out.ply"], ".ply holds no tree"),
+        (["a.ply", "-o", "out.bin"], "a .bin output needs --encoding"),
+        (["a.ply", "-o", "out.spz", "--encoding", "ext"], "--encoding writes .npz, .bin, .raw, not .spz"),
+        (["a.ply", "-o", "out.png", "--encoding", "packed"], "--encoding writes .npz, .bin, .raw, not .png"),
+        (["a-lod.spz", "-o", "out.glb", "--unlod"], "--unlod writes .spz, .ply, .splat, not .glb"),
+        (["a.ply", "--quality"], "there is no option --quality; did you mean --method quality?"),
+        (["a.ply", "--ext"], "there is no option --ext; did you mean --encoding ext?"),
+        (["a.ply", "--overwritten"], "--overwrite"),
     ],
 )
 def test_wrong_usage_is_exit_code_2(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -297,7 +297,7 @@ def test_a_scene_file_says_what_stands_where(tmp_path: Path, capsys: Said) -> No
         ([TREE, "--budget", "many"], "--budget"),
         ([TREE, "--budget", "5k", "--preset", "quest"], "--budget and --preset exclude each other"),
         ([TREE, "--full", "--budget", "5k"], "--full leaves nothing to --budget"),
-        ([TREE, TREE, "--budget", "1"], "a budget of 1 splats is less than one for each of 2 instances"),
+        ([TREE, TREE, "--budget", "1"], "a budget of 1 splat is less than one for each of 2 instances"),
         ([TREE, "--chunk-cache", "5"], "No such option"),
         ([TREE, "--bandwidth", "5Mbit"], "No such option"),
         ([TREE, "--view", "0,0,9:0,0,0", "--orbit", "3"], "--view and --orbit cannot go together"),

@@ -189,7 +189,7 @@ def test_bytes_that_are_changed(data: st.DataObject) -> None:
 def test_floats_that_are_no_colours(value: float, tmp_path: Path) -> None:
     values = np.full((COUNT, 4), 0.5)
     values[3, 2] = value
-    with pytest.raises(FormatError, match="values that are not 0..1"):
+    with pytest.raises(FormatError, match=r"values that are not 0\.\.1"):
         read_rgba(save(tmp_path / "a.npy", values), COUNT)
 
 

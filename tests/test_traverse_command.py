@@ -271,7 +271,7 @@ def test_a_scene_file_says_what_stands_where(tmp_path: Path, capsys: Said) -> No
         ([TREE, "--padded"], "--padded only means something with --indices-out"),
         ([TREE, "--assert", "churn"], "--assert 'churn' is not an assertion"),
         ([TREE, "--threads", "0"], "--threads"),
-        ([TREE, OTHER, "--budget", "1"], "a budget of 1 splats is less than one for each of 2 instances"),
+        ([TREE, OTHER, "--budget", "1"], "a budget of 1 splat is less than one for each of 2 instances"),
         ([TREE, OTHER, "--chunk-cache", "1"], "cannot hold the roots of 2 trees"),
     ],
 )

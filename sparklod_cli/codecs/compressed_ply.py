@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ..errors import FormatError
 from ..limits import MAX_SH_DEGREE
 from ..progress import Progress, silent
+from ..quantities import count_of
 from ..scene import Scene
 from ..sh import degree_of, notes_on_degree
 from ..splats import FloatArray, Splats
@@ -108,7 +109,8 @@ def _checked(header: Header) -> tuple[int, int]:
     if have & {*BOUNDS["color"]}:
         _check_types(header, "chunk", BOUNDS["color"], np.float32)
     if header.count("chunk") * CHUNK_SPLATS < count:
-        raise FormatError(f"{header.count('chunk'):,} chunks of {CHUNK_SPLATS} cannot hold {count:,} splats")
+        chunks = count_of(header.count("chunk"), "chunk")
+        raise FormatError(f"{chunks} of {CHUNK_SPLATS} cannot hold {count_of(count, 'splat')}")
     if "sh" not in header.elements:
         return count, 0
     row_type = header.row_type("sh")
@@ -116,7 +118,8 @@ def _checked(header: Header) -> tuple[int, int]:
     if _check_types(header, "sh", names, np.uint8) != names:
         raise FormatError("the properties of its element sh are not f_rest_0 on, in order")
     if len(names) % 3 or header.count("sh") != count:
-        raise FormatError(f"its element sh has {header.count('sh'):,} rows of {len(names)} values for {count:,} splats")
+        rows, splats = count_of(header.count("sh"), "row"), count_of(count, "splat")
+        raise FormatError(f"its element sh has {rows} of {len(names)} values for {splats}")
     return count, len(names) // 3
 
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from ..errors import FormatError, TruncatedError, VersionError
 from ..gaussian import normalized_quat
 from ..progress import Progress, silent
+from ..quantities import count_of
 from ..scene import Scene
 from ..sh import COEFFICIENTS
 from ..splats import FloatArray, Splats
@@ -112,7 +113,7 @@ def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> 
     firsts = [section.first for section in sections]
     found = sum(section.count for section in sections)
     if found != count:
-        raise FormatError(f"the header promises {count:,} splats, its sections have {found:,}")
+        raise FormatError(f"the header promises {count_of(count, 'splat')}, its sections have {found:,}")
     degrees = [COEFFICIENTS.index(section.row_type["sh"].shape[0] // 3) for section in sections]
     splats = Splats.empty(count, max(degrees, default=0))
     low, high = header["least_sh"] or np.float32(-DEFAULT_SH), header["most_sh"] or np.float32(DEFAULT_SH)
@@ -171,7 +172,7 @@ def _read_sections(file: BinaryIO, size: int, count: int, level: int) -> Iterato
         offset = at + 4 * partial + of["bucket_bytes"] * buckets
         end = offset + of["room"] * rows.itemsize
         if end > size or of["splats"] > of["room"]:
-            raise TruncatedError(f"cut short: a section promises {of['splats']:,} splats")
+            raise TruncatedError(f"cut short: a section promises {count_of(int(of['splats']), 'splat')}")
         middles, ends = np.empty((0, 3), np.float32), np.empty(0, np.int64)
         steps = of["steps"] or LEVELS[level][3]
         if level and of["splats"]:

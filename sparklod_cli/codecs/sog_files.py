@@ -15,6 +15,7 @@ from PIL.WebPImagePlugin import WebPImageFile
 
 from ..errors import ChecksumError, FormatError, NotSplatsError
 from ..printable import printable
+from ..quantities import count_of
 from ..untrusted import QUOTED, parse_json, shown
 from .compression import check_promise
 from .stream import size_of
@@ -175,7 +176,7 @@ class Files:
         texels = self.image(texture, index, SPARE_FACTOR * count + SPARE_TEXELS).reshape(-1, 4)
         if len(texels) < count:
             name = self.meta.name(texture, "files", index)
-            raise FormatError(f"{shown(name)} has {len(texels):,} texels for {count:,} splats")
+            raise FormatError(f"{shown(name)} has {count_of(len(texels), 'texel')} for {count_of(count, 'splat')}")
         return texels[:count]
 
 

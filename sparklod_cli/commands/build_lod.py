@@ -123,7 +123,7 @@ Examples:
 @click.option(
     "--encoding",
     type=click.Choice(limits.ENCODINGS),
-    help="Write the tree as arrays in a viewer's memory layout: .npz, or the words alone if FILE ends otherwise.",
+    help="Write the tree as arrays in a viewer's memory layout: .npz, or the words alone if FILE is .bin or .raw.",
 )
 @click.option(
     "--unlod",
@@ -221,10 +221,15 @@ def _check_usage(ctx: click.Context, inputs: tuple[Path, ...], output: Path | No
             refuse(OF_SPZ, f"is of SPZ, not of {suffix}")
     elif settings["encoding"]:
         refuse(OF_SPZ, "is of SPZ, not of --encoding")
+        if suffix not in ("", ".npz", *limits.RAW_SUFFIXES):
+            known = ", ".join((".npz", *limits.RAW_SUFFIXES))
+            raise click.UsageError(f"--encoding writes {known}, not {suffix}")
     elif suffix in OTHER_SUFFIXES:
         raise click.UsageError(f"{suffix} holds no tree, which is written as SPZ; name the output .spz")
-    elif suffix == ".npz":
-        raise click.UsageError("a .npz output needs --encoding")
+    elif suffix in (".npz", *limits.RAW_SUFFIXES):
+        raise click.UsageError(f"a {suffix} output needs --encoding")
+    elif suffix not in ("", ".spz"):
+        raise click.UsageError(f"a tree is written as SPZ, not as {suffix}; name the output .spz")
     for method, names in OF_METHOD.items():
         if method != settings["method"]:
             refuse(names, f"is of --method {method}, not of {settings['method']}")

@@ -8,6 +8,9 @@ import click
 
 from .options import Numbers
 
+#: Pixels along a side of a picture, and digits of no more than a few times that.
+MAX_SIDE, DIGITS = 1 << 16, 6
+
 
 class View(click.ParamType):
     """Where a camera is and what it looks at, as (eye, target), two tuples of three numbers."""
@@ -48,8 +51,10 @@ class Size(click.ParamType):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, int]:
         parts = value.lower().split("x")
-        if len(parts) != 2 or not all(part.isascii() and part.isdigit() and 0 < int(part) <= 65536 for part in parts):
+        if len(parts) != 2 or not all(part.isascii() and part.isdigit() and part.strip("0") for part in parts):
             self.fail(f"{value!r} is not a width and a height in pixels, such as 1280x720", param, ctx)
+        if any(len(part.lstrip("0")) > DIGITS or int(part) > MAX_SIDE for part in parts):
+            self.fail(f"{value!r} is too large; a picture has at most {MAX_SIDE:,} pixels along a side", param, ctx)
         return int(parts[0]), int(parts[1])
 
     def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:

@@ -12,12 +12,8 @@ from typing import Any, TextIO
 import click
 
 from ..printable import MOST, printable
+from ..quantities import count_of as count_of
 from ..stdout import silence
-
-
-def count_of(count: int, noun: str) -> str:
-    """ "1 node", "1,234 nodes"."""
-    return f"{count:,} {noun}" + ("" if count == 1 else "s")
 
 
 def size_of(size: int) -> str:

@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ..limits import MAX_SH_DEGREE, PLOT_BY
+from ..quantities import parse_size
 from .console import Console
 from .inspect_job import Job
-from .options import Real, common_options, is_given
+from .options import Quantity, Real, common_options, is_given
 from .paths import InputPath, OutputPath, keep_apart
 
 if TYPE_CHECKING:
@@ -66,7 +67,7 @@ def _print_schema(ctx: click.Context, param: click.Parameter, value: bool) -> No
     help="How findings are printed; github makes annotations of GitHub Actions.",
 )
 @click.option("--expect", metavar="FILE", type=InputPath(), help="Expectations as .json or .toml.")
-@click.option("--max-bytes", metavar="N", type=click.IntRange(0), help="Expect a file of at most so many bytes.")
+@click.option("--max-bytes", type=Quantity("SIZE", parse_size), help="Expect a file of at most so much, such as 3MB.")
 @click.option("--min-splats", metavar="N", type=click.IntRange(0), help="Expect so many splats, or leaves, at least.")
 @click.option("--max-splats", metavar="N", type=click.IntRange(0), help="Expect so many splats, or leaves, at most.")
 @click.option("--sh", metavar="N", type=click.IntRange(0, MAX_SH_DEGREE), help="Expect this SH degree.")

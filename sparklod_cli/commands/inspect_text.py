@@ -44,11 +44,9 @@ def _row(name: str, text: str) -> str:
 
 
 def _tree(tree: dict[str, Any]) -> Iterator[str]:
-    inner = count_of(tree["inner"], "inner node")
-    yield _row(
-        "tree",
-        f"{_leaves(tree['leaves'])}, {inner}, growth {tree['growth']:.3f}, {count_of(tree['depth'] + 1, 'level')}",
-    )
+    inner, levels = count_of(tree["inner"], "inner node"), count_of(tree["depth"] + 1, "level")
+    leaves = count_of(tree["leaves"], "leaf", "leaves")
+    yield _row("tree", f"{leaves}, {inner}, growth {tree['growth']:.3f}, {levels}")
     yield _row("", f"{100 * tree['more_than_opaque']:.1f} % of the nodes are more than opaque")
     chunks = count_of(tree["chunks"], "chunk")
     yield _row("", f"{chunks} of 65,536 nodes, the coarsest cut of as many nodes needs {tree['chunks_of_coarse_cut']}")
@@ -63,10 +61,6 @@ def _tree(tree: dict[str, Any]) -> Iterator[str]:
         yield _row("", f"{depth:>5} {level['nodes']:>12,} {level['leaves']:>12,} {size:>10}")
     if tree["depth"] >= MOST_LEVELS:
         yield _row("", f"and {tree['depth'] + 1 - MOST_LEVELS:,} more")
-
-
-def _leaves(count: int) -> str:
-    return "1 leaf" if count == 1 else f"{count:,} leaves"
 
 
 def _values(values: dict[str, Any]) -> Iterator[str]:

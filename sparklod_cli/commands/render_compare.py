@@ -223,7 +223,7 @@ def lines(summary: Sequence[OfBudget], path: CameraPath, leaves: int) -> Iterato
     """The summary as a person reads it."""
     sizes = list(dict.fromkeys((camera.width, camera.height) for camera in path.cameras))
     size = f"{sizes[0][0]} x {sizes[0][1]}" + (" and others" if len(sizes) > 1 else "")
-    yield f"  {count_of(len(path.cameras), 'frame')} of {size}, against {leaves:,} splats, on black and white"
+    yield f"  {count_of(len(path.cameras), 'frame')} of {size}, against {count_of(leaves, 'splat')}, on black and white"
     yield f"  {'budget':>8} {'splats':>11} {'PSNR':>7} {'least':>7} {'SSIM':>7} {'least':>7}   worst tile"
     for each in summary:
         yield (

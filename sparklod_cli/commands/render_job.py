@@ -188,7 +188,8 @@ class Job:
         splats = sorted({frame["splats"] for frame in frames})
         said = [count_of(len(frames), "frame")] if len(frames) > 1 else []
         said.append(next(iter(sizes)) + (" and others" if len(sizes) > 1 else ""))
-        said.append(" to ".join(f"{count:,}" for count in dict.fromkeys([splats[0], splats[-1]])) + " splats")
+        least = "" if splats[0] == splats[-1] else f"{splats[0]:,} to "
+        said.append(least + count_of(splats[-1], "splat"))
         if self.other is not None:
             worst = min(frame["psnr_db"] for frame in frames)
             said.append(f"PSNR {worst:.2f} dB" + (" or more" if len(frames) > 1 else ""))

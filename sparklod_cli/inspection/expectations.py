@@ -12,6 +12,7 @@ from typing import Any
 from ..errors import SparklodError
 from ..io import read_text
 from ..printable import printable
+from ..quantities import count_of
 from ..untrusted import QUOTED, parse_json, parse_toml, shown
 from .findings import Finding
 from .report import Report
@@ -118,13 +119,13 @@ def check(report: Report, expected: Expectations) -> list[Finding]:
     found = []
     is_tree = report.tree is not None
     splats = report.tree.leaves if report.tree is not None else report.splats or 0
-    of = "leaves" if is_tree else "splats"
+    found_splats = count_of(splats, "leaf", "leaves") if is_tree else count_of(splats, "splat")
     if expected.max_bytes is not None and (report.bytes or 0) > expected.max_bytes:
         found.append(Finding("expect.bytes", f"{report.bytes:,} bytes, expected at most {expected.max_bytes:,}"))
     if expected.min_splats is not None and splats < expected.min_splats:
-        found.append(Finding("expect.splats", f"{splats:,} {of}, expected at least {expected.min_splats:,}"))
+        found.append(Finding("expect.splats", f"{found_splats}, expected at least {expected.min_splats:,}"))
     if expected.max_splats is not None and splats > expected.max_splats:
-        found.append(Finding("expect.splats", f"{splats:,} {of}, expected at most {expected.max_splats:,}"))
+        found.append(Finding("expect.splats", f"{found_splats}, expected at most {expected.max_splats:,}"))
     if expected.sh is not None and report.sh_degree != expected.sh:
         found.append(Finding("expect.sh", f"SH degree {report.sh_degree}, expected {expected.sh}"))
     if expected.lod is not None and is_tree != expected.lod:

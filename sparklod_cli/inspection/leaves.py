@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from ..codecs.spz_layout import LOD, Layout
 from ..errors import InvalidSplatsError
+from ..quantities import count_of
 from ..scene import Scene
 from ..selection import Selection
 from ..splats import Splats
@@ -58,7 +59,8 @@ def check(scene: Scene, original: Scene) -> list[Finding]:
     except InvalidSplatsError as error:
         return [Finding("expect.leaves", f"of the original {error}")]
     if len(leaves) != len(splats):
-        return [Finding("expect.leaves", f"{len(leaves):,} leaves, the original has {len(splats):,} splats to draw")]
+        found, expected = count_of(len(leaves), "leaf", "leaves"), count_of(len(splats), "splat")
+        return [Finding("expect.leaves", f"{found}, the original has {expected} to draw")]
     if leaves.sh_degree != splats.sh_degree:
         return [Finding("expect.leaves", f"SH degree {leaves.sh_degree}, the original has {splats.sh_degree}")]
     bits, version = int(scene.header["fractional_bits"]), max(2, int(scene.header["version"]))

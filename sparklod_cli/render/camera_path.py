@@ -12,6 +12,7 @@ from ..errors import CameraPathError
 from .axes import Axes
 from .camera import Camera
 from .frame import DEFAULT_FPS, MAX_FRAMES, Settings, camera_of
+from .paths import own_csv
 from .paths.formats import FORMATS, PathFormat
 from .paths.source import Files, Parsed
 from .pose import rigid, to_opengl
@@ -67,6 +68,8 @@ def read(files: Files, *, format: str | None = None, settings: Settings | None =
 
 def _known(files: Files) -> PathFormat:
     form = next((form for form in FORMATS if form.parser().recognises(files)), None)
+    if form is None and own_csv.resembles(files):
+        form = next(form for form in FORMATS if form.parser() is own_csv)  # which says what it lacks
     if form is None:
         names = ", ".join(form.name for form in FORMATS)
         raise CameraPathError(f"it is of no format that is known by its content; see --camera-format ({names})")

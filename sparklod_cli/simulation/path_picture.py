@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import SparklodError
+from ..quantities import count_of
 from ..render.camera import Camera
 from ..render.colors import range_of, whole_numbers
 from ..render.labels import BACKGROUND, write_png
@@ -79,7 +80,7 @@ def picture_of_path(
         pixels = _seen_through(pixels, stage.photograph(eye))
     if len(chosen) < len(splats):
         drawn += f", {len(chosen):,} of them, evenly chosen"
-    title = f"The cut of {len(splats):,} splats"
+    title = f"The cut of {count_of(len(splats), 'splat')}"
     said = [f"{drawn}; white: the path and the frusta of {min(len(cameras), MOST_FRUSTA)} of {len(cameras):,} frames"]
     if frame is not None:
         title += f" for {_called(cameras[frame], frame)}"

@@ -13,6 +13,7 @@ from ..lod.cut_measure import Changes, Measured, measure
 from ..lod.traversal import Cones, Cut, Frustum, Traversal, View, pixel_limit
 from ..parallel import ordered_map
 from ..progress import Progress, silent
+from ..quantities import count_of
 from ..render.camera import Camera
 from ..render.camera_path import CameraPath
 from ..world import TOTAL, World
@@ -100,9 +101,8 @@ class Simulation:
     def __init__(self, world: World, viewer: Viewer, *, by_instance: bool = False) -> None:
         instances = world.foveated(viewer.foveation)
         if viewer.budget < len(instances):
-            raise ValueError(
-                f"a budget of {viewer.budget} splats is less than one for each of {len(instances)} instances"
-            )
+            budget = count_of(viewer.budget, "splat")
+            raise ValueError(f"a budget of {budget} is less than one for each of {len(instances)} instances")
         if len(instances) > MOST_INSTANCES:
             raise ValueError(f"{len(instances):,} instances are more than {MOST_INSTANCES:,}")
         self.world, self.viewer, self._by_instance = world, viewer, by_instance

@@ -162,7 +162,7 @@ REFUSED: dict[str, tuple[Callable[[], bytes], str]] = {
     "too few chunks": (lambda: edited("element chunk 1", "element chunk 0"), "0 chunks of 256 cannot hold 60 splats"),
     "as many chunks as fill one less": (
         lambda: edited("element vertex 60", "element vertex 257"),
-        "1 chunks of 256 cannot hold 257 splats",
+        "1 chunk of 256 cannot hold 257 splats",
     ),
     "SH of fewer splats": (lambda: edited("element sh 60", "element sh 59"), "59 rows of 45 values for 60 splats"),
     "SH of another type": (lambda: edited("uchar f_rest_7", "char f_rest_7"), "element sh has no f_rest_7"),

@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fixtures import by_hand
-from sparklod_cli.codecs import quantize, spz
+from sparklod_cli.codecs import clamps, quantize, spz
 from sparklod_cli.errors import FormatError
 from sparklod_cli.scene import Scene
 from sparklod_cli.splats import COLUMNS, Splats
@@ -207,6 +207,14 @@ def test_what_is_clamped_is_counted_by_splat() -> None:
     splats.rgb[5] = -0.5
     splats.sh[6:, 2] = 1.1
     assert spz.clamped(splats, threads=2) == {"scale": 3, "rgb": 1, "sh": 2}
+    found = {(at.column, at.above): (at.splats, at.farthest) for at in clamps.clamps(splats, ["scale", "rgb", "sh"])}
+    assert found == {
+        ("scale", False): (2, 0.0),
+        ("scale", True): (1, pytest.approx(high * 1.001)),
+        ("rgb", False): (1, -0.5),
+        ("sh", True): (2, pytest.approx(1.1)),
+    }
+    assert clamps.clamps(splats, []) == []
 
 
 @pytest.mark.parametrize(("name", "decode"), [("scale", quantize.decode_log_scale), ("rgb", quantize.decode_color)])

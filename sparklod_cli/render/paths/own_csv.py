@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+from collections.abc import Collection
 
 from ...errors import CameraPathError
 from ..frame import DEFAULT_UP, Frame, Lens, Settings
@@ -25,12 +26,27 @@ def _names(line: str) -> list[str]:
     return [name.strip().lower() for name in line.split(",")]
 
 
+def resembles(files: Files) -> bool:
+    """Whether it may have been meant to be one: it is called so, or its first line names some of the columns."""
+    names = _names((files.text or "").split("\n", 1)[0])
+    return files.path.suffix.lower() == ".csv" or len(COLUMNS.intersection(names)) > 1
+
+
+def lacking(names: Collection[str]) -> str:
+    """What is missing of the columns that a pose takes."""
+    missing = min(([name for name in POSITION + way if name not in names] for way in (TARGET, QUAT)), key=len)
+    return (
+        f"its first line, which names the columns, lacks {', '.join(missing)}; a camera takes {', '.join(POSITION)},"
+        f" and {', '.join(TARGET)} or {', '.join(QUAT)}"
+    )
+
+
 def parse(files: Files, settings: Settings) -> Parsed:
     """Its rows."""
     lines = files.lines()
     names = _names(lines[0])
     if not recognises(files):
-        raise CameraPathError(f"its first line does not name columns {','.join(POSITION + QUAT)} or {','.join(TARGET)}")
+        raise CameraPathError(lacking(names))
     if len(set(names)) < len(names):
         raise CameraPathError("its first line names a column twice")
     frames = []
