@@ -109,7 +109,7 @@ def test_exit_codes(file: Path, without: int, with_check: int, capsys: Said) -> 
         ([TREE, "--plot-by", "taste"], "--plot-by"),
         ([TREE, "--plot-level", "-1"], "--plot-level"),
         ([TREE, "--max-bytes", "-1"], "--max-bytes"),
-        ([TREE, "--max-bytes", "1MB"], "--max-bytes"),
+        ([TREE, "--max-bytes", "1 mile"], "--max-bytes"),
         ([TREE, "--min-splats", "few"], "--min-splats"),
         ([TREE, "--sh", "4"], "--sh"),
         ([TREE, "--max-growth", "0.9"], "--max-growth"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
-from ..printable import MOST, printable
+from ..printable import MOST, printable, shortened
 from .console import count_of, size_of
 
 if TYPE_CHECKING:
@@ -89,7 +89,7 @@ def finding_line(file: str, found: Finding, style: str) -> str:
     if style == "text":
         return f"{printable(file)}: {found.severity}: {found.code}: {printable(found.message, MOST)}"
     kind = {"note": "notice"}.get(found.severity, found.severity)
-    return f"::{kind} file={_escaped(file, ':,')},title={found.code}::{_escaped(printable(found.message, MOST))}"
+    return f"::{kind} file={_escaped(file, ':,')},title={found.code}::{_escaped(shortened(found.message, MOST))}"
 
 
 def _escaped(text: str, more: str = "") -> str:
