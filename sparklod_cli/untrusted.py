@@ -16,6 +16,9 @@ MAX_DEPTH = 64
 #: Digits, with a sign, of whole numbers of 64 bits; longer ones become floats, as most readers of JSON have them.
 MAX_DIGITS = 19
 
+#: Stands for every whole number that is larger; no number that makes sense is as large.
+LARGEST = sys.float_info.max
+
 #: As much is quoted of what a file says, in characters.
 QUOTED = 100
 
@@ -26,8 +29,9 @@ _ESCAPED_SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
 def parse_json(data: str | bytes, *, keep_surrogates: bool = False) -> Any:
     """The value of a JSON text.
 
-    Whole numbers that do not fit into 64 bits come as the floats next to them. NaN and Infinity, which Python writes,
-    and 1e999 are taken, so who uses a number looks whether it is finite. Nothing is deeper than `MAX_DEPTH`.
+    Whole numbers that do not fit into 64 bits come as the floats next to them, at most `LARGEST`. NaN and Infinity,
+    which Python writes, and 1e999 are taken, so who uses a number looks whether it is finite. Nothing is deeper than
+    `MAX_DEPTH`.
 
     Args:
         data: the text, or its bytes in UTF-8.
@@ -62,8 +66,7 @@ def parse_toml(text: str) -> dict[str, Any]:
 def _whole(digits: str) -> int | float:
     if len(digits) <= MAX_DIGITS:
         return int(digits)
-    largest = sys.float_info.max
-    return min(max(float(digits), -largest), largest)
+    return min(max(float(digits), -LARGEST), LARGEST)
 
 
 def _too_deep() -> ValueError:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from .codecs import lod_tree
 from .codecs.lod_tree import Nodes
-from .errors import FormatError, SparklodError, TreeError
+from .errors import FormatError, SparklodError, TreeError, memory_told
 from .gaussian import moved, placed, spark_size
 from .io import examine_scene, size_on_disk
 from .limits import PRECISIONS
@@ -147,10 +147,12 @@ def read_file(
 
     Raises:
         FormatError: it cannot be read; names the file.
+        OutOfMemoryError: it does not fit into memory; names the file.
         TreeError: its tree is broken; names the file.
     """
     try:
-        scene = examine_scene(file, columns=columns, threads=threads, progress=progress)
+        with memory_told():
+            scene = examine_scene(file, columns=columns, threads=threads, progress=progress)
         if scene.tree is not None:
             scene.tree.validate()
     except TreeError as error:

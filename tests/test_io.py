@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import stat
 import subprocess
 import sys
@@ -11,9 +12,10 @@ from pathlib import Path
 
 import pytest
 
-from sparklod_cli import whole
+from sparklod_cli import io, whole
+from sparklod_cli.cli import run
 from sparklod_cli.codecs.formats import FORMATS
-from sparklod_cli.errors import FormatError, OutputError
+from sparklod_cli.errors import FormatError, OutputError, UnreadableError
 from sparklod_cli.io import check_writable, read_scene, write_stdout, write_whole
 
 from .conftest import FIXTURES
@@ -336,3 +338,30 @@ def test_what_was_private_stays_private(tmp_path: Path) -> None:
     write_whole(target, [b"new"], overwrite=True)
     assert target.stat().st_mode & 0o777 == 0o600
     assert target.stat().st_ino != before  # renamed to, not written into
+
+
+def test_small_texts_are_plain_files_of_some_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever is named, what is read is bounded, and nothing waits for what never comes."""
+    text, pipe = tmp_path / "a.json", tmp_path / "pipe"
+    text.write_bytes(b"\xef\xbb\xbf{}")
+    assert io.read_text(text) == "{}"
+    os.mkfifo(pipe)
+    for path in (pipe, tmp_path, Path("/dev/zero"), Path("/dev/null"), tmp_path / "missing"):
+        with pytest.raises(UnreadableError, match=re.escape(f"{path} cannot be read: ")):
+            io.read_text(path)
+    monkeypatch.setattr(io, "MAX_TEXT", 5)
+    assert io.read_text(text) == "{}"
+    text.write_bytes(b"123456")
+    with pytest.raises(UnreadableError, match="is larger than"):
+        io.read_text(text)
+
+
+@pytest.mark.parametrize("option", ["--scene", "--camera-path", "--world-transform"])
+@pytest.mark.parametrize("source", ["/dev/zero", "/dev/null"])
+def test_no_command_reads_a_device(option: str, source: str, capsys: pytest.CaptureFixture[str]) -> None:
+    tree = [] if option == "--scene" else [str(FIXTURES / "golden" / "hand-tree-v3.spz")]
+    cameras = ["--orbit", "2"] if option == "--scene" else []
+    more = ["--camera-path", str(FIXTURES / "cameras" / "sparklod.json")] if option == "--world-transform" else []
+    assert run(["traverse", *tree, *cameras, *more, option, source]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"error: {source} cannot be read: it is a pipe or a device")

@@ -96,7 +96,7 @@ def test_a_file_that_is_too_large(name: str, large: tuple[Path, Path], tmp_path:
     small, file = (PLAIN, large[0]) if plain else (TREE, large[1])
     code, lines = limited(tmp_path, room, small, file, command)
     assert (code, len(lines)) == (1, 1), lines
-    assert lines[0].startswith("error: ")
+    assert lines[0].startswith(f"error: {file}: ")
     assert "it does not fit into memory" in lines[0]
     assert not [path for path in tmp_path.iterdir() if path.stem != "out"]  # which the small file's run left
 

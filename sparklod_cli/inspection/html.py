@@ -42,6 +42,9 @@ HEADER = {"version": "Version", "fractional_bits": "Fractional bits"}
 #: From bad to harmless.
 SEVERITIES = (ERROR, WARNING, NOTE)
 
+#: Findings of a file that are listed; a check has some forty kinds, a file of expectations any number.
+MOST_FINDINGS = 200
+
 NONE = "\u2013"
 
 
@@ -213,11 +216,14 @@ def _findings(report: Mapping[str, Any]) -> str:
     if not findings:
         return _panel("Notes", notes)
     items = []
-    for found in sorted(findings, key=lambda found: SEVERITIES.index(found["severity"])):
+    worst_first = sorted(findings, key=lambda found: SEVERITIES.index(found["severity"]))
+    for found in worst_first[:MOST_FINDINGS]:
         severity, code, message = (text_of(found[name]) for name in ("severity", "code", "message"))
         meaning = text_of(CODES[found["code"]][1]) if found["code"] in CODES else ""
         head = f'<b>{severity}</b><code>{code}</code> <span class="faint">{meaning}</span>'
         items.append(f'<li class="{severity}">{head}<p>{message}</p></li>')
+    if len(findings) > MOST_FINDINGS:
+        items.append(f"<li>{_number(len(findings) - MOST_FINDINGS)} more findings are left out.</li>")
     return _panel("Findings", f'<ul class="findings">{"".join(items)}</ul>{notes}')
 
 

@@ -196,6 +196,17 @@ def test_findings_come_worst_first() -> None:
     assert "nothing is wrong" in said(Section(REPORT | {"findings": []}))
 
 
+@pytest.mark.parametrize("count", [200, 201, 5000])
+def test_findings_are_bounded_and_the_worst_are_kept(count: int) -> None:
+    finding = {"code": "expect.value", "message": "x", "index": None, "count": None}
+    findings = [finding | {"severity": "note"}] * (count - 1) + [finding | {"severity": "error", "message": "worst"}]
+    text = page([Section(REPORT | {"findings": findings})])
+    assert read(text).all("li")[0]["class"] == "error"
+    assert "worst" in text
+    assert (f"{count - 200:,} more findings are left out" in text) == (count > 200)
+    assert len(text) < 100_000
+
+
 def test_a_picture_is_inside_the_page() -> None:
     section = Section(REPORT, Picture(b"\x89PNG bytes", "Level 3 of 9: 14 nodes; coloured by level"))
     (image,) = read(page([section])).all("img")

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ...errors import CameraPathError
-from ...untrusted import parse_json
+from ...untrusted import LARGEST, parse_json
 from ..camera import Matrix
 from ..frame import Frame
 from ..pose import pose, rotation_of
@@ -170,7 +170,7 @@ def finite(value: Any, way: str) -> float:
         number = float(value) if not isinstance(value, bool) else math.nan
     except (TypeError, ValueError, OverflowError):
         number = math.nan
-    if not math.isfinite(number):
+    if not abs(number) < LARGEST:
         raise CameraPathError(f"{way} has {brief(value)}, which is not a finite number")
     return number
 
