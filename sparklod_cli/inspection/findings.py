@@ -23,6 +23,8 @@ CODES: dict[str, tuple[str, str]] = {
     "container.left-out": (WARNING, "the file holds something that is left out when it is read"),
     "values.empty": (ERROR, "there are no splats"),
     "values.non-finite": (ERROR, "a number is not finite, or a rotation has the length 0"),
+    "values.rotation": (ERROR, "the length of a rotation is not 1"),
+    "values.negative-scale": (ERROR, "a scale is below 0"),
     "values.opacity": (ERROR, "an opacity is below 0, or above 1 in a file that is no tree"),
     "values.invisible": (WARNING, "many splats have opacity 0 or scale 0 and cannot be drawn"),
     "values.scale-clamped": (WARNING, "many scales lie at an end of what the format holds"),
