@@ -123,6 +123,9 @@ def unite(a, b, merged):
     """Centre, covariance and coverage of what two nodes cover together.
 
     The product of two Gaussians with covariances P and Q at 0 and d is one with P - P (P + Q)^-1 P at P (P + Q)^-1 d.
+    Needles side by side, or flat splats nearly in one plane, may have it far away from both, where the lines or planes
+    that they lie in cross; they overlap in projection only. That is no place of what both cover: its moments are then
+    left alone, or the variance of the two would come out too small, or negative.
 
     Args:
         a, b: rows of state. merged: the row to fill; but for its density.
@@ -153,9 +156,17 @@ def unite(a, b, merged):
         for j in range(3):
             gain[i, j] = (p[i, 0] * inverse[0, j] + p[i, 1] * inverse[1, j] + p[i, 2] * inverse[2, j]) / det
     middle, mean = np.empty(3), np.empty(3)
-    left = 1 - hidden
+    from_a = from_b = reach = 0.0
     for i in range(3):
         middle[i] = gain[i, 0] * offset[0] + gain[i, 1] * offset[1] + gain[i, 2] * offset[2]
+        from_a += middle[i] * middle[i]
+        from_b += (middle[i] - offset[i]) * (middle[i] - offset[i])
+        reach += offset[i] * offset[i]
+    merged[COVERED] = total * (1 - hidden)
+    if not max(from_a, from_b) <= reach + trace:
+        hidden = 0.0
+    left = 1 - hidden
+    for i in range(3):
         mean[i] = ((1 - share) * offset[i] - hidden * middle[i]) / left
         merged[CENTER + i] = a[CENTER + i] + mean[i]
     for element in range(6):
@@ -167,7 +178,6 @@ def unite(a, b, merged):
             - hidden * (of_product + middle[i] * middle[j])
         )
         merged[COVARIANCE + element] = second / left - mean[i] * mean[j]
-    merged[COVERED] = total * left
 
 
 @kernel(inline=True)
