@@ -69,7 +69,9 @@ def test_a_negative_scale_is_an_error_or_dropped(
     command += ["--encoding", encoding] if encoding else []
     assert run(command) == 1
     (line,) = said(capfd)
-    expected = "2 of 50 splats are invalid (2 negative scale; the first is splat 7), add --on-invalid drop to leave them out"
+    expected = (
+        "2 of 50 splats are invalid (2 negative scale; the first is splat 7), add --on-invalid drop to leave them out"
+    )
     assert line == f"error: {source}: {expected}"
     assert not output.exists()
     assert run([*command, "--on-invalid", "drop"]) == 0
@@ -136,7 +138,9 @@ def test_a_splat_is_of_one_kind_and_the_first_of_all_is_named() -> None:
     for at, kind in enumerate(INVALID):
         splats = spoiled(kind, 10 - at, splats)
     splats = spoiled("negative_scale", 10, splats)  # which is not finite either
-    assert {kind: int(mask.argmax()) for kind, mask in splats.invalid().items()} == dict(zip(INVALID, (10, 9, 8, 7), strict=True))
+    assert {kind: int(mask.argmax()) for kind, mask in splats.invalid().items()} == dict(
+        zip(INVALID, (10, 9, 8, 7), strict=True)
+    )
     assert np.flatnonzero(~splats.is_valid()).tolist() == [7, 8, 9, 10]
     with pytest.raises(InvalidSplatsError) as raised:
         Selection().apply(splats)

@@ -39,7 +39,10 @@ CODES: dict[str, tuple[str, str]] = {
     "tree.leaf-start": (WARNING, "a leaf has a child_start, which should be 0"),
     "tree.leaf-opacity": (ERROR, "a leaf is more than opaque, which only merged splats can be"),
     "tree.single-child": (WARNING, "an inner node has one child, of which it is only a copy"),
-    "tree.size": (WARNING, "a node is less than a third as large as its children in the mean, by what they cover, and stands for them too long"),
+    "tree.size": (
+        WARNING,
+        "a node is less than a third as large as its children in the mean, by what they cover, and stands for them too long",
+    ),
     "tree.coarse-first": (NOTE, "the file is not ordered coarse before fine, so a part of it is not a coarse scene"),
     "expect.bytes": (ERROR, "the file is larger than expected"),
     "expect.splats": (ERROR, "there are fewer or more splats than expected"),

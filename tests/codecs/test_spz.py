@@ -184,7 +184,7 @@ def test_extent_limits_auto_and_refuses_more_by_name(reach: float, most: int) ->
 
 def test_what_no_bits_hold_is_refused() -> None:
     for bits in (None, 0):
-        with pytest.raises(FormatError, match=r"coordinates reach 1e\+07, SPZ holds at most 8388607"):
+        with pytest.raises(FormatError, match=r"coordinates reach 1e\+07, SPZ holds at most 8388606"):
             bits_of(splats_with(reach=1e7), bits)
 
 
