@@ -16,6 +16,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fixtures import by_hand, by_hand_ksplat, by_hand_splat
 from sparklod_cli.bake import Recipe, bake
 from sparklod_cli.codecs import ply, spz
 from sparklod_cli.errors import InvalidSplatsError, SparklodError
@@ -26,11 +27,12 @@ from sparklod_cli.inspection.report import Wanted, inspect
 from sparklod_cli.io import read_scene
 from sparklod_cli.limits import ENCODINGS, MAX_FRACTIONAL_BITS, METHODS, SPZ_VERSIONS
 from sparklod_cli.scene import Scene
+from sparklod_cli.selection import Selection
 from sparklod_cli.sh import COEFFICIENTS
 from sparklod_cli.splats import Splats
 
 from .conftest import FIXTURES, real_scene
-from .scenes import random_splats
+from .scenes import random_splats, splat_columns
 
 pytestmark = pytest.mark.filterwarnings("error")
 
@@ -97,14 +99,28 @@ def write(path: Path, pieces: Iterable[bytes]) -> int:
     return path.write_bytes(b"".join(pieces))
 
 
+def reported(source: Path) -> None:
+    """Makes everything that `inspect` can say of a file."""
+    report, scene = inspect(source, Wanted(values=True, all_quantities=True, check=True))
+    json.dumps(report.as_dict(), allow_nan=False)
+    assert scene is not None
+    for name in values.names_of(scene.splats):
+        histograms.as_text(histograms.of_quantity(scene.splats, name))
+
+
+def checked(output: Path, source: Path) -> list[Finding]:
+    """What `inspect --check --leaves-of` finds."""
+    report, scene = inspect(output, Wanted(check=True))
+    assert scene is not None
+    return [*(report.findings or []), *leaves.check(scene, read_scene(source))]
+
+
 def findings_of(source: Path, recipe: Recipe) -> list[Finding]:
-    """What `inspect --check --leaves-of` finds in a bake."""
+    """What it finds in a bake."""
     with tempfile.TemporaryDirectory() as folder:
         output = Path(folder, "out.spz")
         bake(source, lambda pieces: write(output, pieces), recipe)
-        report, scene = inspect(output, Wanted(check=True))
-        assert scene is not None
-        return [*(report.findings or []), *leaves.check(scene, read_scene(source))]
+        return checked(output, source)
 
 
 def file_of(folder: str | Path, splats: Splats) -> Path:
@@ -160,11 +176,60 @@ def test_every_encoding_and_every_report_of_an_extreme_scene_is_made_without_a_w
             bake(source, lambda pieces: write(output, pieces), Recipe(method=method, encoding=encoding))
         except InvalidSplatsError as error:  # of which none can be seen
             assert refused(error)
-        report, scene = inspect(source, Wanted(values=True, all_quantities=True, check=True))
-        json.dumps(report.as_dict(), allow_nan=False)
-        assert scene is not None
-        for name in values.names_of(scene.splats):
-            histograms.as_text(histograms.of_quantity(scene.splats, name))
+        reported(source)
+
+
+SPECIAL = np.array([0, -0.0, 1, -1, 1e-45, 1e-38, 1e30, -1e30, 65_519, 65_520, 3.4e38, -3.4e38, np.inf, np.nan])
+
+
+def any_floats(rng: np.random.Generator, count: int, width: int) -> np.ndarray:
+    """(count, width) float32 as damaged files have them: ordinary ones, special ones, and any bits at all."""
+    kinds = rng.choice(3, (count, width), p=[0.9, 0.06, 0.04])
+    bits = rng.integers(0, 2**32, (count, width), np.uint32).view(np.float32)
+    ordinary = rng.normal(size=(count, width)) * 0.1
+    return np.choose(kinds, [ordinary, rng.choice(SPECIAL, (count, width)), bits.astype(np.float64)])
+
+
+def raw_file(rng: np.random.Generator, kind: str) -> bytes:
+    """A file of 40 splats of any numbers."""
+    columns = splat_columns(40, sh_degree=1)
+    if kind == ".ply":
+        for name in columns:
+            columns[name] = any_floats(rng, 40, 1)[:, 0].astype(np.float32)
+        return by_hand.ply(columns)
+    splats = random_splats(40)
+    plain = {"center": splats.center, "scale": any_floats(rng, 40, 3), "quat_wxyz": splats.quat_xyzw}
+    plain |= {"opacity": splats.opacity, "rgb": splats.rgb, "sh": any_floats(rng, 40, 24).reshape(40, 8, 3)}
+    if kind == ".splat":
+        return by_hand_splat.splat(**plain | {"center": any_floats(rng, 40, 3)})
+    return by_hand_ksplat.ksplat(**plain | {"center": any_floats(rng, 40, 3)}, level=0)
+
+
+@given(
+    st.integers(0, 2**32 - 1),
+    st.sampled_from([".ply", ".splat", ".ksplat"]),
+    st.sampled_from(METHODS),
+    st.sampled_from([None, *ENCODINGS]),
+    st.booleans(),
+)
+@settings(max_examples=150, deadline=None)
+def test_any_numbers_are_baked_refused_and_reported_without_a_warning(
+    seed: int, kind: str, method: str, encoding: str | None, drop: bool
+) -> None:
+    with np.errstate(all="ignore"):
+        data = raw_file(np.random.default_rng(seed), kind)
+    with tempfile.TemporaryDirectory() as folder:
+        source, output = Path(folder, f"scene{kind}"), Path(folder, "out.spz")
+        source.write_bytes(data)
+        recipe = Recipe(method=method, encoding=encoding, selection=Selection(drop_invalid=drop))
+        try:
+            bake(source, lambda pieces: write(output, pieces), recipe)
+        except SparklodError as error:
+            assert refused(error)
+        else:
+            if encoding is None:
+                assert [each for each in checked(output, source) if each.severity == ERROR] == []
+        reported(source)
 
 
 #: Scenes that SPZ does not hold, or hardly: how large or how far the splats themselves are is said, of their trees too.

@@ -68,17 +68,12 @@ def largest_fractional_bits(center: NDArray[np.float32]) -> int:
     """
     largest = float(np.abs(center).max(initial=0))
     if np.rint(largest) > LAST_CODE:
-        raise FormatError(f"coordinates reach {_reach(largest)}, SPZ holds at most {LAST_CODE}: scale the scene")
+        reach = f"{largest:.0f}" if largest < 1e7 else f"{largest:.3g}"
+        raise FormatError(f"coordinates reach {reach}, SPZ holds at most {LAST_CODE}: scale the scene")
     bits = MAX_FRACTIONAL_BITS
     while bits and np.rint(largest * 2.0**bits) > LAST_CODE:
         bits -= 1
     return bits
-
-
-def _reach(largest: float) -> str:
-    """Three digits, or all of those before the point where that many would not show what is too much."""
-    text = f"{largest:.3g}"
-    return text if float(text) > LAST_CODE + 1 else f"{largest:.0f}"
 
 
 def fractional_bits(splats: Splats, options: Options) -> int:

@@ -26,7 +26,7 @@ CODES: dict[str, tuple[str, str]] = {
     "values.rotation": (ERROR, "the length of a rotation is not 1"),
     "values.negative-scale": (ERROR, "a scale is below 0"),
     "values.opacity": (ERROR, "an opacity is below 0, or above 1 in a file that is no tree"),
-    "values.invisible": (WARNING, "many splats have opacity 0 or scale 0 and cannot be drawn"),
+    "values.invisible": (WARNING, "many splats, of a tree many leaves, have opacity 0 or scale 0 and cannot be drawn"),
     "values.scale-clamped": (WARNING, "many scales lie at an end of what the format holds"),
     "values.center-clamped": (ERROR, "centres lie at the end of what the format holds"),
     "values.center-far": (WARNING, "centres lie so far out that a viewer's float16 cannot hold them"),
