@@ -1,4 +1,4 @@
-"""Splats that no Gaussian is, such as those of a negative scale: refused, or left out and counted, wherever they come."""
+"""Splats that no Gaussian is, such as those of a negative scale: refused, or left out and counted."""
 
 from __future__ import annotations
 
@@ -124,9 +124,9 @@ def test_every_kind_is_refused_by_builders_and_dropped_by_a_selection(kind: str,
     good = random_splats(20, sh_degree=1)
     splats = spoiled(kind, 4, good)
     assert {each: mask.tolist() for each, mask in splats.invalid().items()} == {kind: [at == 4 for at in range(20)]}
-    with pytest.raises(InvalidSplatsError, match="1 of 20 splats are .*the first is splat 4"):
+    with pytest.raises(InvalidSplatsError, match=r"1 of 20 splats are .*the first is splat 4"):
         builder.build(splats)  # type: ignore[attr-defined]
-    with pytest.raises(InvalidSplatsError, match="1 of 20 splats are .*the first is splat 4"):
+    with pytest.raises(InvalidSplatsError, match=r"1 of 20 splats are .*the first is splat 4"):
         Selection().apply(splats)
     kept, dropped = Selection(drop_invalid=True).apply(splats)
     assert dropped == {kind: 1}
@@ -145,8 +145,8 @@ def test_a_splat_is_of_one_kind_and_the_first_of_all_is_named() -> None:
     with pytest.raises(InvalidSplatsError) as raised:
         Selection().apply(splats)
     assert str(raised.value).startswith(
-        "4 of 20 splats are invalid (1 not finite, 1 rotation not of length 1, 1 negative scale, 1 negative opacity; the"
-        " first is splat 7), add"
+        "4 of 20 splats are invalid (1 not finite, 1 rotation not of length 1, 1 negative scale, 1 negative opacity;"
+        " the first is splat 7), add"
     )
 
 

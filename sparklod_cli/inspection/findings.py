@@ -41,7 +41,7 @@ CODES: dict[str, tuple[str, str]] = {
     "tree.single-child": (WARNING, "an inner node has one child, of which it is only a copy"),
     "tree.size": (
         WARNING,
-        "a node is less than a third as large as its children in the mean, by what they cover, and stands for them too long",
+        "a node is less than a third as large as its children in the mean, by what they cover: it comes too late",
     ),
     "tree.coarse-first": (NOTE, "the file is not ordered coarse before fine, so a part of it is not a coarse scene"),
     "expect.bytes": (ERROR, "the file is larger than expected"),

@@ -15,8 +15,8 @@ from ..tree import LodTree
 from .findings import Finding
 
 #: A node may be this much smaller than what it stands for: its children in the mean, by what they cover. A merged splat
-#: has their variance at least, so a node of a good tree is 0.5 times as large or more; one that is much smaller is drawn
-#: in their place for too long. A single child may be far larger than its parent where it is faint, which is no fault:
+#: has their variance at least, so a node of a good tree is 0.5 times as large or more; one that is much smaller is
+#: drawn in their place for too long. One child may be far larger than its parent where it is faint, which is no fault:
 #: docs/decisions/2026-11-21-sizes-of-parents.md.
 LEAST_RATIO = 1 / 3
 
