@@ -125,8 +125,11 @@ class Splats:
         finite = np.ones(len(self), np.bool_)
         for name in COLUMNS:
             column = getattr(self, name).reshape(len(self), math.prod(getattr(self, name).shape[1:]))
-            # A sum is finite only if all its terms are, unless huge ones overflow: those rows are looked at one by one.
+            # A sum is finite only if all its terms are, unless huge ones overflow: first the sum of all, which is fast,
+            # then those of rows, and the rows that are suspect are looked at one by one.
             with np.errstate(over="ignore", invalid="ignore"):
+                if np.isfinite(column.sum()):
+                    continue
                 suspect = np.flatnonzero(~np.isfinite(np.einsum("ij->i", column)))
             finite[suspect[~np.isfinite(column[suspect]).all(axis=1)]] = False
         return finite
