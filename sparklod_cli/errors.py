@@ -74,7 +74,7 @@ class TooLongError(FormatError):
 
 
 class InvalidSplatsError(SparklodError):
-    """The splats themselves cannot be used: none is left, or some are not finite."""
+    """The splats themselves cannot be used: none is left, or some are invalid."""
 
 
 class TreeError(SparklodError):

@@ -8,13 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import InvalidSplatsError
-from .splats import Splats
+from .splats import INVALID, Splats, describe_invalid
 
 Vector = tuple[float, float, float]
 
 #: Why a splat was left out, in the order in which the reasons are tried, and how a report says it.
-REASONS = {
-    "non_finite": "not finite",
+REASONS = INVALID | {
     "zero_opacity": "zero opacity",
     "zero_scale": "zero scale",
     "low_opacity": "below --min-opacity",
@@ -27,7 +26,7 @@ class Selection:
     """What to keep.
 
     Attributes:
-        drop_invalid: drop splats with a number that is not finite or a rotation of length 0, instead of failing.
+        drop_invalid: drop splats that are invalid (`splats.INVALID`), instead of failing.
         min_opacity: keep splats of at least this opacity, 0..1.
         min_box, max_box: keep centres inside this box, borders (as float32) included; world units.
         within: keep centres in this ball, x y z and radius.
@@ -43,19 +42,14 @@ class Selection:
         """The splats that are kept, in order, and how many were dropped for each of `REASONS` that occurred.
 
         Raises:
-            InvalidSplatsError: some are not finite and `drop_invalid` is not set, or none is left.
+            InvalidSplatsError: some are invalid and `drop_invalid` is not set, or none is left.
         """
         if len(splats) == 0:
             raise InvalidSplatsError("it has no splats")
-        finite = splats.is_finite()
-        if not (self.drop_invalid or finite.all()):
-            bad = np.flatnonzero(~finite)
-            raise InvalidSplatsError(
-                f"{bad.size:,} of {len(splats):,} splats are not finite (NaN, infinite, or a rotation of length 0; the"
-                f" first is splat {bad[0]:,}), add --on-invalid drop to leave them out"
-            )
-        keeps = {
-            "non_finite": finite,
+        invalid = splats.invalid()
+        if invalid and not self.drop_invalid:
+            raise InvalidSplatsError(f"{describe_invalid(invalid)}, add --on-invalid drop to leave them out")
+        keeps = {kind: ~mask for kind, mask in invalid.items()} | {
             "zero_opacity": splats.opacity > 0,
             "zero_scale": splats.scale.max(axis=1, initial=0) > 0,
             "low_opacity": splats.opacity >= self.min_opacity,
@@ -63,7 +57,7 @@ class Selection:
         }
         keep = np.ones(len(splats), np.bool_)
         dropped = {}
-        for reason in REASONS:
+        for reason in (reason for reason in REASONS if reason in keeps):
             before = int(np.count_nonzero(keep))
             keep &= keeps[reason]
             dropped[reason] = before - int(np.count_nonzero(keep))

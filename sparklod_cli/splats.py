@@ -15,6 +15,19 @@ from .sh import COEFFICIENTS, degree_of
 
 FloatArray = NDArray[np.floating[Any]]
 
+#: What makes a splat invalid, in the order in which it is looked for, and how a report says it: no Gaussian has such
+#: numbers, so nothing can be computed with them. A splat of opacity 0 or scale 0 is valid; it only cannot be seen.
+INVALID = {
+    "non_finite": "not finite",
+    "bad_rotation": "rotation not of length 1",
+    "negative_scale": "negative scale",
+    "negative_opacity": "negative opacity",
+}
+
+#: How far the square of a rotation's length may be from 1: codings with a byte a component are normalized when they are
+#: read, so that only float32 rounds.
+UNIT_TOLERANCE = 1e-3
+
 
 @dataclass(frozen=True)
 class Splats:
@@ -79,14 +92,45 @@ class Splats:
         """The splats at an index array, a boolean mask or a slice: the one way to filter, permute and truncate."""
         return Splats(**{name: np.ascontiguousarray(getattr(self, name)[index]) for name in COLUMNS})
 
-    def is_finite(self) -> NDArray[np.bool_]:
-        """(N,) whether all numbers of a splat are finite."""
+    def invalid(self) -> dict[str, NDArray[np.bool_]]:
+        """(N,) masks of the splats that are invalid, by the kinds of `INVALID` that occur; a splat is in one at most.
+
+        This is the one definition of a valid splat: readers give what a file holds, and whoever takes splats refuses or
+        leaves out these.
+        """
+        finite = self._is_finite()
+        with np.errstate(over="ignore", invalid="ignore"):
+            length = np.einsum("ij,ij->i", self.quat_xyzw, self.quat_xyzw)
+            wrong = {
+                "non_finite": ~finite,
+                "bad_rotation": ~(np.abs(length - 1) <= UNIT_TOLERANCE),
+                "negative_scale": np.minimum.reduce(self.scale.T) < 0,
+                "negative_opacity": self.opacity < 0,
+            }
+        valid, found = np.ones(len(self), np.bool_), {}
+        for kind in INVALID:
+            if (mask := wrong[kind] & valid).any():
+                found[kind] = mask
+                valid &= ~mask
+        return found
+
+    def is_valid(self) -> NDArray[np.bool_]:
+        """(N,) whether a splat is none of `INVALID`."""
+        valid = np.ones(len(self), np.bool_)
+        for mask in self.invalid().values():
+            valid &= ~mask
+        return valid
+
+    def _is_finite(self) -> NDArray[np.bool_]:
         finite = np.ones(len(self), np.bool_)
         for name in COLUMNS:
             column = getattr(self, name).reshape(len(self), math.prod(getattr(self, name).shape[1:]))
-            # A sum is finite only if all its terms are, unless huge ones overflow: those rows are looked at one by one.
+            # A sum is finite only if all its terms are, unless huge ones overflow: first the sum of all, which is fast,
+            # then those of rows, and the rows that are suspect are looked at one by one.
             with np.errstate(over="ignore", invalid="ignore"):
-                suspect = np.flatnonzero(~np.isfinite(column.sum(axis=1, dtype=np.float64)))
+                if np.isfinite(column.sum()):
+                    continue
+                suspect = np.flatnonzero(~np.isfinite(np.einsum("ij->i", column)))
             finite[suspect[~np.isfinite(column[suspect]).all(axis=1)]] = False
         return finite
 
@@ -99,3 +143,19 @@ class Splats:
 
 
 COLUMNS = tuple(field.name for field in dataclasses.fields(Splats))
+
+
+def describe_invalid(invalid: dict[str, NDArray[np.bool_]]) -> str:
+    """ "3 of 50 splats are not finite (NaN, infinite, or a rotation of length 0; the first is splat 7)", for people.
+
+    Args:
+        invalid: of `Splats.invalid`, not empty.
+    """
+    counts = {kind: int(np.count_nonzero(mask)) for kind, mask in invalid.items()}
+    total = len(next(iter(invalid.values())))
+    first = min(int(np.argmax(mask)) for mask in invalid.values())
+    if set(invalid) == {"non_finite"}:
+        what = "not finite (NaN, infinite, or a rotation of length 0"
+    else:
+        what = "invalid (" + ", ".join(f"{count:,} {INVALID[kind]}" for kind, count in counts.items())
+    return f"{sum(counts.values()):,} of {total:,} splats are {what}; the first is splat {first:,})"

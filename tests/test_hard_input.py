@@ -143,9 +143,10 @@ NUMBERS: dict[str, tuple[Columns, list[str], str]] = {
     "glaring colours": ({"f_dc_0": 3e38, "f_dc_1": -3e38}, [], "20 splats"),
     "glaring coefficients": ({"f_rest_0": 3e38, "f_rest_8": -3e38}, [], "20 splats"),
     "normals, which nobody reads": ({"nx": np.nan, "ny": (np.inf,)}, [], "20 splats"),
-    "far away": ({"x": 1e7}, [], r"^error: : coordinates reach 1e\+07, SPZ holds at most 8388607: scale the scene"),
+    "far away": ({"x": 1e7}, [], r"^error: : coordinates reach 1e\+07, SPZ holds at most 8388606: scale the scene"),
     "all far away": (each("xyz", (1e38,)), [], "^error: : coordinates reach"),
-    "as far as SPZ holds": (each("xyz", -8388607), [], "20 splats"),
+    "as far as SPZ holds": (each("xyz", -8388606), [], "20 splats"),
+    "a unit farther": (each("xyz", -8388607), [], "^error: : coordinates reach 8388607, SPZ holds at most 8388606"),
     "one place": (each("xyz", (0.1,)), [], "20 splats"),
     "one place, far away": (each("xyz", (8e6,)), [], "20 splats"),
     "places that differ by the least": (

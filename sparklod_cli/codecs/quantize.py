@@ -39,6 +39,8 @@ _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 #: float32, and readers that refuse what is not finite take it.
 FAR = np.float32(110)
 
+LARGEST = np.finfo(np.float32).max
+
 
 def decode_log(values: FloatArray) -> FloatArray:
     """Natural logarithms to what they are of. Exact up to float32 arithmetic, as are the next two."""
@@ -71,8 +73,9 @@ def decode_dc(dc: FloatArray) -> FloatArray:
 
 
 def encode_dc(rgb: FloatArray) -> FloatArray:
-    """Display-referred colours to SH DC coefficients."""
-    return (rgb - np.float32(0.5)) / np.float32(SH_C0)
+    """Display-referred colours to SH DC coefficients, finite also where colours are near the end of float32."""
+    with np.errstate(over="ignore"):
+        return np.clip((rgb - np.float32(0.5)) / np.float32(SH_C0), -LARGEST, LARGEST)
 
 
 def _to_byte(values: NDArray[Any]) -> Bytes:

@@ -38,6 +38,11 @@ READABLE = (1, 2, 3, 4)
 STEPS_A_SPLAT, SMALL_QUANTILE = 16, 0.01
 
 
+#: The largest code that a coordinate is given. The one after it, with either sign, is what writers clamp to: `inspect`
+#: takes a coordinate that has it for one that did not fit.
+LAST_CODE = quantize.FIXED24_MAX - 1
+
+
 @dataclass(frozen=True)
 class Options:
     """How to write.
@@ -62,10 +67,11 @@ def largest_fractional_bits(center: NDArray[np.float32]) -> int:
         FormatError: not even whole units fit.
     """
     largest = float(np.abs(center).max(initial=0))
-    if np.rint(largest) > quantize.FIXED24_MAX:
-        raise FormatError(f"coordinates reach {largest:.3g}, SPZ holds at most {quantize.FIXED24_MAX}: scale the scene")
+    if np.rint(largest) > LAST_CODE:
+        reach = f"{largest:.0f}" if largest < 1e7 else f"{largest:.3g}"
+        raise FormatError(f"coordinates reach {reach}, SPZ holds at most {LAST_CODE}: scale the scene")
     bits = MAX_FRACTIONAL_BITS
-    while bits and np.rint(largest * 2.0**bits) > quantize.FIXED24_MAX:
+    while bits and np.rint(largest * 2.0**bits) > LAST_CODE:
         bits -= 1
     return bits
 

@@ -112,7 +112,7 @@ Examples:
     "--on-invalid",
     type=click.Choice(["error", "drop"]),
     default="error",
-    help="What to do about splats with numbers that are not finite.",
+    help="What to do about invalid splats: numbers that are not finite, or negative scales.",
 )
 @click.option(
     "--rgba",

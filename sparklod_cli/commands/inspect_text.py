@@ -76,6 +76,7 @@ def _values(values: dict[str, Any]) -> Iterator[str]:
         yield _row(quantity, " ".join(f"{cell:>10}" for cell in cells))
     counts = {
         "not finite": values["non_finite"],
+        "of a negative scale": values["negative_scale"],
         "of opacity 0": values["zero_opacity"],
         "of scale 0": values["zero_scale"],
     }

@@ -38,7 +38,8 @@ def world_options(command: Command) -> Command:
             "--precision",
             type=click.Choice(limits.PRECISIONS),
             default=limits.PRECISIONS[0],
-            help="Of centres and sizes: as in the file, or as Spark's traversal has them in memory.",
+            help="Of centres and sizes: as in the file, or rounded to halves, which is nearly, but not exactly, what"
+            " Spark holds after loading it.",
         ),
         click.option(
             "--scene",

@@ -269,6 +269,7 @@ def _values(values: Mapping[str, Any]) -> str:
     extent = _table(("", "x", "y", "z"), boxes, "World units.") if boxes else ""
     counts = (
         ("with a number that is not finite", "non_finite"),
+        ("with a negative scale", "negative_scale"),
         ("of opacity 0", "zero_opacity"),
         ("of scale 0", "zero_scale"),
         ("more than opaque", "more_than_opaque"),

@@ -71,7 +71,7 @@ def plot(scene: Scene, *, by: str = "level", level: int | None = None, size: tup
     """Draws a scene. All levels of a scene are seen from the same place.
 
     Args:
-        scene: N splats; those that are not finite are left out, and the tree may be broken.
+        scene: N splats; those that are invalid are left out, and the tree may be broken.
         by: one of `PLOT_BY`; for a scene that is no tree, "level" is taken for "size".
         level: edges from the root to the nodes that are drawn; None for all leaves, or all splats.
         size: width and height in pixels.
@@ -84,7 +84,7 @@ def plot(scene: Scene, *, by: str = "level", level: int | None = None, size: tup
     splats = scene.splats.with_max_sh(0)
     drawable = is_drawable(splats)
     if not drawable.any():
-        raise SparklodError("there is nothing to draw: no splat is finite and has a size")
+        raise SparklodError("there is nothing to draw: no splat is valid and has a size")
     subject = _subject(scene, level, drawable)
     by = "size" if by == "level" and subject.depth is None else by
     coloring = color_by(by, splats, subject.index, subject.depth)

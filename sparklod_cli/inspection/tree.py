@@ -9,14 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..gaussian import spark_size
-from ..lod.kernels.walk import find_cycles, find_parents, sum_levels, walk
+from ..lod.kernels.walk import find_cycles, find_parents, sizes_below, sum_levels, walk
 from ..lod.traversal import CHUNK_NODES
 from ..splats import FloatArray, Splats
 from ..tree import LodTree
 from .findings import Finding
 
-#: A node may be this much smaller than its largest child. Of ten million nodes of good trees, quick ones of dense and
-#: of sparse scenes, the worst is 0.48 times as large: a faint large splat and a small opaque one.
+#: A node may be this much smaller than what it stands for: its children in the mean, by what they cover. A merged splat
+#: has their variance at least, so a node of a good tree is 0.5 times as large or more; one that is much smaller is
+#: drawn in their place for too long. One child may be far larger than its parent where it is faint, which is no fault:
+#: docs/decisions/2026-11-21-sizes-of-parents.md.
 LEAST_RATIO = 1 / 3
 
 #: Coarse before fine: nodes are wanted when their parent has become too coarse. Of so many parts of a file, none may be
@@ -162,11 +164,8 @@ def _link_findings(
 
 def _node_findings(splats: Splats, tree: LodTree, parent: NDArray[np.int32], size: FloatArray) -> list[Finding]:
     findings = _found("tree.leaf-opacity", tree.is_leaf & (splats.opacity > 1), "is a leaf and more than opaque")
-    children = np.flatnonzero(parent >= 0)
-    smaller = np.zeros(len(tree), np.bool_)
-    above = parent[children]
-    smaller[above[size[above] < np.float32(LEAST_RATIO) * size[children]]] = True
-    return findings + _found("tree.size", smaller, "is less than a third as large as one of its children")
+    smaller = size < LEAST_RATIO * sizes_below(parent, size, splats.scale, splats.opacity)
+    return findings + _found("tree.size", smaller, "is less than a third as large as its children are in the mean")
 
 
 def _order_findings(parent: NDArray[np.int32], limit: FloatArray) -> list[Finding]:

@@ -32,6 +32,14 @@ QUANTITIES: dict[str, Callable[[Splats], FloatArray]] = {
 }
 SH_QUANTITIES = ("sh1", "sh2", "sh3")  # root mean square of a splat's coefficients of a degree
 
+#: The codes of what makes a splat invalid (`splats.INVALID`), and what is said of it.
+OF_INVALID = {
+    "non_finite": ("values.non-finite", "a number is not finite, or the rotation has length 0"),
+    "bad_rotation": ("values.rotation", "the length of the rotation is not 1"),
+    "negative_scale": ("values.negative-scale", "a scale is below 0"),
+    "negative_opacity": ("values.opacity", "the opacity is below 0"),
+}
+
 #: Those that a report has without --stats.
 MAIN = ("scale", "opacity", "anisotropy")
 PERCENTILES = {"p1": 1, "p25": 25, "p50": 50, "p75": 75, "p99": 99}
@@ -54,12 +62,13 @@ class Box:
 
 @dataclass(frozen=True)
 class ValueFacts:
-    """What the numbers are like; those that are not finite are counted and left out.
+    """What the numbers are like; invalid splats (`splats.INVALID`) are counted and left out.
 
     Attributes:
         box: of the centres.
         box_98: between the 1 % and the 99 % quantiles of each coordinate.
         non_finite: splats with a number that is not finite.
+        negative_scale: splats with a scale below 0.
         zero_opacity, zero_scale: splats that cannot be drawn.
         more_than_opaque: splats with an opacity above 1.
         quantities: min, mean, max and percentiles of `QUANTITIES`, by their names.
@@ -68,6 +77,7 @@ class ValueFacts:
     box: Box | None
     box_98: Box | None
     non_finite: int
+    negative_scale: int
     zero_opacity: int
     zero_scale: int
     more_than_opaque: int
@@ -97,8 +107,8 @@ def examine(splats: Splats, *, all_quantities: bool = False) -> ValueFacts:
         splats: N of them.
         all_quantities: all of `QUANTITIES`, not only those of `MAIN`.
     """
-    finite = splats.is_finite()
-    good = splats if finite.all() else splats.take(finite)
+    invalid = splats.invalid()
+    good = splats.take(splats.is_valid()) if invalid else splats
     names = names_of(splats) if all_quantities else MAIN
     box = box_98 = None
     if len(good):
@@ -108,7 +118,8 @@ def examine(splats: Splats, *, all_quantities: bool = False) -> ValueFacts:
     return ValueFacts(
         box=box,
         box_98=box_98,
-        non_finite=int(np.count_nonzero(~finite)),
+        non_finite=int(np.count_nonzero(invalid.get("non_finite", False))),
+        negative_scale=int(np.count_nonzero(invalid.get("negative_scale", False))),
         zero_opacity=int(np.count_nonzero(good.opacity == 0)),
         zero_scale=int(np.count_nonzero(good.scale.max(axis=1, initial=0) == 0)),
         more_than_opaque=int(np.count_nonzero(good.opacity > 1)),
@@ -147,18 +158,24 @@ def check(scene: Scene) -> list[Finding]:
             more = f" and {count - 1:,} more" if count > 1 else ""
             found.append(Finding(code, f"splat {index:,}{more}: {what}", index, count))
 
-    finite = splats.is_finite()
-    report("values.non-finite", ~finite, "a number is not finite, or the rotation has length 0")
-    top = np.inf if scene.tree is not None else 1
-    outside = (splats.opacity < 0) | (splats.opacity > top)
-    report("values.opacity", finite & outside, f"the opacity is not in 0..{top:g}")
+    invalid = splats.invalid()
+    valid = splats.is_valid() if invalid else np.ones(len(splats), np.bool_)
+    for kind, (code, what) in OF_INVALID.items():
+        if kind in invalid:
+            report(code, invalid[kind], what)
+    if scene.tree is None:
+        report("values.opacity", valid & (splats.opacity > 1), "the opacity is above 1")
     invisible = (splats.opacity == 0) | (splats.scale.max(axis=1) == 0)
-    if np.count_nonzero(invisible) > MANY_INVISIBLE * len(splats):
-        report("values.invisible", finite & invisible, "cannot be drawn, opacity or scale is 0")
+    looked_at = len(splats)
+    if scene.tree is not None:  # where thin splats are far apart, what is merged of them is fainter than a code holds
+        invisible &= scene.tree.is_leaf
+        looked_at = int(np.count_nonzero(scene.tree.is_leaf))
+    if np.count_nonzero(invisible) > MANY_INVISIBLE * looked_at:
+        report("values.invisible", valid & invisible, "cannot be drawn, opacity or scale is 0")
     header = scene.header
     if header.get("version", 0) >= 2 and "fractional_bits" in header:  # SPZ version 1 has floats
         most = quantize.FIXED24_MAX * 2.0 ** -int(header["fractional_bits"])
-        clamped = finite & (np.abs(splats.center) >= most).any(axis=1)
+        clamped = valid & (np.abs(splats.center) >= most).any(axis=1)
         report("values.center-clamped", clamped, f"a coordinate is {most:g}, the most that its code holds")
     if "fractional_bits" in header:
         low, high = quantize.decode_log_scale(np.array([0, 255], np.uint8))
@@ -166,6 +183,6 @@ def check(scene: Scene) -> list[Finding]:
         clamped = (most <= low) | (most >= high)
         if np.count_nonzero(clamped) > MANY_CLAMPED * len(splats):
             report("values.scale-clamped", clamped, f"a scale is {low:.2g} or {high:.0f}, the ends of what SPZ holds")
-    far = finite & (np.abs(splats.center) >= FLOAT16_END).any(axis=1)
+    far = valid & (np.abs(splats.center) >= FLOAT16_END).any(axis=1)
     report("values.center-far", far, f"a coordinate is {FLOAT16_END:,} or more, which float16 cannot hold")
     return found

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ..errors import InvalidSplatsError
 from ..jit import threads_for
-from ..splats import Splats
+from ..splats import Splats, describe_invalid
 from .kernels.geometry import extremes
 
 
@@ -32,13 +32,14 @@ def check(splats: Splats) -> Extremes:
     """How far splats reach that a tree can be built of.
 
     Raises:
-        InvalidSplatsError: there is none, or one that cannot be drawn.
+        InvalidSplatsError: there is none, or one that is invalid or cannot be seen.
     """
     if len(splats) == 0:
         raise InvalidSplatsError("no splat is left to build a tree of")
+    if invalid := splats.invalid():
+        raise InvalidSplatsError(f"{describe_invalid(invalid)}: see Selection.apply")
     with threads_for(len(splats)) as threads:
         low, high, smallest, largest = extremes(splats.center, splats.scale, threads)
-    columns = splats.center, splats.scale, splats.quat_xyzw, splats.opacity
-    if not (smallest > 0 and splats.opacity.min() > 0 and all(np.isfinite(column).all() for column in columns)):
-        raise InvalidSplatsError("a splat is not finite, or without opacity or scale: see Selection.apply")
+    if not (smallest > 0 and splats.opacity.min() > 0):
+        raise InvalidSplatsError("a splat is without opacity or scale: see Selection.apply")
     return Extremes(low, high, smallest, largest)

@@ -78,10 +78,9 @@ def _seen(local: Points, angle: float, aspect: float) -> Points:
 
 
 def is_drawable(splats: Splats) -> NDArray[np.bool_]:
-    """(N,) whether a splat is finite and has a size."""
-    columns = (splats.center, splats.scale, splats.quat_xyzw, splats.opacity[:, None])
-    finite = np.isfinite(np.sum([column.sum(axis=1, dtype=np.float64) for column in columns], axis=0))
-    return finite & (splats.scale.min(axis=1) >= 0) & (splats.scale.max(axis=1) > 0)
+    """(N,) whether a splat is valid and has a size."""
+    drawable: NDArray[np.bool_] = splats.is_valid() & (splats.scale.max(axis=1) > 0)
+    return drawable
 
 
 def bounds(splats: Splats) -> tuple[Points, Points]:

@@ -141,12 +141,12 @@ def bits_of(splats: Splats, fractional_bits: int | None = None) -> int | None:
     return spz.fractional_bits(splats, spz.Options(fractional_bits=fractional_bits))
 
 
-@given(reach=st.floats(2.0**-10, 8_388_607, width=32))
+@given(reach=st.floats(2.0**-10, spz.LAST_CODE, width=32))
 def test_the_most_bits_are_the_most_that_fit(reach: float) -> None:
     splats = splats_with(reach=reach, count=2)
     bits = spz.largest_fractional_bits(splats.center)
-    assert round(reach * 2.0**bits) <= 2**23 - 1
-    assert bits == 24 or round(reach * 2.0 ** (bits + 1)) > 2**23 - 1
+    assert round(reach * 2.0**bits) <= spz.LAST_CODE == 2**23 - 2
+    assert bits == 24 or round(reach * 2.0 ** (bits + 1)) > spz.LAST_CODE
     back = spz.decode(io.BytesIO(b"".join(spz.encode(Scene(splats), spz.Options(fractional_bits=bits)))))
     assert np.abs(back.splats.center.astype(np.float64) - splats.center).max() <= 0.5 * 2.0**-bits
 
@@ -184,7 +184,7 @@ def test_extent_limits_auto_and_refuses_more_by_name(reach: float, most: int) ->
 
 def test_what_no_bits_hold_is_refused() -> None:
     for bits in (None, 0):
-        with pytest.raises(FormatError, match=r"coordinates reach 1e\+07, SPZ holds at most 8388607"):
+        with pytest.raises(FormatError, match=r"coordinates reach 1e\+07, SPZ holds at most 8388606"):
             bits_of(splats_with(reach=1e7), bits)
 
 

@@ -187,7 +187,8 @@ def test_without_a_check_nothing_is_looked_for() -> None:
 @pytest.mark.parametrize(("size", "found"), [(0.99, True), (1.01, False), (3.0, False), (0.0, True)])
 def test_how_much_smaller_than_its_children_a_node_may_be(size: float, found: bool) -> None:
     child = 1 / facts_of.LEAST_RATIO
-    splats = sized([100.0, size, child, child / 2, child])
+    splats = sized([100.0, size, child, child, 1000.0])
+    splats.opacity[4] = 1e-10  # a large one that covers nearly nothing
     _, findings = examine(splats, tree_of([(2, 1), (2, 3), (0, 0), (0, 0), (0, 0)]))
     assert [(each.code, each.index) for each in findings] == ([("tree.size", 1)] if found else [])
 

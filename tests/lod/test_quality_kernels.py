@@ -213,6 +213,27 @@ def test_a_union_covers_no_less_than_the_larger_and_no_more_than_both(
     assert np.linalg.eigvalsh(twin.matrix(merged))[0] >= -1e-5 * trace
 
 
+def needle(rng: np.random.Generator, center: np.ndarray, thickness: float) -> np.ndarray:
+    """A needle of length 1 that points nearly along x."""
+    axes = np.linalg.qr(np.eye(3) + rng.normal(0, 0.02, (3, 3)))[0]
+    return twin.row(center, (axes * np.array([1, thickness, thickness]) ** 2) @ axes.T, 0.2)
+
+
+@pytest.mark.parametrize("thickness", [0.03, 0.01, 0.003])
+def test_needles_side_by_side_are_as_long_together_as_each(thickness: float) -> None:
+    """Seen along y or z they overlap, but where their lines come nearest may be far beyond their ends."""
+    rng = np.random.default_rng(10)
+    for _ in range(300):
+        a, b = (needle(rng, rng.normal(0, (0.5, 3 * thickness, 0.2), 3), thickness) for _ in range(2))
+        merged = united(a, b)
+        matrix, plain = twin.matrix(merged), twin.joint_covariance(a, b)
+        assert np.trace(matrix) >= 0.5 * np.trace(plain)
+        assert np.linalg.eigvalsh(matrix)[0] >= -1e-5 * np.trace(plain)
+        middle = (a[CENTER : CENTER + 3] + b[CENTER : CENTER + 3]) / 2
+        assert np.linalg.norm(merged[CENTER : CENTER + 3] - middle) <= math.sqrt(np.trace(plain))
+        assert merged[COVERED] <= (a[COVERED] + b[COVERED]) * (1 + 1e-6)
+
+
 def test_pairs_become_rows_that_cover_as_much_and_are_as_large_as_they_are_drawn() -> None:
     rows = np.zeros((30, pairs.WIDTH), np.float32)
     rows[:20] = twin.random_rows(20, seed=8, spread=0.5)

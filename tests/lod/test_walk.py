@@ -11,10 +11,12 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from sparklod_cli.lod.kernels.walk import STEPS, find_cycles, find_parents, sum_levels, walk
+from sparklod_cli.gaussian import spark_size
+from sparklod_cli.lod.kernels.walk import STEPS, find_cycles, find_parents, sizes_below, sum_levels, walk
 
 from .. import reference
 from ..conftest import ROOT
+from ..scenes import random_splats
 
 Links = list[tuple[int, int]]
 
@@ -95,6 +97,26 @@ def test_cycles_are_what_one_never_leaves_upwards(nodes: Links) -> None:
     depth = [edges for _, edges in nodes]
     found = find_cycles(np.array(parent, np.int32), np.array(depth, np.int32))
     assert found.tolist() == reference.on_cycles(parent, depth)
+
+
+@given(ANY, st.integers(0, 2**32 - 1))
+def test_children_count_by_what_they_cover(links: Links, seed: int) -> None:
+    count, start, _ = arrays(links)
+    splats = random_splats(len(links), seed=seed % 1000)
+    rng = np.random.default_rng(seed)
+    for column in (splats.opacity, splats.scale, splats.scale[:, 1:]):
+        column[rng.random(len(links)) < 0.2] = 0
+    parent, size = find_parents(count, start)[0], spark_size(splats)
+    found = sizes_below(parent, size, splats.scale, splats.opacity)
+    for node in range(len(links)):
+        below = np.flatnonzero((parent == node) & (splats.opacity > 0) & (size > 0))
+        if len(below):
+            # The thinnest of needles count for something.
+            scale = np.maximum(splats.scale[below], 1e-20 * splats.scale[below].max(axis=1, keepdims=True))
+            weight = splats.opacity[below] * reference.ellipsoid_area(scale)
+            assert found[node] == pytest.approx(np.average(size[below], weights=weight), rel=1e-4)
+        else:
+            assert found[node] == 0
 
 
 @given(ANY)

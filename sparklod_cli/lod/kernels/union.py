@@ -123,12 +123,15 @@ def unite(a, b, merged):
     """Centre, covariance and coverage of what two nodes cover together.
 
     The product of two Gaussians with covariances P and Q at 0 and d is one with P - P (P + Q)^-1 P at P (P + Q)^-1 d.
+    Needles side by side, or flat splats nearly in one plane, may have it far away from both, where the lines or planes
+    that they lie in cross; they overlap in projection only. That is no place of what both cover: its moments are then
+    left alone, or the variance of the two would come out too small, or negative.
 
     Args:
         a, b: rows of state. merged: the row to fill; but for its density.
     """
     total = np.float64(a[COVERED]) + np.float64(b[COVERED])
-    share = np.float64(a[COVERED]) / total
+    share, other = np.float64(a[COVERED]) / total, np.float64(b[COVERED]) / total
     hidden = shared_share(a, b)
     offset, p, q, joint = np.empty(3), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     for i in range(3):
@@ -152,22 +155,52 @@ def unite(a, b, merged):
     for i in range(3):
         for j in range(3):
             gain[i, j] = (p[i, 0] * inverse[0, j] + p[i, 1] * inverse[1, j] + p[i, 2] * inverse[2, j]) / det
-    middle, mean = np.empty(3), np.empty(3)
-    left = 1 - hidden
+    merged[COVERED] = total * (1 - hidden)
+    # Of the product's centre from the mean of the two; moments are about that mean, so that nothing cancels.
+    middle = np.empty(3)
+    from_a = from_b = reach = 0.0
     for i in range(3):
-        middle[i] = gain[i, 0] * offset[0] + gain[i, 1] * offset[1] + gain[i, 2] * offset[2]
-        mean[i] = ((1 - share) * offset[i] - hidden * middle[i]) / left
-        merged[CENTER + i] = a[CENTER + i] + mean[i]
+        of_a = gain[i, 0] * offset[0] + gain[i, 1] * offset[1] + gain[i, 2] * offset[2]
+        middle[i] = of_a - other * offset[i]
+        from_a += of_a * of_a
+        from_b += (of_a - offset[i]) * (of_a - offset[i])
+        reach += offset[i] * offset[i]
+    if not max(from_a, from_b) <= reach + trace or not fill_moments(
+        share, other, hidden, offset, middle, gain, p, q, merged
+    ):
+        fill_moments(share, other, 0.0, offset, middle, gain, p, q, merged)
+        hidden = 0.0
+    for i in range(3):
+        merged[CENTER + i] = a[CENTER + i] + (other * offset[i] - hidden * middle[i] / (1 - hidden))
+
+
+@kernel()
+def fill_moments(share, other, hidden, offset, middle, gain, p, q, merged):
+    """The covariance of two, less what they share; tells whether it can be one: not below 0 nor half of theirs.
+
+    Args:
+        share, other: of each of the two in what they cover. hidden: the share that both cover.
+        offset: (3,) from the first to the second. middle: (3,) from their mean to the centre of their product.
+        gain: (3, 3) P (P + Q)^-1. p, q: (3, 3) P and Q.
+        merged: the row whose covariance is filled.
+    """
+    left = 1 - hidden
+    of_two = trace = 0.0
+    sound = True
     for element in range(6):
         i, j = ROW[element], COLUMN[element]
-        of_product = p[i, j] - (gain[i, 0] * p[0, j] + gain[i, 1] * p[1, j] + gain[i, 2] * p[2, j])
-        second = (
-            share * p[i, j]
-            + (1 - share) * (q[i, j] + offset[i] * offset[j])
-            - hidden * (of_product + middle[i] * middle[j])
-        )
-        merged[COVARIANCE + element] = second / left - mean[i] * mean[j]
-    merged[COVERED] = total * left
+        plain = share * p[i, j] + other * q[i, j] + share * other * offset[i] * offset[j]
+        united = plain
+        if hidden > 0:
+            of_product = p[i, j] - (gain[i, 0] * p[0, j] + gain[i, 1] * p[1, j] + gain[i, 2] * p[2, j])
+            # Without the product's part the mean moves by -hidden / left * middle.
+            united = (plain - hidden * of_product) / left - hidden / (left * left) * middle[i] * middle[j]
+        merged[COVARIANCE + element] = united
+        if element < 3:
+            of_two += plain
+            trace += united
+            sound = sound and united >= 0
+    return sound and trace >= 0.5 * of_two
 
 
 @kernel(inline=True)

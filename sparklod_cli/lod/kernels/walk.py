@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...jit import kernel
+from .geometry import ellipsoid_area
 
 #: A tree has fewer links than nodes; of a broken one so many times as many are followed.
 STEPS = 4
@@ -98,6 +99,32 @@ def find_parents(child_count, child_start):
     for node in range(1, count):
         references[node] += references[node - 1]
     return parent, references[:count]
+
+
+@kernel()
+def sizes_below(parent, size, scale, opacity):
+    """How large the children of each node are, in the mean by what they cover, in linear time.
+
+    Args:
+        parent: (N,) int32, of `find_parents`.
+        size: (N,) of each node, any unit.
+        scale: (N, 3) float32.
+        opacity: (N,) float32, linear.
+
+    Returns:
+        (N,) float64: the mean of the children's sizes by opacity times surface; 0 where no child covers anything.
+    """
+    means, weights = np.zeros(len(parent)), np.zeros(len(parent))
+    for node in range(len(parent)):
+        if parent[node] >= 0 and opacity[node] > 0 and 0 < size[node] < np.inf:
+            area = ellipsoid_area(scale[node, 0], scale[node, 1], scale[node, 2])
+            weight = opacity[node] * max(area, 1e-300)
+            weights[parent[node]] += weight
+            means[parent[node]] += weight * size[node]
+    for node in range(len(parent)):
+        if weights[node] > 0:
+            means[node] /= weights[node]
+    return means
 
 
 @kernel()
