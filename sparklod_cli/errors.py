@@ -79,3 +79,7 @@ class OutputError(SparklodError):
 
 class CameraPathError(SparklodError):
     """A camera path cannot be read or made: its file is broken or of no known format, or a camera makes no sense."""
+
+
+class TooManyCamerasError(CameraPathError):
+    """A path has more cameras than are made, or taken."""

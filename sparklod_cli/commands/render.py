@@ -15,7 +15,7 @@ from .camera_options import SOURCES, camera_options
 from .camera_values import View
 from .console import Console
 from .options import Real, common_options, is_given, keep_apart
-from .render_cameras import cameras, is_free, least_cameras
+from .render_cameras import framed, least_cameras
 from .render_compare import BUDGETS, compare_options
 from .render_options import GAIN, background_from, blend_from, check_size, look_options, manner_from
 from .world_options import cut_options, placements_from, viewer_from, world_options
@@ -123,7 +123,6 @@ def render(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, **s
     _output(settings, placements, least_cameras(settings))
     with Console(quiet=quiet, verbose=verbose) as console:
         from ..preview import animation
-        from ..preview.fitting import with_reach
         from ..preview.pictures import Painter
         from .render_job import Job, Wanted
 
@@ -136,10 +135,8 @@ def render(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, **s
         def scenery() -> Scenery:
             return _read(placements, None if settings["full"] else viewer, settings, console)
 
-        path = cameras(settings, lambda: scenery().centers())
-        if is_free(settings) and not is_given(ctx, "near") and not is_given(ctx, "far"):
-            look = with_reach(manner.look, path.cameras[0], scenery().centers())
-            manner = dataclasses.replace(manner, look=look)
+        path, look = framed(ctx, settings, manner.look, lambda: scenery().balls())
+        manner = dataclasses.replace(manner, look=look)
         sheet = _is_sheet(settings)
         output = _output(settings, placements, len(path.cameras))
         background = background_from(ctx, settings, output.form)
@@ -224,10 +221,10 @@ def _compare(ctx: click.Context, settings: dict[str, Any], console: Console, *, 
             threads=settings["threads"],
             progress=console.progress,
         )
-        path = cameras(settings, world.centers)
+        path, look = framed(ctx, settings, manner.look, world.balls)
         for note in path.notes:
             console.say(note)
-        how = How(BACKENDS[settings["backend"]].draw, manner.look, settings["max_sh"], blend_from(settings))
+        how = How(BACKENDS[settings["backend"]].draw, look, settings["max_sh"], blend_from(settings))
         return run(console, world, viewer, path, how, wanted, threads=settings["threads"])
 
 

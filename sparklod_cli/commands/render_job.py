@@ -17,7 +17,7 @@ from ..io import write_stdout, write_whole
 from ..parallel import ordered_map
 from ..preview import pixels as codes
 from ..preview.coloring import OF_PIXELS
-from ..preview.metrics import psnr
+from ..preview.metrics import check_covered, psnr
 from .console import Console, count_of, size_of
 
 if TYPE_CHECKING:
@@ -137,7 +137,9 @@ class Job:
         facts = self._facts(number, camera, drawn)
         image = codes.over(drawn.image, self.wanted.background)
         if self.other is not None:
-            reference = codes.over(self.other.draw(camera).image, self.wanted.background)
+            other = self.other.draw(camera).image
+            check_covered(other, f"what --diff names, in frame {number},")
+            reference = codes.over(other, self.wanted.background)
             clipped = [np.clip(each[..., :3], 0, 1) for each in (image, reference)]
             facts["psnr_db"] = round(psnr(*clipped), 3)
             image = codes.difference(image, reference, self.wanted.gain)

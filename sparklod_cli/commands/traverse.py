@@ -120,7 +120,7 @@ def traverse(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, *
             threads=settings["threads"],
             progress=console.progress,
         )
-        path = cameras_from(settings, world.centers)
+        path = cameras_from(settings, world.balls)
         try:
             simulation = Simulation(world, viewer, by_instance=settings["per_instance"])
         except ValueError as error:

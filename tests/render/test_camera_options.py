@@ -12,11 +12,11 @@ import click
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
-from numpy.typing import NDArray
 
 from sparklod_cli.commands.camera_options import camera_options, cameras_from
 from sparklod_cli.errors import CameraPathError
 from sparklod_cli.render.camera_path import CameraPath
+from sparklod_cli.render.framing import FILLED, Balls
 
 from .cameras import FOLDER, KNOWN, SIZE, check_pose
 
@@ -25,14 +25,15 @@ SHELLS = [2.0] * 50 + [1.0] * 45 + [50.0] * 5
 TURN = "-1,0,0,0,0,-1,0,0,0,0,1,0,0,0,0,1"
 
 
-def centers() -> NDArray[np.float32]:
+def scene_of_shells() -> Balls:
     random = np.random.default_rng(1)
     directions = random.normal(size=(len(SHELLS) * 40, 3))
     offsets = directions / np.linalg.norm(directions, axis=1)[:, None] * np.repeat(SHELLS, 40)[:, None]
-    return (np.concatenate([offsets, -offsets]) + np.array([1, 2, 3])).astype(np.float32)
+    center = np.concatenate([offsets, -offsets]) + np.array([1, 2, 3])
+    return Balls(center, np.zeros(len(center)))
 
 
-def run(*arguments: str | Path, scene: Any = centers) -> tuple[Result, list[CameraPath]]:
+def run(*arguments: str | Path, scene: Any = scene_of_shells) -> tuple[Result, list[CameraPath]]:
     found: list[CameraPath] = []
 
     @click.command()
@@ -44,7 +45,7 @@ def run(*arguments: str | Path, scene: Any = centers) -> tuple[Result, list[Came
     return CliRunner().invoke(command, [str(argument) for argument in arguments]), found
 
 
-def cameras(*arguments: str | Path, scene: Any = centers) -> CameraPath:
+def cameras(*arguments: str | Path, scene: Any = scene_of_shells) -> CameraPath:
     result, found = run(*arguments, scene=scene)
     assert result.exit_code == 0, result.output or result.exception
     return found[0]
@@ -62,7 +63,7 @@ def file_error(*arguments: str | Path) -> str:
     return str(result.exception)
 
 
-def no_scene() -> NDArray[np.float32]:
+def no_scene() -> Balls:
     raise AssertionError("nobody needs to know the scene")
 
 
@@ -72,7 +73,8 @@ def test_without_any_it_is_an_orbit_that_sees_the_scene() -> None:
     camera = path.cameras[0]
     assert (camera.width, camera.height) == (1280, 720)
     offset = camera.position - (1, 2, 3)
-    assert np.linalg.norm(offset) == pytest.approx(2 / math.sin(math.radians(30)), rel=0.03)
+    fits = math.atan(FILLED * math.tan(math.radians(30)))
+    assert np.linalg.norm(offset) == pytest.approx(2 / math.sin(fits), rel=0.03)
     assert offset[1] < 0, "y is down, and it is above"
     for one, other in zip(path.cameras, cameras("--orbit", "60").cameras, strict=True):
         assert np.array_equal(one.camera_to_world, other.camera_to_world)
