@@ -43,10 +43,15 @@ ONLY_WITH = {
     "distance": ("orbit", "dolly"),
     "elevation": ("orbit", "dolly"),
     "seconds": ("dolly", "keyframes"),
+    "fps": ("camera_path", "orbit", "dolly", "keyframes"),
+    "every": ("camera_path", "orbit", "dolly", "keyframes"),
     "world_transform": ("camera_path", "look_at", "keyframes"),
 }
 
 DEFAULT_ELEVATION = 15.0
+
+#: Of the options of `ONLY_WITH` that are something where nobody says anything.
+DEFAULTS = {"every": 1}
 
 #: What numbers with commas between are made of; anything else names a file.
 NUMERIC = set("0123456789+-.,eE ")
@@ -145,7 +150,7 @@ def camera_options(command: Command, *, orbit: int = DEFAULT_ORBIT) -> Command:
                 "--every",
                 metavar="K",
                 type=click.IntRange(1),
-                default=1,
+                default=DEFAULTS["every"],
                 show_default=True,
                 help="Every Kth camera only.",
             ),
@@ -171,7 +176,7 @@ def cameras_from(settings: Mapping[str, Any], scene: Scene, *, orbit: int = DEFA
     if source == "orbit":
         settings = {**settings, "orbit": settings["orbit"] or orbit}
     for option, sources in ONLY_WITH.items():
-        if settings[option] is not None and source not in sources:
+        if settings[option] not in (None, DEFAULTS.get(option)) and source not in sources:
             names = " or ".join(SOURCES[name] for name in sources)
             raise click.UsageError(f"--{option.replace('_', '-')} only means something with {names}")
 

@@ -22,6 +22,18 @@ def is_given(ctx: click.Context, name: str) -> bool:
     return ctx.get_parameter_source(name) not in (None, click.core.ParameterSource.DEFAULT)
 
 
+def flag_of(ctx: click.Context, name: str) -> str:
+    """What people type for a parameter, such as --lod-splat-scale for lod_splat_scale."""
+    return next(max(param.opts, key=len) for param in ctx.command.params if param.name == name)
+
+
+def refuse(ctx: click.Context, why: str, names: Iterable[str]) -> None:
+    """Raises a `click.UsageError` where one of some parameters was given, to which `why` leaves nothing to do."""
+    for name in names:
+        if is_given(ctx, name):
+            raise click.UsageError(f"{why} leaves nothing to {flag_of(ctx, name)}")
+
+
 def keep_apart(outputs: Iterable[Path | None], inputs: Iterable[Path | None]) -> None:
     """Raises a `click.UsageError` where an output would replace an input, or another output."""
     taken = {os.path.realpath(path): "an input" for path in inputs if path is not None}

@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from .camera_options import SOURCES, camera_options
+from .camera_options import camera_options
 from .camera_values import View
 from .console import Console
-from .options import Real, common_options, is_given, keep_apart
-from .render_cameras import framed, least_cameras
+from .options import Real, common_options, flag_of, is_given, keep_apart, refuse
+from .render_cameras import check_cameras, framed, least_cameras
 from .render_compare import BUDGETS, compare_options
-from .render_options import GAIN, background_from, blend_from, check_size, look_options, manner_from
+from .render_options import GAIN, background_from, blend_from, check_size, look_options, manner_from, of_pictures
 from .world_options import cut_options, placements_from, viewer_from, world_options
 
 if TYPE_CHECKING:
@@ -26,10 +26,27 @@ if TYPE_CHECKING:
     from ..world import Placement
     from .render_output import Output
 
-#: Options of how many splats are drawn that --full leaves no room for.
-CUTS = ("budget", "preset", "lod_splat_scale", "lod_render_scale", "pixel_scale_limit")
+#: Options of cuts, of which --full and files without a tree have none.
+CUTS = (
+    "budget",
+    "preset",
+    "lod_splat_scale",
+    "lod_render_scale",
+    "pixel_scale_limit",
+    "cone_fov0",
+    "cone_fov",
+    "cone_foveate",
+    "outside_foveate",
+    "behind_foveate",
+    "continuous",
+    "blend",
+    "precision",
+)
 
-#: Options that --compare leaves no room for, and those that are called otherwise.
+#: Options that only --compare knows.
+COMPARED = ("asserts", "plot", "max_sh")
+
+#: Options that --compare leaves no room for.
 NOT_COMPARED = (
     "full",
     "preset",
@@ -46,7 +63,6 @@ NOT_COMPARED = (
     "sheet",
     "jobs",
 )
-NAMES = {"views": "view", "asserts": "assert"}
 
 EXAMPLES = """
 \b
@@ -109,13 +125,12 @@ def render(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, **s
 
     Coordinates are those of the files; --up, --world-transform and --camera-axes bring cameras into them.
     """
+    check_cameras(ctx, settings)
     if settings["compare"]:
         ctx.exit(_compare(ctx, settings, Console(quiet=quiet, verbose=verbose), as_json=as_json))
     viewer = viewer_from(ctx, settings | {"budget": _one_budget(ctx, settings)})
     if settings["full"]:
-        for name in CUTS:
-            if is_given(ctx, name):
-                raise click.UsageError(f"--full leaves nothing to --{name.replace('_', '-')}")
+        refuse(ctx, "--full", CUTS)
     _check_usage(settings, as_json)
     manner = manner_from(ctx, settings)
     placements = placements_from(settings)
@@ -139,6 +154,8 @@ def render(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, **s
         manner = dataclasses.replace(manner, look=look)
         sheet = _is_sheet(settings)
         output = _output(settings, placements, len(path.cameras))
+        if output.form == "npy":
+            refuse(ctx, "a .npy, which holds numbers,", of_pictures(settings["color_by"]))
         background = background_from(ctx, settings, output.form)
         for camera in path.cameras:
             check_size(camera.width, camera.height, manner.supersample, output.form)
@@ -152,8 +169,10 @@ def render(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, **s
         if output.kind == "animation":
             animation.check(output.form)
         notes = [*path.notes, *scenery().notes]
-        if is_given(ctx, "budget") and all(source.level is None for source in scenery().sources):
-            notes.append("no file is a Level-of-Detail tree, so all splats are drawn, whatever --budget says")
+        cuts = [flag_of(ctx, name) for name in CUTS if is_given(ctx, name)]
+        if cuts and all(source.level is None for source in scenery().sources):
+            say = f"{' and '.join(cuts)} say{'s' * (len(cuts) == 1)}"
+            notes.append(f"no file is a Level-of-Detail tree, so all splats are drawn, whatever {say}")
         for note in notes:
             console.say(note)
         console.detail(f"  read in {time.perf_counter() - start:.2f} s")
@@ -181,9 +200,9 @@ def render(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, **s
 
 def _one_budget(ctx: click.Context, settings: Mapping[str, Any]) -> int | None:
     """The budget of a picture, None where none is given."""
-    for name in ("asserts", "plot", "max_sh"):
+    for name in COMPARED:
         if is_given(ctx, name):
-            raise click.UsageError(f"--{NAMES.get(name, name).replace('_', '-')} only means something with --compare")
+            raise click.UsageError(f"{flag_of(ctx, name)} only means something with --compare")
     budgets = settings["budget"]
     if budgets is None:
         return None
@@ -196,9 +215,8 @@ def _one_budget(ctx: click.Context, settings: Mapping[str, Any]) -> int | None:
 
 def _compare(ctx: click.Context, settings: dict[str, Any], console: Console, *, as_json: bool) -> int:
     """What --compare does; the exit status."""
-    for name in NOT_COMPARED:
-        if is_given(ctx, name):
-            raise click.UsageError(f"--compare leaves nothing to --{NAMES.get(name, name).replace('_', '-')}")
+    refuse(ctx, "--compare", NOT_COMPARED)
+    _check_standard_output(settings, as_json)
     viewer = viewer_from(ctx, settings | {"budget": None})
     manner = manner_from(ctx, settings)
     with console:
@@ -224,15 +242,12 @@ def _compare(ctx: click.Context, settings: dict[str, Any], console: Console, *, 
         path, look = framed(ctx, settings, manner.look, world.balls)
         for note in path.notes:
             console.say(note)
-        how = How(BACKENDS[settings["backend"]].draw, look, settings["max_sh"], blend_from(settings))
+        draw = functools.partial(BACKENDS[settings["backend"]].draw, **manner.options)
+        how = How(draw, look, settings["max_sh"], blend_from(settings))
         return run(console, world, viewer, path, how, wanted, threads=settings["threads"])
 
 
 def _check_usage(settings: Mapping[str, Any], as_json: bool) -> None:
-    if settings["views"]:
-        given = [option for name, option in SOURCES.items() if settings[name]]
-        if given:
-            raise click.UsageError(f"--view and {' and '.join(given)} cannot go together")
     if settings["diff"] is None and settings["gain"] is not None:
         raise click.UsageError("--gain only means something with --diff")
     if settings["diff"] is not None:
@@ -240,8 +255,13 @@ def _check_usage(settings: Mapping[str, Any], as_json: bool) -> None:
             raise click.UsageError("--diff is between colours as they are; leave out --color-by")
         if settings["alpha"] or settings["background"] is None:
             raise click.UsageError("--diff is between pictures without alpha; name a --background")
+    _check_standard_output(settings, as_json)
+
+
+def _check_standard_output(settings: Mapping[str, Any], as_json: bool) -> None:
     if as_json and str(settings["output"]) == "-":
-        raise click.UsageError("--json and the picture cannot both go to standard output")
+        what = "table" if settings["compare"] else "picture"
+        raise click.UsageError(f"--json and the {what} cannot both go to standard output")
 
 
 def _is_sheet(settings: Mapping[str, Any]) -> bool:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from .camera_options import SOURCES, cameras_from
-from .options import is_given
+from .options import is_given, refuse
 
 if TYPE_CHECKING:
     from ..render.camera_path import CameraPath
@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 #: Sources of cameras that are chosen for the scene, where nobody says how far away they are.
 CHOSEN = ("orbit", "dolly")
 
+#: Options that say which frames a path has.
+OF_PATHS = ("fps", "every")
+
 
 def least_cameras(settings: Mapping[str, Any]) -> int:
     """How many cameras there are, or are at least, as far as that can be told before a file is read."""
@@ -28,6 +31,15 @@ def least_cameras(settings: Mapping[str, Any]) -> int:
     if settings["dolly"] or settings["keyframes"]:
         return 2 if settings["every"] == 1 else 1
     return -(-(settings["orbit"] or 1) // settings["every"])
+
+
+def check_cameras(ctx: click.Context, settings: Mapping[str, Any]) -> None:
+    """Raises a `click.UsageError` where options of cameras contradict each other, or mean nothing here."""
+    given = [option for name, option in SOURCES.items() if settings[name]]
+    if settings["views"] and given:
+        raise click.UsageError(f"--view and {' and '.join(given)} cannot go together")
+    if settings["views"] or not given:
+        refuse(ctx, "a camera that does not move", OF_PATHS)
 
 
 def is_free(settings: Mapping[str, Any]) -> bool:

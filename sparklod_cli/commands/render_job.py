@@ -14,9 +14,9 @@ import numpy as np
 
 from .. import jit
 from ..io import write_stdout, write_whole
+from ..limits import OF_PIXELS
 from ..parallel import ordered_map
 from ..preview import pixels as codes
-from ..preview.coloring import OF_PIXELS
 from ..preview.metrics import check_covered, psnr
 from .console import Console, count_of, size_of
 

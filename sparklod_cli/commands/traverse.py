@@ -11,11 +11,14 @@ import click
 from .. import limits
 from .camera_options import camera_options, cameras_from
 from .console import Console
-from .options import common_options, keep_apart
+from .options import common_options, keep_apart, refuse
 from .world_options import placements_from, viewer_from, viewer_options, world_options
 
 #: Below this share of splats in front of the cameras, path and scene probably do not share their axes.
 LEAST_IN_FRONT = 0.05
+
+#: Options of the table.
+OF_TABLES = ("form", "per_instance", "no_timing")
 
 EXAMPLES = """
 \b
@@ -101,6 +104,10 @@ def traverse(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, *
         padded=settings["padded"],
         overwrite=settings["overwrite"],
     )
+    if as_json and str(wanted.output) == "-":
+        raise click.UsageError("--json and the table cannot both go to standard output")
+    if as_json and wanted.output is None:
+        refuse(ctx, "--json without --output, which writes no table,", OF_TABLES)
     if wanted.padded and wanted.indices is None:
         raise click.UsageError("--padded only means something with --indices-out")
     placements = placements_from(settings)

@@ -30,9 +30,6 @@ from ..render.shapes import ticks
 from ..splats import FloatArray
 from .scenery import Piece, Scenery
 
-#: Colours that are of pixels rather than of splats.
-OF_PIXELS = ("overdraw", "depth")
-
 #: So many splats and cameras are looked at to find the ends of a scale.
 SAMPLE, CAMERAS = 1 << 18, 64
 

@@ -62,7 +62,10 @@ def read(files: Files, *, format: str | None = None, settings: Settings | None =
     form = _known(files) if format is None else next(form for form in FORMATS if form.name == format)
     if settings.axes and form.axes is None:
         raise CameraPathError(f"{form.title} says where cameras look, which leaves nothing to --camera-axes")
-    return cameras_of(form.parser().parse(files, settings), form, settings)
+    parsed = form.parser().parse(files, settings)
+    if settings.up is not None and (parsed.turned or not form.looking):
+        raise CameraPathError("its cameras say themselves which way is up, which leaves nothing to --up")
+    return cameras_of(parsed, form, settings)
 
 
 def _known(files: Files) -> PathFormat:

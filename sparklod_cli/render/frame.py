@@ -166,7 +166,7 @@ def _check(focal: tuple[float, float], principal: tuple[float, float]) -> None:
     if not min(focal) > 0 or not all(map(math.isfinite, (*focal, *principal))):
         raise ValueError(
             f"has a focal length of {focal[0]:g}, {focal[1]:g} and a principal point at {principal[0]:g},"
-            f" {principal[1]:g}, which are not sensible numbers"
+            f" {principal[1]:g}, of which one is not a sensible number"
         )
 
 

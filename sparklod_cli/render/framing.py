@@ -139,8 +139,8 @@ def middle_of(scene: Balls) -> Matrix:
 def _support(scene: Balls, camera: Camera) -> tuple[Matrix, Matrix, Matrix]:
     """How far a scene reaches outwards from the sides of a camera's view, if that were at the origin.
 
-    A ball is inside where it is behind all four sides, right, left, top and bottom, so the camera sees all of them where
-    its position, times the normal of each side, is no less than what is told here.
+    A ball is inside where it is behind all four sides, right, left, top and bottom, so the camera sees all of them
+    where its position, times the normal of each side, is no less than what is told here.
 
     Returns:
         (4,) the reach, world units, and of both pairs of sides, (2,), the share of their normals that is to the side,

@@ -82,7 +82,8 @@ def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike) -> Matrix:
         eye, target, up: (3,) in the world. Where `up` is along the line of sight, another direction takes its place.
 
     Raises:
-        ValueError: eye and target are the same point, or no numbers can tell how far apart they are; its text goes on a sentence about the camera.
+        ValueError: eye and target are the same point, or farther apart than numbers go; its text goes on a sentence
+            about the camera.
     """
     eye, target = np.asarray(eye, np.float64), np.asarray(target, np.float64)
     with np.errstate(over="ignore", invalid="ignore"):

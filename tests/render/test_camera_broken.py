@@ -137,7 +137,7 @@ FAULTS: dict[str, tuple[str | bytes, str]] = {
     "SuperSplat for years": (
         '{"version": 2, "animTracks": [{"duration": 1e9, "frameRate": 30, "keyframes": {"times": [0], "values":'
         ' {"position": [0, 0, 0], "target": [1, 0, 0], "fov": [60]}}}]}',
-        "frames are more than 1,048,576",
+        "it has 30,000,000,000 cameras, more than 65,536; see --every",
     ),
     "COLMAP without words": ("# Image list with two lines of data per image\n1 1 0 0\n", "line 2 of images.txt has 4"),
     "frames of frames": ('{"frames": [{"transform_matrix": [[1, 0, 0, 0]]}]}', "is not a list of 12 or 16 numbers"),

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sparklod_cli.errors import CameraPathError, InvalidSplatsError
+from sparklod_cli.errors import CameraPathError
 from sparklod_cli.render.camera_path import GENERATED, cameras_of
 from sparklod_cli.render.frame import Frame, Lens, Settings
-from sparklod_cli.render.framing import framing
 from sparklod_cli.render.generate import Key, between, dolly, orbit
 from sparklod_cli.render.paths.source import Parsed
 from sparklod_cli.render.pose import look_at
