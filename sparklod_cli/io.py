@@ -25,6 +25,10 @@ from .splats import COLUMNS, FloatArray
 Sink = Callable[[Iterable[bytes]], int]
 
 
+#: Bytes of a text file that people write. No device says how many it has, so none is read.
+LARGEST_TEXT = 1 << 26
+
+
 def read_scene(path: Path, *, threads: int = 1, progress: Progress = silent) -> Scene:
     """Reads a splat file of any known format, told by its content, or else by its suffix.
 
@@ -97,9 +101,9 @@ def size_on_disk(path: Path) -> int | None:
 
 
 def read_text(path: Path) -> str:
-    """A small text file; `UnreadableError`, naming it, where that cannot be."""
+    """A text file of at most `LARGEST_TEXT` bytes; `UnreadableError`, naming it, where that cannot be."""
     try:
-        return path.read_text(encoding="utf-8-sig")
+        return _read_up_to(path, LARGEST_TEXT).decode("utf-8-sig")
     except (OSError, ValueError) as error:
         reason = _reason(error) if isinstance(error, OSError) else "it is not text"
         raise UnreadableError(f"{path} cannot be read: {reason}") from None

@@ -142,7 +142,7 @@ Came = tuple[int, dict[str, bytes], Any, str]
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A scene of a few hundred splats with SH, and its tree, which lies where half floats are coarse and stands back."""
+    """A scene of a few hundred splats with SH, and its tree, which lies where half floats are coarse."""
     folder = tmp_path_factory.mktemp("options")
     splats = random_splats(400, sh_degree=3)
     (folder / "plain.ply").write_bytes(b"".join(ply.encode(Scene(splats))))

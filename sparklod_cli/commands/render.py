@@ -139,7 +139,7 @@ def render(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, **s
     with Console(quiet=quiet, verbose=verbose) as console:
         from ..preview import animation
         from ..preview.pictures import Painter
-        from .render_job import Job, Wanted
+        from .render_job import Job, Wanted, frame_rate
 
         console.announce_compiling()
         _use_threads(settings["threads"])
@@ -167,7 +167,7 @@ def render(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, **s
         keep_apart(output.paths(path.numbers), inputs)
         output.check(path.numbers, overwrite=settings["overwrite"])
         if output.kind == "animation":
-            animation.check(output.form)
+            animation.check(output.form, frame_rate(path))
         notes = [*path.notes, *scenery().notes]
         cuts = [flag_of(ctx, name) for name in CUTS if is_given(ctx, name)]
         if cuts and all(source.level is None for source in scenery().sources):

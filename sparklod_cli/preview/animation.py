@@ -20,14 +20,20 @@ ANIMATIONS = ("gif", "webp", "mp4")
 #: GIF counts time in hundredths of a second, and what plays it slows down where a frame is shorter than this.
 GIF_STEP, GIF_LEAST = 10, 2
 
+#: Milliseconds that a frame lasts at most: 16 bits of hundredths in GIF, 24 bits in WebP; of MP4, what ffmpeg takes.
+LONGEST = {"gif": 10 * 0xFFFF, "webp": 0xFFFFFF, "mp4": 1_000_000}
+
 #: Quality of WebP, 0 to 100, and of H.264, 51 to 0: what is lost is hardly seen.
 WEBP_QUALITY, H264_QUALITY = 90, 16
 
 
-def check(form: str) -> None:
+def check(form: str, fps: float) -> None:
     """Raises a `SparklodError` where an animation cannot be written, before work goes into it."""
     if form == "mp4":
         load_imageio()
+    longest = LONGEST[form] / 1000
+    if 1 / fps > longest:
+        raise SparklodError(f"a frame of .{form} lasts {longest:,.3f} s at most, not {1 / fps:,.7g} s; see --fps")
 
 
 def load_imageio() -> ModuleType:

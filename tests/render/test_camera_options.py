@@ -15,6 +15,7 @@ from click.testing import CliRunner, Result
 
 from sparklod_cli.commands.camera_options import camera_options, cameras_from
 from sparklod_cli.errors import CameraPathError
+from sparklod_cli.render import generate
 from sparklod_cli.render.camera_path import CameraPath
 from sparklod_cli.render.framing import FILLED, Balls
 
@@ -193,6 +194,33 @@ def test_a_file_of_gigabytes_is_not_read(monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setattr("sparklod_cli.commands.camera_options.LARGEST", 100)
     assert "inria.json is larger than 0 MiB" in file_error("--camera-path", FOLDER / "inria.json")
     assert "it is a pipe or a device" in file_error("--camera-path", "/dev/null")
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ("--orbit", "1000000", "--distance", "3", "--center", "0,0,0"),
+        ("--dolly", "--seconds", "1e6", "--fps", "1e6", "--distance", "3", "--center", "0,0,0"),
+        ("--keyframes", "0,0,9:0,0,0 9,0,0:0,0,0", "--seconds", "1e6", "--fps", "1e6"),
+    ],
+)
+def test_no_more_cameras_are_made_than_are_taken(options: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:
+    made = []
+    whole = generate.frame_looking
+
+    def counted(*arguments: Any) -> Any:
+        made.append(1)
+        return whole(*arguments)
+
+    monkeypatch.setattr(generate, "frame_looking", counted)
+    output = " ".join(usage_error(*options).split())
+    assert f"{options[0]}: it has 1," in output
+    assert "cameras, more than 65,536; see --every" in output
+    assert made == []
+    count = 10**6 if options[0] == "--orbit" else 10**12
+    path = cameras(*options, "--every", str(count // 4), scene=no_scene)
+    assert len(path.cameras) == len(made) <= 5
+    assert path.numbers[:4] == tuple(range(0, count, count // 4))
 
 
 def test_the_help_names_what_there_is() -> None:
