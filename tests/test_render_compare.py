@@ -112,9 +112,19 @@ def test_a_summary_for_programs(capsys: Said) -> None:
     ],
 )
 def test_options_that_make_no_sense(arguments: tuple[str, ...], tmp_path: Path, capsys: Said) -> None:
-    assert render(TOWN, *VIEW, *arguments, "-o", tmp_path / "x.png") == 2
+    name = "x.csv" if "--compare" in arguments else "x.png"
+    assert render(TOWN, *VIEW, *arguments, "-o", tmp_path / name) == 2
     assert not list(tmp_path.iterdir())
     assert "Error" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["table.png", "table.xlsx", "table.txt"])
+def test_a_table_is_what_its_name_says(name: str, tmp_path: Path, capsys: Said) -> None:
+    assert render(TOWN, *VIEW, "--compare", "-o", tmp_path / name) == 2
+    assert f"{name}: tables are written as .csv, .json, .parquet" in capsys.readouterr().err
+    assert render(TOWN, *VIEW, "--compare", "--plot", tmp_path / "charts.svg") == 2
+    assert "charts.svg: plots are written as .png" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_continuous_cut_is_nearly_the_ordinary_one(tmp_path: Path) -> None:

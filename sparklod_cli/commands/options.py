@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import click
 
 from .. import __version__
-from ..limits import MAX_THREADS
+from ..limits import MAX_THREADS, TABLES
 from ..parallel import processors
 
 Command = TypeVar("Command", bound=Callable[..., Any])
@@ -44,6 +44,26 @@ def keep_apart(outputs: Iterable[Path | None], inputs: Iterable[Path | None]) ->
         if place in taken:
             raise click.UsageError(f"{path} is {taken[place]}; write elsewhere")
         taken[place] = "an output already"
+
+
+def table_form(flag: str, output: Path | None) -> str:
+    """The format of a table that a name asks for; CSV where it has no suffix, or goes to standard output.
+
+    Raises:
+        click.UsageError: nothing is written by that suffix.
+    """
+    suffix = output.suffix.lower() if output is not None else ""
+    if not suffix:
+        return TABLES[0]
+    if suffix[1:] not in TABLES:
+        raise click.UsageError(f"{flag} {output}: tables are written as {', '.join(f'.{form}' for form in TABLES)}")
+    return suffix[1:]
+
+
+def check_plot(output: Path | None) -> None:
+    """Raises a `click.UsageError` where --plot is to go to what is no .png by its name."""
+    if output is not None and output.suffix.lower() not in ("", ".png"):
+        raise click.UsageError(f"--plot {output}: plots are written as .png")
 
 
 class Numbers(click.ParamType):

@@ -14,7 +14,7 @@ import click
 from .camera_options import camera_options
 from .camera_values import View
 from .console import Console
-from .options import Real, common_options, flag_of, is_given, keep_apart, refuse
+from .options import Real, check_plot, common_options, flag_of, is_given, keep_apart, refuse
 from .render_cameras import check_cameras, framed, least_cameras
 from .render_compare import BUDGETS, compare_options
 from .render_options import GAIN, background_from, blend_from, check_size, look_options, manner_from, of_pictures
@@ -230,6 +230,7 @@ def _compare(ctx: click.Context, settings: dict[str, Any], console: Console, *, 
         placements = placements_from(settings)
         inputs = [settings["scene"], settings["camera_path"], *(place.file for place in placements)]
         keep_apart([wanted.output, wanted.plot], inputs)
+        check_plot(wanted.plot)
         console.announce_compiling()
         _use_threads(settings["threads"])
         world = read_world(

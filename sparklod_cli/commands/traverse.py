@@ -11,7 +11,7 @@ import click
 from .. import limits
 from .camera_options import camera_options, cameras_from
 from .console import Console
-from .options import common_options, keep_apart, refuse
+from .options import check_plot, common_options, keep_apart, refuse, table_form
 from .world_options import placements_from, viewer_from, viewer_options, world_options
 
 #: Below this share of splats in front of the cameras, path and scene probably do not share their axes.
@@ -87,7 +87,12 @@ def traverse(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, *
     from .traverse_job import Job, Wanted
 
     viewer = viewer_from(ctx, settings)
-    form = settings["form"] or _form(settings["output"])
+    placements = placements_from(settings)
+    keep_apart(
+        [settings["output"], settings["plot"]],
+        [settings["scene"], settings["camera_path"], *(place.file for place in placements)],
+    )
+    form = settings["form"] or table_form("--output", settings["output"])
     try:
         asserts = [assertions.parse(text) for text in settings["asserts"]]
     except assertions.BadAssertionError as error:
@@ -110,11 +115,7 @@ def traverse(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, *
         refuse(ctx, "--json without --output, which writes no table,", OF_TABLES)
     if wanted.padded and wanted.indices is None:
         raise click.UsageError("--padded only means something with --indices-out")
-    placements = placements_from(settings)
-    keep_apart(
-        [wanted.output, wanted.plot],
-        [settings["scene"], settings["camera_path"], *(place.file for place in placements)],
-    )
+    check_plot(wanted.plot)
     with Console(quiet=quiet, verbose=verbose) as console:
         from ..splats import COLUMNS
 
@@ -142,9 +143,3 @@ def traverse(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, *
                 " share their axes (--camera-axes, --world-transform, --up)"
             )
         ctx.exit(job.report())
-
-
-def _form(output: Path | None) -> str:
-    """The format that a name asks for."""
-    suffix = output.suffix.lower().removeprefix(".") if output is not None else ""
-    return suffix if suffix in limits.TABLES else limits.TABLES[0]
