@@ -17,7 +17,7 @@ from .console import Console
 from .options import Real, check_plot, common_options, flag_of, is_given, keep_apart, refuse
 from .render_cameras import check_cameras, framed, least_cameras
 from .render_compare import BUDGETS, compare_options
-from .render_options import GAIN, background_from, blend_from, check_size, look_options, manner_from, of_pictures
+from .render_options import background_from, blend_from, check_size, look_options, manner_from, of_pictures
 from .world_options import cut_options, placements_from, viewer_from, world_options
 
 if TYPE_CHECKING:
@@ -94,7 +94,7 @@ Examples:
     help="Draw how far the picture is from that of another file, and say its PSNR.",
 )
 @click.option(
-    "--gain", metavar="X", type=Real(0, min_open=True), help=f"Multiplies the difference.  [default: {GAIN:g}]"
+    "--gain", metavar="X", type=Real(0, min_open=True), help="Multiplies the difference.  [default: what suits it]"
 )
 @click.option(
     "-o",
@@ -125,6 +125,7 @@ def render(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, **s
 
     Coordinates are those of the files; --up, --world-transform and --camera-axes bring cameras into them.
     """
+    start = time.perf_counter()
     check_cameras(ctx, settings)
     if settings["compare"]:
         ctx.exit(_compare(ctx, settings, Console(quiet=quiet, verbose=verbose), as_json=as_json))
@@ -139,12 +140,11 @@ def render(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, **s
     with Console(quiet=quiet, verbose=verbose) as console:
         from ..preview import animation
         from ..preview.pictures import Painter
+        from ..preview.pixels import scale_width
         from .render_job import Job, Wanted, frame_rate
 
         console.announce_compiling()
         _use_threads(settings["threads"])
-
-        start = time.perf_counter()
 
         @functools.cache
         def scenery() -> Scenery:
@@ -158,7 +158,9 @@ def render(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, **s
             refuse(ctx, "a .npy, which holds numbers,", of_pictures(settings["color_by"]))
         background = background_from(ctx, settings, output.form)
         for camera in path.cameras:
-            check_size(camera.width, camera.height, manner.supersample, output.form)
+            has_bar = (manner.color_by or settings["diff"]) and not settings["no_bar"]
+            wider = scale_width(camera.width, camera.height) if has_bar else 0
+            check_size(camera.width + wider, camera.height, manner.supersample, output.form)
         if output.kind in ("animation", "sheet") and len({(at.width, at.height) for at in path.cameras}) > 1:
             raise click.UsageError(
                 f"the cameras have pictures of several sizes, which no {output.kind} has; see --size"
@@ -188,12 +190,12 @@ def render(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, **s
             overwrite=settings["overwrite"],
             background=background,
             bar=not settings["no_bar"],
-            gain=settings["gain"] or GAIN,
+            gain=settings["gain"],
             jobs=settings["jobs"],
             threads=settings["threads"],
         )
         captions = [camera.name or f"frame {number}" for number, camera in zip(path.numbers, path.cameras, strict=True)]
-        job = Job(console, wanted, painter, other, path, captions if sheet else [])
+        job = Job(console, wanted, painter, other, path, captions if sheet else [], start)
         job.run()
         job.report(as_json=as_json)
 

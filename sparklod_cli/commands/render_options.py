@@ -22,9 +22,6 @@ COLORS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "transparent": Non
 #: Pixels that are drawn for a picture: the floats of more do not fit into the memory of most machines.
 MOST_PIXELS = 1 << 27
 
-#: By default the difference to another file is made so many times as strong.
-GAIN = 10.0
-
 
 #: Options that styles leave nothing to, and those that backends do not have.
 UNSTYLED = {
@@ -120,7 +117,7 @@ def look_options(command: Command) -> Command:
             click.option(
                 "--color-by",
                 type=click.Choice(limits.COLOR_BY),
-                help="Colours that mean something, without light, and a bar that says what.",
+                help="Colours that mean something, without light, and beside the picture a bar that says what.",
             ),
             click.option("--no-bar", is_flag=True, help="Leave that bar out."),
             click.option(
@@ -180,8 +177,8 @@ def manner_from(ctx: click.Context, settings: Mapping[str, Any]) -> Manner:
         refuse(ctx, "--color-by overdraw, which counts splats,", ["sort"])
     if by == "overdraw" and (style != "splats" or is_given(ctx, "backend")):
         raise click.UsageError("--color-by overdraw counts splats; leave out --style and --backend")
-    if settings["no_bar"] and by is None:
-        raise click.UsageError("--no-bar only means something with --color-by")
+    if settings["no_bar"] and by is None and settings["diff"] is None:
+        raise click.UsageError("--no-bar only means something with --color-by or --diff")
     options = {
         name: settings[option]
         for option, name in (("sorting", "sorting"), ("sort_throttle", "throttle"))

@@ -102,6 +102,14 @@ class Scenery:
             for number, source in enumerate(self.sources)
         ]
 
+    def drawn(self, camera: Camera) -> list[tuple[Source, Index]]:
+        """Of what a camera sees, which splats of which sources, in the order of `pieces`."""
+        cuts = iter(self._cuts(camera))
+        return [
+            (source, source.leaves if self._simulation is None or source.level is None else next(cuts)[0])
+            for source in self.sources
+        ]
+
     def _cuts(self, camera: Camera) -> list[tuple[Index, NDArray[np.float64] | None]]:
         """For each tree the nodes that are drawn, and their weights where cuts are continuous."""
         if self._simulation is None:
