@@ -171,8 +171,8 @@ class Job:
         from ..splats import Splats
 
         world = self.simulation.world
-        moments = self._lookout.moments()
-        frame = self._kept[moments[0].what if moments else "first"]
+        worth = [self._kept[what] for what in (*(moment.what for moment in self._lookout.moments()), "first")]
+        frame = next((each for each in worth if len(each.cut)), worth[0])  # before anything arrived, nothing is drawn
         at = self.path.numbers.index(frame.number)
         nodes = frame.cut.indices()
         splats = [world.splats_of(number, part) for number, part in enumerate(nodes)]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import itertools
 import sys
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -51,6 +52,19 @@ def test_times_do_not_drift(fps: float) -> None:
         assert all(time % step == 0 for time in times)
         if 1000 / fps >= least * step:
             assert abs(sum(times) - 200 * 1000 / fps) <= step
+
+
+@pytest.mark.parametrize("form", ["gif", "webp"])
+def test_encoding_tells_how_far_it_is(form: str) -> None:
+    told: list[tuple[str, int, int]] = []
+
+    def drawn() -> Iterator[np.ndarray]:
+        for frame in frames():
+            assert not told, "all are drawn before the first is written"
+            yield frame
+
+    animation.animate(drawn(), form, 10.0, lambda stage, done, total, unit: told.append((stage, done, total)))
+    assert list(dict.fromkeys(told)) == [("encoding", number, 4) for number in (1, 2, 3, 4)]
 
 
 @pytest.mark.parametrize(("form", "longest"), [("gif", 655.35), ("webp", 16777.215)])

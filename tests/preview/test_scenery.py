@@ -10,6 +10,7 @@ import pytest
 from sparklod_cli.codecs import ext_splats, packed_splats, ply
 from sparklod_cli.errors import FormatError, InvalidSplatsError
 from sparklod_cli.gaussian import moved
+from sparklod_cli.preview.coloring import values_of
 from sparklod_cli.preview.metrics import psnr
 from sparklod_cli.preview.pictures import Manner, Painter
 from sparklod_cli.preview.scenery import Scenery, read_scenery
@@ -47,6 +48,25 @@ def test_a_cut_is_that_of_the_simulation() -> None:
     assert len(plain.index) == len(scenery.sources[1].splats)
     assert np.array_equal(town.splats.center, scenery.sources[0].splats.center[town.index])
     assert len(town.index) + len(tree.index) <= 3000
+
+
+@pytest.mark.parametrize("by", ["level", "chunk"])
+@pytest.mark.parametrize("budget", [50, 3000, 50_000])
+def test_colours_of_whole_numbers_span_what_the_cuts_have(by: str, budget: int) -> None:
+    scenery = read_scenery(at(TOWN, TREE), Viewer(budget))
+    views = [camera(160, 120, z) for z in (3.0, 20.0)]
+    scale = Painter(scenery, Manner(color_by=by), views).scale
+    assert scale is not None
+    pieces = [piece for view in views for piece in scenery.pieces(view)]
+    values = np.concatenate([values_of(by, piece) for piece in pieces])
+    assert (scale.low, scale.high) == (values.min(), values.max())
+    texts = [text for _, text in scale.bar.marks]
+    assert (texts[0], texts[-1]) == (f"{scale.low}", f"{scale.high}")
+    for view in views:
+        told = scenery.drawn(view)
+        assert all(
+            np.array_equal(index, piece.index) for (_, index), piece in zip(told, scenery.pieces(view), strict=True)
+        )
 
 
 def test_in_full_it_is_the_leaves() -> None:
