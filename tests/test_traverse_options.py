@@ -1,4 +1,4 @@
-"""The law of options for `sparklod traverse`: what is given is used, or refused by its name; see `test_render_options`."""
+"""The law of options for `sparklod traverse`: what is given is used, or refused by its name."""
 
 from __future__ import annotations
 
