@@ -93,6 +93,10 @@ class CameraPathError(SparklodError):
     """A camera path cannot be read or made: its file is broken or of no known format, or a camera makes no sense."""
 
 
+class TooManyCamerasError(CameraPathError):
+    """A path has more cameras than are made, or taken."""
+
+
 class OutOfMemoryError(SparklodError):
     """What was asked for does not fit into memory."""
 

@@ -104,7 +104,7 @@ def size_on_disk(path: Path) -> int | None:
 
 
 def read_text(path: Path) -> str:
-    """A small text file; `UnreadableError`, naming it, where that cannot be."""
+    """A text file of at most `MAX_TEXT` bytes; `UnreadableError`, naming it, where that cannot be."""
     try:
         return str(_read_up_to(path, MAX_TEXT), "utf-8-sig")
     except (OSError, ValueError) as error:

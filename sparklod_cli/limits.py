@@ -42,6 +42,9 @@ STYLES = ("splats", "points", "billboards", "sorted-billboards")
 COLOR_BY = ("level", "lod-opacity", "size", "chunk", "overdraw", "depth")
 THROUGH = ("packed", "ext", "spz")
 
+#: Colours that are of pixels rather than of splats.
+OF_PIXELS = ("overdraw", "depth")
+
 #: Pixels a pixel along a side.
 MAX_SUPERSAMPLE = 4
 

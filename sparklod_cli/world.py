@@ -13,13 +13,14 @@ from numpy.typing import NDArray
 from .codecs import lod_tree
 from .codecs.lod_tree import Nodes
 from .errors import FormatError, SparklodError, TreeError, memory_told
-from .gaussian import moved, placed, spark_size
+from .gaussian import placed, spark_size
 from .io import examine_scene, size_on_disk
 from .limits import PRECISIONS
 from .lod.traversal import CHUNK_NODES, Cones, Forest, Frustum, Instance, Matrix
 from .progress import Progress, silent
+from .render.framing import Balls, balls_of, together
 from .scene import Scene
-from .splats import COLUMNS, FloatArray, Splats
+from .splats import COLUMNS, Splats
 
 #: What all instances together are called.
 TOTAL = "total"
@@ -87,14 +88,14 @@ class World:
             for at, place in zip(self.instances, self.placements, strict=True)
         ]
 
-    def centers(self) -> FloatArray:
-        """(N, 3) where splats are in the world: the leaves of every instance."""
+    def balls(self) -> Balls:
+        """What the splats cover in the world: the leaves of every instance."""
         parts = []
         for instance in self.instances:
             scene = self.trees[instance.tree].scene
             assert scene.tree is not None
-            parts.append(moved(scene.splats.center[scene.tree.is_leaf], instance.object_to_world))
-        return np.concatenate(parts)
+            parts.append(balls_of(scene.splats.take(scene.tree.is_leaf), instance.object_to_world))
+        return together(parts)
 
     def splats_of(self, number: int, nodes: NDArray[np.uint32]) -> Splats:
         """Some nodes of an instance, in the world; SH stay in the directions of its own space."""

@@ -55,6 +55,38 @@ def test_what_does_not_hold_is_status_3(capsys: Said, tmp_path: Path) -> None:
     assert render(*how, "--assert", "pnsr>99") == 2
 
 
+@pytest.fixture
+def huge(tmp_path: Path) -> Path:
+    """A scene beyond where the far plane is by default, in an instances file."""
+    (tmp_path / "town.spz").write_bytes(TOWN.read_bytes())
+    path = tmp_path / "huge.json"
+    path.write_text(json.dumps({"instances": [{"file": "town.spz", "scale": 5000}]}))
+    return path
+
+
+@pytest.mark.parametrize("source", [(), ("--orbit", "2"), ("--dolly", "--every", "20")])
+def test_a_scene_of_any_size_is_compared_as_it_is_drawn(source: tuple[str, ...], huge: Path, capsys: Said) -> None:
+    """Wherever cameras are chosen for the scene, near and far are, too."""
+    size = ("--size", "160x90")
+    assert render("--scene", huge, *size, *source, "--compare", "--budget", "0.5%,100%") == 0
+    rows = table(capsys)
+    assert all(float(row["psnr"]) < 60 for row in rows[::2]), "something was in the pictures"
+    one = {row["frame"]: row for row in rows[::2]}
+    assert render(TOWN, *size, *source, "--compare", "--budget", "0.5%,100%") == 0
+    for row in table(capsys)[::2]:
+        assert float(row["psnr"]) == pytest.approx(float(one[row["frame"]]["psnr"]), abs=0.2)
+
+
+@pytest.mark.parametrize("look", [("--look-at", "0,-3,9:0,-3,18"), ("--look-at", "0,-3,9:0,0,0", "--far", "0.02")])
+def test_a_comparison_with_nothing_is_none(look: tuple[str, ...], tmp_path: Path, capsys: Said) -> None:
+    for how in (("--compare", "-o", tmp_path / "out.csv"), ("--diff", TOWN, "-o", tmp_path / "out.png")):
+        assert render(TOWN, "--size", "64x48", *look, *how) == 1
+        out, err = capsys.readouterr()
+        assert (out, err.count("\n")) == ("", 1)
+        assert "covers no pixel, so there is nothing to compare with" in err
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_summary_for_programs(capsys: Said) -> None:
     assert render(TOWN, *VIEW, "--compare", "--budget", "1k,5%", "--json", "-q") == 0
     summary = json.loads(capsys.readouterr().out)
@@ -80,9 +112,19 @@ def test_a_summary_for_programs(capsys: Said) -> None:
     ],
 )
 def test_options_that_make_no_sense(arguments: tuple[str, ...], tmp_path: Path, capsys: Said) -> None:
-    assert render(TOWN, *VIEW, *arguments, "-o", tmp_path / "x.png") == 2
+    name = "x.csv" if "--compare" in arguments else "x.png"
+    assert render(TOWN, *VIEW, *arguments, "-o", tmp_path / name) == 2
     assert not list(tmp_path.iterdir())
     assert "Error" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["table.png", "table.xlsx", "table.txt"])
+def test_a_table_is_what_its_name_says(name: str, tmp_path: Path, capsys: Said) -> None:
+    assert render(TOWN, *VIEW, "--compare", "-o", tmp_path / name) == 2
+    assert f"{name}: tables are written as .csv, .json, .parquet" in capsys.readouterr().err
+    assert render(TOWN, *VIEW, "--compare", "--plot", tmp_path / "charts.svg") == 2
+    assert "charts.svg: plots are written as .png" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_continuous_cut_is_nearly_the_ordinary_one(tmp_path: Path) -> None:

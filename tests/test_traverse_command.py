@@ -109,11 +109,11 @@ def test_parquet_has_the_same_cells(tmp_path: Path, capsys: Said) -> None:
 
 
 def test_a_name_decides_the_format_unless_it_is_said(tmp_path: Path) -> None:
-    for name, form in (("a.csv", None), ("a.json", None), ("a.txt", None), ("a", "json"), ("b.json", "csv")):
+    for name, form in (("a.csv", None), ("a.JSON", None), ("a.txt", "csv"), ("a", "json"), ("b", None)):
         said = () if form is None else ("--format", form)
         assert traverse(TREE, *ORBIT, "-o", tmp_path / name, *said) == 0
     begins = {path.name: path.read_bytes()[:1] for path in tmp_path.iterdir()}
-    assert begins == {"a.csv": b"f", "a.json": b"{", "a.txt": b"f", "a": b"{", "b.json": b"f"}
+    assert begins == {"a.csv": b"f", "a.JSON": b"{", "a.txt": b"f", "a": b"{", "b": b"f"}
 
 
 def test_a_summary_is_said_when_it_is_asked_for(tmp_path: Path, capsys: Said) -> None:
@@ -268,6 +268,11 @@ def test_a_scene_file_says_what_stands_where(tmp_path: Path, capsys: Said) -> No
         ([TREE, "--up", "0,0,0"], "--up 0,0,0 is no direction"),
         ([TREE, "--every", "0"], "--every"),
         ([TREE, "--format", "xlsx"], "--format"),
+        ([TREE, "-o", "t.xlsx"], "--output t.xlsx: tables are written as .csv, .json, .parquet"),
+        ([TREE, "-o", "t.png"], "--output t.png: tables are written as .csv"),
+        ([TREE, "--plot", "t.jpg"], "--plot t.jpg: plots are written as .png"),
+        ([TREE, "--json", "-o", "-"], "--json and the table cannot both go to standard output"),
+        ([TREE, "--json", "--per-instance"], "which writes no table, leaves nothing to --per-instance"),
         ([TREE, "--padded"], "--padded only means something with --indices-out"),
         ([TREE, "--assert", "churn"], "--assert 'churn' is not an assertion"),
         ([TREE, "--threads", "0"], "--threads"),
@@ -422,6 +427,29 @@ def test_a_plot_is_a_picture(tmp_path: Path, capsys: Said) -> None:
     assert traverse(TOWN, *ORBIT, "--plot", tmp_path / "path.png", "-o", tmp_path / "other.csv") == 1
     assert "path.png exists, add --overwrite" in capsys.readouterr().err
     assert not (tmp_path / "other.csv").exists()
+
+
+def test_a_plot_shows_what_the_frame_had(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Over a slow network few chunks are there; the picture is of what was drawn with these."""
+    pytest.importorskip("matplotlib", reason="charts need the extra `render`")
+    from sparklod_cli.simulation import plot
+
+    shown: list[plot.Scenery] = []
+
+    def drawn(rows: object, title: str, scenery: plot.Scenery) -> plot.Plot:
+        shown.append(scenery)
+        return plot.Plot(b"a plot", None)
+
+    monkeypatch.setattr(plot, "plot", drawn)
+    slow = ("--bandwidth", "0.1Mbit", "--latency", "50ms")
+    for number, network in enumerate(((), slow)):
+        table = tmp_path / f"{number}.csv"
+        assert traverse(TOWN, *ORBIT, *network, "--plot", tmp_path / f"{number}.png", "-o", table) == 0
+        rows = list(csv.DictReader(io.StringIO(table.read_text())))
+        scenery = shown[-1]
+        assert scenery.frame is not None
+        assert len(scenery.splats) == len(scenery.level) == int(rows[scenery.frame]["selected"])
+    assert len(shown[1].splats) < len(shown[0].splats)
 
 
 def test_help_shows_how(capsys: Said) -> None:

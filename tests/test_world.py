@@ -82,7 +82,7 @@ def test_centres_are_those_of_all_leaves_in_the_world() -> None:
         assert scene.tree is not None
         leaves = scene.splats.center[scene.tree.child_count == 0].astype(np.float64)
         parts.append(leaves @ place.object_to_world[:3, :3].T + place.object_to_world[:3, 3])
-    centers = read_world(placements).centers()
+    centers = read_world(placements).balls().center
     assert np.allclose(centers, np.concatenate(parts), rtol=1e-6, atol=1e-5)
 
 

@@ -236,6 +236,15 @@ optional = dict.fromkeys(list(KEYS)[1:], anything | lists)
 plausible = st.fixed_dictionaries({"file": st.text(min_size=1)}, optional=optional)
 
 
+def test_what_never_ends_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(SparklodError, match="it is a pipe or a device"):
+        read_placements(Path("/dev/zero"))
+    monkeypatch.setattr("sparklod_cli.io.LARGEST_TEXT", 100)
+    (tmp_path / "large.json").write_bytes(b" " * 101)
+    with pytest.raises(SparklodError, match=r"large\.json is larger than"):
+        read_placements(tmp_path / "large.json")
+
+
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=300)
 @given(anything | st.fixed_dictionaries({"instances": st.lists(some_instances | plausible | anything, max_size=3)}))
 def test_whatever_it_says_it_is_understood_or_refused_in_a_line(scene: Path, data: Any) -> None:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..errors import CameraPathError, SparklodError
+from ..errors import CameraPathError, SparklodError, TooManyCamerasError
 from ..render.axes import Axes
 from ..render.paths.formats import FORMATS, NAMES
 from .camera_values import Size, View, Views
@@ -17,15 +17,14 @@ from .options import Command, Numbers, Real
 from .paths import InputPath
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from ..render.camera import Matrix
     from ..render.camera_path import CameraPath
-    from ..render.frame import Settings
+    from ..render.frame import Frame, Settings
+    from ..render.framing import Balls
     from ..render.paths.source import Parsed
 
-    #: Gives the centres of the splats, (N, 3).
-    Centers = Callable[[], NDArray[Any]]
+    #: Gives what the splats cover.
+    Scene = Callable[[], Balls]
 
 #: The options that each are a source of cameras, of which one is taken, and the one that is where none is given.
 SOURCES = {
@@ -45,10 +44,15 @@ ONLY_WITH = {
     "distance": ("orbit", "dolly"),
     "elevation": ("orbit", "dolly"),
     "seconds": ("dolly", "keyframes"),
+    "fps": ("camera_path", "orbit", "dolly", "keyframes"),
+    "every": ("camera_path", "orbit", "dolly", "keyframes"),
     "world_transform": ("camera_path", "look_at", "keyframes"),
 }
 
 DEFAULT_ELEVATION = 15.0
+
+#: Of the options of `ONLY_WITH` that are something where nobody says anything.
+DEFAULTS = {"every": 1}
 
 #: What numbers with commas between are made of; anything else names a file.
 NUMERIC = set("0123456789+-.,eE ")
@@ -147,7 +151,7 @@ def camera_options(command: Command, *, orbit: int = DEFAULT_ORBIT) -> Command:
                 "--every",
                 metavar="K",
                 type=click.IntRange(1),
-                default=1,
+                default=DEFAULTS["every"],
                 show_default=True,
                 help="Every Kth camera only.",
             ),
@@ -157,12 +161,12 @@ def camera_options(command: Command, *, orbit: int = DEFAULT_ORBIT) -> Command:
     return command
 
 
-def cameras_from(settings: Mapping[str, Any], centers: Centers, *, orbit: int = DEFAULT_ORBIT) -> CameraPath:
+def cameras_from(settings: Mapping[str, Any], scene: Scene, *, orbit: int = DEFAULT_ORBIT) -> CameraPath:
     """The cameras that the options of `camera_options` ask for.
 
     Args:
         settings: what click gave the command, by the parameters' names; others are not looked at.
-        centers: gives the centres of the splats, (N, 3); called only where --orbit or --dolly need to know the scene.
+        scene: gives what the splats cover; called only where --orbit or --dolly need to know it.
         orbit: as for `camera_options`.
 
     Raises:
@@ -173,7 +177,7 @@ def cameras_from(settings: Mapping[str, Any], centers: Centers, *, orbit: int = 
     if source == "orbit":
         settings = {**settings, "orbit": settings["orbit"] or orbit}
     for option, sources in ONLY_WITH.items():
-        if settings[option] is not None and source not in sources:
+        if settings[option] not in (None, DEFAULTS.get(option)) and source not in sources:
             names = " or ".join(SOURCES[name] for name in sources)
             raise click.UsageError(f"--{option.replace('_', '-')} only means something with {names}")
 
@@ -182,7 +186,10 @@ def cameras_from(settings: Mapping[str, Any], centers: Centers, *, orbit: int = 
     how = _settings(settings)
     if source == "camera_path":
         return _read(settings["camera_path"], settings["camera_format"], how)
-    return cameras_of(_generated(source, settings, how, centers), GENERATED[source], how)
+    try:
+        return cameras_of(_generated(source, settings, how, scene), GENERATED[source], how)
+    except TooManyCamerasError as error:
+        raise click.UsageError(f"{SOURCES[source]}: {error}") from None
 
 
 def _source(settings: Mapping[str, Any]) -> str:
@@ -242,9 +249,9 @@ def _read(path: Path, form: str | None, how: Settings) -> CameraPath:
         raise CameraPathError(f"{path}: {error}") from None
 
 
-def _generated(source: str, settings: Mapping[str, Any], how: Settings, centers: Centers) -> Parsed:
+def _generated(source: str, settings: Mapping[str, Any], how: Settings, scene: Scene) -> Parsed:
     from ..render import generate
-    from ..render.frame import DEFAULT_FPS, DEFAULT_UP, MAX_FRAMES
+    from ..render.frame import DEFAULT_FPS, DEFAULT_UP
     from ..render.paths.source import Parsed
 
     fps, up = how.fps or DEFAULT_FPS, how.up or DEFAULT_UP
@@ -258,25 +265,35 @@ def _generated(source: str, settings: Mapping[str, Any], how: Settings, centers:
     center, distance = settings["center"], settings["distance"]
     elevation = DEFAULT_ELEVATION if settings["elevation"] is None else settings["elevation"]
     tilt = math.radians(elevation)
+    count = settings["orbit"] if source == "orbit" else max(2, round(seconds * fps))
     if center is None or distance is None:
-        middle, fits = _scene(centers, how)
-        center = middle if center is None else center
+        origin = (0.0, 0.0, 0.0)
+        if source == "orbit":
+            around = generate.orbit(count, origin, 1, tilt, up)
+        else:
+            around = generate.dolly(2, origin, 1, 1, tilt, up)
+        center, fits = _place(around, center, scene(), how)
         distance = distance or (fits if source == "orbit" else generate.DOLLY_START * fits)
     if source == "orbit":
-        return Parsed(generate.orbit(settings["orbit"], center, distance, tilt, up))
-    count = max(2, round(seconds * fps))
-    if count > MAX_FRAMES:
-        raise click.UsageError(f"{count:,} frames are more than {MAX_FRAMES:,}; see --seconds and --fps")
+        return Parsed(generate.orbit(count, center, distance, tilt, up))
     return Parsed(generate.dolly(count, center, distance, distance / generate.DOLLY_ZOOM, tilt, up))
 
 
-def _scene(centers: Centers, how: Settings) -> tuple[Any, float]:
-    """The middle of the scene, (3,), and how far from it a camera sees all of it, world units."""
+def _place(frames: Sequence[Frame], center: Any, scene: Balls, how: Settings) -> tuple[Any, float]:
+    """What cameras of these directions look at, (3,), and how far from there they all have the scene in their pictures.
+
+    Args:
+        frames: at least one.
+        center: (3,) where it is known; None for the middle of the scene.
+        scene: all that the splats cover.
+        how: what the user says.
+    """
     import numpy as np
 
-    from ..render.frame import Lens, camera_of
-    from ..render.framing import framing
+    from ..render.frame import camera_of
+    from ..render.framing import covered, distance, middle_of, some
 
-    middle, radius = framing(centers())
-    camera = camera_of(np.eye(4), Lens(), 0, "", how)
-    return middle, radius / math.sin(min(camera.fov_x, camera.fov_y) / 2)
+    kept = covered(scene)
+    middle = middle_of(kept) if center is None else np.asarray(center, np.float64)
+    cameras = [camera_of(frame.matrix, frame.lens, 0, "", how) for frame in some(frames)]
+    return middle, distance(cameras, middle, kept)

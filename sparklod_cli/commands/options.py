@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, TypeVar
 
 import click
 
 from .. import __version__
-from ..limits import MAX_THREADS
+from ..limits import MAX_THREADS, TABLES
 from ..parallel import processors
 
 Command = TypeVar("Command", bound=Callable[..., Any])
@@ -26,6 +27,38 @@ class Verbosity:
 def is_given(ctx: click.Context, name: str) -> bool:
     """Whether a parameter is not what it is by default because somebody said so."""
     return ctx.get_parameter_source(name) not in (None, click.core.ParameterSource.DEFAULT)
+
+
+def flag_of(ctx: click.Context, name: str) -> str:
+    """What people type for a parameter, such as --lod-splat-scale for lod_splat_scale."""
+    return next(max(param.opts, key=len) for param in ctx.command.params if param.name == name)
+
+
+def refuse(ctx: click.Context, why: str, names: Iterable[str]) -> None:
+    """Raises a `click.UsageError` where one of some parameters was given, to which `why` leaves nothing to do."""
+    for name in names:
+        if is_given(ctx, name):
+            raise click.UsageError(f"{why} leaves nothing to {flag_of(ctx, name)}")
+
+
+def table_form(flag: str, output: Path | None) -> str:
+    """The format of a table that a name asks for; CSV where it has no suffix, or goes to standard output.
+
+    Raises:
+        click.UsageError: nothing is written by that suffix.
+    """
+    suffix = output.suffix.lower() if output is not None else ""
+    if not suffix:
+        return TABLES[0]
+    if suffix[1:] not in TABLES:
+        raise click.UsageError(f"{flag} {output}: tables are written as {', '.join(f'.{form}' for form in TABLES)}")
+    return suffix[1:]
+
+
+def check_plot(output: Path | None) -> None:
+    """Raises a `click.UsageError` where --plot is to go to what is no .png by its name."""
+    if output is not None and output.suffix.lower() not in ("", ".png"):
+        raise click.UsageError(f"--plot {output}: plots are written as .png")
 
 
 class Numbers(click.ParamType):

@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from .camera_options import SOURCES, camera_options
+from .camera_options import camera_options
 from .camera_values import View
 from .console import Console
-from .options import Real, common_options, is_given
+from .options import Real, check_plot, common_options, flag_of, is_given, refuse
 from .paths import InputPath, OutputPath, keep_apart
-from .render_cameras import cameras, is_free, least_cameras
+from .render_cameras import check_cameras, framed, least_cameras
 from .render_compare import BUDGETS, compare_options
-from .render_options import GAIN, background_from, blend_from, check_size, look_options, manner_from
+from .render_options import background_from, blend_from, check_size, look_options, manner_from, of_pictures
 from .world_options import cut_options, files_meant, placements_from, viewer_from, world_options
 
 if TYPE_CHECKING:
@@ -26,10 +26,27 @@ if TYPE_CHECKING:
     from ..world import Placement
     from .render_output import Output
 
-#: Options of how many splats are drawn that --full leaves no room for.
-CUTS = ("budget", "preset", "lod_splat_scale", "lod_render_scale", "pixel_scale_limit")
+#: Options of cuts, of which --full and files without a tree have none.
+CUTS = (
+    "budget",
+    "preset",
+    "lod_splat_scale",
+    "lod_render_scale",
+    "pixel_scale_limit",
+    "cone_fov0",
+    "cone_fov",
+    "cone_foveate",
+    "outside_foveate",
+    "behind_foveate",
+    "continuous",
+    "blend",
+    "precision",
+)
 
-#: Options that --compare leaves no room for, and those that are called otherwise.
+#: Options that only --compare knows.
+COMPARED = ("asserts", "plot", "max_sh")
+
+#: Options that --compare leaves no room for.
 NOT_COMPARED = (
     "full",
     "preset",
@@ -46,7 +63,6 @@ NOT_COMPARED = (
     "sheet",
     "jobs",
 )
-NAMES = {"views": "view", "asserts": "assert"}
 
 EXAMPLES = """
 \b
@@ -78,7 +94,7 @@ Examples:
     help="Draw how far the picture is from that of another file, and say its PSNR.",
 )
 @click.option(
-    "--gain", metavar="X", type=Real(0, min_open=True), help=f"Multiplies the difference.  [default: {GAIN:g}]"
+    "--gain", metavar="X", type=Real(0, min_open=True), help="Multiplies the difference.  [default: what suits it]"
 )
 @click.option(
     "-o",
@@ -109,13 +125,13 @@ def render(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, **s
 
     Coordinates are those of the files; --up, --world-transform and --camera-axes bring cameras into them.
     """
+    start = time.perf_counter()
+    check_cameras(ctx, settings)
     if settings["compare"]:
         ctx.exit(_compare(ctx, settings, Console(quiet=quiet, verbose=verbose), as_json=as_json))
     viewer = viewer_from(ctx, settings | {"budget": _one_budget(ctx, settings)})
     if settings["full"]:
-        for name in CUTS:
-            if is_given(ctx, name):
-                raise click.UsageError(f"--full leaves nothing to --{name.replace('_', '-')}")
+        refuse(ctx, "--full", CUTS)
     _check_usage(settings, as_json)
     manner = manner_from(ctx, settings)
     placements = placements_from(settings)
@@ -123,28 +139,28 @@ def render(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, **s
     _output(settings, placements, least_cameras(settings))
     with Console(quiet=quiet, verbose=verbose) as console:
         from ..preview import animation
-        from ..preview.fitting import with_reach
         from ..preview.pictures import Painter
-        from .render_job import Job, Wanted
+        from ..preview.pixels import scale_width
+        from .render_job import Job, Wanted, frame_rate
 
         console.announce_compiling("render")
         _use_threads(settings["threads"])
-
-        start = time.perf_counter()
 
         @functools.cache
         def scenery() -> Scenery:
             return _read(placements, None if settings["full"] else viewer, settings, console)
 
-        path = cameras(settings, lambda: scenery().centers())
-        if is_free(settings) and not is_given(ctx, "near") and not is_given(ctx, "far"):
-            look = with_reach(manner.look, path.cameras[0], scenery().centers())
-            manner = dataclasses.replace(manner, look=look)
+        path, look = framed(ctx, settings, manner.look, lambda: scenery().balls())
+        manner = dataclasses.replace(manner, look=look)
         sheet = _is_sheet(settings)
         output = _output(settings, placements, len(path.cameras))
+        if output.form == "npy":
+            refuse(ctx, "a .npy, which holds numbers,", of_pictures(settings["color_by"]))
         background = background_from(ctx, settings, output.form)
         for camera in path.cameras:
-            check_size(camera.width, camera.height, manner.supersample, output.form)
+            has_bar = (manner.color_by or settings["diff"]) and not settings["no_bar"]
+            wider = scale_width(camera.width, camera.height) if has_bar else 0
+            check_size(camera.width + wider, camera.height, manner.supersample, output.form)
         if output.kind in ("animation", "sheet") and len({(at.width, at.height) for at in path.cameras}) > 1:
             raise click.UsageError(
                 f"the cameras have pictures of several sizes, which no {output.kind} has; see --size"
@@ -152,10 +168,12 @@ def render(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, **s
         keep_apart(ctx, {**files_meant(settings, placements), "output": output.paths(path.numbers)})
         output.check(path.numbers, overwrite=settings["overwrite"])
         if output.kind == "animation":
-            animation.check(output.form)
+            animation.check(output.form, frame_rate(path))
         notes = [*path.notes, *scenery().notes]
-        if is_given(ctx, "budget") and all(source.level is None for source in scenery().sources):
-            notes.append("no file is a Level-of-Detail tree, so all splats are drawn, whatever --budget says")
+        cuts = [flag_of(ctx, name) for name in CUTS if is_given(ctx, name)]
+        if cuts and all(source.level is None for source in scenery().sources):
+            say = f"{' and '.join(cuts)} say{'s' * (len(cuts) == 1)}"
+            notes.append(f"no file is a Level-of-Detail tree, so all splats are drawn, whatever {say}")
         for note in notes:
             console.say(note)
         console.detail(f"  read in {time.perf_counter() - start:.2f} s")
@@ -171,21 +189,21 @@ def render(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, **s
             overwrite=settings["overwrite"],
             background=background,
             bar=not settings["no_bar"],
-            gain=settings["gain"] or GAIN,
+            gain=settings["gain"],
             jobs=settings["jobs"],
             threads=settings["threads"],
         )
         captions = [camera.name or f"frame {number}" for number, camera in zip(path.numbers, path.cameras, strict=True)]
-        job = Job(console, wanted, painter, other, path, captions if sheet else [])
+        job = Job(console, wanted, painter, other, path, captions if sheet else [], start)
         job.run()
         job.report(as_json=as_json)
 
 
 def _one_budget(ctx: click.Context, settings: Mapping[str, Any]) -> int | None:
     """The budget of a picture, None where none is given."""
-    for name in ("asserts", "plot", "max_sh"):
+    for name in COMPARED:
         if is_given(ctx, name):
-            raise click.UsageError(f"--{NAMES.get(name, name).replace('_', '-')} only means something with --compare")
+            raise click.UsageError(f"{flag_of(ctx, name)} only means something with --compare")
     budgets = settings["budget"]
     if budgets is None:
         return None
@@ -198,9 +216,8 @@ def _one_budget(ctx: click.Context, settings: Mapping[str, Any]) -> int | None:
 
 def _compare(ctx: click.Context, settings: dict[str, Any], console: Console, *, as_json: bool) -> int:
     """What --compare does; the exit status."""
-    for name in NOT_COMPARED:
-        if is_given(ctx, name):
-            raise click.UsageError(f"--compare leaves nothing to --{NAMES.get(name, name).replace('_', '-')}")
+    refuse(ctx, "--compare", NOT_COMPARED)
+    _check_standard_output(settings, as_json)
     viewer = viewer_from(ctx, settings | {"budget": None})
     manner = manner_from(ctx, settings)
     with console:
@@ -213,6 +230,7 @@ def _compare(ctx: click.Context, settings: dict[str, Any], console: Console, *, 
         wanted = wanted_from(settings, settings["budget"], output=settings["output"], as_json=as_json)
         placements = placements_from(settings)
         keep_apart(ctx, files_meant(settings, placements))
+        check_plot(wanted.plot)
         console.announce_compiling("render")
         _use_threads(settings["threads"])
         world = read_world(
@@ -222,18 +240,15 @@ def _compare(ctx: click.Context, settings: dict[str, Any], console: Console, *, 
             threads=settings["threads"],
             progress=console.progress,
         )
-        path = cameras(settings, world.centers)
+        path, look = framed(ctx, settings, manner.look, world.balls)
         for note in path.notes:
             console.say(note)
-        how = How(BACKENDS[settings["backend"]].draw, manner.look, settings["max_sh"], blend_from(settings))
+        draw = functools.partial(BACKENDS[settings["backend"]].draw, **manner.options)
+        how = How(draw, look, settings["max_sh"], blend_from(settings))
         return run(console, world, viewer, path, how, wanted, threads=settings["threads"])
 
 
 def _check_usage(settings: Mapping[str, Any], as_json: bool) -> None:
-    if settings["views"]:
-        given = [option for name, option in SOURCES.items() if settings[name]]
-        if given:
-            raise click.UsageError(f"--view and {' and '.join(given)} cannot go together")
     if settings["diff"] is None and settings["gain"] is not None:
         raise click.UsageError("--gain only means something with --diff")
     if settings["diff"] is not None:
@@ -241,8 +256,13 @@ def _check_usage(settings: Mapping[str, Any], as_json: bool) -> None:
             raise click.UsageError("--diff is between colours as they are; leave out --color-by")
         if settings["alpha"] or settings["background"] is None:
             raise click.UsageError("--diff is between pictures without alpha; name a --background")
+    _check_standard_output(settings, as_json)
+
+
+def _check_standard_output(settings: Mapping[str, Any], as_json: bool) -> None:
     if as_json and str(settings["output"]) == "-":
-        raise click.UsageError("--json and the picture cannot both go to standard output")
+        what = "table" if settings["compare"] else "picture"
+        raise click.UsageError(f"--json and the {what} cannot both go to standard output")
 
 
 def _is_sheet(settings: Mapping[str, Any]) -> bool:

@@ -15,7 +15,7 @@ import click
 
 from .. import limits
 from .console import Console, count_of, for_screen, is_terminal
-from .options import Command, Quantity
+from .options import Command, Quantity, table_form
 from .paths import OutputPath
 
 if TYPE_CHECKING:
@@ -86,6 +86,7 @@ class Wanted:
     Attributes:
         budgets: at least one.
         output: of the table; None for standard output.
+        form: of the table.
         plot: of the charts; None for none.
         asserts: what must hold, and of which of the budgets; None for all.
         as_json: print a summary instead of the table.
@@ -94,16 +95,11 @@ class Wanted:
 
     budgets: Sequence[Budget]
     output: Path | None
+    form: str
     plot: Path | None
     asserts: Sequence[tuple[int | None, Assertion]]
     as_json: bool
     overwrite: bool
-
-    @property
-    def form(self) -> str:
-        """Of the table, by its name."""
-        suffix = self.output.suffix.lower().removeprefix(".") if self.output is not None else ""
-        return suffix if suffix in limits.TABLES else limits.TABLES[0]
 
     def check(self) -> None:
         """Raises a `SparklodError` where an output cannot be made, before work goes into it."""
@@ -128,11 +124,12 @@ def wanted_from(
     """What the options of `compare_options`, and `overwrite`, ask for.
 
     Raises:
-        click.UsageError: an assertion cannot be understood.
+        click.UsageError: an assertion cannot be understood, or a name is not of what is written.
     """
     budgets = _budgets(DEFAULT_BUDGETS) if budgets is None else budgets
     asserts = [_assertion(text, budgets) for text in settings["asserts"]]
-    return Wanted(budgets, output, settings["plot"], asserts, as_json, settings["overwrite"])
+    form = table_form("--output", output)
+    return Wanted(budgets, output, form, settings["plot"], asserts, as_json, settings["overwrite"])
 
 
 def _assertion(text: str, budgets: Sequence[Budget]) -> tuple[int | None, Assertion]:

@@ -14,10 +14,10 @@ import numpy as np
 
 from .. import jit
 from ..io import write_stdout, write_whole
+from ..limits import OF_PIXELS
 from ..parallel import ordered_map
 from ..preview import pixels as codes
-from ..preview.coloring import OF_PIXELS
-from ..preview.metrics import psnr
+from ..preview.metrics import check_covered, psnr
 from .console import Console, count_of, size_of
 
 if TYPE_CHECKING:
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from ..preview.pixels import Color, Pixels
     from ..render.camera import Camera
     from ..render.camera_path import CameraPath
+    from ..render.colors import Coloring
     from .render_output import Output
 
 
@@ -38,8 +39,8 @@ class Wanted:
         output: where it goes.
         overwrite: replace files that exist.
         background: behind the splats; None keeps alpha.
-        bar: say in the picture what its colours mean.
-        gain: how many times as strong differences are.
+        bar: say beside the picture what its colours mean.
+        gain: how many times as strong differences are; None for what suits them.
         jobs: pictures at a time.
         threads: of kernels.
     """
@@ -48,7 +49,7 @@ class Wanted:
     overwrite: bool
     background: Color | None
     bar: bool
-    gain: float
+    gain: float | None
     jobs: int
     threads: int
 
@@ -81,6 +82,7 @@ class Job:
         other: draws what they are compared with; None for nothing.
         path: the cameras.
         captions: of each, for a contact sheet.
+        start: when the work began, by `time.perf_counter`.
     """
 
     console: Console
@@ -89,17 +91,21 @@ class Job:
     other: Painter | None
     path: CameraPath
     captions: list[str]
+    start: float
     frames: list[dict[str, Any]] = field(default_factory=list)
     seconds: float = 0.0
     written: int = 0
     _empty: bool = True
+    _gain: float = 1.0
 
     def run(self) -> None:
         """Draws and writes all of them."""
         from ..preview.animation import animate
         from ..preview.sheet import sheet
 
-        start, output = time.perf_counter(), self.wanted.output
+        output = self.wanted.output
+        if self.other is not None:
+            self._gain = self.wanted.gain or self._fitting_gain(self.other)
         drawn = self._drawn()
         if output.kind == "frames":
             for frame in drawn:
@@ -108,12 +114,13 @@ class Job:
             (frame,) = drawn
             self._write(output.name, frame.data)
         elif output.kind == "animation":
-            data = animate((_pixels(frame) for frame in drawn), output.form, frame_rate(self.path))
+            pictures = (_pixels(frame) for frame in drawn)
+            data = animate(pictures, output.form, frame_rate(self.path), self.console.progress)
             self._write(output.name, data)
         else:
             whole = sheet([_pixels(frame) for frame in drawn], self.captions)
             self._write(output.name, codes.encode(whole, output.form))
-        self.seconds = time.perf_counter() - start
+        self.seconds = time.perf_counter() - self.start
         self.console.clear()
         if self._empty:
             self.console.say(
@@ -137,19 +144,42 @@ class Job:
         facts = self._facts(number, camera, drawn)
         image = codes.over(drawn.image, self.wanted.background)
         if self.other is not None:
-            reference = codes.over(self.other.draw(camera).image, self.wanted.background)
+            other = self.other.draw(camera).image
+            check_covered(other, f"what --diff names, in frame {number},")
+            reference = codes.over(other, self.wanted.background)
             clipped = [np.clip(each[..., :3], 0, 1) for each in (image, reference)]
             facts["psnr_db"] = round(psnr(*clipped), 3)
-            image = codes.difference(image, reference, self.wanted.gain)
+            image = codes.difference(image, reference, self._gain)
         empty = not drawn.image[..., 3].any()
         if self.wanted.output.form == "npy":
             return Frame(number, facts, None, codes.encode_floats(self._floats(drawn, image)), empty)
         pixels = codes.eight_bits(image)
-        if self.wanted.bar and self.painter.scale is not None:
-            pixels = codes.with_scale(pixels, self.painter.scale.bar)
+        bar = self._bar()
+        if bar is not None:
+            pixels = codes.with_scale(pixels, bar)
+            facts["width"] = pixels.shape[1]
         if self.wanted.output.kind in ("picture", "frames"):
             return Frame(number, facts, None, codes.encode(pixels, self.wanted.output.form), empty)
         return Frame(number, facts, pixels, b"", empty)
+
+    def _bar(self) -> Coloring | None:
+        """What colours mean; None where that is not said."""
+        if not self.wanted.bar:
+            return None
+        if self.other is not None:
+            return codes.difference_bar(self._gain)
+        return self.painter.scale.bar if self.painter.scale is not None else None
+
+    def _fitting_gain(self, other: Painter) -> float:
+        """What suits the first picture, the last and the one in the middle; the same for all."""
+        cameras, background = self.path.cameras, self.wanted.background
+        some = sorted({0, len(cameras) // 2, len(cameras) - 1}, reverse=True)
+        differences = []
+        for done, at in enumerate(some, 1):
+            images = [codes.over(each.draw(cameras[at]).image, background) for each in (self.painter, other)]
+            differences.append(codes.apart(*images))
+            self.console.progress("comparing", done, len(some), "frame")
+        return codes.gain_for(differences)
 
     def _facts(self, number: int, camera: Camera, drawn: Drawn) -> dict[str, Any]:
         facts = {"frame": number, "time_s": camera.time, "name": camera.name, "splats": drawn.splats}
@@ -182,6 +212,8 @@ class Job:
                 "frames": frames,
                 "seconds": round(self.seconds, 3),
             }
+            if self.other is not None:
+                report["gain"] = self._gain
             click.echo(json.dumps(report, allow_nan=False))
         name = "standard output" if output.name is None else output.name
         sizes = dict.fromkeys(f"{frame['width']} x {frame['height']}" for frame in frames)
@@ -193,6 +225,7 @@ class Job:
         if self.other is not None:
             worst = min(frame["psnr_db"] for frame in frames)
             said.append(f"PSNR {worst:.2f} dB" + (" or more" if len(frames) > 1 else ""))
+            said.append(f"differences {self._gain:g} times as strong")
         self.console.say(f"{name}  {', '.join(said)}, {self.seconds:.2f} s")
         manner = self.painter.manner
         self.console.detail(

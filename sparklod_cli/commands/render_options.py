@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from .. import limits
+from ..limits import OF_PIXELS
 from ..render.look import PROFILES, SORTS, Look
-from .options import Command, Real, is_given
+from .options import Command, Real, is_given, refuse
 
 if TYPE_CHECKING:
     from ..preview.pictures import Manner
@@ -21,8 +22,19 @@ COLORS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "transparent": Non
 #: Pixels that are drawn for a picture: the floats of more do not fit into the memory of most machines.
 MOST_PIXELS = 1 << 27
 
-#: By default the difference to another file is made so many times as strong.
-GAIN = 10.0
+
+#: Options that styles leave nothing to, and those that backends do not have.
+UNSTYLED = {
+    "points": ("profile", "sort"),
+    "billboards": ("profile", "sort"),
+    "sorted-billboards": ("profile",),
+}
+UNKNOWN_TO = {"open3d": ("profile", "sort")}
+
+
+def of_pictures(color_by: str | None) -> tuple[str, ...]:
+    """Options that a file of numbers leaves nothing to, by what its numbers are."""
+    return ("no_bar", "background", "alpha") if color_by in OF_PIXELS else ("no_bar",)
 
 
 class Background(click.ParamType):
@@ -105,7 +117,7 @@ def look_options(command: Command) -> Command:
             click.option(
                 "--color-by",
                 type=click.Choice(limits.COLOR_BY),
-                help="Colours that mean something, without light, and a bar that says what.",
+                help="Colours that mean something, without light, and beside the picture a bar that says what.",
             ),
             click.option("--no-bar", is_flag=True, help="Leave that bar out."),
             click.option(
@@ -159,10 +171,14 @@ def manner_from(ctx: click.Context, settings: Mapping[str, Any]) -> Manner:
         raise click.UsageError(f"--near {settings['near']:g} is not less than --far {settings['far']:g}")
     if style != "splats" and is_given(ctx, "backend"):
         raise click.UsageError(f"--backend draws splats, and has no --style {style}")
+    refuse(ctx, f"--style {style}", UNSTYLED.get(style, ()))
+    refuse(ctx, f"--backend {settings['backend']}", UNKNOWN_TO.get(settings["backend"], ()))
+    if by == "overdraw":
+        refuse(ctx, "--color-by overdraw, which counts splats,", ["sort"])
     if by == "overdraw" and (style != "splats" or is_given(ctx, "backend")):
         raise click.UsageError("--color-by overdraw counts splats; leave out --style and --backend")
-    if settings["no_bar"] and by is None:
-        raise click.UsageError("--no-bar only means something with --color-by")
+    if settings["no_bar"] and by is None and settings["diff"] is None:
+        raise click.UsageError("--no-bar only means something with --color-by or --diff")
     options = {
         name: settings[option]
         for option, name in (("sorting", "sorting"), ("sort_throttle", "throttle"))

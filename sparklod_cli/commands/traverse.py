@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-from pathlib import Path
 from typing import Any
 
 import click
@@ -11,12 +10,15 @@ import click
 from .. import limits
 from .camera_options import camera_options, cameras_from
 from .console import Console
-from .options import common_options
+from .options import check_plot, common_options, refuse, table_form
 from .paths import OutputPath, keep_apart
 from .world_options import files_meant, placements_from, viewer_from, viewer_options, world_options
 
 #: Below this share of splats in front of the cameras, path and scene probably do not share their axes.
 LEAST_IN_FRONT = 0.05
+
+#: Options of the table.
+OF_TABLES = ("form", "per_instance", "no_timing")
 
 EXAMPLES = """
 \b
@@ -83,7 +85,9 @@ def traverse(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, *
     from .traverse_job import Job, Wanted
 
     viewer = viewer_from(ctx, settings)
-    form = settings["form"] or _form(settings["output"])
+    placements = placements_from(settings)
+    keep_apart(ctx, files_meant(settings, placements))
+    form = settings["form"] or table_form("--output", settings["output"])
     try:
         asserts = [assertions.parse(text) for text in settings["asserts"]]
     except assertions.BadAssertionError as error:
@@ -100,10 +104,13 @@ def traverse(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, *
         padded=settings["padded"],
         overwrite=settings["overwrite"],
     )
+    if as_json and str(wanted.output) == "-":
+        raise click.UsageError("--json and the table cannot both go to standard output")
+    if as_json and wanted.output is None:
+        refuse(ctx, "--json without --output, which writes no table,", OF_TABLES)
     if wanted.padded and wanted.indices is None:
         raise click.UsageError("--padded only means something with --indices-out")
-    placements = placements_from(settings)
-    keep_apart(ctx, files_meant(settings, placements))
+    check_plot(wanted.plot)
     with Console(quiet=quiet, verbose=verbose) as console:
         from ..splats import COLUMNS
 
@@ -116,7 +123,7 @@ def traverse(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, *
             threads=settings["threads"],
             progress=console.progress,
         )
-        path = cameras_from(settings, world.centers)
+        path = cameras_from(settings, world.balls)
         try:
             simulation = Simulation(world, viewer, by_instance=settings["per_instance"])
         except ValueError as error:
@@ -132,9 +139,3 @@ def traverse(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, *
                 " share their axes (--camera-axes, --world-transform, --up)"
             )
         ctx.exit(job.report())
-
-
-def _form(output: Path | None) -> str:
-    """The format that a name asks for."""
-    suffix = output.suffix.lower().removeprefix(".") if output is not None else ""
-    return suffix if suffix in limits.TABLES else limits.TABLES[0]

@@ -16,6 +16,7 @@ import numpy as np
 
 from ..io import check_writable, write_stdout, write_whole
 from ..progress import Progress, silent
+from ..simulation.summary import Lookout
 from .console import Console, for_screen, is_terminal
 from .traverse_text import lines
 
@@ -84,6 +85,8 @@ class Job:
     path: CameraPath
     rows: list[Row] = field(default_factory=list)
     in_front: float = 1.0
+    _lookout: Lookout = field(default_factory=Lookout)
+    _kept: dict[str, Frame] = field(default_factory=dict)
 
     def run(self, threads: int) -> None:
         """Simulates the path and writes what is made frame by frame, then the plot."""
@@ -142,6 +145,8 @@ class Job:
             if self.wanted.indices is not None:
                 self._write_indices(frame, self.wanted.indices)
             self.rows.append(frame.rows[0])
+            if self.wanted.plot is not None:
+                self._keep(frame)
             yield from frame.rows
         self.in_front = float(np.mean(shares))
 
@@ -150,6 +155,12 @@ class Job:
         if self.wanted.indices is not None:
             for number in self.path.numbers:
                 yield from _index_files(self.wanted.indices, number, len(self.simulation.world.instances))
+
+    def _keep(self, frame: Frame) -> None:
+        """Keeps what may be drawn in the end: the frames that are most worth looking at until now, and the first."""
+        for what in self._lookout.add(frame.rows[0]):
+            self._kept[what] = frame
+        self._kept.setdefault("first", frame)
 
     def _write_indices(self, frame: Frame, folder: Path) -> None:
         parts = frame.cut.indices()
@@ -161,16 +172,15 @@ class Job:
             write_whole(file, [out.getvalue()], overwrite=self.wanted.overwrite)
 
     def _plot(self, target: Path) -> None:
-        """Draws the charts, and the path over the cut of the frame that is most worth looking at."""
+        """Draws the charts, and the path over what the frame that is most worth looking at had: its cut, as drawn."""
         from ..simulation.plot import Scenery, plot
-        from ..simulation.summary import look_at
         from ..splats import Splats
 
         world = self.simulation.world
-        moments = look_at(self.rows)
-        numbers = list(self.path.numbers)
-        at = numbers.index(moments[0].frame) if moments else 0
-        nodes = self.simulation.cut(self.path.cameras[at]).indices()
+        worth = [self._kept[what] for what in (*(moment.what for moment in self._lookout.moments()), "first")]
+        frame = next((each for each in worth if len(each.cut)), worth[0])  # before anything arrived, nothing is drawn
+        at = self.path.numbers.index(frame.number)
+        nodes = frame.cut.indices()
         splats = [world.splats_of(number, part) for number, part in enumerate(nodes)]
         level = [world.trees[place.tree].level[part] for place, part in zip(world.instances, nodes, strict=True)]
         degree = min(part.sh_degree for part in splats)

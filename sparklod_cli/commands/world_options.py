@@ -10,7 +10,7 @@ import click
 
 from .. import limits
 from ..quantities import parse_bandwidth, parse_count, parse_latency
-from .options import Command, Quantity, Real, is_given
+from .options import Command, Quantity, Real, is_given, refuse
 from .paths import InputPath, file_of
 
 if TYPE_CHECKING:
@@ -195,9 +195,7 @@ def viewer_from(ctx: click.Context, settings: Mapping[str, Any]) -> Viewer:
 
     behind, outside = settings["behind_foveate"], settings["outside_foveate"]
     if outside is not None:
-        for name in CONES:
-            if is_given(ctx, name):
-                raise click.UsageError(f"--outside-foveate leaves nothing to --{name.replace('_', '-')}")
+        refuse(ctx, "--outside-foveate", CONES)
     for name in OF_BANDWIDTH:
         if settings.get(name) is not None and settings["bandwidth"] is None:
             raise click.UsageError(f"--{name} only means something with --bandwidth")

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import io
 import itertools
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from types import ModuleType
 from typing import Any
 
@@ -12,6 +13,7 @@ import numpy as np
 from PIL import Image
 
 from ..errors import SparklodError
+from ..progress import Progress, silent
 from .pixels import Pixels
 
 #: What animations are written as.
@@ -20,14 +22,20 @@ ANIMATIONS = ("gif", "webp", "mp4")
 #: GIF counts time in hundredths of a second, and what plays it slows down where a frame is shorter than this.
 GIF_STEP, GIF_LEAST = 10, 2
 
+#: Milliseconds that a frame lasts at most: 16 bits of hundredths in GIF, 24 bits in WebP; of MP4, what ffmpeg takes.
+LONGEST = {"gif": 10 * 0xFFFF, "webp": 0xFFFFFF, "mp4": 1_000_000}
+
 #: Quality of WebP, 0 to 100, and of H.264, 51 to 0: what is lost is hardly seen.
 WEBP_QUALITY, H264_QUALITY = 90, 16
 
 
-def check(form: str) -> None:
+def check(form: str, fps: float) -> None:
     """Raises a `SparklodError` where an animation cannot be written, before work goes into it."""
     if form == "mp4":
         load_imageio()
+    longest = LONGEST[form] / 1000
+    if 1 / fps > longest:
+        raise SparklodError(f"a frame of .{form} lasts {longest:,.3f} s at most, not {1 / fps:,.7g} s; see --fps")
 
 
 def load_imageio() -> ModuleType:
@@ -47,13 +55,15 @@ def load_imageio() -> ModuleType:
     return module
 
 
-def animate(frames: Iterable[Pixels], form: str, fps: float) -> bytes:
+def animate(frames: Iterable[Pixels], form: str, fps: float, progress: Progress = silent) -> bytes:
     """The bytes of an animation that is repeated for ever, or of a video.
 
     Args:
         frames: at least one, all of one size; with alpha for "webp" only.
         form: one of `ANIMATIONS`.
         fps: frames a second.
+        progress: is told how many frames are written, where that begins when all of them are there: MP4's are
+            written as they come.
 
     Raises:
         SparklodError: MP4 cannot be written here.
@@ -63,10 +73,10 @@ def animate(frames: Iterable[Pixels], form: str, fps: float) -> bytes:
         _write_mp4(out, frames, fps)
     elif form == "gif":
         pictures = (Image.fromarray(frame).convert("P", palette=Image.Palette.ADAPTIVE, colors=256) for frame in frames)
-        _write_images(out, "GIF", pictures, _times(fps, GIF_STEP, GIF_LEAST))
+        _write_images(out, "GIF", pictures, _times(fps, GIF_STEP, GIF_LEAST), progress)
     else:
         pictures = (Image.fromarray(frame) for frame in frames)
-        _write_images(out, "WEBP", pictures, _times(fps, 1, 1), quality=WEBP_QUALITY, method=4)
+        _write_images(out, "WEBP", pictures, _times(fps, 1, 1), progress, quality=WEBP_QUALITY, method=4)
     return out.getvalue()
 
 
@@ -80,11 +90,19 @@ def _times(fps: float, step: int, least: int) -> Iterator[int]:
 
 
 def _write_images(
-    out: io.BytesIO, name: str, pictures: Iterable[Image.Image], times: Iterator[int], **how: Any
+    out: io.BytesIO, name: str, pictures: Iterable[Image.Image], times: Iterator[int], progress: Progress, **how: Any
 ) -> None:
-    first, *others = pictures
-    durations = list(itertools.islice(times, 1 + len(others)))
+    first, *others = every = list(pictures)
+    durations = list(itertools.islice(times, len(every)))
+    for number, picture in enumerate(every):
+        # What Pillow does with a picture before it writes it, and all that it tells of how far it is.
+        picture.seek = functools.partial(_sought, picture.seek, progress, number, len(every))  # type: ignore[method-assign]
     first.save(out, name, save_all=True, append_images=others, duration=durations, loop=0, **how)
+
+
+def _sought(seek: Callable[[int], None], progress: Progress, number: int, total: int, frame: int) -> None:
+    seek(frame)
+    progress("encoding", number + 1, total, "frame")
 
 
 def _write_mp4(out: io.BytesIO, frames: Iterable[Pixels], fps: float) -> None:

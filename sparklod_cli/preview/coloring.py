@@ -28,13 +28,13 @@ from ..render.colors import (
 from ..render.look import Look
 from ..render.shapes import ticks
 from ..splats import FloatArray
-from .scenery import Piece, Scenery
-
-#: Colours that are of pixels rather than of splats.
-OF_PIXELS = ("overdraw", "depth")
+from .scenery import Index, Piece, Scenery, Source
 
 #: So many splats and cameras are looked at to find the ends of a scale.
 SAMPLE, CAMERAS = 1 << 18, 64
+
+#: So many cuts are found for that, which takes longer.
+CUTS = 16
 
 #: Marks nearer to an end of a scale than this would touch its own.
 APART = 0.05
@@ -71,29 +71,23 @@ def values_of(by: str, piece: Piece) -> FloatArray:
 
     Sizes are in world units; splats of files without a tree are of level 0.
     """
-    if by == "level":
-        level = piece.source.level
-        return np.zeros(len(piece.index), np.float32) if level is None else level[piece.index].astype(np.float32)
-    if by == "chunk":
-        return (piece.source.first_chunk + piece.index // CHUNK_NODES).astype(np.float64)
+    if by in ("level", "chunk"):
+        return numbers_of(by, piece.source, piece.index).astype(np.float64)
     if by == "lod-opacity":
         return lod_opacity(np.maximum(piece.splats.opacity, 0))
     return spark_size(piece.splats) * np.float32(np.cbrt(np.linalg.det(piece.object_to_world[:3, :3])))
 
 
-def scale_of_splats(by: str, scenery: Scenery) -> Scale:
-    """The scale of a colour that is of splats, for all that cameras may see.
+def scale_of_splats(by: str, scenery: Scenery, cameras: Sequence[Camera]) -> Scale:
+    """The scale of a colour that is of splats, for all that cameras may see; of whole numbers, for what they do see.
 
     Raises:
         SparklodError: by level, where no file is a tree.
     """
-    if by == "chunk":
-        return _whole("chunk", 0, max(source.first_chunk + source.chunks for source in scenery.sources) - 1)
-    if by == "level":
-        levels = [int(source.level.max()) for source in scenery.sources if source.level is not None]
-        if not levels:
-            raise SparklodError("there are no levels to colour by: no file is a Level-of-Detail tree")
-        return _whole("level", 0, max(levels))
+    if by == "level" and all(source.level is None for source in scenery.sources):
+        raise SparklodError("there are no levels to colour by: no file is a Level-of-Detail tree")
+    if by in ("chunk", "level"):
+        return _whole(by, scenery, cameras)
     pieces = scenery.candidates()
     every = max(1, sum(len(piece.index) for piece in pieces) // SAMPLE)
     values = np.concatenate([values_of(by, piece)[::every] for piece in pieces])
@@ -127,8 +121,21 @@ def scale_of_overdraw(counts: Sequence[FloatArray]) -> Scale:
     return _linear("overdraw", 0.0, max(1.0, float(math.ceil(most))), MAGMA, ends=True)
 
 
-def _whole(title: str, low: int, high: int) -> Scale:
-    return Scale(whole_numbers(title, np.arange(low, high + 1), low, high), low, high)
+def _whole(by: str, scenery: Scenery, cameras: Sequence[Camera]) -> Scale:
+    """From the least to the most that some cameras see; others may see less, or more."""
+    every = -(-len(cameras) // CUTS)
+    seen = [numbers_of(by, source, index) for camera in cameras[::every] for source, index in scenery.drawn(camera)]
+    ends = [(int(numbers.min()), int(numbers.max())) for numbers in seen if len(numbers)] or [(0, 0)]
+    low, high = min(low for low, _ in ends), max(high for _, high in ends)
+    beyond = int(every > 1)
+    return Scale(whole_numbers(by, np.arange(low - beyond, high + 1 + beyond), low, high), low, high)
+
+
+def numbers_of(by: str, source: Source, index: Index) -> NDArray[np.int64]:
+    """(M,) the "level" or the "chunk" of some splats of a file; without a tree, all are of level 0."""
+    if by == "chunk":
+        return source.first_chunk + index // CHUNK_NODES
+    return np.zeros(len(index), np.int64) if source.level is None else source.level[index].astype(np.int64)
 
 
 def _linear(title: str, low: float, high: float, stops: tuple[str, ...], *, ends: bool) -> Scale:

@@ -29,7 +29,7 @@ from ..simulation.statistics import numbers, statistic
 from ..splats import Splats
 from ..world import World
 from .continuous import ContinuousCuts, parts_of
-from .metrics import psnr, ssim, worst_tile
+from .metrics import check_covered, psnr, ssim, worst_tile
 
 #: What a budget can be a share of: the splats of full detail.
 SHARE = re.compile(r"([0-9]{1,3}(?:\.[0-9]{1,9})?|\.[0-9]{1,9})\s*%")
@@ -156,6 +156,9 @@ class Comparison:
         """Rows of `COLUMNS`: for each camera one for each budget.
 
         Pictures are made one after the other, each on all threads that kernels have; meanwhile others are measured.
+
+        Raises:
+            SparklodError: full detail covers no pixel of a frame.
         """
         total = len(path.cameras) * len(self.counts)
         for at, row in enumerate(ordered_map(_measured, self._pictures(path), min(threads, MEASURERS))):
@@ -166,6 +169,7 @@ class Comparison:
         """What is known of a row, its picture, and that of full detail."""
         for number, camera in zip(path.numbers, path.cameras, strict=True):
             full = self._draw(self._full, camera)
+            check_covered(full, f"full detail in frame {number}")
             for count, traversal in zip(self.counts, self._traversals, strict=True):
                 parts = self._parts(camera, count, traversal)
                 row: Row = {

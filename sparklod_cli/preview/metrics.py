@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import SparklodError
+
 #: (H, W, C), 0..1.
 Image = NDArray[np.floating[Any]]
 
@@ -39,6 +41,20 @@ class Tile:
     psnr: float
     x: int
     y: int
+
+
+def check_covered(reference: Image, what: str) -> None:
+    """Raises a `SparklodError` where a picture that others are compared with shows nothing: any would be like it.
+
+    Args:
+        reference: (H, W, 4), its last channel alpha.
+        what: it is a picture of.
+    """
+    if not (reference[..., 3] > 0).any():
+        raise SparklodError(
+            f"{what} covers no pixel, so there is nothing to compare with; cameras and scene may not share their axes"
+            " (--camera-axes, --world-transform, --up), or --near and --far leave nothing"
+        )
 
 
 def psnr_of(mse: float) -> float:

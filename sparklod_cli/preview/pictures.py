@@ -87,7 +87,7 @@ class Painter:
         if by == "overdraw":
             some = {number: cameras[number] for number in (0, len(cameras) // 2, len(cameras) - 1)}
             return coloring.scale_of_overdraw([self._overdraw(self.scenery.pieces(at), at) for at in some.values()])
-        return coloring.scale_of_splats(by, self.scenery)
+        return coloring.scale_of_splats(by, self.scenery, cameras)
 
     def draw(self, camera: Camera) -> Drawn:
         """The picture of a camera.

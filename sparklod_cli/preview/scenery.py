@@ -11,15 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InvalidSplatsError
-from ..gaussian import moved
 from ..limits import PRECISIONS
 from ..lod.traversal import CHUNK_NODES, Matrix
 from ..progress import Progress, silent
 from ..render.camera import Camera
+from ..render.framing import Balls, balls_of, together
 from ..scene import Scene
 from ..selection import Selection, describe
 from ..simulation.simulate import Simulation, Viewer, view_of
-from ..splats import FloatArray, Splats
+from ..splats import Splats
 from ..world import Placement, read_file, world_of
 from .continuous import ContinuousCuts, faded
 from .encodings import after
@@ -102,6 +102,14 @@ class Scenery:
             for number, source in enumerate(self.sources)
         ]
 
+    def drawn(self, camera: Camera) -> list[tuple[Source, Index]]:
+        """Of what a camera sees, which splats of which sources, in the order of `pieces`."""
+        cuts = iter(self._cuts(camera))
+        return [
+            (source, source.leaves if self._simulation is None or source.level is None else next(cuts)[0])
+            for source in self.sources
+        ]
+
     def _cuts(self, camera: Camera) -> list[tuple[Index, NDArray[np.float64] | None]]:
         """For each tree the nodes that are drawn, and their weights where cuts are continuous."""
         if self._simulation is None:
@@ -147,13 +155,11 @@ class Scenery:
                 pieces.append(Piece(source, index, source.splats, place.object_to_world))
         return pieces
 
-    def centers(self) -> FloatArray:
-        """(N, 3) where splats are in the world: the leaves of every placement."""
-        return np.concatenate(
-            [
-                moved(source.splats.center[source.leaves], place.object_to_world)
-                for place, source in zip(self.placements, self.sources, strict=True)
-            ]
+    def balls(self) -> Balls:
+        """What the splats cover in the world: the leaves of every placement."""
+        return together(
+            balls_of(source.splats.take(source.leaves), place.object_to_world)
+            for place, source in zip(self.placements, self.sources, strict=True)
         )
 
 

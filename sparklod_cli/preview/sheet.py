@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bisect
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -64,7 +65,17 @@ def _caption_height(size: tuple[int, int]) -> int:
 
 
 def _fitting(text: str, width: int, draw: ImageDraw.ImageDraw, font: Font) -> str:
-    text = "".join(mark if mark.isprintable() else "\N{REPLACEMENT CHARACTER}" for mark in text)
-    while text and draw.textlength(text, font=font) > width:
-        text = text[:-2].rstrip() + "…" if len(text) > 2 else ""
-    return text
+    # No letter is narrower than a pixel, so no more of them can fit; longer texts take long to measure.
+    marks = text[: width + 1]
+    text = "".join(mark if mark.isprintable() else "\N{REPLACEMENT CHARACTER}" for mark in marks)
+
+    def cut(length: int) -> str:
+        return text if length == len(text) else text[:length].rstrip() + "…"
+
+    def fits(length: int) -> bool:
+        return bool(draw.textlength(cut(length), font=font) <= width)
+
+    if fits(len(text)):
+        return text
+    longest = bisect.bisect_left(range(1, len(text)), True, key=lambda length: not fits(length))
+    return cut(longest) if longest else ""

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..errors import CameraPathError
+from ..errors import CameraPathError, TooManyCamerasError
 from .axes import Axes
 from .camera import Camera
-from .frame import DEFAULT_FPS, MAX_FRAMES, Settings, camera_of
+from .frame import DEFAULT_FPS, MAX_FRAMES, MAX_MADE, Sampled, Settings, camera_of
 from .paths import own_csv
 from .paths.formats import FORMATS, PathFormat
 from .paths.source import Files, Parsed
@@ -63,7 +63,10 @@ def read(files: Files, *, format: str | None = None, settings: Settings | None =
     form = _known(files) if format is None else next(form for form in FORMATS if form.name == format)
     if settings.axes and form.axes is None:
         raise CameraPathError(f"{form.title} says where cameras look, which leaves nothing to --camera-axes")
-    return cameras_of(form.parser().parse(files, settings), form, settings)
+    parsed = form.parser().parse(files, settings)
+    if settings.up is not None and (parsed.turned or not form.looking):
+        raise CameraPathError("its cameras say themselves which way is up, which leaves nothing to --up")
+    return cameras_of(parsed, form, settings)
 
 
 def _known(files: Files) -> PathFormat:
@@ -81,18 +84,19 @@ def cameras_of(parsed: Parsed, form: PathFormat, settings: Settings) -> CameraPa
 
     Raises:
         CameraPathError: there is none, or one makes no sense; the text names it.
+        TooManyCamerasError: there are too many of them.
     """
-    count = len(parsed.frames)
-    if not count:
+    numbers = range(0, len(parsed.frames), settings.every)
+    if not numbers:
         raise CameraPathError("it has no cameras")
-    if count > MAX_FRAMES:
-        raise CameraPathError(f"it has {count:,} cameras, more than {MAX_FRAMES:,}")
-    numbers = range(0, count, settings.every)
-    first = parsed.frames[0].time
+    most = MAX_MADE if isinstance(parsed.frames, Sampled) else MAX_FRAMES
+    if len(numbers) > most:
+        raise TooManyCamerasError(f"it has {len(numbers):,} cameras, more than {most:,}; see --every")
+    frames = parsed.frames[:: settings.every]
+    first = frames[0].time
     world = np.eye(4) if settings.world is None else settings.world
     cameras = []
-    for number in numbers:
-        frame = parsed.frames[number]
+    for number, frame in zip(numbers, frames, strict=True):
         if frame.time is None or first is None or settings.fps:
             time = number / (settings.fps or parsed.fps or DEFAULT_FPS)
         else:

@@ -3,8 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import overload
 
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import TooManyCamerasError
 from .axes import Axes
 from .camera import Camera, Matrix
 
@@ -12,8 +18,14 @@ DEFAULT_SIZE = (1280, 720)
 DEFAULT_FOV_Y = math.radians(60)
 DEFAULT_FPS = 30.0
 
-#: So many cameras are taken; an hour at 60 frames a second has fewer.
+#: So many cameras are taken of a file that has them all; an hour at 60 frames a second has fewer.
 MAX_FRAMES = 1 << 20
+
+#: So many are made where a few numbers ask for them; half an hour at 30 frames a second has fewer.
+MAX_MADE = 1 << 16
+
+#: Numbers of frames are below this, so that they are whole numbers as floats, too.
+NUMBERED = 1 << 53
 
 #: y is down in scenes as training leaves them.
 DEFAULT_UP = (0.0, -1.0, 0.0)
@@ -62,6 +74,48 @@ class Frame:
 
 
 @dataclass(frozen=True)
+class Sampled(Sequence[Frame]):
+    """Frames that are worked out where they are asked for: a few keys can make any number of them.
+
+    Attributes:
+        length: how many there are.
+        at: makes those of some numbers, (K,) int64, each below `length`.
+    """
+
+    length: int
+    at: Callable[[NDArray[np.int64]], list[Frame]]
+
+    def __len__(self) -> int:
+        return self.length
+
+    @overload
+    def __getitem__(self, index: int) -> Frame: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> list[Frame]: ...
+
+    def __getitem__(self, index: int | slice) -> Frame | list[Frame]:
+        numbers = range(self.length)[index]
+        if isinstance(numbers, int):
+            return self.at(np.array([numbers]))[0]
+        return self.at(np.arange(numbers.start, numbers.stop, numbers.step))
+
+    def __iter__(self) -> Iterator[Frame]:
+        return iter(self[:])
+
+
+def sampled(count: float, at: Callable[[NDArray[np.int64]], list[Frame]]) -> Sampled:
+    """Frames of a count that a formula gives, rounded up.
+
+    Raises:
+        TooManyCamerasError: it is more than can be counted, or no number.
+    """
+    if not count < NUMBERED:
+        raise TooManyCamerasError(f"{count:.3g} frames are more than {MAX_MADE:,}")
+    return Sampled(max(math.ceil(count), 1), at)
+
+
+@dataclass(frozen=True)
 class Settings:
     """What a user says about a path, over what its file says; None leaves it to the file.
 
@@ -93,6 +147,7 @@ def camera_of(pose: Matrix, lens: Lens, time: float, name: str, settings: Settin
     size = lens.size or settings.size or DEFAULT_SIZE
     focal = lens.focal if lens.size and lens.focal else _focal_of(lens, size)
     principal = lens.principal or (size[0] / 2, size[1] / 2)
+    _check(focal, principal)
     if settings.fov_y is not None:
         fy = size[1] / (2 * math.tan(settings.fov_y / 2))
         focal = (focal[0] * fy / focal[1], fy)  # pixels keep their shape
@@ -103,9 +158,16 @@ def camera_of(pose: Matrix, lens: Lens, time: float, name: str, settings: Settin
         off = [(principal[k] - size[k] / 2) * zoom for k in (0, 1)]
         size = settings.size
         principal = (size[0] / 2 + off[0], size[1] / 2 + off[1])
-    if not all(map(math.isfinite, (*focal, *principal))) or min(focal) <= 0:
-        raise ValueError("has a focal length or principal point that is not a sensible number")
+        _check(focal, principal)
     return Camera(pose, *size, focal, principal, time, name)
+
+
+def _check(focal: tuple[float, float], principal: tuple[float, float]) -> None:
+    if not min(focal) > 0 or not all(map(math.isfinite, (*focal, *principal))):
+        raise ValueError(
+            f"has a focal length of {focal[0]:g}, {focal[1]:g} and a principal point at {principal[0]:g},"
+            f" {principal[1]:g}, of which one is not a sensible number"
+        )
 
 
 def _focal_of(lens: Lens, size: tuple[int, int]) -> tuple[float, float]:

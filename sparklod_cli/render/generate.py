@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ..errors import CameraPathError
 from .axes import Axes
 from .camera import Matrix
-from .frame import DEFAULT_FOV_Y, DEFAULT_FPS, MAX_FRAMES, NO_LENS, Frame, Lens
+from .frame import DEFAULT_FOV_Y, DEFAULT_FPS, NO_LENS, NUMBERED, Frame, Lens, Sampled, sampled
 from .pose import look_at, normalized
 from .spline import catmull_rom_tangents, centripetal_knots, hermite
 
@@ -56,7 +56,7 @@ def frame_looking(
         raise CameraPathError(f"the camera at {_spell(eye)} {error}") from None
 
 
-def orbit(count: int, center: ArrayLike, distance: float, elevation: float, up: ArrayLike) -> list[Frame]:
+def orbit(count: int, center: ArrayLike, distance: float, elevation: float, up: ArrayLike) -> Sampled:
     """`count` frames once around, counter-clockwise as seen from above.
 
     Args:
@@ -66,35 +66,49 @@ def orbit(count: int, center: ArrayLike, distance: float, elevation: float, up: 
         elevation: above it, radians.
         up: (3,) the axis.
     """
-    center, axis = np.asarray(center, np.float64), normalized(up)
+    axis = normalized(up)
     front = _front(axis)
     side = np.cross(axis, front)
-    frames = []
-    for turn in 2 * math.pi * np.arange(count) / count:
-        ahead = math.cos(turn) * front + math.sin(turn) * side
-        offset = math.cos(elevation) * ahead + math.sin(elevation) * axis
-        frames.append(frame_looking(center + distance * offset, center, axis))
-    return frames
+
+    def at(numbers: NDArray[np.int64]) -> list[Frame]:
+        turn = 2 * math.pi * numbers[:, None] / count
+        offset = math.cos(elevation) * (np.cos(turn) * front + np.sin(turn) * side) + math.sin(elevation) * axis
+        return _looking_at(center, np.full(len(numbers), distance), offset, axis)
+
+    return Sampled(count, at)
 
 
-def dolly(count: int, center: ArrayLike, far: float, near: float, elevation: float, up: ArrayLike) -> list[Frame]:
+def dolly(count: float, center: ArrayLike, far: float, near: float, elevation: float, up: ArrayLike) -> Sampled:
     """`count` frames straight towards a point; from each to the next, what is there grows by the same factor.
 
     Args:
-        count: of frames.
+        count: of frames, at least 2.
         center: (3,) that all look at.
         far, near: distance of the first and the last from it, world units.
         elevation: above it, radians.
         up: (3,)
     """
-    center, axis = np.asarray(center, np.float64), normalized(up)
+    axis = normalized(up)
     offset = math.cos(elevation) * _front(axis) + math.sin(elevation) * axis
-    return [frame_looking(center + distance * offset, center, axis) for distance in np.geomspace(far, near, count)]
+
+    def at(numbers: NDArray[np.int64]) -> list[Frame]:
+        away = far * (near / far) ** (numbers / (count - 1))
+        return _looking_at(center, away, np.broadcast_to(offset, (len(numbers), 3)), axis)
+
+    return sampled(count, at)
+
+
+def _looking_at(center: ArrayLike, distance: Matrix, offset: Matrix, up: Matrix) -> list[Frame]:
+    """Frames that look at a point, (3,), from (N,) distances along (N, 3) unit vectors."""
+    target = np.asarray(center, np.float64)
+    with np.errstate(over="ignore", invalid="ignore"):
+        eyes = target + distance[:, None] * offset
+    return [frame_looking(eye, target, up) for eye in eyes]
 
 
 def between(
     keys: Sequence[Key], fps: float | None, up: ArrayLike, lens: Lens = NO_LENS, seconds: float = SECONDS
-) -> list[Frame]:
+) -> Sampled:
     """Frames from the first key to the last, on a Catmull-Rom spline through all of them.
 
     Eye, target, up and field of view each have theirs, so that what two keys look at stays in view between them. The
@@ -111,7 +125,7 @@ def between(
     Raises:
         CameraPathError: there are too few keys, or too many frames; times are missing, or do not increase.
     """
-    fps = fps or DEFAULT_FPS
+    rate = fps or DEFAULT_FPS
     if len(keys) < 2:
         raise CameraPathError("a path of keyframes takes two of them, or more")
     ups = [normalized(key.up or up) for key in keys]
@@ -119,19 +133,39 @@ def between(
     fovs = [key.fov if key.fov is not None else known for key in keys]
     values = np.array([[*key.eye, *key.target, *up, fov] for key, up, fov in zip(keys, ups, fovs, strict=True)])
     knots = _times(keys, values, seconds)
-    count = (knots[-1] - knots[0]) * fps
-    if not count < MAX_FRAMES:
-        raise CameraPathError(f"{count:.3g} frames between its keyframes are more than {MAX_FRAMES:,}")
-    times = np.arange(int(count + 1e-6) + 1) / fps
-    tangents = catmull_rom_tangents(knots, values)
-    samples = hermite(knots, values, tangents, np.minimum(knots[0] + times, knots[-1]))
+    with np.errstate(all="ignore"):
+        count = (float(knots[-1]) - float(knots[0])) * rate
+        tangents = catmull_rom_tangents(knots, values)
     fov_is_known = any(key.fov is not None for key in keys)
-    frames = []
-    for time, sample in zip(times, samples, strict=True):
-        fov = float(np.clip(sample[9], min(fovs), max(fovs)))  # a spline may overshoot
-        own = dataclasses.replace(lens, fov=fov, focal=None) if fov_is_known else lens
-        frames.append(frame_looking(sample[:3], sample[3:6], sample[6:9], own, float(time)))
-    return frames
+
+    def at(numbers: NDArray[np.int64]) -> list[Frame]:
+        times = numbers / rate
+        samples = along(lambda at: hermite(knots, values, tangents, at), np.minimum(knots[0] + times, knots[-1]))
+        frames = []
+        for time, sample in zip(times, samples, strict=True):
+            fov = float(np.clip(sample[9], min(fovs), max(fovs)))  # a spline may overshoot
+            own = dataclasses.replace(lens, fov=fov, focal=None) if fov_is_known else lens
+            frames.append(frame_looking(sample[:3], sample[3:6], sample[6:9], own, float(time)))
+        return frames
+
+    return sampled(math.floor(count + 1e-6) + 1 if count < NUMBERED else count, at)
+
+
+def along(curve: Callable[[Matrix], Matrix], at: Matrix) -> Matrix:
+    """(N, K) points of a curve.
+
+    Args:
+        curve: from parameters to points.
+        at: (N,) parameters.
+
+    Raises:
+        CameraPathError: some are no numbers: keys are too far apart, or too near in time.
+    """
+    with np.errstate(all="ignore"):
+        points = curve(at)
+    if not np.isfinite(points).all():
+        raise CameraPathError("its keyframes have numbers so large that what is between them is no number")
+    return points
 
 
 def _times(keys: Sequence[Key], values: Matrix, seconds: float) -> Matrix:

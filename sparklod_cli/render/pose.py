@@ -82,10 +82,15 @@ def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike) -> Matrix:
         eye, target, up: (3,) in the world. Where `up` is along the line of sight, another direction takes its place.
 
     Raises:
-        ValueError: eye and target are the same point; its text goes on a sentence about the camera.
+        ValueError: eye and target are the same point, or farther apart than numbers go; its text goes on a sentence
+            about the camera.
     """
     eye, target = np.asarray(eye, np.float64), np.asarray(target, np.float64)
-    back = normalized(eye - target)
+    with np.errstate(over="ignore", invalid="ignore"):
+        back = eye - target
+    if not np.isfinite(back).all():
+        raise ValueError("looks at a point that is too far away")
+    back = normalized(back)
     if not np.isfinite(back).all():
         raise ValueError("looks at the point where it is")
     right = np.cross(normalized(up), back)

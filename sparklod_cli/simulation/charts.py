@@ -104,7 +104,7 @@ def _drawn(axes: Axes, frames: Frames, matplotlib: ModuleType) -> Series:
     budget = frames.column("budget")
     axes.plot(frames.x, budget, color=YELLOW, linewidth=1.4, label="budget")
     axes.set_ylim(0, max(axes.get_ylim()[1], 1.05 * float(np.nanmax(budget))))
-    axes.yaxis.set_major_formatter(matplotlib.ticker.EngFormatter(sep=""))
+    _counted(axes, matplotlib)
     axes.set_ylabel("splats")
     return frames.column("selected")
 
@@ -112,7 +112,7 @@ def _drawn(axes: Axes, frames: Frames, matplotlib: ModuleType) -> Series:
 def _where(axes: Axes, frames: Frames, matplotlib: ModuleType) -> Series:
     parts = (("in the picture", "in_frustum", GREEN), ("beside it", "outside", BLUE), ("behind", "behind", INDIGO))
     _stack(axes, frames, parts)
-    axes.yaxis.set_major_formatter(matplotlib.ticker.EngFormatter(sep=""))
+    _counted(axes, matplotlib)
     axes.set_ylabel("splats")
     return frames.column("in_frustum")
 
@@ -129,6 +129,12 @@ def _stack(axes: Axes, frames: Frames, parts: Sequence[tuple[str, str, str]]) ->
 def _from_zero(axes: Axes, values: Series) -> None:
     """Makes the axis go from 0 to above the greatest of numbers, some of which may be missing."""
     axes.set_ylim(0, HEADROOM * float(np.nanmax(values)) or 1)
+
+
+def _counted(axes: Axes, matplotlib: ModuleType, unit: str = "") -> None:
+    """Marks an axis of heights in whole numbers, with k and M for thousands and millions."""
+    axes.yaxis.set_major_locator(matplotlib.ticker.MaxNLocator(6, steps=[1, 2, 5, 10], integer=True, min_n_ticks=1))
+    axes.yaxis.set_major_formatter(matplotlib.ticker.EngFormatter(unit, sep=" " if unit else ""))
 
 
 def _beside(axes: Axes) -> Axes:
@@ -166,14 +172,14 @@ def _fetched(axes: Axes, frames: Frames, matplotlib: ModuleType) -> Series:
     values = frames.column("bytes_new")
     some = values > 0
     axes.vlines(frames.x[some], 0, values[some], color=ORANGE, linewidth=1.8, label="for a frame")
-    axes.yaxis.set_major_formatter(matplotlib.ticker.EngFormatter(unit="B"))
+    _counted(axes, matplotlib, "B")
     _from_zero(axes, values)
     axes.set_ylabel("for a frame")
     total = _beside(axes)
     fetched = np.nancumsum(values)
     total.plot(frames.x, fetched, color=GREEN, linewidth=1.6)
     axes.plot([], [], color=GREEN, linewidth=1.6, label="in all")
-    total.yaxis.set_major_formatter(matplotlib.ticker.EngFormatter(unit="B"))
+    _counted(total, matplotlib, "B")
     _from_zero(total, fetched)
     total.set_ylabel("in all")
     return values
@@ -183,8 +189,8 @@ def _cache(axes: Axes, frames: Frames, matplotlib: ModuleType) -> Series:
     values = frames.column("missing")
     axes.fill_between(frames.x, 0, values, color=ORANGE, alpha=0.35, linewidth=0)
     axes.plot(frames.x, values, color=ORANGE, linewidth=1.2, label="missing")
-    axes.yaxis.set_major_formatter(matplotlib.ticker.EngFormatter(sep=""))
     _from_zero(axes, values)
+    _counted(axes, matplotlib)
     axes.set_ylabel("splats, missing")
     chunks = _beside(axes)
     resident = frames.column("chunks_resident")

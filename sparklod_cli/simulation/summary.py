@@ -157,19 +157,43 @@ MOMENTS: dict[str, tuple[Callable[[Row], Number | None], Number, str]] = {
 }
 
 
-def look_at(frames: Sequence[Row]) -> list[Moment]:
-    """The frames with the most of each reason to look at them; the first of those with as much.
+class Lookout:
+    """Finds the frames with the most of each reason to look at them, one frame after the other.
 
-    What the first frame fetches is no such reason: it has to fetch everything.
+    Of those with as much it is the first. What the first frame fetches is no such reason: it has to fetch everything.
     """
-    found = []
-    for what, (measure, above, unit) in MOMENTS.items():
-        candidates = frames[1:] if what == "bytes" else frames
-        measured = [(value, row) for row in candidates if (value := measure(row)) is not None]
-        value, row = max(measured, key=lambda each: each[0], default=(above, {}))
-        if value > above:
-            found.append(_moment(what, row, _rounded(value), unit))
-    return found
+
+    def __init__(self) -> None:
+        self._most: dict[str, tuple[Number, Row]] = {}
+        self._frames = 0
+
+    def add(self, row: Row) -> list[str]:
+        """Takes the row of the next frame; of which of `MOMENTS` it has more than all before."""
+        found = []
+        for what, (measure, above, _) in MOMENTS.items():
+            value = None if what == "bytes" and not self._frames else measure(row)
+            if value is not None and value > (self._most[what][0] if what in self._most else above):
+                self._most[what] = value, row
+                found.append(what)
+        self._frames += 1
+        return found
+
+    def moments(self) -> list[Moment]:
+        """Those of the frames until now, in the order of `MOMENTS`."""
+        return [
+            _moment(what, row, _rounded(value), unit)
+            for what, (_, _, unit) in MOMENTS.items()
+            for value, row in [self._most.get(what, (None, {}))]
+            if value is not None
+        ]
+
+
+def look_at(frames: Sequence[Row]) -> list[Moment]:
+    """The frames with the most of each reason to look at them."""
+    lookout = Lookout()
+    for row in frames:
+        lookout.add(row)
+    return lookout.moments()
 
 
 def _moment(what: str, row: Row, value: Number, unit: str) -> Moment:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import itertools
 import sys
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -53,6 +54,32 @@ def test_times_do_not_drift(fps: float) -> None:
             assert abs(sum(times) - 200 * 1000 / fps) <= step
 
 
+@pytest.mark.parametrize("form", ["gif", "webp"])
+def test_encoding_tells_how_far_it_is(form: str) -> None:
+    told: list[tuple[str, int, int]] = []
+
+    def drawn() -> Iterator[np.ndarray]:
+        for frame in frames():
+            assert not told, "all are drawn before the first is written"
+            yield frame
+
+    animation.animate(drawn(), form, 10.0, lambda stage, done, total, unit: told.append((stage, done, total)))
+    assert list(dict.fromkeys(told)) == [("encoding", number, 4) for number in (1, 2, 3, 4)]
+
+
+@pytest.mark.parametrize(("form", "longest"), [("gif", 655.35), ("webp", 16777.215)])
+def test_a_frame_lasts_as_long_as_its_format_can_say(form: str, longest: float) -> None:
+    animation.check(form, 1 / longest)
+    data = animation.animate(frames(), form, 1 / longest)
+    with Image.open(io.BytesIO(data)) as picture:
+        picture.seek(1)
+        picture.load()
+        assert picture.info["duration"] == pytest.approx(1000 * longest)
+    for fps in (0.999 / longest, 1e-6, 1e-300):
+        with pytest.raises(SparklodError, match=rf"^a frame of \.{form} lasts .* s at most, not .* s; see --fps$"):
+            animation.check(form, fps)
+
+
 @pytest.mark.parametrize("size", [(64, 48), (33, 21)])
 def test_a_video_has_the_frames(size: tuple[int, int]) -> None:
     pytest.importorskip("imageio_ffmpeg", reason="the extra video is not installed")
@@ -68,5 +95,5 @@ def test_a_video_has_the_frames(size: tuple[int, int]) -> None:
 def test_without_imageio_it_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "imageio", None)
     with pytest.raises(SparklodError, match=r"pip install 'sparklod\[video\]'"):
-        animation.check("mp4")
-    animation.check("gif")
+        animation.check("mp4", 30)
+    animation.check("gif", 30)

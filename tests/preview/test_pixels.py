@@ -115,10 +115,41 @@ def test_a_scale_stands_at_the_right(channels: int) -> None:
     bar = smooth("numbers", np.empty(0), VIRIDIS, [(0.0, "0"), (1.0, "12 or more")])
     codes = np.full((360, 640, channels), 255, np.uint8)
     result = pixels.with_scale(codes, bar)
-    assert result.shape == codes.shape
-    assert np.array_equal(result[:, :480], codes[:, :480])
+    assert result.shape == (360, 640 + pixels.scale_width(640, 360), channels)
+    assert np.array_equal(result[:, :640], codes), "it hides nothing"
+    assert (result[:, 640:, :3] != 255).any(axis=2).all()
+    assert (result[:, 640:, 3:] == 255).all()
     flat = result[..., :3].reshape(-1, 3).astype(int)
     for color in (bar.ramp[0], bar.ramp[-1]):
         assert np.abs(flat - color).max(axis=1).min() <= 3
     small = codes[:100, :100]
     assert pixels.with_scale(small, bar) is small
+    assert pixels.scale_width(100, 100) == 0
+
+
+@pytest.mark.parametrize("size", [1e-4, 3e-3, 0.02, 0.3, 1.0])
+def test_a_gain_shows_differences_and_cuts_few(size: float) -> None:
+    random = np.random.default_rng(3)
+    a = np.full((60, 80, 4), 0.5, np.float32)
+    b = a.copy()
+    b[20:40, :, :3] += size * random.uniform(-0.5, 0.5, (20, 80, 3)).astype(np.float32)
+    gain = pixels.gain_for([pixels.apart(a, b), pixels.apart(a, a)])
+    shown = pixels.difference(a, b, gain)[..., :3]
+    assert gain in pixels.GAINS
+    assert (shown[20:40] < 1).all(axis=2).mean() >= 0.98
+    assert shown.max() > 0.39 or gain == pixels.GAINS[-1]
+    assert not shown[:20].any()
+
+
+def test_what_is_the_same_needs_no_gain() -> None:
+    same = np.ones((8, 8, 4), np.float32)
+    assert pixels.gain_for([pixels.apart(same, same)]) == 1
+
+
+@pytest.mark.parametrize("gain", [0.5, 1.0, 20.0])
+def test_the_bar_of_a_difference_has_its_ends(gain: float) -> None:
+    bar = pixels.difference_bar(gain)
+    assert [place for place, _ in bar.marks] == [0, 0.5, 1]
+    assert float(bar.marks[-1][1].removesuffix(" or more")) == pytest.approx(1 / gain)
+    assert bar.ramp[0].tolist() == [0, 0, 0]
+    assert bar.ramp[-1].tolist() == [255, 255, 255]

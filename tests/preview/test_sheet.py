@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
+from PIL import Image, ImageDraw, ImageFont
 
-from sparklod_cli.preview.sheet import cells, grid, sheet
+from sparklod_cli.preview.sheet import _fitting, cells, grid, sheet
 
 
 def pictures(count: int, width: int, height: int, channels: int = 3) -> list[np.ndarray]:
@@ -42,6 +45,33 @@ def test_one_with_alpha_makes_the_sheet_have_it() -> None:
     assert np.array_equal(whole[ay : ay + 20, ax : ax + 20, :3], plain)
     assert (whole[ay : ay + 20, ax : ax + 20, 3] == 255).all()
     assert np.array_equal(whole[by : by + 20, bx : bx + 20], clear)
+
+
+def test_a_caption_of_any_length_takes_few_measurements(monkeypatch: pytest.MonkeyPatch) -> None:
+    lengths = []
+    measure = ImageDraw.ImageDraw.textlength
+
+    def counted(self: Any, text: str, *rest: Any, **named: Any) -> float:
+        lengths.append(len(text))
+        return measure(self, text, *rest, **named)
+
+    monkeypatch.setattr(ImageDraw.ImageDraw, "textlength", counted)
+    made = pictures(2, 300, 200)
+    assert sheet(made, ["name " * 200_000, "\x07" * 8_000]).shape
+    assert len(lengths) < 40
+    assert max(lengths) <= 302
+
+
+@pytest.mark.parametrize("text", ["W" * 100, "i" * 1000, "a b " * 99, "fits"])
+def test_a_caption_is_as_long_as_fits(text: str) -> None:
+    font, draw = ImageFont.load_default(size=14), ImageDraw.Draw(Image.new("RGB", (8, 8)))
+    for width in (1, 20, 150, 400):
+        made = _fitting(text, width, draw, font)
+        assert draw.textlength(made, font=font) <= width
+        whole = made == text
+        assert whole or made == "" or made.endswith("…")
+        if not whole:
+            assert draw.textlength(f"{text[: len(made) + 1].rstrip()}…", font=font) > width, "one more does not fit"
 
 
 def test_a_caption_is_written() -> None:

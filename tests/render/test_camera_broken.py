@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import re
 import struct
 import sys
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,7 @@ from hypothesis import strategies as st
 
 from sparklod_cli.errors import CameraPathError
 from sparklod_cli.render.camera_path import read
+from sparklod_cli.render.frame import Settings
 from sparklod_cli.render.paths.formats import FORMATS
 from sparklod_cli.render.paths.source import Files
 
@@ -137,7 +140,7 @@ FAULTS: dict[str, tuple[str | bytes, str]] = {
     "SuperSplat for years": (
         '{"version": 2, "animTracks": [{"duration": 1e9, "frameRate": 30, "keyframes": {"times": [0], "values":'
         ' {"position": [0, 0, 0], "target": [1, 0, 0], "fov": [60]}}}]}',
-        "frames are more than 1,048,576",
+        "it has 30,000,000,000 cameras, more than 65,536; see --every",
     ),
     "COLMAP without words": ("# Image list with two lines of data per image\n1 1 0 0\n", "line 2 of images.txt has 4"),
     "frames of frames": ('{"frames": [{"transform_matrix": [[1, 0, 0, 0]]}]}', "is not a list of 12 or 16 numbers"),
@@ -171,17 +174,50 @@ def test_what_is_cut_or_changed_gives_cameras_or_an_error(name: str, data: st.Da
 
 
 def check_any(files: Files, form: str | None) -> None:
-    """They are cameras that can be used, or an error of one line."""
-    try:
-        path = read(files, format=form)
-    except CameraPathError as error:
-        assert "\n" not in str(error)
-        return
-    assert path.cameras
-    for camera in path.cameras:
-        assert np.isfinite(camera.camera_to_world).all()
-        assert min(camera.focal) > 0
-        assert np.isfinite(camera.time)
+    """They are cameras that can be used, or an error of one line; nothing is said by numpy."""
+    for settings in (Settings(every=50), Settings(fov_y=1.0, size=(64, 48), fps=3.0, every=50)):
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("error", RuntimeWarning)
+                path = read(files, format=form, settings=settings)
+        except CameraPathError as error:
+            assert "\n" not in str(error)
+            continue
+        assert path.cameras
+        for camera in path.cameras:
+            assert np.isfinite(camera.camera_to_world).all()
+            assert min(camera.focal) > 0
+            assert np.isfinite(camera.time)
+
+
+#: Numbers that are finite, and of which few sums and products are.
+HUGE = [0.0, -0.0, 5e-324, 1e-300, -1e308, 1e308, 1.7e308, 9223372036854775808, 1.5]
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if "open3d" not in name and "binary" not in name])
+def test_a_number_of_any_size_gives_cameras_or_an_error(name: str) -> None:
+    """Each number of a file by turns becomes each of `HUGE`."""
+    whole = files_at(FOLDER / name)
+    for file, content in whole.contents.items():
+        text = content.decode()
+        numbers = list(re.finditer(r"(?<![\w.])-?\d+(\.\d+)?(e-?\d+)?", text))
+        for number in numbers[:: -(-len(numbers) // 60)]:
+            for value in HUGE:
+                changed = f"{text[: number.start()]}{value!r}{text[number.end() :]}"
+                check_any(Files(whole.path, {**whole.contents, file: changed.encode()}), CASES[name][0])
+
+
+@pytest.mark.parametrize(
+    "model", [struct.pack("<d", 0.0), struct.pack("<d", 5e-324), struct.pack("<d", -1.0), struct.pack("<d", 1e308)]
+)
+def test_colmap_with_a_focal_length_that_is_none(model: bytes) -> None:
+    whole = files_at(FOLDER / "colmap-binary")
+    cameras = bytearray(whole.contents["cameras.bin"])
+    cameras[8 + 24 : 8 + 24 + 8] = model
+    check_any(Files(whole.path, {**whole.contents, "cameras.bin": bytes(cameras)}), "colmap")
+    if struct.unpack("<d", model)[0] <= 0:
+        with pytest.raises(CameraPathError, match=r"focal length .* not a sensible number"):
+            read(Files(whole.path, {**whole.contents, "cameras.bin": bytes(cameras)}), settings=Settings(fov_y=1.0))
 
 
 VALUES = st.recursive(

@@ -12,11 +12,12 @@ import click
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
-from numpy.typing import NDArray
 
 from sparklod_cli.commands.camera_options import camera_options, cameras_from
 from sparklod_cli.errors import CameraPathError
+from sparklod_cli.render import generate
 from sparklod_cli.render.camera_path import CameraPath
+from sparklod_cli.render.framing import FILLED, Balls
 
 from .cameras import FOLDER, KNOWN, SIZE, check_pose
 
@@ -25,14 +26,15 @@ SHELLS = [2.0] * 50 + [1.0] * 45 + [50.0] * 5
 TURN = "-1,0,0,0,0,-1,0,0,0,0,1,0,0,0,0,1"
 
 
-def centers() -> NDArray[np.float32]:
+def scene_of_shells() -> Balls:
     random = np.random.default_rng(1)
     directions = random.normal(size=(len(SHELLS) * 40, 3))
     offsets = directions / np.linalg.norm(directions, axis=1)[:, None] * np.repeat(SHELLS, 40)[:, None]
-    return (np.concatenate([offsets, -offsets]) + np.array([1, 2, 3])).astype(np.float32)
+    center = np.concatenate([offsets, -offsets]) + np.array([1, 2, 3])
+    return Balls(center, np.zeros(len(center)))
 
 
-def run(*arguments: str | Path, scene: Any = centers) -> tuple[Result, list[CameraPath]]:
+def run(*arguments: str | Path, scene: Any = scene_of_shells) -> tuple[Result, list[CameraPath]]:
     found: list[CameraPath] = []
 
     @click.command()
@@ -44,7 +46,7 @@ def run(*arguments: str | Path, scene: Any = centers) -> tuple[Result, list[Came
     return CliRunner().invoke(command, [str(argument) for argument in arguments]), found
 
 
-def cameras(*arguments: str | Path, scene: Any = centers) -> CameraPath:
+def cameras(*arguments: str | Path, scene: Any = scene_of_shells) -> CameraPath:
     result, found = run(*arguments, scene=scene)
     assert result.exit_code == 0, result.output or result.exception
     return found[0]
@@ -62,7 +64,7 @@ def file_error(*arguments: str | Path) -> str:
     return str(result.exception)
 
 
-def no_scene() -> NDArray[np.float32]:
+def no_scene() -> Balls:
     raise AssertionError("nobody needs to know the scene")
 
 
@@ -72,7 +74,8 @@ def test_without_any_it_is_an_orbit_that_sees_the_scene() -> None:
     camera = path.cameras[0]
     assert (camera.width, camera.height) == (1280, 720)
     offset = camera.position - (1, 2, 3)
-    assert np.linalg.norm(offset) == pytest.approx(2 / math.sin(math.radians(30)), rel=0.03)
+    fits = math.atan(FILLED * math.tan(math.radians(30)))
+    assert np.linalg.norm(offset) == pytest.approx(2 / math.sin(fits), rel=0.03)
     assert offset[1] < 0, "y is down, and it is above"
     for one, other in zip(path.cameras, cameras("--orbit", "60").cameras, strict=True):
         assert np.array_equal(one.camera_to_world, other.camera_to_world)
@@ -191,6 +194,33 @@ def test_a_file_of_gigabytes_is_not_read(monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setattr("sparklod_cli.commands.camera_options.LARGEST", 100)
     assert "inria.json is larger than 0 MiB" in file_error("--camera-path", FOLDER / "inria.json")
     assert "it is a pipe or a device" in file_error("--camera-path", "/dev/null")
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ("--orbit", "1000000", "--distance", "3", "--center", "0,0,0"),
+        ("--dolly", "--seconds", "1e6", "--fps", "1e6", "--distance", "3", "--center", "0,0,0"),
+        ("--keyframes", "0,0,9:0,0,0 9,0,0:0,0,0", "--seconds", "1e6", "--fps", "1e6"),
+    ],
+)
+def test_no_more_cameras_are_made_than_are_taken(options: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:
+    made = []
+    whole = generate.frame_looking
+
+    def counted(*arguments: Any) -> Any:
+        made.append(1)
+        return whole(*arguments)
+
+    monkeypatch.setattr(generate, "frame_looking", counted)
+    output = " ".join(usage_error(*options).split())
+    assert f"{options[0]}: it has 1," in output
+    assert "cameras, more than 65,536; see --every" in output
+    assert made == []
+    count = 10**6 if options[0] == "--orbit" else 10**12
+    path = cameras(*options, "--every", str(count // 4), scene=no_scene)
+    assert len(path.cameras) == len(made) <= 5
+    assert path.numbers[:4] == tuple(range(0, count, count // 4))
 
 
 def test_the_help_names_what_there_is() -> None:

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sparklod_cli.errors import CameraPathError, InvalidSplatsError
+from sparklod_cli.errors import CameraPathError
 from sparklod_cli.render.camera_path import GENERATED, cameras_of
 from sparklod_cli.render.frame import Frame, Lens, Settings
-from sparklod_cli.render.framing import framing
 from sparklod_cli.render.generate import Key, between, dolly, orbit
 from sparklod_cli.render.paths.source import Parsed
 from sparklod_cli.render.pose import look_at
@@ -144,20 +143,6 @@ def test_both_tangents_reproduce_straight_lines_and_catmull_rom_parabolas() -> N
         assert np.allclose(hermite(knots, line, tangents(knots, line), at)[:, 0], 2 * at - 1)
     parabola = (knots**2)[:, None]
     assert np.allclose(hermite(knots, parabola, catmull_rom_tangents(knots, parabola), at)[:, 0], at**2)
-
-
-def test_framing_is_not_impressed_by_what_is_far_away() -> None:
-    random = np.random.default_rng(0)
-    center = random.normal(size=(20_000, 3)).astype(np.float32) + np.array([5, 6, 7])
-    center[:500] = 1e6
-    center[500:600] = np.nan
-    middle, radius = framing(center)
-    assert np.allclose(middle, (5, 6, 7), atol=0.1)
-    assert 2 < radius < 3.5
-    assert framing(np.full((3, 3), 2.0))[1] == 1, "a scene of one point has some size"
-    assert framing(np.repeat(center, 20, axis=0))[1] == pytest.approx(radius, rel=0.02)
-    with pytest.raises(InvalidSplatsError, match="no finite centres"):
-        framing(np.full((3, 3), np.nan))
 
 
 def test_generated_cameras_have_times() -> None:

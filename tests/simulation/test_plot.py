@@ -72,6 +72,20 @@ def scenery(frame: int | None = 3) -> Scenery:
     return Scenery(circle(), splats, np.arange(500) // 100, frame)
 
 
+@pytest.mark.parametrize("most", [0, 1, 2, 3, 7, 999, 12_345, 2_500_000])
+def test_axes_count_in_whole_numbers(most: int, charting: None) -> None:
+    matplotlib = charts.load_matplotlib()
+    figure = matplotlib.figure.Figure()
+    matplotlib.backends.backend_agg.FigureCanvasAgg(figure)
+    axes = figure.subplots()
+    axes.set_ylim(0, 1.22 * most or 1)
+    charts._counted(axes, matplotlib)
+    figure.canvas.draw()
+    texts = [text.get_text() for text in axes.get_yticklabels()]
+    assert len(texts) >= 2
+    assert all("m" not in text and (text.isdigit() or text[-1] in "kM") for text in texts), texts
+
+
 def pixels(png: bytes) -> np.ndarray:
     image = Image.open(io.BytesIO(png))
     assert image.format == "PNG"

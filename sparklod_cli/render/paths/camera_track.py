@@ -25,7 +25,9 @@ def parse(files: Files, settings: Settings) -> Parsed:
     fps = root.get("frameRate").number() if root.has("frameRate") else None
     if fps is not None and not fps > 0:
         raise CameraPathError("frameRate is not positive")
-    return Parsed([_frame(item, settings.up or UP) for item in root.get("frames").items()], fps=fps)
+    items = list(root.get("frames").items())
+    turned = all(item.has("up") for item in items)
+    return Parsed([_frame(item, settings.up or UP) for item in items], fps=fps, turned=turned)
 
 
 def _frame(item: Json, up: tuple[float, ...]) -> Frame:

@@ -24,6 +24,7 @@ class PathFormat:
         title: for people.
         module: in this package; has `recognises(files) -> bool` and `parse(files, settings) -> Parsed`.
         axes: of its matrices; None where it has eyes and targets, about which there is nothing to know.
+        looking: its cameras look from an eye to a target, or may, so that it matters which way is up.
         world: said where `--world-transform` is not given: the world of the cameras may not be that of the splats.
         names: sets of files that belong together, as they are named in a folder of it; empty where any name will do.
     """
@@ -32,6 +33,7 @@ class PathFormat:
     title: str
     module: str
     axes: Axes | None
+    looking: bool = False
     world: str = ""
     names: tuple[tuple[str, ...], ...] = ()
 
@@ -42,20 +44,20 @@ class PathFormat:
 
 #: In the order in which they are tried.
 FORMATS = (
-    PathFormat("sparklod", "sparklod's JSON", "own_json", Axes.OPENGL_C2W),
-    PathFormat("csv", "sparklod's CSV", "own_csv", Axes.OPENGL_C2W),
+    PathFormat("sparklod", "sparklod's JSON", "own_json", Axes.OPENGL_C2W, looking=True),
+    PathFormat("csv", "sparklod's CSV", "own_csv", Axes.OPENGL_C2W, looking=True),
     PathFormat(
         "nerfstudio",
         "nerfstudio's camera path",
         "nerfstudio",
         Axes.OPENGL_C2W,
-        "nerfstudio's viewer works in a world that it centred, turned and scaled, as are the splats that it exports;"
-        " splats trained elsewhere need --world-transform.",
+        world="nerfstudio's viewer works in a world that it centred, turned and scaled, as are the splats that it"
+        " exports; splats trained elsewhere need --world-transform.",
     ),
     PathFormat("transforms", "transforms.json", "transforms", Axes.OPENGL_C2W, names=(("transforms.json",),)),
     PathFormat("inria", "Inria's cameras.json", "inria", Axes.OPENCV_C2W, names=(("cameras.json",),)),
-    PathFormat("supersplat", "SuperSplat", "supersplat", None, PLAYCANVAS),
-    PathFormat("camera-track", "splat-transform's camera track", "camera_track", None, PLAYCANVAS),
+    PathFormat("supersplat", "SuperSplat", "supersplat", None, looking=True, world=PLAYCANVAS),
+    PathFormat("camera-track", "splat-transform's camera track", "camera_track", None, looking=True, world=PLAYCANVAS),
     PathFormat("open3d", "Open3D's camera trajectory", "open3d_trajectory", Axes.OPENCV_W2C),
     PathFormat(
         "colmap",

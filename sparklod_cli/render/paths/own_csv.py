@@ -57,7 +57,8 @@ def parse(files: Files, settings: Settings) -> Parsed:
     except csv.Error as error:
         raise CameraPathError(f"it is not CSV: {error}") from None
     unknown = sorted(set(names) - COLUMNS)
-    return Parsed(frames, (f"Columns that mean nothing were left out: {', '.join(unknown)}.",) if unknown else ())
+    notes = (f"Columns that mean nothing were left out: {', '.join(unknown)}.",) if unknown else ()
+    return Parsed(frames, notes, turned=TARGET[0] not in names)
 
 
 def _frame(row: list[str], names: list[str], way: str, settings: Settings) -> Frame:

@@ -33,9 +33,11 @@ def parse(files: Files, settings: Settings) -> Parsed:
         raise CameraPathError("fps is not positive")
     if root.has("keyframes"):
         keys = [_key(item) for item in root.get("keyframes").items()]
-        return Parsed(between(keys, settings.fps or fps, settings.up or DEFAULT_UP, lens), fps=fps)
-    axes = _axes(root)
-    return Parsed([_frame(item, lens, axes, settings) for item in root.get("frames").items()], fps=fps)
+        frames = between(keys, settings.fps or fps, settings.up or DEFAULT_UP, lens)
+        return Parsed(frames, fps=fps, turned=all(key.up for key in keys))
+    axes, items = _axes(root), list(root.get("frames").items())
+    turned = all(item.has("up") or not item.has("eye") for item in items)
+    return Parsed([_frame(item, lens, axes, settings) for item in items], fps=fps, turned=turned)
 
 
 def _axes(root: Json) -> Axes:

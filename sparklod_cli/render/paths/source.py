@@ -71,14 +71,16 @@ class Parsed:
     """What a parser found.
 
     Attributes:
-        frames: in order.
+        frames: in order; a path that is made of keys has them made when they are asked for.
         notes: what was left out or assumed, a sentence each, for people.
         fps: frames a second that the file names; None where it does not.
+        turned: every camera says itself which way is up.
     """
 
-    frames: list[Frame]
+    frames: Sequence[Frame]
     notes: tuple[str, ...] = ()
     fps: float | None = None
+    turned: bool = False
 
 
 @dataclass(frozen=True)

@@ -10,11 +10,12 @@ import math
 from collections.abc import Callable
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...errors import CameraPathError
 from ..camera import Matrix
-from ..frame import MAX_FRAMES, Frame, Lens, Settings
-from ..generate import frame_looking
+from ..frame import Frame, Lens, Settings, sampled
+from ..generate import along, frame_looking
 from ..spline import cardinal_tangents, hermite
 from .source import Files, Json, Parsed, brief
 
@@ -40,6 +41,7 @@ def recognises(files: Files) -> bool:
     )
 
 
+@np.errstate(all="ignore")  # numbers may be of any size; what comes of them is looked at in the end
 def parse(files: Files, settings: Settings) -> Parsed:
     """The frames of its first animation, or else its views."""
     root = files.object()
@@ -76,7 +78,7 @@ def _of_track(track: Json, fov: float, first_version: bool, settings: Settings) 
         length = (duration + (duration == times[-1] / rate)) * rate
     step = track.has("interpolation") and track.get("interpolation").value == "step"
     at = _curve(times, points, smoothness, length, step)
-    return _sampled(at, round(duration * rate), rate, settings)
+    return _sampled(at, _whole(duration * rate), rate, settings)
 
 
 def _of_document(root: Json, settings: Settings) -> Parsed:
@@ -94,7 +96,13 @@ def _of_document(root: Json, settings: Settings) -> Parsed:
     looping = not line.has("loop") or line.get("loop").value is True
     times = np.array(sorted(keys))
     points = np.array([keys[time] for time in times]).reshape(-1, 7)
-    return _sampled(_curve(times, points, smoothness, count if looping else None, False), int(count), rate, settings)
+    curve = _curve(times, points, smoothness, count if looping else None, False)
+    return _sampled(curve, float(math.floor(count)), rate, settings)
+
+
+def _whole(frames: float) -> float:
+    """Rounded; what is infinite stays so."""
+    return float(round(frames)) if math.isfinite(frames) else frames
 
 
 def _values(view: Json, fov: float) -> list[float]:
@@ -135,16 +143,16 @@ def _curve(
     return lambda at: hermite(times, points, tangents, np.clip(at, times[0], times[-1]))
 
 
-def _sampled(at: Callable[[Matrix], Matrix], count: int, rate: float, settings: Settings) -> Parsed:
+def _sampled(curve: Callable[[Matrix], Matrix], count: float, rate: float, settings: Settings) -> Parsed:
     """All frames of a path of `count` frames; --fps takes more of them, or fewer, over the same time."""
     fps = settings.fps or rate
-    frames = max(count, 1) / rate * fps
-    if not frames < MAX_FRAMES:
-        raise CameraPathError(f"its {frames:.3g} frames are more than {MAX_FRAMES:,}")
-    times = np.arange(max(math.ceil(frames - 1e-6), 1)) / fps
-    samples = at(times * rate)
-    looks = [_looking(sample, float(time), settings) for sample, time in zip(samples, times, strict=True)]
-    return Parsed(looks, fps=rate)
+
+    def at(numbers: NDArray[np.int64]) -> list[Frame]:
+        times = numbers / fps
+        samples = along(curve, times * rate)
+        return [_looking(sample, float(time), settings) for sample, time in zip(samples, times, strict=True)]
+
+    return Parsed(sampled(max(count, 1) / rate * fps - 1e-6, at), fps=rate)
 
 
 def _looking(sample: Matrix | list[float], time: float | None, settings: Settings) -> Frame:
