@@ -399,3 +399,12 @@ def test_a_page_and_a_picture_are_said(tmp_path: Path, capsys: Said, monkeypatch
     assert f"{page}  page of 2 files, " in capsys.readouterr().err
     assert inspect(TREE, "--plot", picture, "--html", page, "--overwrite", "-q") == 0
     assert capsys.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(("option", "name"), [("--html", "page.spz"), ("--plot", "picture.html")])
+def test_an_output_is_what_its_name_says(
+    option: str, name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["inspect", str(FIXTURES / "one.ply"), option, str(tmp_path / name)]) == 2
+    assert f"{name}' does not end in ." in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())

@@ -270,7 +270,7 @@ def test_a_scene_file_says_what_stands_where(tmp_path: Path, capsys: Said) -> No
         ([TREE, "--format", "xlsx"], "--format"),
         ([TREE, "-o", "t.xlsx"], "--output t.xlsx: tables are written as .csv, .json, .parquet"),
         ([TREE, "-o", "t.png"], "--output t.png: tables are written as .csv"),
-        ([TREE, "--plot", "t.jpg"], "--plot t.jpg: plots are written as .png"),
+        ([TREE, "--plot", "t.jpg"], "'t.jpg' does not end in .png, which is what is written"),
         ([TREE, "--json", "-o", "-"], "--json and the table cannot both go to standard output"),
         ([TREE, "--json", "--per-instance"], "which writes no table, leaves nothing to --per-instance"),
         ([TREE, "--padded"], "--padded only means something with --indices-out"),

@@ -79,10 +79,12 @@ def _print_schema(ctx: click.Context, param: click.Parameter, value: bool) -> No
     type=InputPath(),
     help="Expect the leaves to be exactly the splats of this file, within the steps of the coding.",
 )
-@click.option("--plot", metavar="FILE", type=OutputPath(), help="Draw a .png, with pyvista.")
+@click.option("--plot", metavar="FILE", type=OutputPath(suffixes=[".png"]), help="Draw a .png, with pyvista.")
 @click.option("--plot-level", metavar="N", type=click.IntRange(0), help="Draw the nodes so many edges from the root.")
 @click.option("--plot-by", type=click.Choice(PLOT_BY), default=PLOT_BY[0], help="What colours mean in the picture.")
-@click.option("--html", metavar="FILE", type=OutputPath(), help="Write the reports as one HTML page.")
+@click.option(
+    "--html", metavar="FILE", type=OutputPath(suffixes=[".html", ".htm"]), help="Write the reports as one HTML page."
+)
 @click.option("--overwrite", is_flag=True, help="Replace pictures and pages that exist.")
 @click.option(
     "--json-schema",

@@ -55,12 +55,6 @@ def table_form(flag: str, output: Path | None) -> str:
     return suffix[1:]
 
 
-def check_plot(output: Path | None) -> None:
-    """Raises a `click.UsageError` where --plot is to go to what is no .png by its name."""
-    if output is not None and output.suffix.lower() not in ("", ".png"):
-        raise click.UsageError(f"--plot {output}: plots are written as .png")
-
-
 class Numbers(click.ParamType):
     """`count` finite numbers with commas between, as a tuple of floats."""
 

@@ -6,7 +6,7 @@ import functools
 import os
 import re
 import stat
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +24,10 @@ class _NamedPath(click.Path):
 
     _to_do = ""
 
-    def __init__(self, *, folder: bool = False) -> None:
+    def __init__(self, *, folder: bool = False, suffixes: Sequence[str] = ()) -> None:
         super().__init__(path_type=Path, file_okay=not folder, readable=False)
         self.folder = folder
+        self._suffixes = suffixes
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         text = os.fsdecode(value)
@@ -34,6 +35,8 @@ class _NamedPath(click.Path):
             self.fail("the name is empty", param, ctx)
         if URL.match(text):
             self.fail(f"{text!r} is an address on a network, not a path; {self._to_do}", param, ctx)
+        if self._suffixes and Path(text).suffix.lower() not in ("", *self._suffixes):
+            self.fail(f"{text!r} does not end in {' or '.join(self._suffixes)}, which is what is written", param, ctx)
         return super().convert(value, param, ctx)
 
 
@@ -44,7 +47,10 @@ class InputPath(_NamedPath):
 
 
 class OutputPath(_NamedPath):
-    """A file that a command writes, or with `folder` a folder that it fills."""
+    """A file that a command writes, or with `folder` a folder that it fills.
+
+    With `suffixes`, that is all it is written as: a name that promises something else is refused.
+    """
 
     _to_do = "write a file and upload that"
 

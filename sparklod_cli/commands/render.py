@@ -13,7 +13,7 @@ import click
 from .camera_options import camera_options
 from .camera_values import View
 from .console import Console
-from .options import Real, check_plot, common_options, flag_of, is_given, refuse
+from .options import Real, common_options, flag_of, is_given, refuse
 from .paths import InputPath, OutputPath, keep_apart
 from .render_cameras import check_cameras, framed, least_cameras
 from .render_compare import BUDGETS, compare_options
@@ -230,7 +230,6 @@ def _compare(ctx: click.Context, settings: dict[str, Any], console: Console, *, 
         wanted = wanted_from(settings, settings["budget"], output=settings["output"], as_json=as_json)
         placements = placements_from(settings)
         keep_apart(ctx, files_meant(settings, placements))
-        check_plot(wanted.plot)
         console.announce_compiling("render")
         _use_threads(settings["threads"])
         world = read_world(

@@ -63,7 +63,7 @@ def compare_options(command: Command) -> Command:
             click.option(
                 "--plot",
                 metavar="FILE",
-                type=OutputPath(),
+                type=OutputPath(suffixes=[".png"]),
                 help="With --compare: draw the table as a .png.",
             ),
             click.option(

@@ -10,7 +10,7 @@ import click
 from .. import limits
 from .camera_options import camera_options, cameras_from
 from .console import Console
-from .options import check_plot, common_options, refuse, table_form
+from .options import common_options, refuse, table_form
 from .paths import OutputPath, keep_apart
 from .world_options import files_meant, placements_from, viewer_from, viewer_options, world_options
 
@@ -58,7 +58,9 @@ Examples:
     multiple=True,
     help="What must hold, such as 'churn_p95<0.2'; the exit status is 3 if it does not.",
 )
-@click.option("--plot", metavar="FILE", type=OutputPath(), help="Draw the table and the path as a .png.")
+@click.option(
+    "--plot", metavar="FILE", type=OutputPath(suffixes=[".png"]), help="Draw the table and the path as a .png."
+)
 @click.option(
     "--indices-out",
     metavar="DIR",
@@ -110,7 +112,6 @@ def traverse(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, *
         refuse(ctx, "--json without --output, which writes no table,", OF_TABLES)
     if wanted.padded and wanted.indices is None:
         raise click.UsageError("--padded only means something with --indices-out")
-    check_plot(wanted.plot)
     with Console(quiet=quiet, verbose=verbose) as console:
         from ..splats import COLUMNS
 
