@@ -112,6 +112,7 @@ def _failed(error: BaseException, verbosity: Verbosity) -> int:
 
 def main() -> NoReturn:
     """Entry point of the script; cleans up on a polite kill as on Ctrl-C."""
+    stdout.reserve()
     interrupts.handle()
     code = run()
     interrupts.ignore()

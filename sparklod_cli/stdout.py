@@ -76,3 +76,15 @@ class _Told:
             if isinstance(error, BrokenPipeError):
                 raise ReaderGoneError(error.errno, reason) from None
             raise StdoutError(f"cannot write standard output: {reason}") from None
+
+
+def reserve() -> None:
+    """Opens what is closed of standard input, output and error, so that no file of ours gets one of their numbers.
+
+    It would get what libraries print, too. Python goes by what it found at its start: to it they stay closed.
+    """
+    while True:
+        descriptor = os.open(os.devnull, os.O_RDWR)
+        if descriptor > 2:
+            os.close(descriptor)
+            return

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -108,3 +109,11 @@ def test_an_error_of_what_is_written_is_not_its_own() -> None:
 
     with pytest.raises(OSError, match="Input/output error"):
         write_stdout(piece for piece in pieces())
+
+
+@pytest.mark.skipif(os.name != "posix", reason="a shell of POSIX")
+def test_no_file_gets_the_number_of_a_closed_stream() -> None:
+    code = "import os; from sparklod_cli import stdout; stdout.reserve(); os._exit(os.open(os.devnull, os.O_RDONLY))"
+    for closed in ("<&-", ">&-", "2>&-", "<&- >&- 2>&-"):
+        done = subprocess.run(["sh", "-c", f"{sys.executable} -c '{code}' {closed}"], cwd=ROOT, check=False)
+        assert done.returncode > 2
