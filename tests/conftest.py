@@ -26,10 +26,9 @@ def real_scene(name: str) -> Path:
     return path
 
 
-@pytest.fixture(scope="session", autouse=True)
-def compiled() -> None:
-    """All kernels are in the cache, so that no test meets a notice of compiling, or waits for one of its own."""
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Compiles all kernels that no cache has, so that no test meets a notice of it, or waits for one of its own."""
     from sparklod_cli import jit, warmup
 
-    if jit.CACHE_FOLDER is not None:
+    if not hasattr(session.config, "workerinput") and jit.CACHE_FOLDER is not None:  # once, not in each of xdist's
         warmup.warm_up(processes=2)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import pytest
@@ -37,9 +38,20 @@ def folder_with(
     label = variable.lower().removesuffix("_dir")
     parent = cache.mkdir(label) if cache else tmp_path_factory.mktemp(label)
     folder: Path = parent / "-".join(packages.values())
-    if not _has(folder, packages):
-        _install(folder, packages)
+    with _locked(parent / "lock"):  # several processes may test at once
+        if not _has(folder, packages):
+            _install(folder, packages)
     return folder
+
+
+@contextlib.contextmanager
+def _locked(path: Path) -> Iterator[None]:
+    with path.open("w") as file:
+        if os.name == "posix":
+            import fcntl
+
+            fcntl.flock(file, fcntl.LOCK_EX)
+        yield
 
 
 def _has(folder: Path, packages: Mapping[str, str]) -> bool:
