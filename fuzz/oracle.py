@@ -16,7 +16,7 @@ from types import TracebackType
 from typing import Any
 
 from sparklod_cli.commands.console import say_error
-from sparklod_cli.errors import SparklodError
+from sparklod_cli.errors import OutOfMemoryError, SparklodError
 
 from .case import Case, LawError, Target
 from .streams import STREAMS
@@ -120,7 +120,7 @@ def run(target: Target, case: Case, folder: Path, watched: Watched) -> Result:
             outcome, fault = "refused", error_fault(error)
             if fault:
                 finding = Finding("message", fault, where_of(error.__traceback__), traceback.format_exc())
-            elif "memory" in str(error):
+            elif isinstance(error, OutOfMemoryError):
                 finding = Finding("memory", str(error), where_of(error.__traceback__), traceback.format_exc())
         except LawError as error:
             finding = Finding("law", str(error).splitlines()[0][:300], error.fault, str(error))

@@ -59,7 +59,7 @@ JOBS = {
         ("traverse tree.spz --orbit 2 -o frames.csv",),
     ),
     "inspect": Job(
-        ("walk.find_cycles", "walk.find_parents", "walk.sum_levels", "walk.walk"),
+        ("walk.find_cycles", "walk.find_parents", "walk.sizes_below", "walk.sum_levels", "walk.walk"),
         ("inspect tree.spz --check",),
     ),
     "quality": Job(

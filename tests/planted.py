@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from fuzz.case import Case, LawError, Rng
+from sparklod_cli.commands import console
 from sparklod_cli.errors import FormatError
 
 
@@ -45,11 +46,17 @@ def talks() -> None:
     os.write(2, b"libpng: bad\n")
 
 
+def _as_it_is(text: str, most: int | None = None) -> str:
+    return text
+
+
 def says_two_lines() -> None:
+    console.printable = _as_it_is
     raise FormatError("first\nsecond")
 
 
 def says_a_lot() -> None:
+    console.printable = _as_it_is
     raise FormatError("x" * 100_000)
 
 

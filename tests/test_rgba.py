@@ -131,6 +131,7 @@ HEADERS = {
     "texts": GOOD.replace("<f4", "<U4"),
     "dates": GOOD.replace("<f4", "<M8"),
     "complex numbers": GOOD.replace("<f4", "<c8"),
+    "texts by an old name": GOOD.replace("<f4", "a1"),
     "a record": GOOD.replace("'<f4'", "[('a', '<f4')]"),
     "control characters": GOOD.replace("<f4", "\x1b[31m\n"),
 }

@@ -84,7 +84,7 @@ def test_what_an_encoding_has_not_is_spelt(tmp_path: Path) -> None:
     done = sparklod(("inspect", tree), "").stdout
     assert "café 漢.spz  SPZ 3" in done
     words = [sys.executable, "-m", "sparklod_cli", "inspect", str(tree)]
-    env = {"PYTHONIOENCODING": "latin-1", "PATH": ""}
+    env = {**os.environ, "PYTHONIOENCODING": "latin-1"}
     plain = subprocess.run(words, capture_output=True, cwd=ROOT, env=env)
     assert (plain.returncode, plain.stderr) == (0, b"")
     assert "café \\u6f22.spz  SPZ 3".encode("latin-1") in plain.stdout

@@ -519,3 +519,17 @@ def test_a_city(built: Path, tmp_path: Path, capsys: Said) -> None:
     assert frames[-1]["selected"] > 50_000
     assert traverse("--scene", scene, *settings, *network, "--no-timing", "--assert", "frame_count==300") == 0
     assert len(table(capsys.readouterr().out)) == 300
+
+
+def test_a_usage_error_makes_no_folder(tmp_path: Path, capsys: Said) -> None:
+    """Also one that only shows when the cameras are looked at."""
+    folder = tmp_path / "cuts"
+    assert traverse(TREE, "--seconds", "2", "--indices-out", folder) == 2
+    assert "--seconds" in capsys.readouterr().err
+    assert not folder.exists()
+
+
+def test_indices_do_not_go_where_a_file_is(tmp_path: Path, capsys: Said) -> None:
+    (tmp_path / "cuts").touch()
+    assert traverse(TREE, *ORBIT, "--indices-out", tmp_path / "cuts") == 2
+    assert "cuts" in capsys.readouterr().err

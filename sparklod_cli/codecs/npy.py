@@ -22,7 +22,7 @@ MAX_HEADER = 1 << 12
 
 #: Each key of a header and what it may say, as Python spells that.
 KEYS = {
-    "descr": r"""['"]([<>|=]?[a-zA-Z]\d{1,2})['"]""",
+    "descr": r"""['"]([<>|=]?[biufc]\d{1,2})['"]""",
     "fortran_order": r"(True|False)",
     "shape": r"\(([\d,\s]{0,200})\)",
 }

@@ -15,8 +15,8 @@ from ..untrusted import QUOTED
 
 MAX_HEADER = 1 << 20
 
-#: Digits of a count; what has more is larger than any file, and than Python makes a number of.
-MAX_DIGITS = 18
+#: Digits of a count; Python makes no number of some thousands.
+MAX_DIGITS = 100
 
 
 @dataclass(frozen=True)

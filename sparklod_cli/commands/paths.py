@@ -27,7 +27,7 @@ class _NamedPath(click.Path):
     def __init__(self, *, folder: bool = False, suffixes: Sequence[str] = ()) -> None:
         super().__init__(path_type=Path, file_okay=not folder, readable=False)
         self.folder = folder
-        self._suffixes = suffixes
+        self.suffixes = suffixes
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         text = os.fsdecode(value)
@@ -35,8 +35,6 @@ class _NamedPath(click.Path):
             self.fail("the name is empty", param, ctx)
         if URL.match(text):
             self.fail(f"{text!r} is an address on a network, not a path; {self._to_do}", param, ctx)
-        if self._suffixes and Path(text).suffix.lower() not in ("", *self._suffixes):
-            self.fail(f"{text!r} does not end in {' or '.join(self._suffixes)}, which is what is written", param, ctx)
         return super().convert(value, param, ctx)
 
 
@@ -49,7 +47,7 @@ class InputPath(_NamedPath):
 class OutputPath(_NamedPath):
     """A file that a command writes, or with `folder` a folder that it fills.
 
-    With `suffixes`, that is all it is written as: a name that promises something else is refused.
+    With `suffixes`, that is all it is written as: `keep_apart` refuses a name that promises something else.
     """
 
     _to_do = "write a file and upload that"
@@ -57,6 +55,8 @@ class OutputPath(_NamedPath):
 
 def keep_apart(ctx: click.Context, stands_for: Mapping[str, Iterable[Path]] | None = None) -> None:
     """Raises a `click.UsageError` where an output of a command would replace an input of it, or another output.
+
+    Then also where the name of an output promises something else than what is written.
 
     Files are told by what they are, so by links and by names in other letters, too. What a pipe or a device is given
     replaces nothing.
@@ -69,14 +69,21 @@ def keep_apart(ctx: click.Context, stands_for: Mapping[str, Iterable[Path]] | No
     stands_for = stands_for or {}
     inputs: list[Path] = []
     outputs: list[Path] = []
+    promised: list[tuple[click.Parameter, OutputPath, Path]] = []
     for parameter in ctx.command.params:
         kind, value, more = parameter.type, ctx.params.get(parameter.name or ""), stands_for.get(parameter.name or "")
         values = [] if value is None else list(value) if isinstance(value, tuple) else [value]
         if isinstance(kind, OutputPath):
             outputs += more if more is not None else [] if kind.folder else values
+            promised += [(parameter, kind, path) for path in values if kind.suffixes]
         else:
             inputs += [*(values if isinstance(kind, InputPath) else []), *(more or ())]
     _keep_apart(outputs, inputs)
+    for parameter, kind, path in promised:
+        if path.suffix.lower() not in ("", *kind.suffixes):
+            raise click.BadParameter(
+                f"{str(path)!r} does not end in {' or '.join(kind.suffixes)}, which is what is written", ctx, parameter
+            )
 
 
 def _keep_apart(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:

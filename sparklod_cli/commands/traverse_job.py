@@ -63,8 +63,8 @@ class Wanted:
         for target in (self.output, self.plot):
             if target is not None and str(target) != "-":
                 check_writable(target, overwrite=self.overwrite)
-        if self.indices is not None:
-            check_writable(self.indices / "0.npy", overwrite=True, make_parent=True)
+        if self.indices is not None and self.indices.exists():  # it is made when all else is known to be right
+            check_writable(self.indices / "0.npy", overwrite=True)
         if self.form == "parquet":
             from ..simulation.tables import load_pyarrow
 
@@ -139,6 +139,8 @@ class Job:
 
     def _rows(self, threads: int, progress: Progress) -> Iterator[Row]:
         """The rows of the table; on the way, cuts are written and rows kept for the report."""
+        if self.wanted.indices is not None:
+            check_writable(self.wanted.indices / "0.npy", overwrite=True, make_parent=True)
         shares = []
         for frame in self.simulation.run(self.path, threads=threads, progress=progress):
             shares.append(frame.in_front)

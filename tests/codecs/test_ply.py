@@ -249,7 +249,7 @@ def test_a_count_is_digits(count: str) -> None:
         decode(by_hand.ply(columns()).replace(b"element vertex 5", f"element vertex {count}".encode(), 1))
 
 
-@pytest.mark.parametrize("digits", [19, 5_000, 900_000])
+@pytest.mark.parametrize("digits", [101, 5_000, 900_000])
 def test_a_count_of_more_digits_than_any_file_has_bytes(digits: int) -> None:
     head = b"ply\nformat binary_little_endian 1.0\nelement vertex " + b"9" * digits + b"\nend_header\n"
     with pytest.raises(FormatError, match=f"promises a count of {digits:,} digits"):

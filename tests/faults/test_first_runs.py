@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from sparklod_cli.jit_cache import SUFFIX
+
 from ..conftest import ROOT
 from .runs import ENVIRONMENT
 
@@ -57,4 +59,4 @@ def test_first_runs_side_by_side_share_an_empty_cache(tmp_path: Path) -> None:
     assert Path(ends[0][0]).parent == cache
     assert any(count for _, count, _ in ends)
     assert finish(start(cache)) == (ends[0][0], 0, ends[0][2])  # what they left is whole
-    assert not [path for path in cache.rglob("*") if path.suffix not in (".nbi", ".nbc", "") and path.is_file()]
+    assert not [path for path in cache.rglob("*") if path.suffix != SUFFIX and path.is_file()]

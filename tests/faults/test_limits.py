@@ -52,7 +52,9 @@ def test_many_files_are_not_open_at_a_time(tmp_path: Path) -> None:
 #: Prints how much address space a process has that has done what all commands do first.
 BASELINE = """
 import re, sys
+from sparklod_cli import interrupts
 from sparklod_cli.cli import run
+interrupts.handle()  # by a thread, whose stack and heap count
 code = run(sys.argv[1:])
 text = open("/proc/self/status").read()
 print("peak", re.search(r"VmPeak:\\s*(\\d+) kB", text)[1], code)

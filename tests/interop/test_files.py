@@ -51,7 +51,7 @@ def test_fractional_bits(spark: Spark, extent: float, bits: int | None) -> None:
 
 def test_coordinates_at_the_limit(spark: Spark) -> None:
     splats = random_splats(2)
-    limit = 2**23 - 1
+    limit = spz.LAST_CODE
     splats.center[:] = [[limit, -limit, 0.4], [-limit, limit, -0.6]]
     laws.check(spark, Scene(splats), spz.Options(fractional_bits=0))
 

@@ -167,6 +167,14 @@ def test_progress_tells_stage_by_stage_and_is_full_only_at_the_end_of_each() -> 
     assert told[-1] == ("ordering", len(nodes), len(nodes), "node")
 
 
+def test_splats_farther_apart_than_float32_holds_make_a_node_as_large_as_it_holds() -> None:
+    splats = random_splats(2)
+    splats.center[:] = [[3e38, -3e38, 3e38], [-3e38, 3e38, -3e38]]
+    nodes, _ = quality.build(splats)
+    assert nodes.is_valid().all()
+    assert nodes.scale.max() == np.finfo(np.float32).max
+
+
 def test_no_splat_is_an_error() -> None:
     with pytest.raises(InvalidSplatsError, match="no splat"):
         quality.build(random_splats(0))

@@ -17,6 +17,9 @@ from ...jit import kernel
 CENTER, SCALE, QUAT, OPACITY, WIDTH = 0, 3, 6, 10, 11  # first column of each, and the number of columns
 
 BLOCK = 256  # rows that are gathered before they are computed with, so that their cache misses overlap
+#: What float32 holds: a merged splat of others that are farther apart is as large as that.
+LARGEST = float(np.finfo(np.float32).max)
+
 AXIS_FLOOR = np.float32(1e-20)
 THOMSEN_P32, THOMSEN_ROOT, THIRD = np.float32(THOMSEN_P), np.float32(1 / THOMSEN_P), np.float32(1 / 3)
 

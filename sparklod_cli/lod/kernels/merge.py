@@ -14,7 +14,7 @@ from numba import prange
 from ...gaussian import MAX_OPACITY, MIN_OPACITY
 from ...jit import kernel
 from .eigen import ROWS, decompose
-from .geometry import CENTER, OPACITY, QUAT, SCALE, WIDTH, ellipsoid_area
+from .geometry import CENTER, LARGEST, OPACITY, QUAT, SCALE, WIDTH, ellipsoid_area
 
 SCALE_FLOOR = 1e-30
 BLOCK = 64  # groups that are merged together: gathered, summed, then decomposed side by side
@@ -116,9 +116,9 @@ def merge_groups(nodes, first, geometry, weight, base):
         decompose(moments, block_end - block_begin)
         for k in range(block_end - block_begin):
             made = base + block_begin + k
-            a = max(math.sqrt(max(moments[0, k], 0.0)), SCALE_FLOOR)
-            b = max(math.sqrt(max(moments[1, k], 0.0)), SCALE_FLOOR)
-            c = max(math.sqrt(max(moments[2, k], 0.0)), SCALE_FLOOR)
+            a = min(max(math.sqrt(max(moments[0, k], 0.0)), SCALE_FLOOR), LARGEST)
+            b = min(max(math.sqrt(max(moments[1, k], 0.0)), SCALE_FLOOR), LARGEST)
+            c = min(max(math.sqrt(max(moments[2, k], 0.0)), SCALE_FLOOR), LARGEST)
             geometry[made, SCALE], geometry[made, SCALE + 1], geometry[made, SCALE + 2] = a, b, c
             for i in range(4):
                 geometry[made, QUAT + i] = moments[6 + i, k]

@@ -9,7 +9,7 @@ from numba import prange
 
 from ...jit import kernel
 from .eigen import ROWS, decompose
-from .geometry import ellipsoid_area
+from .geometry import LARGEST, ellipsoid_area
 from .merge import covariance
 from .pairs import CENTER, COLOR, COVARIANCE, COVERED, DENSITY, LOG_DET, WEIGHT, log_det
 from .profile import profile_of
@@ -106,7 +106,8 @@ def fill_merged(order, leaves, state, middle, unit, center, scale, quat, opacity
             linear, spread = profile_of(np.float64(row[DENSITY]))
             opacity[i] = linear
             for axis in range(3):
-                center[i, axis] = np.float64(row[CENTER + axis]) * unit + middle[axis]
-                scale[i, axis] = max(math.sqrt(max(moments[axis, k], 0.0) / spread) * unit, 1e-30)
+                place = np.float64(row[CENTER + axis]) * unit + middle[axis]
+                center[i, axis] = min(max(place, -LARGEST), LARGEST)
+                scale[i, axis] = min(max(math.sqrt(max(moments[axis, k], 0.0) / spread) * unit, 1e-30), LARGEST)
             for part in range(4):
                 quat[i, part] = moments[6 + part, k]
