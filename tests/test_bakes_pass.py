@@ -264,6 +264,15 @@ def test_bakes_of_random_scenes_pass_the_recipe_for_ci(count: int, seed: int, ex
         passes(file_of(folder, random_splats(count, seed=seed, extent=extent)), method)
 
 
+@pytest.mark.parametrize("method", METHODS)
+def test_a_line_without_width_is_not_what_a_node_stands_for(method: str, tmp_path: Path) -> None:
+    """SPZ gives it a width, after the tree is built."""
+    splats = random_splats(3)
+    splats.scale[:] = [[8e-5, 1e-5, 1e-6], [3e-7, 7e-4, 1e-13], [1e-24, 1e-19, 11]]
+    splats.center[:] = 0
+    passes(file_of(tmp_path, splats), method)
+
+
 def faint_and_large(seed: int) -> Splats:
     """Small opaque splats, and among them needles and balls that are a hundred times as large and hardly seen."""
     splats = random_splats(400, seed=seed)

@@ -95,7 +95,8 @@ def inspect(
     findings = _container_findings(scene)
     facts = None
     if scene.tree is not None and count:
-        facts, found = tree.examine(splats, scene.tree, check=wanted.check)
+        least, _ = values.scale_ends(scene)
+        facts, found = tree.examine(splats, scene.tree, check=wanted.check, least_scale=least)
         findings += found
     if wanted.check:
         findings += values.check(scene)

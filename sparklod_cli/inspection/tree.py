@@ -74,13 +74,16 @@ class TreeFacts:
     chunks_of_coarse_cut: int
 
 
-def examine(splats: Splats, tree: LodTree, *, check: bool = True) -> tuple[TreeFacts, list[Finding]]:
+def examine(
+    splats: Splats, tree: LodTree, *, check: bool = True, least_scale: float = 0.0
+) -> tuple[TreeFacts, list[Finding]]:
     """The facts of a tree and what is wrong with it; of a broken one, the facts of what its root leads to.
 
     Args:
         splats: N nodes, of which scale and opacity are looked at.
         tree: their links, N of them and at least one.
         check: look for what is wrong.
+        least_scale: the least that the file's format holds, world units: a scale of that may have been any smaller.
     """
     size = spark_size(splats)
     depth, limit = walk(tree.child_count, tree.child_start, size)
@@ -108,7 +111,7 @@ def examine(splats: Splats, tree: LodTree, *, check: bool = True) -> tuple[TreeF
     parent, references = find_parents(tree.child_count, tree.child_start)
     return facts, [
         *_link_findings(tree, parent, references, depth),
-        *_node_findings(splats, tree, parent, size),
+        *_node_findings(splats, tree, parent, size, least_scale),
         *_order_findings(parent, limit),
     ]
 
@@ -162,9 +165,14 @@ def _link_findings(
     ]
 
 
-def _node_findings(splats: Splats, tree: LodTree, parent: NDArray[np.int32], size: FloatArray) -> list[Finding]:
+def _node_findings(
+    splats: Splats, tree: LodTree, parent: NDArray[np.int32], size: FloatArray, least_scale: float
+) -> list[Finding]:
     findings = _found("tree.leaf-opacity", tree.is_leaf & (splats.opacity > 1), "is a leaf and more than opaque")
     smaller = size < LEAST_RATIO * sizes_below(parent, size, splats.scale, splats.opacity)
+    # How wide a line is, and so what it covers beside others, is not known where the format holds no scale that small.
+    line = np.count_nonzero(splats.scale <= least_scale, axis=1) >= 2
+    smaller[parent[line & (parent >= 0)]] = False
     return findings + _found("tree.size", smaller, "is less than a third as large as its children are in the mean")
 
 

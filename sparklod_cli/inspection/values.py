@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -144,6 +145,14 @@ def _numbers(values: NDArray[Any]) -> list[float]:
     return [_number(value) for value in values]
 
 
+def scale_ends(scene: Scene) -> tuple[float, float]:
+    """The least and the largest scale that the file's format holds, world units; 0 and infinite for floats."""
+    if "fractional_bits" not in scene.header:
+        return 0.0, math.inf
+    low, high = quantize.decode_log_scale(np.array([0, 255], np.uint8))
+    return low, high
+
+
 def check(scene: Scene) -> list[Finding]:
     """What is wrong with the numbers of a scene."""
     splats = scene.splats
@@ -178,7 +187,7 @@ def check(scene: Scene) -> list[Finding]:
         clamped = valid & (np.abs(splats.center) >= most).any(axis=1)
         report("values.center-clamped", clamped, f"a coordinate is {most:g}, the most that its code holds")
     if "fractional_bits" in header:
-        low, high = quantize.decode_log_scale(np.array([0, 255], np.uint8))
+        low, high = scale_ends(scene)
         most = splats.scale.max(axis=1)  # that a thin splat is not quite as thin is not seen
         clamped = (most <= low) | (most >= high)
         if np.count_nonzero(clamped) > MANY_CLAMPED * len(splats):

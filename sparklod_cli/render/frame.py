@@ -24,6 +24,9 @@ MAX_FRAMES = 1 << 20
 #: So many are made where a few numbers ask for them; half an hour at 30 frames a second has fewer.
 MAX_MADE = 1 << 16
 
+#: Pixels that a focal length has, and how far away the principal point is: what float32 holds, and products of it.
+MOST_PIXELS = 1e15
+
 #: Numbers of frames are below this, so that they are whole numbers as floats, too.
 NUMBERED = 1 << 53
 
@@ -158,12 +161,12 @@ def camera_of(pose: Matrix, lens: Lens, time: float, name: str, settings: Settin
         off = [(principal[k] - size[k] / 2) * zoom for k in (0, 1)]
         size = settings.size
         principal = (size[0] / 2 + off[0], size[1] / 2 + off[1])
-        _check(focal, principal)
+    _check(focal, principal)
     return Camera(pose, *size, focal, principal, time, name)
 
 
 def _check(focal: tuple[float, float], principal: tuple[float, float]) -> None:
-    if not min(focal) > 0 or not all(map(math.isfinite, (*focal, *principal))):
+    if not min(focal) > 0 or not all(abs(number) <= MOST_PIXELS for number in (*focal, *principal)):
         raise ValueError(
             f"has a focal length of {focal[0]:g}, {focal[1]:g} and a principal point at {principal[0]:g},"
             f" {principal[1]:g}, of which one is not a sensible number"

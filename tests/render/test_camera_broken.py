@@ -75,6 +75,11 @@ FAULTS: dict[str, tuple[str | bytes, str]] = {
         ' "target": [0, 0, 0]}]}',
         "frame 0 has a focal length .* not a sensible number",
     ),
+    "a focal length beyond all measure": (
+        '{"format": "sparklod-camera-path", "size": [9, 9], "focal": [9, 1e200], "frames": [{"eye": [1, 0, 0],'
+        ' "target": [0, 0, 0]}]}',
+        "frame 0 has a focal length .* not a sensible number",
+    ),
     "half a pixel": ('{"format": "sparklod-camera-path", "size": [9.5, 9], "frames": []}', "size of 9.5 is not a"),
     "a fov of 180": (
         '{"format": "sparklod-camera-path", "fov": 180, "frames": [{"eye": [1, 0, 0], "target": [0, 0, 0]}]}',
@@ -256,6 +261,14 @@ def test_any_parser_refuses_what_is_another_format(form: str) -> None:
         if other != form:
             with pytest.raises(CameraPathError):
                 read(files_at(FOLDER / name), format=form)
+
+
+@pytest.mark.parametrize("form", [None, *(form.name for form in FORMATS if form.name != "open3d")])
+@pytest.mark.parametrize("content", ["", "\n", "#", "\ufeff"])
+def test_any_parser_refuses_a_file_that_says_nothing(form: str | None, content: str) -> None:
+    for name in ("path.json", "path.csv", "images.txt"):
+        with pytest.raises(CameraPathError):
+            read(text_file(content, name), format=form)
 
 
 def colmap(images: bytes = b"", cameras: bytes = b"") -> Files:

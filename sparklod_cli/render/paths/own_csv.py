@@ -43,7 +43,7 @@ def lacking(names: Collection[str]) -> str:
 
 def parse(files: Files, settings: Settings) -> Parsed:
     """Its rows."""
-    lines = files.lines()
+    lines = files.lines() or [""]
     names = _names(lines[0])
     if not recognises(files):
         raise CameraPathError(lacking(names))
