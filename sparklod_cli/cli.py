@@ -72,14 +72,14 @@ def _run(arguments: list[str] | None) -> int:
     except click.ClickException as error:
         say_usage_error(error)
         return error.exit_code
+    except stdout.ReaderGoneError:
+        return 1
     except SparklodError as error:
         say_error(str(error))
         return 1
     except (click.Abort, KeyboardInterrupt):
         say("interrupted")
         return interrupts.INTERRUPTED
-    except stdout.ReaderGoneError:
-        return 1
     except OSError as error:  # of neither a file that was named nor standard output: those are told where they occur
         if out_of_memory(error):
             return _failed(error, verbosity)

@@ -7,6 +7,7 @@ import os
 import signal
 import sys
 import threading
+import time
 from types import FrameType
 
 #: What ends a run, where the system has it.
@@ -19,6 +20,9 @@ INTERRUPTED = 130
 #: answer can crash the process. And one kernel can take LLVM seconds, in which Python handles no signal.
 COMPILERS = ("numba", "llvmlite")
 
+#: Seconds in which another thread says that the run was interrupted.
+FAREWELL = 0.1
+
 #: Both the main thread and the one that watches may want to end the process; it is said once.
 _leaving = threading.Lock()
 
@@ -29,8 +33,15 @@ def handle() -> None:
     Nothing is lost by that: the cache of kernels and outputs are whole at any moment.
     """
     handled = [number for number in ENDING if signal.getsignal(number) != signal.SIG_IGN]  # nohup and the like hold
+
+    def interrupt(signum: int, frame: FrameType | None) -> None:
+        _leave_if_compiling()
+        for number in handled:
+            signal.signal(number, signal.SIG_DFL)  # a second one does not wait for the cleaning up
+        raise KeyboardInterrupt
+
     for number in handled:
-        signal.signal(number, _interrupt)
+        signal.signal(number, interrupt)
     if handled and os.name == "posix":  # elsewhere a compilation is waited for
         reader, writer = os.pipe()
         os.set_blocking(writer, False)
@@ -42,13 +53,6 @@ def ignore() -> None:
     """Lets the process end as it was about to: what there was to do is done."""
     for number in ENDING:
         signal.signal(number, signal.SIG_IGN)
-
-
-def _interrupt(signum: int, frame: FrameType | None) -> None:
-    _leave_if_compiling()
-    for number in ENDING:
-        signal.signal(number, signal.SIG_DFL)  # a second one does not wait for the cleaning up
-    raise KeyboardInterrupt
 
 
 def _watch(reader: int, handled: list[signal.Signals]) -> None:
@@ -64,8 +68,11 @@ def _leave_if_compiling() -> None:
         at: FrameType | None = frame
         while at is not None:
             if at.f_globals.get("__name__", "").partition(".")[0] in COMPILERS:
-                _leaving.acquire()  # by whichever thread comes first, and not given back
-                with contextlib.suppress(OSError):  # not by `sys.stderr`, which the other thread may hold
-                    os.write(2, b"\r\x1b[Kinterrupted\n" if os.isatty(2) else b"interrupted\n")
+                # Whoever comes second, another thread or the same one at a second signal, waits for nobody.
+                if _leaving.acquire(blocking=False):
+                    with contextlib.suppress(OSError):  # not by `sys.stderr`, which the other thread may hold
+                        os.write(2, b"\r\x1b[Kinterrupted\n" if os.isatty(2) else b"interrupted\n")
+                    os._exit(INTERRUPTED)
+                time.sleep(FAREWELL)
                 os._exit(INTERRUPTED)
             at = at.f_back

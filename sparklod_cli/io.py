@@ -298,7 +298,7 @@ def write_stdout(pieces: Iterable[bytes]) -> int:
                 size += sys.stdout.buffer.write(piece)
             sys.stdout.buffer.flush()
         except ReaderGoneError as error:
-            raise StdoutError(f"cannot write standard output: {error.strerror}") from None
+            raise StdoutError(str(error)) from None
     return size
 
 

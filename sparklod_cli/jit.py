@@ -25,7 +25,7 @@ if "OMP_WAIT_POLICY" not in os.environ:
 import numba  # noqa: E402
 from numba.core import event  # noqa: E402
 
-from .jit_cache import SUFFIX, KernelCache, Trouble, stem_of  # noqa: E402
+from .jit_cache import KernelCache, Trouble, is_whole, pattern_of, stem_of  # noqa: E402
 
 #: Is told the name of a kernel that is being compiled, and how many seconds that took.
 Begun = Callable[[str], None]
@@ -44,6 +44,7 @@ SOURCES = (
     "splats.py",
     "tree.py",
     "errors.py",
+    "whole.py",
     "lod/kernels/*.py",
     "render/kernels/*.py",
 )
@@ -107,8 +108,12 @@ def kernel(
 
 
 def is_cached(name: str) -> bool:
-    """Whether compiled code of a kernel is there, named as its module in `kernels`, a point, and its own name."""
-    return CACHE_FOLDER is not None and any(CACHE_FOLDER.glob(f"{name}-*{SUFFIX}"))
+    """Whether this process finds compiled code of a kernel; its name is that of its module, a point, and its own."""
+    if CACHE_FOLDER is None:
+        return False
+    with contextlib.suppress(OSError):
+        return any(path.is_file() and is_whole(path.read_bytes()) for path in CACHE_FOLDER.glob(pattern_of(name)))
+    return False
 
 
 def use_threads(count: int) -> None:

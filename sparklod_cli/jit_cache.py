@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import os
 import pickle
 import platform
 from collections.abc import Callable
@@ -13,7 +12,11 @@ from typing import Any
 
 import numba
 from numba.core import caching, compiler
+from numba.core.registry import cpu_target
 from numba.core.serialize import dumps
+
+from . import whole
+from .errors import out_of_memory
 
 #: Ends the name of every file of a compiled kernel.
 SUFFIX = ".kernel"
@@ -65,16 +68,19 @@ class KernelCache(caching._Cache):
         target_context.refresh()
         path = self._path(signature, target_context.codegen())
         try:
-            content = path.read_bytes() if self._enabled else None
+            content = path.read_bytes() if self._enabled and path.is_file() else None  # no pipe, no device
         except OSError:
             return None
         if content is None:
             return None
         if is_whole(content):
-            # What has been kept as it was written can still be of no use, such as types of another numpy.
-            with contextlib.suppress(Exception):
+            try:
                 return compiler.CompileResult._rebuild(target_context, *pickle.loads(content[CHECKSUM:]))
-        self._trouble(f"{path} is damaged; {self._stem} is compiled again")
+            except Exception as error:
+                # What has been kept as it was written can still be of no use, such as types of another numpy.
+                if out_of_memory(error):
+                    raise
+        self._trouble(f"compiled code in {self._folder} is damaged; what is damaged is compiled again")
         with contextlib.suppress(OSError):
             path.unlink()
         return None
@@ -84,25 +90,28 @@ class KernelCache(caching._Cache):
         if not self._enabled or compiled.lifted or compiled.library.has_dynamic_globals:
             return
         payload = dumps(compiled._reduce())
-        path = self._path(signature, compiled.codegen)
-        temporary = path.with_name(f".{path.name}.{os.getpid()}")
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
-            try:
-                temporary.write_bytes(_checksum(payload) + payload)
-                temporary.replace(path)
-            finally:
-                temporary.unlink(missing_ok=True)
+            whole.write(self._path(signature, compiled.codegen), [_checksum(payload), payload], overwrite=True)
         except OSError as error:
             reason = (error.strerror or str(error)).lower()
             self._trouble(f"compiled code cannot be kept in {self._folder} ({reason}), so it is compiled in every run")
 
     def _path(self, signature: Any, codegen: Any) -> Path:
-        depends_on = (str(signature), codegen.magic_tuple(), numba.__version__, platform.python_version())
-        return (
-            self._folder
-            / f"{self._stem}-{hashlib.blake2b(repr(depends_on).encode(), digest_size=8).hexdigest()}{SUFFIX}"
-        )
+        return self._folder / f"{self._stem}-{_digest(*_machine(codegen))}-{_digest(str(signature))}{SUFFIX}"
+
+
+def pattern_of(stem: str) -> str:
+    """What the files of a kernel match that this process can use, on this processor, by this numba and Python."""
+    return f"{stem}-{_digest(*_machine(cpu_target.target_context.codegen()))}-*{SUFFIX}"
+
+
+def _machine(codegen: Any) -> tuple[Any, ...]:
+    return codegen.magic_tuple(), numba.__version__, platform.python_version()
+
+
+def _digest(*depends_on: Any) -> str:
+    return hashlib.blake2b(repr(depends_on).encode(), digest_size=8).hexdigest()
 
 
 def stem_of(function: Callable[..., Any]) -> str:

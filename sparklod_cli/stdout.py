@@ -11,8 +11,8 @@ from typing import Any
 from .errors import StdoutError
 
 
-class ReaderGoneError(BrokenPipeError):
-    """Whoever read standard output has gone."""
+class ReaderGoneError(StdoutError):
+    """Whoever read standard output has gone. No `OSError`, as click would take one for its own to handle."""
 
 
 @contextlib.contextmanager
@@ -29,7 +29,9 @@ def told() -> Iterator[None]:
 def silence(stream: Any) -> None:
     """Sends what a broken stream still holds nowhere: the interpreter flushes it at its end, and fails if it cannot."""
     with contextlib.suppress(OSError, ValueError):
-        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, stream.fileno())
+        os.close(nowhere)
 
 
 class _Told:
@@ -74,7 +76,7 @@ class _Told:
             silence(self._stream)
             reason = (error.strerror or str(error)).lower()
             if isinstance(error, BrokenPipeError):
-                raise ReaderGoneError(error.errno, reason) from None
+                raise ReaderGoneError(f"cannot write standard output: {reason}") from None
             raise StdoutError(f"cannot write standard output: {reason}") from None
 
 

@@ -9,6 +9,7 @@ import os
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -84,6 +85,30 @@ JOBS = {
 }
 
 
+class _Children:
+    """Processes that are ended together; none is started afterwards."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._started: list[subprocess.Popen[str]] = []
+        self._stopped = False
+
+    def start(self, line: list[str], **how: Any) -> subprocess.Popen[str] | None:
+        """Another one; None where all have been stopped."""
+        with self._lock:
+            if self._stopped:
+                return None
+            process: subprocess.Popen[str] = subprocess.Popen(line, **how)
+            self._started.append(process)
+            return process
+
+    def stop(self) -> None:
+        with self._lock:
+            self._stopped = True
+            for process in self._started:
+                process.terminate()
+
+
 def missing(jobs: Iterable[str]) -> set[str]:
     """The kernels of some of `JOBS` that no cache has."""
     return {name for job in jobs for name in JOBS[job].kernels if not jit.is_cached(name)}
@@ -104,18 +129,17 @@ def warm_up(*, processes: int, progress: Progress = silent) -> int:
     wanted = missing(JOBS)
     if not wanted:
         return 0
-    started: list[subprocess.Popen[str]] = []
+    children = _Children()
     with tempfile.TemporaryDirectory(prefix="sparklod-") as name, ThreadPoolExecutor(processes) as pool:
         _write_inputs(Path(name))
-        running = [pool.submit(_do, job, Path(name), started) for job in JOBS if missing([job])]
+        running = [pool.submit(_do, job, Path(name), children) for job in JOBS if missing([job])]
         try:
             while not all(map(Future.done, running)):
                 progress("compiling", len(wanted) - len(missing(JOBS)), len(wanted), "kernel")
                 time.sleep(PATIENCE)
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
-            for process in started:
-                process.terminate()
+            children.stop()
             raise
         for job in running:
             job.result()
@@ -125,7 +149,7 @@ def warm_up(*, processes: int, progress: Progress = silent) -> int:
     return len(wanted)
 
 
-def _do(job: str, folder: Path, started: list[subprocess.Popen[str]]) -> None:
+def _do(job: str, folder: Path, children: _Children) -> None:
     """Runs the commands of a job in processes of their own, since numba compiles one kernel at a time.
 
     Raises:
@@ -133,13 +157,14 @@ def _do(job: str, folder: Path, started: list[subprocess.Popen[str]]) -> None:
     """
     package = Path(__file__).parent
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(package.parent), os.environ.get("PYTHONPATH", "")])}
-    if "NUMBA_CACHE_DIR" in environment:  # which may be relative to where we are
-        environment["NUMBA_CACHE_DIR"] = str(Path(environment["NUMBA_CACHE_DIR"]).resolve())
+    if jit.CACHE_FOLDER is not None:
+        environment["NUMBA_CACHE_DIR"] = str(jit.CACHE_FOLDER.parent.resolve())
     quiet: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
     for command in JOBS[job].commands:
         line = [sys.executable, "-m", package.name, *command.split(), "--quiet"]
-        process = subprocess.Popen(line, cwd=folder, env=environment, text=True, **quiet)
-        started.append(process)
+        process = children.start(line, cwd=folder, env=environment, text=True, **quiet)
+        if process is None:
+            return
         said = process.communicate()[1].strip()
         if process.returncode:
             last = said.rpartition("\n")[2] or f"exit status {process.returncode}"

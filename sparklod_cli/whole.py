@@ -193,7 +193,7 @@ def _sweep(folder: Path) -> None:
 
 def _remove_unlocked(path: Path) -> None:
     """Removes a file of ours that no living process has locked; `OSError` where it is locked."""
-    descriptor = os.open(path, _FLAGS | os.O_NONBLOCK)
+    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)  # it may be read-only
     try:
         about = os.fstat(descriptor)
         if stat.S_ISREG(about.st_mode) and about.st_uid == os.geteuid():

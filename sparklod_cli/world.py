@@ -94,7 +94,7 @@ class World:
         for instance in self.instances:
             scene = self.trees[instance.tree].scene
             assert scene.tree is not None
-            parts.append(balls_of(scene.splats.take(scene.tree.is_leaf), instance.object_to_world))
+            parts.append(balls_of(scene.splats, scene.tree.is_leaf, instance.object_to_world))
         return together(parts)
 
     def splats_of(self, number: int, nodes: NDArray[np.uint32]) -> Splats:

@@ -273,6 +273,15 @@ def test_a_line_without_width_is_not_what_a_node_stands_for(method: str, tmp_pat
     passes(file_of(tmp_path, splats), method)
 
 
+@pytest.mark.parametrize("method", METHODS)
+def test_small_splats_far_apart_are_no_reason_for_a_warning(method: str, tmp_path: Path) -> None:
+    """What is merged of them is larger than SPZ holds, and clamped."""
+    splats = random_splats(4)
+    splats.scale[:] = 0.02
+    splats.center[:] = [[2047.9999, 0, 0], [-2047.9999, 2048, 5], [0, 0, 0], [1, 1, 1]]
+    passes(file_of(tmp_path, splats), method)
+
+
 def faint_and_large(seed: int) -> Splats:
     """Small opaque splats, and among them needles and balls that are a hundred times as large and hardly seen."""
     splats = random_splats(400, seed=seed)

@@ -12,7 +12,8 @@ from typing import Any
 import numba
 import pytest
 
-from sparklod_cli.jit_cache import SUFFIX, KernelCache
+from sparklod_cli import whole
+from sparklod_cli.jit_cache import SUFFIX, KernelCache, pattern_of
 
 from .conftest import ROOT
 
@@ -41,6 +42,30 @@ def was_cached(kernel: Any) -> bool:
     return bool(kernel.stats.cache_hits) and not kernel.stats.cache_misses
 
 
+def test_what_was_compiled_for_another_processor_is_not_there(tmp_path: Path) -> None:
+    compiled(tmp_path, [])(2.0)
+    assert list(tmp_path.glob(pattern_of("test_jit_cache.twice")))
+    code = "from sparklod_cli.jit_cache import pattern_of; print(pattern_of('test_jit_cache.twice'))"
+    environment = {**os.environ, "NUMBA_CPU_NAME": "generic"}
+    other = subprocess.run([sys.executable, "-c", code], cwd=ROOT, env=environment, capture_output=True, text=True)
+    assert other.stdout.startswith("test_jit_cache.twice-")
+    assert not list(tmp_path.glob(other.stdout.strip()))
+
+
+def test_memory_that_runs_out_is_no_damage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[str] = []
+    compiled(tmp_path, told)(2.0)
+
+    def starved(*arguments: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr("sparklod_cli.jit_cache.pickle.loads", starved)
+    with pytest.raises(MemoryError):
+        compiled(tmp_path, told)(2.0)
+    assert told == []
+    assert len(list(tmp_path.iterdir())) == 1
+
+
 def test_a_second_process_finds_what_the_first_has_compiled(tmp_path: Path) -> None:
     told: list[str] = []
     for cached in (False, True):
@@ -62,7 +87,7 @@ def test_a_damaged_file_is_told_of_and_compiled_again(tmp_path: Path, damage: Ca
     kernel = compiled(tmp_path, told)
     assert kernel(2.0) == 4
     assert not was_cached(kernel)
-    assert told == [f"{path} is damaged; test_jit_cache.twice is compiled again"]
+    assert told == [f"compiled code in {tmp_path} is damaged; what is damaged is compiled again"]
     kernel = compiled(tmp_path, told)
     assert kernel(2.0) == 4
     assert was_cached(kernel)
@@ -85,11 +110,10 @@ def test_a_folder_that_was_removed_is_made_again(tmp_path: Path) -> None:
 
 
 def test_a_full_disk_leaves_no_part_of_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(path: Path, content: bytes) -> int:
-        path.touch()
+    def full(file: object, pieces: object) -> int:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(Path, "write_bytes", full)
+    monkeypatch.setattr(whole, "_fill", full)
     told: list[str] = []
     assert compiled(tmp_path, told)(2.0) == 4
     assert "no space left on device" in told[0]
@@ -110,7 +134,8 @@ def test_a_bake_heals_a_cache_in_which_every_file_is_damaged(tmp_path: Path) -> 
     for number, path in enumerate(files):
         path.write_bytes([*DAMAGE.values()][number % len(DAMAGE)](path.read_bytes()))
     healed = subprocess.run(command, **how)
-    assert healed.stderr.count("is damaged") >= 4
+    assert healed.stderr.count("is damaged;") == 1  # for all of them
+    assert "compiled 5 kernels" in healed.stderr
     again = subprocess.run(command, **how)
     assert "damaged" not in again.stderr
     assert "ompil" not in again.stderr

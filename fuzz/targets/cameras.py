@@ -23,9 +23,6 @@ from ..command import command
 from ..containers import FIXTURES
 from ..mutate import json_mutated, mutated, pick, text_mutated
 
-#: Formats that a package reads which is not loaded here.
-ELSEWHERE = ("open3d",)
-
 
 @functools.cache
 def groups() -> Mapping[str, Mapping[str, bytes]]:

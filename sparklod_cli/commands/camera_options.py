@@ -295,5 +295,8 @@ def _place(frames: Sequence[Frame], center: Any, scene: Balls, how: Settings) ->
 
     kept = covered(scene)
     middle = middle_of(kept) if center is None else np.asarray(center, np.float64)
-    cameras = [camera_of(frame.matrix, frame.lens, 0, "", how) for frame in some(frames)]
+    try:
+        cameras = [camera_of(frame.matrix, frame.lens, 0, "", how) for frame in some(frames)]
+    except ValueError as error:
+        raise CameraPathError(f"the camera {error}") from None
     return middle, distance(cameras, middle, kept)

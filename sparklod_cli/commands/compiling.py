@@ -26,12 +26,13 @@ class Reporter:
         self._console, self._jobs = console, jobs
         self._total = self._done = 0
         self._seconds = 0.0
+        self._troubles: set[str] = set()
 
     def listen(self) -> Callable[[], None]:
         """Begins; returns what ends it."""
         from .. import jit
 
-        stop = jit.listen(self._begin, self._end, self._console.say)
+        stop = jit.listen(self._begin, self._end, self._say_once)
 
         def close() -> None:
             stop()
@@ -39,6 +40,12 @@ class Reporter:
                 self._console.say(f"compiled {count_of(self._done, 'kernel')} in {self._seconds:.1f} s")
 
         return close
+
+    def _say_once(self, trouble: str) -> None:
+        """What is wrong with the cache is wrong for one kernel after another."""
+        if trouble not in self._troubles:
+            self._troubles.add(trouble)
+            self._console.say(trouble)
 
     def _begin(self, name: str) -> None:
         if not self._total:

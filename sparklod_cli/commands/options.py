@@ -35,10 +35,10 @@ def flag_of(ctx: click.Context, name: str) -> str:
 
 
 def refuse(ctx: click.Context, why: str, names: Iterable[str]) -> None:
-    """Raises a `click.UsageError` where one of some parameters was given, to which `why` leaves nothing to do."""
+    """Raises a `click.UsageError` where one of some parameters was given, which cannot be used with `why`."""
     for name in names:
         if is_given(ctx, name):
-            raise click.UsageError(f"{why} leaves nothing to {flag_of(ctx, name)}")
+            raise click.UsageError(f"{flag_of(ctx, name)} cannot be used with {why}")
 
 
 def table_form(flag: str, output: Path | None) -> str:
@@ -138,6 +138,11 @@ def _note_verbosity(ctx: click.Context, param: click.Parameter, value: bool) -> 
     return value
 
 
+def verbose_option(text: str) -> Callable[[Command], Command]:
+    """`-v`, with its help; whoever ends the run hears of it, too."""
+    return click.option("-v", "--verbose", is_flag=True, callback=_note_verbosity, help=text)
+
+
 def common_options(
     command: Command,
     *,
@@ -147,13 +152,7 @@ def common_options(
     """`--threads`, `--json`, `-q`, `-v`, `--version`; `json` and `quiet` are the help of theirs."""
     for option in (
         click.version_option(__version__, package_name="sparklod"),
-        click.option(
-            "-v",
-            "--verbose",
-            is_flag=True,
-            callback=_note_verbosity,
-            help="Say how long each stage took, and what was chosen.",
-        ),
+        verbose_option("Say how long each stage took, and what was chosen."),
         click.option("-q", "--quiet", is_flag=True, help=quiet),
         click.option("--json", "as_json", is_flag=True, help=json),
         click.option(

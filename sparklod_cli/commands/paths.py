@@ -75,12 +75,14 @@ def keep_apart(ctx: click.Context, stands_for: Mapping[str, Iterable[Path]] | No
         values = [] if value is None else list(value) if isinstance(value, tuple) else [value]
         if isinstance(kind, OutputPath):
             outputs += more if more is not None else [] if kind.folder else values
-            promised += [(parameter, kind, path) for path in values if kind.suffixes]
+            promised += [(parameter, kind, path) for path in values if kind.suffixes or kind.folder]
         else:
             inputs += [*(values if isinstance(kind, InputPath) else []), *(more or ())]
     _keep_apart(outputs, inputs)
     for parameter, kind, path in promised:
-        if path.suffix.lower() not in ("", *kind.suffixes):
+        if path == DASH:
+            raise click.BadParameter("this does not go to standard output; name a file or folder", ctx, parameter)
+        if kind.suffixes and path.suffix.lower() not in ("", *kind.suffixes):
             raise click.BadParameter(
                 f"{str(path)!r} does not end in {' or '.join(kind.suffixes)}, which is what is written", ctx, parameter
             )

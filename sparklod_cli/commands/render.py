@@ -155,7 +155,7 @@ def render(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, **s
         sheet = _is_sheet(settings)
         output = _output(settings, placements, len(path.cameras))
         if output.form == "npy":
-            refuse(ctx, "a .npy, which holds numbers,", of_pictures(settings["color_by"]))
+            refuse(ctx, "a .npy, which holds numbers", of_pictures(settings["color_by"]))
         background = background_from(ctx, settings, output.form)
         for camera in path.cameras:
             has_bar = (manner.color_by or settings["diff"]) and not settings["no_bar"]

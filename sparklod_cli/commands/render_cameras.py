@@ -62,7 +62,7 @@ def framed(
 
     scene = functools.cache(scene)
     path = _cameras(settings, scene)
-    chosen = is_free(settings) or any(settings[name] for name in CHOSEN)
+    chosen = not settings["views"] and all(name in CHOSEN for name in SOURCES if settings[name])
     if chosen and not settings["distance"] and not is_given(ctx, "near") and not is_given(ctx, "far"):
         look = with_reach(look, path.cameras, scene())
     return path, look

@@ -225,7 +225,7 @@ class Job:
         if self.other is not None:
             worst = min(frame["psnr_db"] for frame in frames)
             said.append(f"PSNR {worst:.2f} dB" + (" or more" if len(frames) > 1 else ""))
-            said.append(f"differences {self._gain:g} times as strong")
+            said.append(f"differences {self._gain:g} times as strong" if self._gain != 1 else "differences as they are")
         self.console.say(f"{name}  {', '.join(said)}, {self.seconds:.2f} s")
         manner = self.painter.manner
         self.console.detail(

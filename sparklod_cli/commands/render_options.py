@@ -33,7 +33,7 @@ UNKNOWN_TO = {"open3d": ("profile", "sort")}
 
 
 def of_pictures(color_by: str | None) -> tuple[str, ...]:
-    """Options that a file of numbers leaves nothing to, by what its numbers are."""
+    """Options that cannot be used with a file of numbers, by what its numbers are."""
     return ("no_bar", "background", "alpha") if color_by in OF_PIXELS else ("no_bar",)
 
 
@@ -174,7 +174,7 @@ def manner_from(ctx: click.Context, settings: Mapping[str, Any]) -> Manner:
     refuse(ctx, f"--style {style}", UNSTYLED.get(style, ()))
     refuse(ctx, f"--backend {settings['backend']}", UNKNOWN_TO.get(settings["backend"], ()))
     if by == "overdraw":
-        refuse(ctx, "--color-by overdraw, which counts splats,", ["sort"])
+        refuse(ctx, "--color-by overdraw, which counts splats", ["sort"])
     if by == "overdraw" and (style != "splats" or is_given(ctx, "backend")):
         raise click.UsageError("--color-by overdraw counts splats; leave out --style and --backend")
     if settings["no_bar"] and by is None and settings["diff"] is None:

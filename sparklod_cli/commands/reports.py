@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 CLAMPED = {
     ("scale", False): (
         "scales",
-        "too small to be seen but from nearer than 0.1 units; if the whole scene is that small, scale it up first",
+        "too small to be seen from farther away than 0.1 units; if the whole scene is that small, scale it up first",
     ),
     ("scale", True): (
         "scales",

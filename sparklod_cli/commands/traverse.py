@@ -109,7 +109,7 @@ def traverse(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, *
     if as_json and str(wanted.output) == "-":
         raise click.UsageError("--json and the table cannot both go to standard output")
     if as_json and wanted.output is None:
-        refuse(ctx, "--json without --output, which writes no table,", OF_TABLES)
+        refuse(ctx, "--json without --output, which writes no table", OF_TABLES)
     if wanted.padded and wanted.indices is None:
         raise click.UsageError("--padded only means something with --indices-out")
     with Console(quiet=quiet, verbose=verbose) as console:

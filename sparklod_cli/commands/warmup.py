@@ -10,6 +10,7 @@ import click
 from .. import __version__
 from ..parallel import processors
 from .console import Console, count_of
+from .options import verbose_option
 
 EXAMPLES = """
 \b
@@ -31,18 +32,21 @@ Examples:
 )
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object on standard output.")
 @click.option("-q", "--quiet", is_flag=True, help="Say nothing but errors.")
+@verbose_option("Say which kernels are missing.")
 @click.version_option(__version__, package_name="sparklod")
-def warmup(jobs: int, as_json: bool, quiet: bool) -> None:
+def warmup(jobs: int, as_json: bool, quiet: bool, verbose: bool) -> None:
     """Compile all inner loops for this machine, so that no later command has to.
 
     sparklod is Python whose inner loops are compiled for the processor that they run on, when they are first called.
     This does all of it at once and keeps the result in the cache that later commands read: beside the package or, where
     that is read-only, in your cache directory; NUMBA_CACHE_DIR names another. What is there already is left alone.
     """
-    with Console(quiet=quiet, verbose=False) as console:
+    with Console(quiet=quiet, verbose=verbose) as console:
         from .. import jit
-        from ..warmup import warm_up
+        from ..warmup import JOBS, missing, warm_up
 
+        for name in sorted(missing(JOBS)):
+            console.detail(f"  {name} is to be compiled")
         start = time.perf_counter()
         compiled = warm_up(processes=jobs, progress=console.progress)
         seconds = time.perf_counter() - start

@@ -27,7 +27,10 @@ CODES: dict[str, tuple[str, str]] = {
     "values.negative-scale": (ERROR, "a scale is below 0"),
     "values.opacity": (ERROR, "an opacity is below 0, or above 1 in a file that is no tree"),
     "values.invisible": (WARNING, "many splats, of a tree many leaves, have opacity 0 or scale 0 and cannot be drawn"),
-    "values.scale-clamped": (WARNING, "many scales lie at an end of what the format holds"),
+    "values.scale-clamped": (
+        WARNING,
+        "scales of many splats, of a tree of many leaves, lie at an end of what SPZ holds",
+    ),
     "values.center-clamped": (ERROR, "centres lie at the end of what the format holds"),
     "values.center-far": (WARNING, "centres lie so far out that a viewer's float16 cannot hold them"),
     "tree.root": (ERROR, "node 0 is the child of another node"),

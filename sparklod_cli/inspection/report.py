@@ -95,8 +95,7 @@ def inspect(
     findings = _container_findings(scene)
     facts = None
     if scene.tree is not None and count:
-        least, _ = values.scale_ends(scene)
-        facts, found = tree.examine(splats, scene.tree, check=wanted.check, least_scale=least)
+        facts, found = tree.examine(splats, scene.tree, check=wanted.check, scale_ends=values.scale_ends(scene))
         findings += found
     if wanted.check:
         findings += values.check(scene)

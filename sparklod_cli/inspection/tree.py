@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -75,7 +76,7 @@ class TreeFacts:
 
 
 def examine(
-    splats: Splats, tree: LodTree, *, check: bool = True, least_scale: float = 0.0
+    splats: Splats, tree: LodTree, *, check: bool = True, scale_ends: tuple[float, float] = (0.0, math.inf)
 ) -> tuple[TreeFacts, list[Finding]]:
     """The facts of a tree and what is wrong with it; of a broken one, the facts of what its root leads to.
 
@@ -83,7 +84,8 @@ def examine(
         splats: N nodes, of which scale and opacity are looked at.
         tree: their links, N of them and at least one.
         check: look for what is wrong.
-        least_scale: the least that the file's format holds, world units: a scale of that may have been any smaller.
+        scale_ends: the least and the largest scale that the file's format holds, world units: one of them may have been
+            any smaller, or larger.
     """
     size = spark_size(splats)
     depth, limit = walk(tree.child_count, tree.child_start, size)
@@ -111,7 +113,7 @@ def examine(
     parent, references = find_parents(tree.child_count, tree.child_start)
     return facts, [
         *_link_findings(tree, parent, references, depth),
-        *_node_findings(splats, tree, parent, size, least_scale),
+        *_node_findings(splats, tree, parent, size, scale_ends),
         *_order_findings(parent, limit),
     ]
 
@@ -166,13 +168,16 @@ def _link_findings(
 
 
 def _node_findings(
-    splats: Splats, tree: LodTree, parent: NDArray[np.int32], size: FloatArray, least_scale: float
+    splats: Splats, tree: LodTree, parent: NDArray[np.int32], size: FloatArray, scale_ends: tuple[float, float]
 ) -> list[Finding]:
     findings = _found("tree.leaf-opacity", tree.is_leaf & (splats.opacity > 1), "is a leaf and more than opaque")
     smaller = size < LEAST_RATIO * sizes_below(parent, size, splats.scale, splats.opacity)
-    # How wide a line is, and so what it covers beside others, is not known where the format holds no scale that small.
-    line = np.count_nonzero(splats.scale <= least_scale, axis=1) >= 2
+    # How wide a line is, and so what it covers beside others, is not known where the format holds no scale that small;
+    # nor is how large a node was meant to be where it holds none that large.
+    least, largest = scale_ends
+    line = np.count_nonzero(splats.scale <= least, axis=1) >= 2
     smaller[parent[line & (parent >= 0)]] = False
+    smaller &= splats.scale.max(axis=1) < largest
     return findings + _found("tree.size", smaller, "is less than a third as large as its children are in the mean")
 
 

@@ -186,7 +186,7 @@ def _merge(
     growing: _Growing, active: Nodes, space: _Space, largest: float, rounds: int | None, progress: Progress
 ) -> Nodes:
     """Rounds of merging; returns what is left, which is one node if `rounds` is None."""
-    done, rows = 0, len(growing.state)
+    done, leaves = 0, (len(growing.state) + 1) // 2
     while len(active) > 1 and (rounds is None or done < rounds):
         with threads_for(len(active)) as threads:
             active = space.sort(growing.state, active, growing.rounds, threads)
@@ -201,7 +201,7 @@ def _merge(
             union.unite_pairs(found, growing.used, growing.state, growing.children, growing.size, growing.error)
         growing.used += len(found)
         growing.rounds += 1
-        progress("building", growing.used, rows, "node")
+        progress("building", growing.used - leaves, leaves - 1, "node")
         done += 1
         if rounds is not None and len(found) <= LEAST * before:
             break

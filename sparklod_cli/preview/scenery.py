@@ -158,7 +158,7 @@ class Scenery:
     def balls(self) -> Balls:
         """What the splats cover in the world: the leaves of every placement."""
         return together(
-            balls_of(source.splats.take(source.leaves), place.object_to_world)
+            balls_of(source.splats, source.leaves, place.object_to_world)
             for place, source in zip(self.placements, self.sources, strict=True)
         )
 

@@ -62,10 +62,10 @@ def read(files: Files, *, format: str | None = None, settings: Settings | None =
         raise CameraPathError("it is empty")
     form = _known(files) if format is None else next(form for form in FORMATS if form.name == format)
     if settings.axes and form.axes is None:
-        raise CameraPathError(f"{form.title} says where cameras look, which leaves nothing to --camera-axes")
+        raise CameraPathError(f"{form.title} says itself where cameras look, so --camera-axes cannot be used with it")
     parsed = form.parser().parse(files, settings)
     if settings.up is not None and (parsed.turned or not form.looking):
-        raise CameraPathError("its cameras say themselves which way is up, which leaves nothing to --up")
+        raise CameraPathError("its cameras say themselves which way is up, so --up cannot be used with them")
     return cameras_of(parsed, form, settings)
 
 

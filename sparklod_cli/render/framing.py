@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,17 +67,18 @@ class Balls:
         return Balls(self.center[index], self.radius[index])
 
 
-def balls_of(splats: Splats, object_to_world: Matrix) -> Balls:
+def balls_of(splats: Splats, index: NDArray[Any] | slice, object_to_world: Matrix) -> Balls:
     """What some splats cover where they stand; those without finite numbers are left out.
 
     Args:
-        splats: N of them.
+        splats: that they are of.
+        index: which of them.
         object_to_world: (4, 4) a rotation, a uniform scale and a translation.
     """
     with np.errstate(all="ignore"):
-        center = splats.center.astype(np.float64) @ object_to_world[:3, :3].T + object_to_world[:3, 3]
+        center = splats.center[index].astype(np.float64) @ object_to_world[:3, :3].T + object_to_world[:3, 3]
         times = SEEN * float(np.cbrt(np.linalg.det(object_to_world[:3, :3])))
-        radius = times * splats.scale.max(axis=1, initial=0).astype(np.float64)
+        radius = times * splats.scale[index].max(axis=1, initial=0).astype(np.float64)
         finite = np.isfinite(center).all(axis=1) & np.isfinite(radius)
     return Balls(center[finite], radius[finite])
 
@@ -195,7 +196,11 @@ def some(cameras: Sequence[Item]) -> Sequence[Item]:
 def with_reach(look: Look, cameras: Sequence[Camera], scene: Balls) -> Look:
     """A look that leaves nothing out of a scene, however small or large it is, because of near and far."""
     near, far = look.near, look.far
+    sample = scene.center[:: max(len(scene.center) // SAMPLE, 1)]
+    corners = np.stack([scene.center.min(axis=0), scene.center.max(axis=0)])
+    largest = float(scene.radius.max())
     for camera in some(cameras):
-        away = np.linalg.norm(scene.center - camera.position, axis=1)
-        near, far = min(near, float(np.median(away)) / 100), max(far, 2 * float((away + scene.radius).max()))
+        away = np.linalg.norm(sample - camera.position, axis=1)
+        farthest = float(np.linalg.norm(np.abs(corners - camera.position).max(axis=0)))
+        near, far = min(near, float(np.median(away)) / 100), max(far, 2 * (farthest + largest))
     return dataclasses.replace(look, near=near, far=min(far, FARTHEST))

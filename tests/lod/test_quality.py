@@ -163,7 +163,7 @@ def test_progress_tells_stage_by_stage_and_is_full_only_at_the_end_of_each() -> 
     for states in stages.values():
         assert [done for done, _ in states] == sorted(done for done, _ in states)
         assert all(done < total for done, total in states[:-1])
-    assert stages["building"][-1] == (999, 999)
+    assert stages["building"][-1] == (499, 499)
     assert told[-1] == ("ordering", len(nodes), len(nodes), "node")
 
 

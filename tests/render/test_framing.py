@@ -135,7 +135,7 @@ def test_balls_stand_where_splats_do_and_leave_out_what_is_no_number() -> None:
     splats.scale[4] = np.inf
     matrix = np.diag([2.0, 2.0, 2.0, 1.0])
     matrix[:3, 3] = (0, 0, 7)
-    found = balls_of(splats, matrix)
+    found = balls_of(splats, slice(None), matrix)
     assert np.allclose(found.center, [(2, 0, 7), (4, 0, 7), (2 * float(np.float32(3e38)), 0, 7)])
     assert np.allclose(found.radius, 2.0)
 
