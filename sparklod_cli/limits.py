@@ -76,3 +76,6 @@ BLEND = 1.25
 
 #: How the backend osmesa sorts splats.
 SORTINGS = ("exact", "counting16")
+
+#: No far plane is farther away, world units, so that it is a float32.
+FARTHEST = 1e37

@@ -325,6 +325,7 @@ def test_a_scene_file_says_what_stands_where(tmp_path: Path, capsys: Said) -> No
         ([TREE, "--scene", "s.json"], "--scene names the files; leave out FILE"),
         ([TREE, "--budget", "many"], "--budget"),
         ([TREE, "--budget", "5k", "--preset", "quest"], "--budget and --preset exclude each other"),
+        ([TREE, "--far", "1e308"], "--far"),
         ([TREE, "--full", "--budget", "5k"], "--budget cannot be used with --full"),
         ([TREE, TREE, "--budget", "1"], "a budget of 1 splat is less than one for each of 2 instances"),
         ([TREE, "--chunk-cache", "5"], "No such option"),

@@ -80,7 +80,7 @@ def look_options(command: Command) -> Command:
             click.option(
                 "--near",
                 metavar="D",
-                type=Real(0, min_open=True),
+                type=Real(0, limits.FARTHEST, min_open=True),
                 default=look.near,
                 show_default=False,
                 help="Draw nothing nearer along the axis."
@@ -89,7 +89,7 @@ def look_options(command: Command) -> Command:
             click.option(
                 "--far",
                 metavar="D",
-                type=Real(0, min_open=True),
+                type=Real(0, limits.FARTHEST, min_open=True),
                 default=look.far,
                 show_default=False,
                 help="Draw nothing farther along the axis."

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InvalidSplatsError
+from ..limits import FARTHEST
 from ..splats import Splats
 from .camera import Camera, Matrix
 from .look import Look
@@ -43,9 +44,6 @@ STEPS = 1e-6
 
 #: So many cameras of a path are looked through; those between them see as good as the same.
 CAMERAS = 64
-
-#: No far plane is farther away, so that it is a float32.
-FARTHEST = 1e37
 
 Item = TypeVar("Item")
 
