@@ -270,6 +270,7 @@ def test_a_scene_file_says_what_stands_where(tmp_path: Path, capsys: Said) -> No
         ([TREE, "--format", "xlsx"], "--format"),
         ([TREE, "-o", "t.xlsx"], "--output t.xlsx: tables are written as .csv, .json, .parquet"),
         ([TREE, "-o", "t.png"], "--output t.png: tables are written as .csv"),
+        ([TREE, "-o", "t.spz", "--format", "json"], "t.spz does not end in .json, which --format asks for"),
         ([TREE, "--plot", "t.jpg"], "'t.jpg' does not end in .png, which is what is written"),
         ([TREE, "--json", "-o", "-"], "--json and the table cannot both go to standard output"),
         ([TREE, "--json", "--per-instance"], "--per-instance cannot be used with --json without --output"),

@@ -14,6 +14,9 @@ from .. import __version__
 from ..limits import MAX_THREADS, TABLES
 from ..parallel import processors
 
+#: Suffixes, without a point, of what is no table, whatever format is asked for.
+NO_TABLES = ("gif", "html", "ksplat", "mp4", "npy", "npz", "ply", "png", "sog", "splat", "spz", "webp")
+
 Command = TypeVar("Command", bound=Callable[..., Any])
 
 
@@ -41,15 +44,19 @@ def refuse(ctx: click.Context, why: str, names: Iterable[str]) -> None:
             raise click.UsageError(f"{flag_of(ctx, name)} cannot be used with {why}")
 
 
-def table_form(flag: str, output: Path | None) -> str:
-    """The format of a table that a name asks for; CSV where it has no suffix, or goes to standard output.
+def table_form(flag: str, output: Path | None, form: str | None = None) -> str:
+    """The format of a table that is asked for, or by a name; CSV where that has no suffix, or goes to standard output.
 
     Raises:
-        click.UsageError: nothing is written by that suffix.
+        click.UsageError: nothing is written by that suffix, or it promises something else than `form`.
     """
     suffix = output.suffix.lower() if output is not None else ""
     if not suffix:
-        return TABLES[0]
+        return form or TABLES[0]
+    if form is not None:
+        if suffix[1:] != form and suffix[1:] in (*TABLES, *NO_TABLES):
+            raise click.UsageError(f"{flag} {output} does not end in .{form}, which --format asks for")
+        return form
     if suffix[1:] not in TABLES:
         raise click.UsageError(f"{flag} {output}: tables are written as {', '.join(f'.{form}' for form in TABLES)}")
     return suffix[1:]

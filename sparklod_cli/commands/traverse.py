@@ -89,7 +89,7 @@ def traverse(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, *
     viewer = viewer_from(ctx, settings)
     placements = placements_from(settings)
     keep_apart(ctx, files_meant(settings, placements))
-    form = settings["form"] or table_form("--output", settings["output"])
+    form = table_form("--output", settings["output"], settings["form"])
     try:
         asserts = [assertions.parse(text) for text in settings["asserts"]]
     except assertions.BadAssertionError as error:
