@@ -105,3 +105,8 @@ def well_formed(text: str) -> str:
 def shown(value: Any) -> str:
     """A value as it may be quoted: on one line, and not too much of it, however deep it is."""
     return printable(reprlib.repr(value), QUOTED)
+
+
+def quoted(error: Exception) -> str:
+    """What a library says of a file, as it may be quoted: it may quote the file at length itself."""
+    return printable(str(error), 2 * QUOTED)

@@ -19,12 +19,11 @@ from ..errors import FormatError, NotSplatsError, TruncatedError
 from ..gaussian import normalized_quat
 from ..limits import MAX_SH_DEGREE
 from ..parallel import chunks_of, ordered_map
-from ..printable import printable
 from ..progress import Progress, silent
 from ..scene import Scene
 from ..sh import degree_of, notes_on_degree
 from ..splats import FloatArray, Splats
-from ..untrusted import QUOTED
+from ..untrusted import quoted
 from . import quantize
 from .ply_header import Header, read_header
 from .stream import Rows, decode_rows, rows_of, size_of
@@ -126,7 +125,7 @@ def _binary_rows(file: BinaryIO, header: Header) -> Iterator[Rows]:
     try:
         data = PlyData.read(file)["vertex"].data
     except (PlyParseError, ValueError) as error:
-        raise FormatError(f"bad PLY data: {printable(str(error), 2 * QUOTED)}") from None
+        raise FormatError(f"bad PLY data: {quoted(error)}") from None
     for part in chunks_of(len(data)):
         yield part, data[part]
 
@@ -148,9 +147,7 @@ def _text_rows(file: BinaryIO, header: Header) -> Iterator[Rows]:
         try:
             rows = np.loadtxt(lines, dtype=row_type, ndmin=1, comments=None)
         except ValueError as error:
-            raise FormatError(
-                f"bad PLY data after vertex {part.start:,}: {printable(str(error), 2 * QUOTED)}"
-            ) from None
+            raise FormatError(f"bad PLY data after vertex {part.start:,}: {quoted(error)}") from None
         yield part, rows
 
 

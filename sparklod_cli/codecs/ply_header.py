@@ -10,8 +10,7 @@ import numpy as np
 from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
 
 from ..errors import FormatError, PromiseError, TruncatedError
-from ..printable import printable
-from ..untrusted import QUOTED
+from ..untrusted import quoted
 
 MAX_HEADER = 1 << 20
 
@@ -98,6 +97,6 @@ def read_header(file: BinaryIO) -> Header:
     try:
         parsed = PlyData.read(io.BytesIO(b"\n".join(lines) + b"\n"))
     except (PlyParseError, ValueError) as error:
-        raise FormatError(f"bad PLY header: {printable(str(error), 2 * QUOTED)}") from None
+        raise FormatError(f"bad PLY header: {quoted(error)}") from None
     elements = {element.name: (element, count) for element, count in zip(parsed, counts, strict=True)}
     return Header(elements, parsed.text, parsed.byte_order, len(text))

@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from PIL.WebPImagePlugin import WebPImageFile
 
 from ..errors import ChecksumError, FormatError, NotSplatsError
-from ..printable import printable
 from ..quantities import count_of
-from ..untrusted import QUOTED, parse_json, shown
+from ..untrusted import parse_json, quoted, shown
 from .compression import check_promise
 from .stream import size_of
 
@@ -188,7 +187,7 @@ class _Archive:
         try:
             self._zip = zipfile.ZipFile(file)
         except _ZIP_ERRORS as error:
-            raise FormatError(f"not a whole zip archive: {printable(str(error), 2 * QUOTED)}") from None
+            raise FormatError(f"not a whole zip archive: {quoted(error)}") from None
         names = [name for name in self._zip.namelist() if name == META or name.endswith("/" + META)]
         if not names:
             raise NotSplatsError(f"a zip archive without {META} is not a SOG")
@@ -207,7 +206,7 @@ class _Archive:
                 return file.read(member.file_size)  # without a size it would unfold all there is before it counts
         except _ZIP_ERRORS as error:
             kind = ChecksumError if "CRC" in str(error) else FormatError
-            raise kind(f"{shown(name)} cannot be unpacked: {printable(str(error), 2 * QUOTED)}") from None
+            raise kind(f"{shown(name)} cannot be unpacked: {quoted(error)}") from None
 
 
 def _webp_size(data: bytes, name: str) -> tuple[int, int]:

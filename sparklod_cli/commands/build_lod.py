@@ -16,7 +16,7 @@ import click
 from .. import limits
 from ..printable import MOST, shortened
 from .console import Console, is_terminal
-from .options import AutoOr, Ball, Numbers, Real, common_options
+from .options import AutoOr, Ball, Numbers, Real, common_options, is_given
 from .paths import InputPath, OutputPath, keep_apart
 from .reports import report_baked, report_unbaked
 
@@ -209,7 +209,7 @@ def _check_usage(ctx: click.Context, inputs: tuple[Path, ...], output: Path | No
 
     def refuse(names: tuple[str, ...], why: str) -> None:
         for name in names:
-            if ctx.get_parameter_source(name) not in (None, click.core.ParameterSource.DEFAULT):
+            if is_given(ctx, name):
                 raise click.UsageError(f"--{name.replace('_', '-')} {why}")
 
     suffix = output.suffix.lower() if output is not None and output != STDOUT else ""

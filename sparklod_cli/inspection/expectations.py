@@ -13,7 +13,7 @@ from ..errors import SparklodError
 from ..io import read_text
 from ..printable import printable
 from ..quantities import count_of
-from ..untrusted import QUOTED, parse_json, parse_toml, shown
+from ..untrusted import QUOTED, parse_json, parse_toml, quoted, shown
 from .findings import Finding
 from .report import Report
 
@@ -55,7 +55,7 @@ def read(path: Path) -> Expectations:
         text = read_text(path)
         data = parse_toml(text) if path.suffix.lower() == ".toml" else parse_json(text)
     except ValueError as error:
-        raise ExpectationError(f"{path} is not what it is called: {printable(str(error), 2 * QUOTED)}") from None
+        raise ExpectationError(f"{path} is not what it is called: {quoted(error)}") from None
     if not isinstance(data, dict):
         raise ExpectationError(f"{path} is not a table of expectations")
     types: dict[str, tuple[type, ...]] = {each.name: (int,) for each in fields(Expectations)}
