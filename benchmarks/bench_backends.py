@@ -15,17 +15,17 @@ import numpy as np
 from bench_build import machine
 from scenes import load
 
-from sparklod_cli import jit
-from sparklod_cli.errors import SparklodError
-from sparklod_cli.parallel import processors
+from sparklod_cli.cameras.camera import Camera
+from sparklod_cli.cameras.framing import framing
+from sparklod_cli.cameras.pose import look_at
+from sparklod_cli.model.splats import Splats
 from sparklod_cli.render.backends import BACKENDS
-from sparklod_cli.render.camera import Camera
-from sparklod_cli.render.framing import framing
-from sparklod_cli.render.look import Look
-from sparklod_cli.render.pose import look_at
 from sparklod_cli.render.rasterizer import Image
-from sparklod_cli.render.shown import Shown, show
-from sparklod_cli.splats import Splats
+from sparklod_cli.render.settings import Look
+from sparklod_cli.render.shading import Shown, show
+from sparklod_cli.support import jit
+from sparklod_cli.support.errors import SparklodError
+from sparklod_cli.support.parallel import processors
 
 HEADINGS = (
     "scene",

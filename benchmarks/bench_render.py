@@ -10,12 +10,12 @@ import time
 import numpy as np
 from bench_build import machine
 
-from sparklod_cli import jit
-from sparklod_cli.parallel import processors
-from sparklod_cli.render.camera import Camera
-from sparklod_cli.render.look import Look
+from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.render.rasterizer import draw
-from sparklod_cli.render.shown import Shown
+from sparklod_cli.render.settings import Look
+from sparklod_cli.render.shading import Shown
+from sparklod_cli.support import jit
+from sparklod_cli.support.parallel import processors
 
 
 def scattered(count: int, camera: Camera) -> Shown:

@@ -13,10 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
-from sparklod_cli import jit
 from sparklod_cli.io import read_scene
-from sparklod_cli.parallel import processors
-from sparklod_cli.render.look import SORTS, Look
+from sparklod_cli.render.settings import SORTS, Look
+from sparklod_cli.support import jit
+from sparklod_cli.support.parallel import processors
 from tests.interop.page import Page
 from tests.interop.pictures import AROUND, Difference, cameras_around, compare
 

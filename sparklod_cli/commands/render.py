@@ -21,8 +21,8 @@ from .render_options import background_from, blend_from, check_size, look_option
 from .world_options import cut_options, files_meant, placements_from, viewer_from, world_options
 
 if TYPE_CHECKING:
-    from ..preview.scenery import Scenery
-    from ..simulation.simulate import Viewer
+    from ..scenery import Scenery
+    from ..simulation.frames import Viewer
     from ..world import Placement
     from .render_output import Output
 
@@ -138,9 +138,9 @@ def render(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, **s
     # Before much is read, what is wrong with the output already.
     _output(settings, placements, least_cameras(settings))
     with Console(quiet=quiet, verbose=verbose) as console:
-        from ..preview import animation
-        from ..preview.pictures import Painter
-        from ..preview.pixels import scale_width
+        from ..images import animation
+        from ..images.pixels import scale_width
+        from ..render.renderer import Painter
         from .render_job import Job, Wanted, frame_rate
 
         console.announce_compiling("render")
@@ -221,9 +221,9 @@ def _compare(ctx: click.Context, settings: dict[str, Any], console: Console, *, 
     viewer = viewer_from(ctx, settings | {"budget": None})
     manner = manner_from(ctx, settings)
     with console:
-        from ..preview.compare import How
+        from ..compare import How
+        from ..model.splats import COLUMNS
         from ..render.backends import BACKENDS
-        from ..splats import COLUMNS
         from ..world import read_world
         from .render_compare import run, wanted_from
 
@@ -276,7 +276,7 @@ def _output(settings: Mapping[str, Any], placements: list[Placement], cameras: i
 
 
 def _read(placements: list[Placement], viewer: Viewer | None, settings: Mapping[str, Any], console: Console) -> Scenery:
-    from ..preview.scenery import read_scenery
+    from ..scenery import read_scenery
 
     try:
         return read_scenery(
@@ -293,6 +293,6 @@ def _read(placements: list[Placement], viewer: Viewer | None, settings: Mapping[
 
 
 def _use_threads(count: int) -> None:
-    from .. import jit
+    from ..support import jit
 
     jit.use_threads(count)

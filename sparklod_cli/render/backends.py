@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import Any, Protocol, cast
 
-from ..errors import SparklodError
-from .camera import Camera
-from .look import Look
+from ..cameras.camera import Camera
+from ..support.errors import SparklodError
 from .rasterizer import Image
-from .shown import Shown
+from .settings import Look
+from .shading import Shown
 
 
 class BackendError(SparklodError):
@@ -46,7 +46,7 @@ BACKENDS = {
     backend.name: backend
     for backend in (
         Backend("numba", ".rasterizer"),
-        Backend("osmesa", ".osmesa"),
-        Backend("open3d", ".open3d_backend"),
+        Backend("osmesa", ".gl.osmesa"),
+        Backend("open3d", ".open3d.backend"),
     )
 }

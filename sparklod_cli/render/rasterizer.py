@@ -7,12 +7,12 @@ import threading
 import numpy as np
 from numpy.typing import NDArray
 
-from ..jit import threads_in_use
-from .camera import Camera
+from ..cameras.camera import Camera
+from ..cameras.pose import FLIP
+from ..support.jit import threads_in_use
 from .kernels import project, raster
-from .look import BLUR, CLIP, MAX_STD_DEV, MIN_ALPHA, STD_DEV_PER_D, Look
-from .pose import FLIP
-from .shown import Shown
+from .settings import BLUR, CLIP, MAX_STD_DEV, MIN_ALPHA, STD_DEV_PER_D, Look
+from .shading import Shown
 
 Image = NDArray[np.float32]
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ...splats import FloatArray
-from ..camera import Camera
-from ..look import CLIP, MIN_ALPHA, Look
+from ...cameras.camera import Camera
+from ...model.splats import FloatArray
 from ..rasterizer import world_to_camera
-from ..shown import Shown
+from ..settings import CLIP, MIN_ALPHA, Look
+from ..shading import Shown
 
 #: By the distance itself, or by 65,536 steps of it.
 SORTINGS = ("exact", "counting16")

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...codecs import data_texture
-from ...sh import COEFFICIENTS
-from ...splats import FloatArray, Splats
+from ...codecs.gpu import data_texture
+from ...model.sh import COEFFICIENTS
+from ...model.splats import FloatArray, Splats
 from ..kernels.project import BRIGHTEST
-from ..shown import Shown
+from ..shading import Shown
 
 #: How exactly splats are held: as they are, or as antimatter15's viewer holds them.
 PRECISIONS = ("float", "half")
