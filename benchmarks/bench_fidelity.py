@@ -39,7 +39,7 @@ from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.selection import Selection
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.render.rasterizer import Image, draw
-from sparklod_cli.render.settings import Look
+from sparklod_cli.render.settings import RasterSettings
 from sparklod_cli.render.shading import show
 from sparklod_cli.simulation.frames import view_of
 from sparklod_cli.support import jit
@@ -167,7 +167,7 @@ def cameras_around(center: NDArray[np.floating]) -> tuple[Camera, ...]:
 
 def picture(splats: Splats, camera: Camera) -> Image:
     """What a camera sees."""
-    return draw(show([(splats, np.eye(4))], camera), camera, Look())
+    return draw(show([(splats, np.eye(4))], camera), camera, RasterSettings())
 
 
 def difference(image: Image, full: Image) -> float:

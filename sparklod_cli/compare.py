@@ -18,9 +18,9 @@ from .lod.traversal import Matrix, Traversal
 from .model.splats import Splats
 from .render.backends import Draw
 from .render.rasterizer import Image
-from .render.settings import Look
+from .render.settings import RasterSettings
 from .render.shading import show
-from .simulation.frames import Viewer, view_of
+from .simulation.frames import LodSettings, view_of
 from .support.defaults import MAX_SH_DEGREE
 from .support.errors import SparklodError
 from .support.parallel import ordered_map
@@ -100,7 +100,7 @@ def parse_budgets(text: str) -> tuple[Budget, ...]:
 
 
 @dataclass(frozen=True)
-class How:
+class ComparisonSettings:
     """How the pictures are made.
 
     Attributes:
@@ -111,7 +111,7 @@ class How:
     """
 
     draw: Draw
-    look: Look
+    look: RasterSettings
     max_sh: int = MAX_SH_DEGREE
     width: float | None = None
 
@@ -133,7 +133,7 @@ class Comparison:
         SparklodError: a budget is less than one splat for each instance.
     """
 
-    def __init__(self, world: World, viewer: Viewer, budgets: Sequence[Budget], how: How) -> None:
+    def __init__(self, world: World, viewer: LodSettings, budgets: Sequence[Budget], how: ComparisonSettings) -> None:
         self._world, self._viewer, self._how = world, viewer, how
         of_trees = []
         for tree in world.trees:

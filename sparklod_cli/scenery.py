@@ -18,7 +18,7 @@ from .lod.traversal import CHUNK_NODES, Matrix
 from .model.scene import Scene
 from .model.selection import Selection, describe
 from .model.splats import Splats
-from .simulation.frames import Simulation, Viewer, view_of
+from .simulation.frames import LodSettings, Simulation, view_of
 from .support.defaults import PRECISIONS
 from .support.errors import InvalidSplatsError
 from .support.progress import Progress, silent
@@ -165,7 +165,7 @@ class Scenery:
 
 def read_scenery(
     placements: Sequence[Placement],
-    viewer: Viewer | None,
+    viewer: LodSettings | None,
     *,
     through: str | None = None,
     blend: float | None = None,

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..model.splats import Splats
-from ..render.settings import Look
+from ..render.settings import RasterSettings
 from ..support.defaults import FARTHEST
 from ..support.errors import InvalidSplatsError
 from .camera import Camera, Matrix
@@ -191,7 +191,7 @@ def some(cameras: Sequence[Item]) -> Sequence[Item]:
     return cameras[:: -(-len(cameras) // CAMERAS)]
 
 
-def with_reach(look: Look, cameras: Sequence[Camera], scene: Balls) -> Look:
+def with_reach(look: RasterSettings, cameras: Sequence[Camera], scene: Balls) -> RasterSettings:
     """A look that leaves nothing out of a scene, however small or large it is, because of near and far."""
     near, far = look.near, look.far
     sample = scene.center[:: max(len(scene.center) // SAMPLE, 1)]

@@ -15,7 +15,7 @@ from .options import is_given, refuse
 if TYPE_CHECKING:
     from ..cameras.framing import Balls
     from ..cameras.path import CameraPath
-    from ..render.settings import Look
+    from ..render.settings import RasterSettings
 
 #: Sources of cameras that are chosen for the scene, where nobody says how far away they are.
 CHOSEN = ("orbit", "dolly")
@@ -48,8 +48,8 @@ def is_free(settings: Mapping[str, Any]) -> bool:
 
 
 def framed(
-    ctx: click.Context, settings: Mapping[str, Any], look: Look, scene: Callable[[], Balls]
-) -> tuple[CameraPath, Look]:
+    ctx: click.Context, settings: Mapping[str, Any], look: RasterSettings, scene: Callable[[], Balls]
+) -> tuple[CameraPath, RasterSettings]:
     """The cameras, and a look in whose reach they have the scene where they were chosen for it.
 
     Args:

@@ -20,8 +20,8 @@ from .paths import OutputPath
 
 if TYPE_CHECKING:
     from ..cameras.path import CameraPath
-    from ..compare import Budget, Comparison, How, OfBudget
-    from ..simulation.frames import Viewer
+    from ..compare import Budget, Comparison, ComparisonSettings, OfBudget
+    from ..simulation.frames import LodSettings
     from ..tables.assertions import Assertion
     from ..tables.columns import Row
     from ..world import World
@@ -149,7 +149,14 @@ def _assertion(text: str, budgets: Sequence[Budget]) -> tuple[int | None, Assert
 
 
 def run(
-    console: Console, world: World, viewer: Viewer, path: CameraPath, how: How, wanted: Wanted, *, threads: int
+    console: Console,
+    world: World,
+    viewer: LodSettings,
+    path: CameraPath,
+    how: ComparisonSettings,
+    wanted: Wanted,
+    *,
+    threads: int,
 ) -> int:
     """Compares, writes the table and the charts, and says what they come to; the exit status.
 

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from ..cameras.path import CameraPath
     from ..images.pixels import Color, Pixels
     from ..render.color_scales import Coloring
-    from ..render.renderer import Drawn, Painter
+    from ..render.renderer import Drawn, Renderer
     from .render_output import Output
 
 
@@ -87,8 +87,8 @@ class Job:
 
     console: Console
     wanted: Wanted
-    painter: Painter
-    other: Painter | None
+    painter: Renderer
+    other: Renderer | None
     path: CameraPath
     captions: list[str]
     start: float
@@ -170,7 +170,7 @@ class Job:
             return codes.difference_bar(self._gain)
         return self.painter.scale.bar if self.painter.scale is not None else None
 
-    def _fitting_gain(self, other: Painter) -> float:
+    def _fitting_gain(self, other: Renderer) -> float:
         """What suits the first picture, the last and the one in the middle; the same for all."""
         cameras, background = self.path.cameras, self.wanted.background
         some = sorted({0, len(cameras) // 2, len(cameras) - 1}, reverse=True)

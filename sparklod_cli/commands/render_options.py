@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..render.settings import PROFILES, SORTS, Look
+from ..render.settings import PROFILES, SORTS, RasterSettings
 from ..support import defaults
 from ..support.defaults import OF_PIXELS
 from .options import Command, Real, is_given, refuse
 
 if TYPE_CHECKING:
     from ..images.pixels import Color
-    from ..render.renderer import Manner
+    from ..render.renderer import RenderSettings
 
 COLORS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "transparent": None}
 
@@ -60,7 +60,7 @@ class Background(click.ParamType):
 
 def look_options(command: Command) -> Command:
     """How pictures look."""
-    look = Look()
+    look = RasterSettings()
     for option in reversed(
         (
             click.option(
@@ -162,9 +162,9 @@ def look_options(command: Command) -> Command:
     return command
 
 
-def manner_from(ctx: click.Context, settings: Mapping[str, Any]) -> Manner:
+def manner_from(ctx: click.Context, settings: Mapping[str, Any]) -> RenderSettings:
     """The manner that the options of `look_options` ask for."""
-    from ..render.renderer import Manner
+    from ..render.renderer import RenderSettings
 
     style, by = settings["style"], settings["color_by"]
     if not settings["near"] < settings["far"]:
@@ -186,8 +186,8 @@ def manner_from(ctx: click.Context, settings: Mapping[str, Any]) -> Manner:
     }
     if options and settings["backend"] != "osmesa":
         raise click.UsageError("--sorting and --sort-throttle only mean something with --backend osmesa")
-    return Manner(
-        look=Look(settings["near"], settings["far"], settings["profile"], settings["sort"]),
+    return RenderSettings(
+        look=RasterSettings(settings["near"], settings["far"], settings["profile"], settings["sort"]),
         style=style,
         backend=settings["backend"],
         color_by=by,

@@ -14,7 +14,7 @@ from .options import Command, Quantity, Real, is_given, refuse
 from .paths import InputPath, file_of
 
 if TYPE_CHECKING:
-    from ..simulation.frames import Viewer
+    from ..simulation.frames import LodSettings
     from ..world import Placement
 
 #: Options of the cones, which --outside-foveate leaves no room for.
@@ -187,10 +187,10 @@ def _streaming_options(command: Command) -> Command:
     return command
 
 
-def viewer_from(ctx: click.Context, settings: Mapping[str, Any]) -> Viewer:
+def viewer_from(ctx: click.Context, settings: Mapping[str, Any]) -> LodSettings:
     """The viewer that the options of `viewer_options`, or of `cut_options`, ask for."""
     from ..lod.traversal import Cones, Frustum
-    from ..simulation.frames import Viewer
+    from ..simulation.frames import LodSettings
     from ..simulation.streaming import Network
 
     behind, outside = settings["behind_foveate"], settings["outside_foveate"]
@@ -218,7 +218,7 @@ def viewer_from(ctx: click.Context, settings: Mapping[str, Any]) -> Viewer:
     budget = defaults.PRESETS[settings["preset"]] if settings["budget"] is None else settings["budget"]
     if not 0 < budget * settings["lod_splat_scale"] < BUDGETS:
         raise click.UsageError("the budget is to be more than 0, and no more than people can count")
-    return Viewer(
+    return LodSettings(
         budget=max(1, int(budget * settings["lod_splat_scale"])),
         foveation=foveation,
         pixel_scale_limit=settings["pixel_scale_limit"],

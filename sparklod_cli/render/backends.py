@@ -9,8 +9,8 @@ from typing import Any, Protocol, cast
 from ..cameras.camera import Camera
 from ..support.errors import SparklodError
 from .rasterizer import Image
-from .settings import Look
-from .shading import Shown
+from .settings import RasterSettings
+from .shading import ShadedSplats
 
 
 class BackendError(SparklodError):
@@ -27,7 +27,7 @@ class Draw(Protocol):
         BackendError: it cannot draw here.
     """
 
-    def __call__(self, shown: Shown, camera: Camera, look: Look, **options: Any) -> Image: ...
+    def __call__(self, shown: ShadedSplats, camera: Camera, look: RasterSettings, **options: Any) -> Image: ...
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Backend:
     name: str
     module: str
 
-    def draw(self, shown: Shown, camera: Camera, look: Look, **options: Any) -> Image:
+    def draw(self, shown: ShadedSplats, camera: Camera, look: RasterSettings, **options: Any) -> Image:
         """What a camera sees; see `Draw`. Options are those of the module's function."""
         return cast(Draw, import_module(self.module, __package__).draw)(shown, camera, look, **options)
 

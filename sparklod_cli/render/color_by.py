@@ -28,7 +28,7 @@ from .color_scales import (
     whole_numbers,
     with_ends,
 )
-from .settings import Look
+from .settings import RasterSettings
 
 #: So many splats and cameras are looked at to find the ends of a scale.
 SAMPLE, CAMERAS = 1 << 18, 64
@@ -94,7 +94,7 @@ def scale_of_splats(by: str, scenery: Scenery, cameras: Sequence[Camera]) -> Sca
     return _opacities(values) if by == "lod-opacity" else _sizes(values)
 
 
-def scale_of_depth(scenery: Scenery, cameras: Sequence[Camera], look: Look) -> Scale:
+def scale_of_depth(scenery: Scenery, cameras: Sequence[Camera], look: RasterSettings) -> Scale:
     """From the nearest splats to the farthest that cameras see, but for a few."""
     pieces = scenery.candidates()
     every = max(1, sum(len(piece.index) for piece in pieces) // SAMPLE)

@@ -1,4 +1,4 @@
-"""Draws what a camera sees of a scenery: `Painter`."""
+"""Draws what a camera sees of a scenery: `Renderer`."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from ..scenery import Piece, Scenery
 from . import color_by, styles
 from .color_by import Scale
 from .rasterizer import Image
-from .settings import Look
-from .shading import Shown, show
+from .settings import RasterSettings
+from .shading import ShadedSplats, show
 
 #: Held while kernels run on all threads: they do not share them, and not every layer of threads survives their trying.
 _KERNELS = threading.Lock()
 
 
 @dataclass(frozen=True)
-class Manner:
+class RenderSettings:
     """How pictures are drawn.
 
     Attributes:
@@ -36,7 +36,7 @@ class Manner:
         options: of the backend.
     """
 
-    look: Look = field(default_factory=Look)
+    look: RasterSettings = field(default_factory=RasterSettings)
     style: str = "splats"
     backend: str = "numba"
     color_by: str | None = None
@@ -59,7 +59,7 @@ class Drawn:
     splats: int
 
 
-class Painter:
+class Renderer:
     """Draws pictures of a scenery, all in one manner, from several threads if they want to.
 
     Args:
@@ -74,7 +74,7 @@ class Painter:
         SparklodError: there is nothing to colour by.
     """
 
-    def __init__(self, scenery: Scenery, manner: Manner, cameras: Sequence[Camera]) -> None:
+    def __init__(self, scenery: Scenery, manner: RenderSettings, cameras: Sequence[Camera]) -> None:
         self.scenery, self.manner = scenery, manner
         self.scale = self._scale(cameras)
 
@@ -113,17 +113,17 @@ class Painter:
             image = self._image(shown, fine)
         return Drawn(averaged(image, self.manner.supersample), None, count)
 
-    def _show(self, pieces: Sequence[Piece], camera: Camera) -> Shown:
+    def _show(self, pieces: Sequence[Piece], camera: Camera) -> ShadedSplats:
         """Colours that are not the splats' own are not lit either."""
         degree = 3 if self.manner.color_by is None else 0
         return show([(piece.splats.with_max_sh(degree), piece.object_to_world) for piece in pieces], camera)
 
-    def _image(self, shown: Shown, camera: Camera) -> Image:
+    def _image(self, shown: ShadedSplats, camera: Camera) -> Image:
         look = self._look
         return styles.draw(self.manner.style, self.manner.backend, shown, camera, look, self.manner.options)
 
     @property
-    def _look(self) -> Look:
+    def _look(self) -> RasterSettings:
         """That of finer pictures: the largest radius counts in pixels of those that are shown."""
         look = self.manner.look
         return dataclasses.replace(look, max_radius=look.max_radius * self.manner.supersample)

@@ -1,4 +1,4 @@
-"""`Look`: how splats become pixels; the defaults are Spark 2's."""
+"""`RasterSettings`: how splats become pixels; the defaults are Spark 2's."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SORTS = ("radial", "z")
 
 
 @dataclass(frozen=True)
-class Look:
+class RasterSettings:
     """How splats become pixels.
 
     Attributes:

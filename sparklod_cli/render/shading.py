@@ -1,4 +1,4 @@
-"""`Shown`: splats as one camera sees them, which is what backends draw."""
+"""`ShadedSplats`: splats as one camera sees them, which is what backends draw."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .kernels.shade import add_sh
 
 
 @dataclass(frozen=True)
-class Shown:
+class ShadedSplats:
     """N splats in the world, in the colours that a camera sees.
 
     Attributes:
@@ -36,18 +36,18 @@ class Shown:
         return len(self.center)
 
 
-def show(parts: Sequence[tuple[Splats, Matrix]], camera: Camera) -> Shown:
+def show(parts: Sequence[tuple[Splats, Matrix]], camera: Camera) -> ShadedSplats:
     """Splats with their places, (4, 4) object to world, as a camera sees them.
 
     Spherical harmonics are those of the direction from the camera to a splat's centre, in the space of its object.
     """
     shown = [_show(splats, matrix, camera) for splats, matrix in parts]
-    return Shown(
-        **{field.name: np.concatenate([getattr(part, field.name) for part in shown]) for field in fields(Shown)}
+    return ShadedSplats(
+        **{field.name: np.concatenate([getattr(part, field.name) for part in shown]) for field in fields(ShadedSplats)}
     )
 
 
-def _show(splats: Splats, matrix: Matrix, camera: Camera) -> Shown:
+def _show(splats: Splats, matrix: Matrix, camera: Camera) -> ShadedSplats:
     rgb = splats.rgb.copy()
     if splats.sh.shape[1]:
         eye = np.linalg.solve(matrix, np.append(camera.position, 1))[:3].astype(np.float32)
@@ -55,4 +55,4 @@ def _show(splats: Splats, matrix: Matrix, camera: Camera) -> Shown:
     np.maximum(rgb, 0, out=rgb)
     if not np.array_equal(matrix, np.eye(4)):
         splats = placed(splats, matrix)
-    return Shown(splats.center, splats.scale, splats.quat_xyzw, lod_opacity(splats.opacity), rgb)
+    return ShadedSplats(splats.center, splats.scale, splats.quat_xyzw, lod_opacity(splats.opacity), rgb)

@@ -14,8 +14,8 @@ from . import rasterizer
 from .backends import BACKENDS
 from .kernels import bands
 from .rasterizer import Image
-from .settings import CLIP, MIN_ALPHA, Look
-from .shading import Shown
+from .settings import CLIP, MIN_ALPHA, RasterSettings
+from .shading import ShadedSplats
 
 #: How opaque a billboard is.
 BILLBOARD_ALPHA = 0.5
@@ -43,7 +43,12 @@ class OnScreen:
 
 
 def draw(
-    style: str, backend: str, shown: Shown, camera: Camera, look: Look, options: Mapping[str, Any] | None = None
+    style: str,
+    backend: str,
+    shown: ShadedSplats,
+    camera: Camera,
+    look: RasterSettings,
+    options: Mapping[str, Any] | None = None,
 ) -> Image:
     """What a camera sees; the image is that of `rasterizer.draw`.
 
@@ -88,7 +93,7 @@ def draw(
     return image
 
 
-def on_screen(shown: Shown, camera: Camera, look: Look) -> OnScreen:
+def on_screen(shown: ShadedSplats, camera: Camera, look: RasterSettings) -> OnScreen:
     """The splats between near and far whose centres are in the picture, or as far beside it as splats are drawn."""
     local = (shown.center - camera.position.astype(np.float32)) @ camera.camera_to_world[:3, :3].astype(np.float32)
     depth = -local[:, 2]
@@ -106,7 +111,7 @@ def on_screen(shown: Shown, camera: Camera, look: Look) -> OnScreen:
     )
 
 
-def overdraw(shown: Shown, camera: Camera, look: Look) -> NDArray[np.float32]:
+def overdraw(shown: ShadedSplats, camera: Camera, look: RasterSettings) -> NDArray[np.float32]:
     """(height, width) how many splats are blended into each pixel, those too that others hide.
 
     Splats are those that the backend numba draws.

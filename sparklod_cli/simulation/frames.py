@@ -26,7 +26,7 @@ MOST_INSTANCES = 65_535
 
 
 @dataclass(frozen=True)
-class Viewer:
+class LodSettings:
     """How a viewer is set.
 
     Attributes:
@@ -98,7 +98,7 @@ class Simulation:
         ValueError: the budget, or the cache, is too small for even the roots; or there are too many instances.
     """
 
-    def __init__(self, world: World, viewer: Viewer, *, by_instance: bool = False) -> None:
+    def __init__(self, world: World, viewer: LodSettings, *, by_instance: bool = False) -> None:
         instances = world.foveated(viewer.foveation)
         if viewer.budget < len(instances):
             budget = count_of(viewer.budget, "splat")

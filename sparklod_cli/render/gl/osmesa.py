@@ -17,8 +17,8 @@ import numpy as np
 from ...cameras.camera import Camera
 from ..backends import BackendError
 from ..rasterizer import Image, world_to_camera
-from ..settings import Look
-from ..shading import Shown
+from ..settings import RasterSettings
+from ..shading import ShadedSplats
 from . import context as contexts
 from .order import Order
 from .shaders import sources
@@ -31,9 +31,9 @@ _T = TypeVar("_T")
 
 
 def draw(
-    shown: Shown,
+    shown: ShadedSplats,
     camera: Camera,
-    look: Look,
+    look: RasterSettings,
     *,
     precision: str = "float",
     sorting: str = "exact",
@@ -82,7 +82,7 @@ class Renderer:
         self._array: Any = None
         on_gl_thread(self._compile, precision)
 
-    def draw(self, shown: Shown, camera: Camera, look: Look) -> Image:
+    def draw(self, shown: ShadedSplats, camera: Camera, look: RasterSettings) -> Image:
         """See the function `draw`."""
         return on_gl_thread(self._draw, shown, camera, look)
 
@@ -91,7 +91,7 @@ class Renderer:
         self._program = self._context.program(**sources(precision))
         self._corners = self._context.buffer(CORNERS.tobytes())
 
-    def _draw(self, shown: Shown, camera: Camera, look: Look) -> Image:
+    def _draw(self, shown: ShadedSplats, camera: Camera, look: RasterSettings) -> Image:
         self._context.gc()
         self._hold(shown)
         self._sort(shown, camera, look)
@@ -109,7 +109,7 @@ class Renderer:
         self._check("drawing")
         return image
 
-    def _hold(self, shown: Shown) -> None:
+    def _hold(self, shown: ShadedSplats) -> None:
         changed, moved = self._data.update(shown)
         if moved:
             self._order.forget()
@@ -125,7 +125,7 @@ class Renderer:
         self._texture.write(self._data.texture)
         self.uploads += 1
 
-    def _sort(self, shown: Shown, camera: Camera, look: Look) -> None:
+    def _sort(self, shown: ShadedSplats, camera: Camera, look: RasterSettings) -> None:
         indices = self._order.update(shown, camera, look)
         if indices is None:
             return
@@ -148,7 +148,7 @@ class Renderer:
         self._check(f"a picture of {width} x {height} pixels")
         self._size = width, height
 
-    def _tell(self, camera: Camera, look: Look) -> None:
+    def _tell(self, camera: Camera, look: RasterSettings) -> None:
         uniforms = {
             "world_to_camera": tuple(world_to_camera(camera).T.ravel()),
             "focal": camera.focal,

@@ -3,8 +3,8 @@
 What it does otherwise than the backend `numba`:
 
 - Opacity ends at 1: a merged splat of linear opacity A > 1 is drawn as an opaque one that is A ** (1 / 3) larger, which
-  has the same sum over its volume. `Look.profile` means nothing here.
-- Splats are sorted by depth; `Look.sort` means nothing here.
+  has the same sum over its volume. `RasterSettings.profile` means nothing here.
+- Splats are sorted by depth; `RasterSettings.sort` means nothing here.
 - Colours end at 1 before they are blended, and have 8 bits, as has the picture. Alpha is worked out from a picture on
   black and one on white.
 - Quaternions have 8 bits, and a splat's centre on the picture may be off by 1/16 of a pixel.
@@ -27,8 +27,8 @@ from ...cameras.camera import Camera
 from ...model.gaussian import linear_opacity
 from ...model.sh import SH_C0
 from ..rasterizer import Image
-from ..settings import BLUR, CLIP, MAX_STD_DEV, MIN_ALPHA, Look
-from ..shading import Shown
+from ..settings import BLUR, CLIP, MAX_STD_DEV, MIN_ALPHA, RasterSettings
+from ..shading import ShadedSplats
 from .child import COLUMNS, PIECE, TILE, Array
 from .process import Child
 
@@ -46,7 +46,7 @@ MOST_SCALE = 2.0**12
 ASKEW = 1e-5
 
 
-def draw(shown: Shown, camera: Camera, look: Look) -> Image:
+def draw(shown: ShadedSplats, camera: Camera, look: RasterSettings) -> Image:
     """What a camera sees: (height, width, 4) float32, red, green, blue, multiplied by alpha, and alpha; 0..1.
 
     Raises:
@@ -67,7 +67,7 @@ def draw(shown: Shown, camera: Camera, look: Look) -> Image:
 
 
 def pieces(
-    shown: Shown, camera: Camera, look: Look, most_entries: int
+    shown: ShadedSplats, camera: Camera, look: RasterSettings, most_entries: int
 ) -> Iterator[tuple[tuple[int, int], dict[str, Any], Array]]:
     """What Open3D is asked to draw: left and top of a piece, the request, and the splats that touch it.
 
