@@ -15,17 +15,17 @@ import click
 import numpy as np
 
 from ..io import check_writable, write_stdout, write_whole
-from ..simulation.summary import Lookout
 from ..support.progress import Progress, silent
+from ..tables.summary import Lookout
 from .console import Console, for_screen, is_terminal
 from .traverse_text import lines
 
 if TYPE_CHECKING:
     from ..cameras.path import CameraPath
     from ..simulation.frames import Frame, Simulation
-    from ..simulation.summary import Summary
     from ..tables.assertions import Assertion
     from ..tables.columns import Column, Row
+    from ..tables.summary import Summary
 
 #: Nodes of a row of Spark's index texture.
 ROW = 16_384
@@ -115,8 +115,8 @@ class Job:
 
     def report(self) -> int:
         """Says what is asked for; the exit status."""
-        from ..simulation.summary import summarize
         from ..tables.assertions import check
+        from ..tables.summary import summarize
 
         wanted = self.wanted
         outcomes = check(wanted.asserts, self.rows)
@@ -156,7 +156,7 @@ class Job:
         """The files of --indices-out, all that will be written."""
         if self.wanted.indices is not None:
             for number in self.path.numbers:
-                yield from _index_files(self.wanted.indices, number, len(self.simulation.world.instances))
+                yield from _index_files(self.wanted.indices, number, len(self.simulation.scenes.instances))
 
     def _keep(self, frame: Frame) -> None:
         """Keeps what may be drawn in the end: the frames that are most worth looking at until now, and the first."""
@@ -176,24 +176,19 @@ class Job:
     def _plot(self, target: Path) -> None:
         """Draws the charts, and the path over what the frame that is most worth looking at had: its cut, as drawn."""
         from ..figures.traversal_chart import Scenery, plot
-        from ..model.splats import Splats
 
-        world = self.simulation.world
+        scenes = self.simulation.scenes
         worth = [self._kept[what] for what in (*(moment.what for moment in self._lookout.moments()), "first")]
         frame = next((each for each in worth if len(each.cut)), worth[0])  # before anything arrived, nothing is drawn
         at = self.path.numbers.index(frame.number)
-        nodes = frame.cut.indices()
-        splats = [world.splats_of(number, part) for number, part in enumerate(nodes)]
-        level = [world.trees[place.tree].level[part] for place, part in zip(world.instances, nodes, strict=True)]
-        degree = min(part.sh_degree for part in splats)
+        cut = scenes.cut_of(frame.cut)
         scenery = Scenery(
             self.path.cameras,
-            Splats.concat([part.with_max_sh(degree) for part in splats]),
-            np.concatenate(level),
+            cut.splats,
+            np.concatenate([part.depth for part in cut.parts]),
             at,
         )
-        title = ", ".join(dict.fromkeys(tree.file.name for tree in world.trees))
-        drawn = plot(self.rows, title, scenery)
+        drawn = plot(self.rows, scenes.title, scenery)
         if drawn.note:
             self.console.say(f"{target}: {drawn.note}")
         write_whole(target, [drawn.png], overwrite=self.wanted.overwrite)

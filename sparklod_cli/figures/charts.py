@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..simulation.summary import Moment, coarseness, look_at
 from ..support.errors import SparklodError
 from ..tables.columns import Row
 from ..tables.statistics import numbers
+from ..tables.summary import Moment, coarseness, look_at
 from .labels import BACKGROUND, FAINT, INK, LINE
 
 #: Pixels an inch, and in them the width of all charts together and the height of a row of two.

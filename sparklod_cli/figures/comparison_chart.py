@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from ..compare import Budget, rows_of
 from ..tables.columns import Row
+from ..tables.comparison import rows_by_budget
 from ..tables.statistics import numbers
 from .charts import BLUE, DPI, GREEN, INDIGO, ORANGE, PINK, WIDTH, YELLOW, Frames, load_matplotlib, styled
 from .labels import BACKGROUND, FAINT, write_title
@@ -26,12 +26,12 @@ COLORS = (INDIGO, BLUE, GREEN, YELLOW, ORANGE, PINK)
 Axes = Any
 
 
-def plot(rows: Sequence[Row], budgets: Sequence[Budget], title: str) -> bytes:
+def plot(rows: Sequence[Row], budgets: Sequence[str], title: str) -> bytes:
     """The PNG of charts: PSNR and SSIM by budget and along the path.
 
     Args:
         rows: of `Comparison.run`.
-        budgets: that it was made with.
+        budgets: that it was made with, as they were given.
         title: the name of the scene.
 
     Raises:
@@ -39,7 +39,7 @@ def plot(rows: Sequence[Row], budgets: Sequence[Budget], title: str) -> bytes:
     """
     matplotlib = load_matplotlib()
     with styled(matplotlib):
-        charts = _charts(matplotlib, rows_of(rows, budgets), budgets)
+        charts = _charts(matplotlib, rows_by_budget(rows, len(budgets)), budgets)
     head = Image.new("RGB", (WIDTH, HEAD), BACKGROUND)
     frames = len(rows) // len(budgets)
     about = f"against full detail, {frames:,} frame{'s' * (frames > 1)}, on black and on white"
@@ -49,7 +49,7 @@ def plot(rows: Sequence[Row], budgets: Sequence[Budget], title: str) -> bytes:
     return out.getvalue()
 
 
-def _charts(matplotlib: ModuleType, groups: Sequence[Sequence[Row]], budgets: Sequence[Budget]) -> NDArray[np.uint8]:
+def _charts(matplotlib: ModuleType, groups: Sequence[Sequence[Row]], budgets: Sequence[str]) -> NDArray[np.uint8]:
     figure = matplotlib.figure.Figure((WIDTH / DPI, 2 * ROW / DPI), DPI, layout="constrained")
     canvas = matplotlib.backends.backend_agg.FigureCanvasAgg(figure)
     figure.get_layout_engine().set(rect=(0.012, 0.008, 0.976, 0.992), wspace=0.05, hspace=0.05)
@@ -85,12 +85,12 @@ def _by_budget(
 
 
 def _by_frame(
-    axes: Axes, groups: Sequence[Sequence[Row]], budgets: Sequence[Budget], name: str, title: str, unit: str
+    axes: Axes, groups: Sequence[Sequence[Row]], budgets: Sequence[str], name: str, title: str, unit: str
 ) -> None:
     """A line for each budget."""
     for at, (rows, budget) in enumerate(zip(groups, budgets, strict=True)):
         frames = Frames(rows)
-        axes.plot(frames.x, frames.column(name), color=COLORS[at % len(COLORS)], linewidth=1.4, label=budget.text)
+        axes.plot(frames.x, frames.column(name), color=COLORS[at % len(COLORS)], linewidth=1.4, label=budget)
         axes.xaxis.set_major_formatter(frames.tick)
         axes.set_xlim(frames.x[0], frames.x[-1])
     axes.set_title(title)

@@ -13,10 +13,10 @@ from PIL import Image, ImageDraw
 
 from ..cameras.camera import Camera
 from ..model.splats import Splats
-from ..simulation.summary import look_at
 from ..support.errors import SparklodError
 from ..tables.columns import Row
 from ..tables.statistics import numbers, totals
+from ..tables.summary import look_at
 from . import charts
 from .camera_path import picture_of_path
 from .labels import BACKGROUND, FAINT, write_title
