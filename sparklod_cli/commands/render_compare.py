@@ -15,7 +15,8 @@ import click
 
 from ..support import defaults
 from .console import Console, count_of, for_screen, is_terminal
-from .options import Command, Quantity, table_form
+from .options.common import Command, table_form
+from .options.types import Quantity
 from .paths import OutputPath
 
 if TYPE_CHECKING:
