@@ -26,8 +26,7 @@ from .support.errors import SparklodError
 from .support.parallel import ordered_map
 from .support.progress import Progress, silent
 from .support.units import parse_count
-from .tables.columns import COLUMNS as OF_SIMULATION
-from .tables.columns import Column, Row
+from .tables.columns import FRAME, Column, Row
 from .tables.statistics import numbers, statistic
 from .world import World
 
@@ -37,10 +36,8 @@ SHARE = re.compile(r"([0-9]{1,3}(?:\.[0-9]{1,9})?|\.[0-9]{1,9})\s*%")
 #: Threads that measure pictures; each has a few that wait, which take memory.
 MEASURERS = 4
 
-WHERE = ("frame", "time_s", "name")
-
 COLUMNS = (
-    *(column for column in OF_SIMULATION if column.name in WHERE),
+    *FRAME,
     Column("budget", int, "", "splats", "the most that may be drawn, all instances together"),
     Column("share", float, ".6g", "share", "budget over the splats of full detail"),
     Column("selected", int, "", "splats", "what is drawn; with `--continuous` more than the budget, as some fade"),
