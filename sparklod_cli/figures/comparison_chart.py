@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from ..compare import Budget, rows_of
+from ..compare import rows_of
+from ..lod.budget import Budget
 from ..tables.columns import Row
 from ..tables.statistics import numbers
 from .charts import BLUE, DPI, GREEN, INDIGO, ORANGE, PINK, WIDTH, YELLOW, Frames, load_matplotlib, styled
