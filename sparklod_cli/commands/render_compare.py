@@ -20,7 +20,8 @@ from .paths import OutputPath
 
 if TYPE_CHECKING:
     from ..cameras.path import CameraPath
-    from ..compare import Budget, Comparison, ComparisonSettings, OfBudget
+    from ..compare import Comparison, ComparisonSettings, OfBudget
+    from ..lod.budget import Budget
     from ..simulation.frames import LodSettings
     from ..tables.assertions import Assertion
     from ..tables.columns import Row
@@ -34,7 +35,7 @@ ABOUT = ":"
 
 
 def _budgets(text: str) -> Any:
-    from ..compare import parse_budgets
+    from ..lod.budget import parse_budgets
 
     return parse_budgets(text)
 

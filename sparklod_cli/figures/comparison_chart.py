@@ -24,7 +24,6 @@ COLORS = (INDIGO, BLUE, GREEN, YELLOW, ORANGE, PINK)
 
 Axes = Any
 
-
 #: The rows of a budget, one for each frame, and the budget as it was given ("5%").
 Series = tuple[str, Sequence[Row]]
 
