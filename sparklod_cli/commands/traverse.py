@@ -83,8 +83,9 @@ def traverse(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, *
 
     Coordinates are those of the files; --up, --world-transform and --camera-axes bring cameras into them.
     """
+    from ..simulation import columns
     from ..simulation.frames import Simulation
-    from ..tables import assertions, files
+    from ..tables import assertions
     from ..world import TRAVERSED, read_world
     from .traverse_job import Job, Wanted
 
@@ -93,13 +94,13 @@ def traverse(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, *
     keep_apart(ctx, files_meant(settings, placements))
     form = table_form("--output", settings["output"], settings["form"])
     try:
-        asserts = [assertions.parse(text) for text in settings["asserts"]]
+        asserts = [assertions.parse(text, columns.COLUMNS) for text in settings["asserts"]]
     except assertions.BadAssertionError as error:
         raise click.UsageError(f"--assert {error}") from None
     wanted = Wanted(
         output=settings["output"],
         form=form,
-        columns=files.select(timing=not settings["no_timing"]),
+        columns=columns.select(timing=not settings["no_timing"]),
         summary=settings["summary"],
         as_json=as_json,
         asserts=asserts,
