@@ -17,9 +17,8 @@ from sparklod_cli.cli import run
 from sparklod_cli.codecs.formats import FORMATS
 from sparklod_cli.errors import FormatError, OutputError, UnreadableError
 from sparklod_cli.io import check_writable, read_scene, write_stdout, write_whole
-
-from .conftest import FIXTURES
-from .test_whole import has_unnamed_files
+from tests.conftest import FIXTURES
+from tests.support.test_atomic import has_unnamed_files
 
 IS_ROOT = hasattr(os, "geteuid") and os.geteuid() == 0
 posix = pytest.mark.skipif(os.name != "posix", reason="POSIX only")

@@ -19,11 +19,10 @@ from sparklod_cli.io import read_scene
 from sparklod_cli.lod.traversal import CHUNK_NODES, Cones, Frustum
 from sparklod_cli.splats import COLUMNS
 from sparklod_cli.world import Placement, World, names_of, read_world
-
-from . import reference
-from .conftest import FIXTURES
-from .lod.forests import transform
-from .scenes import random_splats
+from tests.conftest import FIXTURES
+from tests.lod.forests import transform
+from tests.references import reference
+from tests.scenes import random_splats
 
 TREE, TOWN = FIXTURES / "golden" / "tree-v3.spz", FIXTURES / "traverse" / "town.spz"
 HAND = FIXTURES / "golden" / "hand-tree-v3.spz"

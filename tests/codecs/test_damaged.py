@@ -20,8 +20,7 @@ from fixtures import by_hand, by_hand_sog
 from sparklod_cli.codecs.formats import FORMATS, HEAD, Format, sniff
 from sparklod_cli.errors import FormatError
 from sparklod_cli.scene import Scene
-
-from ..conftest import FIXTURES
+from tests.conftest import FIXTURES
 
 #: Files to damage: small ones of every kind that is read.
 FILES = (

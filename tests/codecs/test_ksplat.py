@@ -12,8 +12,7 @@ import pytest
 from sparklod_cli.codecs import ksplat
 from sparklod_cli.errors import FormatError
 from sparklod_cli.scene import Scene
-
-from ..conftest import FIXTURES
+from tests.conftest import FIXTURES
 
 GOLDEN = [FIXTURES / "golden" / f"sh2-level{level}.ksplat" for level in range(3)]
 SECTION = 4096

@@ -18,8 +18,7 @@ from sparklod_cli.codecs import ply
 from sparklod_cli.errors import FormatError
 from sparklod_cli.scene import Scene
 from sparklod_cli.splats import COLUMNS
-
-from ..conftest import FIXTURES
+from tests.conftest import FIXTURES
 
 SH_C0 = 0.28209479177387814
 

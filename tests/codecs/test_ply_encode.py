@@ -14,8 +14,7 @@ from sparklod_cli.errors import FormatError
 from sparklod_cli.scene import Scene
 from sparklod_cli.splats import COLUMNS, Splats
 from sparklod_cli.tree import LodTree
-
-from ..scenes import random_splats, splat_columns
+from tests.scenes import random_splats, splat_columns
 
 SH_C0 = 0.28209479177387814
 

@@ -16,11 +16,10 @@ from sparklod_cli.io import read_scene
 from sparklod_cli.scene import Scene
 from sparklod_cli.splats import COLUMNS, Splats
 from sparklod_cli.tree import LodTree
-
-from ..conftest import FIXTURES
-from ..scenes import random_splats
-from .test_quantize import rotation_degrees
-from .writers import WRITERS, Precision, put
+from tests.codecs.test_quantize import rotation_degrees
+from tests.codecs.writers import WRITERS, Precision, put
+from tests.conftest import FIXTURES
+from tests.scenes import random_splats
 
 SCENES = ("sh0", "sh1", "sh2", "sh3", "flat", "needle", "coincident", "huge", "one")
 

@@ -22,10 +22,9 @@ from sparklod_cli.errors import FormatError
 from sparklod_cli.io import read_scene
 from sparklod_cli.scene import Scene
 from sparklod_cli.splats import COLUMNS
-
-from ..conftest import FIXTURES
-from ..scenes import random_splats
-from .writers import linear
+from tests.codecs.writers import linear
+from tests.conftest import FIXTURES
+from tests.scenes import random_splats
 
 SH_C0 = 0.28209479177387814
 FOLDER = FIXTURES / "golden" / "sh1-sog"

@@ -15,9 +15,8 @@ from sparklod_cli.io import read_scene
 from sparklod_cli.scene import Scene
 from sparklod_cli.splats import Splats
 from sparklod_cli.tree import LodTree
-
-from ..conftest import FIXTURES
-from ..scenes import random_splats
+from tests.conftest import FIXTURES
+from tests.scenes import random_splats
 
 GOLDEN = FIXTURES / "golden" / "sh0.splat"
 

@@ -18,9 +18,8 @@ from sparklod_cli.codecs import clamps, quantize, spz
 from sparklod_cli.errors import FormatError
 from sparklod_cli.scene import Scene
 from sparklod_cli.splats import COLUMNS, Splats
-
-from ..conftest import FIXTURES
-from ..scenes import random_splats
+from tests.conftest import FIXTURES
+from tests.scenes import random_splats
 
 GOLDEN = FIXTURES / "golden"
 

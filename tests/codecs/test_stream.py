@@ -18,8 +18,7 @@ from sparklod_cli.errors import FormatError
 from sparklod_cli.parallel import CHUNK, ordered_map
 from sparklod_cli.scene import Scene
 from sparklod_cli.splats import COLUMNS, Splats
-
-from ..scenes import random_splats
+from tests.scenes import random_splats
 
 COUNT = 12 * CHUNK
 

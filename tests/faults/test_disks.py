@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from .runs import DEMO, SMALL, TREE, WRITERS, mounted, said_one_error, shell, sparklod
+from tests.faults.runs import DEMO, SMALL, TREE, WRITERS, mounted, said_one_error, shell, sparklod
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="Windows has other file systems")
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from .runs import ENVIRONMENT, TREE, WRITERS, check_whole, command, sparklod
+from tests.faults.runs import ENVIRONMENT, TREE, WRITERS, check_whole, command, sparklod
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="there is no kill -9 on Windows")
 

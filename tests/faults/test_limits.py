@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from .runs import ENVIRONMENT, TREE, WRITERS, check_whole, said_one_error, shell
+from tests.faults.runs import ENVIRONMENT, TREE, WRITERS, check_whole, said_one_error, shell
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no ulimit")
 

@@ -13,8 +13,7 @@ from sparklod_cli.cli import run
 from sparklod_cli.errors import SparklodError
 from sparklod_cli.inspection.expectations import ExpectationError, Expectations, check, read, value_at
 from sparklod_cli.inspection.report import Report, Wanted, inspect
-
-from ..conftest import FIXTURES
+from tests.conftest import FIXTURES
 
 TREE, PLAIN = FIXTURES / "golden" / "hand-tree-v3.spz", FIXTURES / "golden" / "sh3-v3.spz"
 #: The tree has nine nodes, of which six are leaves, and two edges from the root to the deepest.

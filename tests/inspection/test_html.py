@@ -17,9 +17,8 @@ from sparklod_cli.inspection.html import Section, page
 from sparklod_cli.inspection.plot import Picture
 from sparklod_cli.inspection.report import Wanted, inspect
 from sparklod_cli.inspection.values import names_of
-
-from ..conftest import FIXTURES
-from ..scenes import random_splats
+from tests.conftest import FIXTURES
+from tests.scenes import random_splats
 
 VOID = {"meta", "img", "link", "br", "hr", "input"}
 

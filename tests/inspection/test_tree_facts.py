@@ -19,9 +19,8 @@ from sparklod_cli.lod import quick
 from sparklod_cli.lod.kernels.walk import find_parents, walk
 from sparklod_cli.splats import Splats
 from sparklod_cli.tree import LodTree
-
-from .. import reference
-from ..scenes import random_splats
+from tests.references import reference
+from tests.scenes import random_splats
 
 Links = list[tuple[int, int]]
 

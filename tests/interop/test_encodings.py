@@ -29,11 +29,10 @@ from sparklod_cli.scene import Scene
 from sparklod_cli.sh import SH_C0
 from sparklod_cli.splats import Splats
 from tests.conftest import real_scene
+from tests.interop import ties
+from tests.interop.spark import Spark
+from tests.interop.ties import Floats, Words, check, ext_codes, ext_steps, packed_codes, packed_steps
 from tests.scenes import random_splats
-
-from . import ties
-from .spark import Spark
-from .ties import Floats, Words, check, ext_codes, ext_steps, packed_codes, packed_steps
 
 WIDE = Encoding(rgb_min=-0.5, rgb_max=2, ln_scale_min=-8, ln_scale_max=1, sh1_max=0.5, sh2_max=2, sh3_max=0.25)
 PROGRAM = Path(__file__).with_name("spark_encode.mjs")

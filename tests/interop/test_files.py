@@ -13,10 +13,9 @@ from sparklod_cli.limits import METHODS
 from sparklod_cli.scene import Scene
 from sparklod_cli.splats import Splats
 from sparklod_cli.tree import MAX_CHILDREN
+from tests.interop import laws
+from tests.interop.spark import Spark
 from tests.scenes import random_splats
-
-from . import laws
-from .spark import Spark
 
 
 def baked(splats: Splats, method: str = "quick") -> Scene:

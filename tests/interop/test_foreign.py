@@ -17,10 +17,9 @@ from sparklod_cli.codecs import ply, splat
 from sparklod_cli.io import read_scene
 from sparklod_cli.splats import Splats
 from tests.conftest import FIXTURES, real_scene
-
-from .foreign import Foreign
-from .laws import EXT_DEGREES, HALF, TINY, Floats, degrees_between, held_by_ext_sh, within
-from .spark import Spark
+from tests.interop.foreign import Foreign
+from tests.interop.laws import EXT_DEGREES, HALF, TINY, Floats, degrees_between, held_by_ext_sh, within
+from tests.interop.spark import Spark
 
 #: Makes a file in a folder of what is in a PLY file, and says where.
 Writer = Callable[[Foreign, Path, Path], Path]

@@ -16,10 +16,9 @@ from sparklod_cli.render.look import SORTS, Look
 from sparklod_cli.scene import Scene
 from sparklod_cli.splats import Splats
 from tests.conftest import FIXTURES
+from tests.interop.page import Page
+from tests.interop.pictures import Difference, cameras_around, compare
 from tests.scenes import random_splats
-
-from .page import Page
-from .pictures import Difference, cameras_around, compare
 
 SIZE = 320, 180
 

@@ -12,9 +12,8 @@ from sparklod_cli.codecs import spz
 from sparklod_cli.io import read_scene
 from sparklod_cli.scene import Scene
 from tests.conftest import real_scene
-
-from . import laws
-from .spark import Spark
+from tests.interop import laws
+from tests.interop.spark import Spark
 
 
 @cache

@@ -17,11 +17,10 @@ from sparklod_cli.codecs import ext_splats, lod_tree
 from sparklod_cli.codecs.lod_tree import Nodes
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod.traversal import CHUNK_NODES, Cones, Cut, Forest, Instance, Traversal, View, pixel_limit, views_of
-from tests import reference
 from tests.conftest import FIXTURES, real_scene
+from tests.interop.spark import NODE, Spark
 from tests.lod.forests import rotation, transform
-
-from .spark import NODE, Spark
+from tests.references import reference
 
 SPARKS_CONES = Cones(90, 120, 0.4, 0.2)
 FOVEATIONS = (

@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 from sparklod_cli.codecs.lod_tree import Nodes
 from sparklod_cli.lod.traversal import Cones, Cut, Forest, Frustum, Instance, Traversal, View
 from sparklod_cli.tree import LodTree
-
-from .. import reference
+from tests.references import reference
 
 FOVEATIONS = (
     Cones(),

@@ -35,11 +35,10 @@ from sparklod_cli.selection import Selection
 from sparklod_cli.simulation.simulate import view_of
 from sparklod_cli.splats import Splats
 from sparklod_cli.tree import LodTree
-
-from .. import reference
-from ..conftest import real_scene
-from ..scenes import random_splats
-from .trees import check_threads, check_tree, children, coincident, hard_cases, parents
+from tests.conftest import real_scene
+from tests.lod.trees import check_threads, check_tree, children, coincident, hard_cases, parents
+from tests.references import reference
+from tests.scenes import random_splats
 
 GROWTHS = [1.05, 1.4, 2.0]
 

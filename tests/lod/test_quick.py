@@ -16,11 +16,10 @@ from sparklod_cli.io import read_scene
 from sparklod_cli.lod import quick
 from sparklod_cli.splats import Splats
 from sparklod_cli.tree import MAX_CHILDREN, LodTree
-
-from .. import reference
-from ..conftest import real_scene
-from ..scenes import random_splats
-from .trees import check_threads, check_tree, children, coincident, hard_cases, parents
+from tests.conftest import real_scene
+from tests.lod.trees import check_threads, check_tree, children, coincident, hard_cases, parents
+from tests.references import reference
+from tests.scenes import random_splats
 
 
 def as_merged(nodes: Splats, tree: LodTree) -> Splats:

@@ -24,9 +24,8 @@ from sparklod_cli.lod.traversal import (
     pixel_limit,
     views_of,
 )
-
-from .. import reference
-from .forests import Case, ancestors_drawn, cases, check, drawn, links, random_tree, rotation, transform, views
+from tests.lod.forests import Case, ancestors_drawn, cases, check, drawn, links, random_tree, rotation, transform, views
+from tests.references import reference
 
 #: Pixel scales at which nothing happens, something does, and everything does.
 LIMITS = (0.0, 0.02, 0.3)

@@ -20,9 +20,8 @@ from sparklod_cli.render.pose import look_at
 from sparklod_cli.render.rasterizer import Image, draw
 from sparklod_cli.render.shown import Shown, show
 from sparklod_cli.splats import Splats
-
-from .. import reference
-from ..scenes import random_splats
+from tests.references import reference
+from tests.scenes import random_splats
 
 #: Largest difference to the twin, which computes in float64, at pixels of which float32 can tell what they are in.
 MOST = 1e-3

@@ -15,9 +15,8 @@ import numpy as np
 import pytest
 
 from sparklod_cli.cli import run
-
-from ..conftest import FIXTURES
-from . import twin
+from tests.conftest import FIXTURES
+from tests.references import frames as twin
 
 TOWN, GOLDEN = FIXTURES / "traverse" / "town.spz", FIXTURES / "traverse" / "orbit.csv"
 README = (FIXTURES / "README.md").read_text()

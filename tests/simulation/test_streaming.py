@@ -14,8 +14,7 @@ from hypothesis import strategies as st
 
 from sparklod_cli.simulation.chunks import Chunks
 from sparklod_cli.simulation.streaming import Network, Stream
-
-from .test_chunks import NaiveCache, roots_first
+from tests.simulation.test_chunk_cache import NaiveCache, roots_first
 
 MB = 1_000_000
 #: Nearer than this to each other, rounding decides which of two events comes first.

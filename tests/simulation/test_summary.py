@@ -11,8 +11,7 @@ from sparklod_cli.commands.traverse_text import WIDTH, lines
 from sparklod_cli.simulation.assertions import check, parse
 from sparklod_cli.simulation.columns import COLUMNS
 from sparklod_cli.simulation.summary import IN_FRUSTUM, MOMENTS, QUANTITIES, summarize
-
-from .rows import flight, row
+from tests.tables.rows import flight, row
 
 
 def test_its_statistics_are_what_assertions_compare() -> None:
