@@ -21,7 +21,7 @@ from sparklod_cli.splats import COLUMNS
 from sparklod_cli.world import Placement, World, names_of, read_world
 from tests.conftest import FIXTURES
 from tests.lod.forests import transform
-from tests.references import reference
+from tests.references import gaussians
 from tests.scenes import random_splats
 
 TREE, TOWN = FIXTURES / "golden" / "tree-v3.spz", FIXTURES / "traverse" / "town.spz"
@@ -41,8 +41,8 @@ def test_placed_splats_have_the_covariance_of_the_matrix(matrix: np.ndarray) -> 
     splats = random_splats(200, sh_degree=1)
     there = placed(splats, matrix)
     axes = matrix[:3, :3]
-    expected = axes @ reference.covariance(splats.scale, splats.quat_xyzw) @ axes.T
-    found = reference.covariance(there.scale, there.quat_xyzw)
+    expected = axes @ gaussians.covariance(splats.scale, splats.quat_xyzw) @ axes.T
+    found = gaussians.covariance(there.scale, there.quat_xyzw)
     size = np.abs(expected).max(axis=(1, 2), keepdims=True)
     assert (np.abs(found - expected) <= 2e-6 * size).all()
     assert np.allclose(np.linalg.norm(there.quat_xyzw, axis=1), 1, atol=1e-6)

@@ -20,7 +20,7 @@ from sparklod_cli.lod.traversal import CHUNK_NODES, Cones, Cut, Forest, Instance
 from tests.conftest import FIXTURES, real_scene
 from tests.interop.spark import NODE, Spark
 from tests.lod.forests import rotation, transform
-from tests.references import reference
+from tests.references import budgeted_cuts
 
 SPARKS_CONES = Cones(90, 120, 0.4, 0.2)
 FOVEATIONS = (
@@ -102,7 +102,7 @@ class Both:
     def pixel_scale(self, instance: Instance, camera: np.ndarray) -> np.float32:
         """Of the root."""
         (view,) = views_of(self._forest, [instance], View(camera, FOV_Y, FOV_Y))
-        return reference.pixel_scale(self._forest.nodes[view["node_base"]], view)
+        return budgeted_cuts.pixel_scale(self._forest.nodes[view["node_base"]], view)
 
     def _instance(self, instance: Instance, camera: np.ndarray) -> dict[str, Any]:
         view_to_object = np.linalg.inv(instance.object_to_world) @ camera

@@ -14,7 +14,7 @@ from sparklod_cli.gaussian import lod_opacity
 from sparklod_cli.lod.traversal import Cones, Forest, Instance, Traversal, View
 from sparklod_cli.preview.continuous import BlendedCut, ContinuousCuts, faded, find_threshold, pixel_scales, shares
 from tests.lod.forests import Case, cases, random_tree, transform
-from tests.references import reference
+from tests.references import budgeted_cuts
 
 WIDTHS = (1.05, 1.25, 2.0)
 SPARK = Cones(90, 120, 0.4, 0.2)
@@ -184,7 +184,9 @@ def test_pixel_scales_are_those_of_the_traversal(case: Case) -> None:
     for view in views:
         some = nodes[view["node_base"] : view["node_base"] + 20]
         found = pixel_scales([np.ascontiguousarray(some[name]) for name in ("x", "y", "z", "size")], view)
-        expected = [reference.number_of(reference.bits_of(reference.pixel_scale(node, view))) for node in some]
+        expected = [
+            budgeted_cuts.number_of(budgeted_cuts.bits_of(budgeted_cuts.pixel_scale(node, view))) for node in some
+        ]
         np.testing.assert_array_equal(found, np.array([math.inf if math.isnan(e) else e for e in expected], np.float32))
 
 

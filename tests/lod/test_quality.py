@@ -37,7 +37,7 @@ from sparklod_cli.splats import Splats
 from sparklod_cli.tree import LodTree
 from tests.conftest import real_scene
 from tests.lod.trees import check_threads, check_tree, children, coincident, hard_cases, parents
-from tests.references import reference
+from tests.references import gaussians
 from tests.scenes import random_splats
 
 GROWTHS = [1.05, 1.4, 2.0]
@@ -132,7 +132,7 @@ def test_colours_are_means_of_the_leaves_by_what_they_cover(growth: float, sh_de
     nodes, tree = quality.build(random_splats(2_000, sh_degree=sh_degree, seed=8), growth)
     parent = parents(tree)
     color = np.concatenate([nodes.rgb, nodes.sh.reshape(len(nodes), -1)], axis=1).astype(np.float64)
-    weight = np.where(tree.is_leaf, nodes.opacity.astype(np.float64) * reference.ellipsoid_area(nodes.scale), 0)
+    weight = np.where(tree.is_leaf, nodes.opacity.astype(np.float64) * gaussians.ellipsoid_area(nodes.scale), 0)
     total = weight[:, None] * color
     for node in range(len(tree) - 1, 0, -1):
         weight[parent[node]] += weight[node]

@@ -18,7 +18,7 @@ from sparklod_cli.splats import Splats
 from sparklod_cli.tree import MAX_CHILDREN, LodTree
 from tests.conftest import real_scene
 from tests.lod.trees import check_threads, check_tree, children, coincident, hard_cases, parents
-from tests.references import reference
+from tests.references import gaussians, quick_trees
 from tests.scenes import random_splats
 
 
@@ -31,13 +31,13 @@ def as_merged(nodes: Splats, tree: LodTree) -> Splats:
 
 def check_merge(nodes: Splats, tree: LodTree, node: int) -> None:
     """One merged node of `as_merged` has the moments of its children."""
-    expected = reference.merge(nodes.take(children(tree, node)))
+    expected = gaussians.merge(nodes.take(children(tree, node)))
     extent = math.sqrt(np.abs(expected.covariance).max())
     size = np.abs(expected.center).max()
     assert np.allclose(nodes.center[node], expected.center, atol=1e-5 * extent + 1e-6 * size)
-    got = reference.covariance(nodes.scale[node], nodes.quat_xyzw[node])
+    got = gaussians.covariance(nodes.scale[node], nodes.quat_xyzw[node])
     assert np.allclose(got, expected.covariance, atol=1e-5 * extent**2)
-    opacity = reference.opacity_of(expected.weight, nodes.scale[node])
+    opacity = gaussians.opacity_of(expected.weight, nodes.scale[node])
     assert nodes.opacity[node] == pytest.approx(opacity, rel=1e-4)
     assert np.allclose(nodes.rgb[node], expected.rgb, atol=1e-5)
     assert np.allclose(nodes.sh[node], expected.sh, atol=1e-5)
@@ -54,7 +54,7 @@ def test_every_merged_node_has_the_moments_of_its_children(base: float, sh_degre
         check_merge(merged, tree, node)
 
 
-def shape_of(tree: LodTree, leaf_of: dict[int, int], node: int = 0) -> reference.Tree:
+def shape_of(tree: LodTree, leaf_of: dict[int, int], node: int = 0) -> quick_trees.Tree:
     if node in leaf_of:
         return (leaf_of[node],)
     part = children(tree, node)
@@ -80,11 +80,11 @@ def test_the_tree_is_the_one_that_the_method_describes(count: int, base: float, 
         below[node] = frozenset({leaf_of[node]}) if node in leaf_of else frozenset().union(*parts)
     center_of = {leaves: nodes.center[node] for node, leaves in reversed(below.items())}
 
-    def leaves_of(shape: reference.Tree) -> frozenset[int]:
+    def leaves_of(shape: quick_trees.Tree) -> frozenset[int]:
         return frozenset(shape) if isinstance(shape[0], int) else frozenset().union(*map(leaves_of, shape))
 
-    levels = [reference.natural_level(scale, base) for scale in splats.scale]
-    expected = reference.quick_tree(
+    levels = [quick_trees.natural_level(scale, base) for scale in splats.scale]
+    expected = quick_trees.quick_tree(
         {(i,): splats.center[i] for i in range(count)},
         levels,
         base,

@@ -25,7 +25,7 @@ from sparklod_cli.lod.traversal import (
     views_of,
 )
 from tests.lod.forests import Case, ancestors_drawn, cases, check, drawn, links, random_tree, rotation, transform, views
-from tests.references import reference
+from tests.references import budgeted_cuts
 
 #: Pixel scales at which nothing happens, something does, and everything does.
 LIMITS = (0.0, 0.02, 0.3)
@@ -44,7 +44,7 @@ def test_what_is_no_larger_than_the_limit_is_not_divided(case: Case, data: st.Da
     sight = views_of(found.forest, case.instances, case.view)
     number = data.draw(st.integers(0, len(sight) - 1))
     node = data.draw(st.integers(0, len(case.trees[case.instances[number].tree].size) - 1))
-    smallest = float(reference.pixel_scale(found.forest.nodes[sight[number]["node_base"] + node], sight[number]))
+    smallest = float(budgeted_cuts.pixel_scale(found.forest.nodes[sight[number]["node_base"] + node], sight[number]))
     case = dataclasses.replace(case, smallest=smallest)
     check(case, case.find(found))
 
@@ -215,7 +215,7 @@ def test_pixel_scales_are_those_of_the_world(seed: int, foveation: Cones | Frust
         seen = (abs(x) <= np.tan(view.fov_x / 2) * -z) & (abs(y) <= np.tan(view.fov_y / 2) * -z)
         weight = np.where(z < 0, np.where(seen, 1, foveation.outside), foveation.behind)
     expected = scale * tree.size / distance * placed.lod_scale * weight
-    got = np.array([reference.pixel_scale(node, sight) for node in forest.nodes])
+    got = np.array([budgeted_cuts.pixel_scale(node, sight) for node in forest.nodes])
     # One in a thousand lies on an edge, where it falls to the other side.
     assert np.count_nonzero(~np.isclose(got, expected, rtol=1e-4)) <= 1
 

@@ -15,7 +15,7 @@ from sparklod_cli.gaussian import linear_opacity, lod_opacity, normalized_quat
 from sparklod_cli.lod.kernels.geometry import ellipsoid_area
 from sparklod_cli.sh import COEFFICIENTS, degree_of
 from sparklod_cli.splats import COLUMNS, Splats
-from tests.references import reference
+from tests.references import gaussians
 from tests.scenes import random_splats
 
 
@@ -96,7 +96,7 @@ def test_quaternions_of_any_length_become_units(quat: np.ndarray, length: float)
 
 @given(arrays(np.float32, (3,), elements=st.floats(np.float32(1e-10), np.float32(1e10), width=32)))
 def test_area_is_thomsens(scale: np.ndarray) -> None:
-    assert ellipsoid_area(*scale) == pytest.approx(reference.ellipsoid_area(scale), rel=1e-5)
+    assert ellipsoid_area(*scale) == pytest.approx(gaussians.ellipsoid_area(scale), rel=1e-5)
 
 
 def test_area_of_a_sphere_and_of_flat_and_needle_like_splats() -> None:

@@ -17,7 +17,7 @@ from sparklod_cli.lod.kernels.pairs import (
     WEIGHT,
     WIDTH,
 )
-from tests.references import reference
+from tests.references import gaussians
 
 #: Where the elements of a covariance are in a row of state.
 ELEMENTS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
@@ -33,7 +33,7 @@ def row(
     filled[COLOR : COLOR + 3] = color
     filled[LOG_DET] = np.linalg.slogdet(covariance)[1]
     filled[DENSITY] = density
-    filled[COVERED] = filled[WEIGHT] = density * reference.ellipsoid_area(np.sqrt(np.linalg.eigvalsh(covariance)))
+    filled[COVERED] = filled[WEIGHT] = density * gaussians.ellipsoid_area(np.sqrt(np.linalg.eigvalsh(covariance)))
     return filled
 
 

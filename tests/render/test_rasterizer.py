@@ -20,7 +20,7 @@ from sparklod_cli.render.pose import look_at
 from sparklod_cli.render.rasterizer import Image, draw
 from sparklod_cli.render.shown import Shown, show
 from sparklod_cli.splats import Splats
-from tests.references import reference
+from tests.references import spark_pictures
 from tests.scenes import random_splats
 
 #: Largest difference to the twin, which computes in float64, at pixels of which float32 can tell what they are in.
@@ -79,7 +79,7 @@ def check(of: Shown, camera: Camera, look: Look | None = None, *, most: float = 
         unsure: the share of pixels that may be left out, because a splat ends there.
     """
     look = look or Look()
-    image, twin = draw(of, camera, look), reference.picture(of, camera, look)
+    image, twin = draw(of, camera, look), spark_pictures.picture(of, camera, look)
     assert image.shape == (camera.height, camera.width, 4) and image.dtype == np.float32
     assert twin.unsure.mean() <= unsure
     difference = (image - twin.rgba)[~twin.unsure]
@@ -182,7 +182,7 @@ def test_spherical_harmonics(sh_degree: int) -> None:
     splats = random_splats(200, sh_degree=sh_degree)
     eye = (1.0, -2.0, 3.0)
     seen = show([(splats, np.eye(4))], camera_at(eye))
-    np.testing.assert_allclose(seen.rgb, reference.seen_rgb(splats, np.array(eye)), atol=2e-6)
+    np.testing.assert_allclose(seen.rgb, spark_pictures.seen_rgb(splats, np.array(eye)), atol=2e-6)
     check(seen, camera_at(eye))
 
 

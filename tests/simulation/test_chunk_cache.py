@@ -10,44 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sparklod_cli.simulation.chunks import ChunkCache, Chunks, by_priority
-
-
-class NaiveCache:
-    """Of each chunk that is here, when it was last used, in which place of the list; the smallest goes first."""
-
-    def __init__(self, capacity: int | None) -> None:
-        self.capacity = math.inf if capacity is None else capacity
-        self.wanted: list[int] = []
-        self.used: dict[int, tuple[int, float]] = {}
-        self.clock = 0
-
-    def want(self, wanted: list[int]) -> None:
-        self.wanted = wanted
-        self.use()
-
-    def arrive(self, chunk: int) -> int | None:
-        self.used[chunk] = (self.clock + 1, -math.inf)
-        self.use()
-        if len(self.used) <= self.capacity:
-            return None
-        evicted = min(self.used, key=lambda each: self.used[each])
-        del self.used[evicted]
-        return evicted
-
-    def use(self) -> None:
-        self.clock += 1
-        for place, chunk in enumerate(self.wanted):
-            if chunk in self.used:
-                self.used[chunk] = (self.clock, -place)
-
-
-def roots_first(chunks: Chunks, wanted: list[int]) -> list[int]:
-    """What a list of wanted chunks comes to."""
-    result: list[int] = []
-    for chunk in [each for each in wanted if each in chunks.roots] + chunks.roots + wanted:
-        if chunk not in result:
-            result.append(chunk)
-    return result
+from tests.references.streaming import NaiveCache, roots_first
 
 
 def here(cache: ChunkCache) -> set[int]:

@@ -1,114 +1,25 @@
-"""What frames tell of cuts: laws over their rows, and one frame worked out by hand."""
+"""What frames tell of cuts: laws over their rows."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from sparklod_cli.lod.traversal import Cones, Forest, Frustum, Instance
-from sparklod_cli.render.camera import Camera
 from sparklod_cli.render.camera_path import CameraPath
-from sparklod_cli.render.pose import look_at
-from sparklod_cli.scene import Scene
 from sparklod_cli.simulation.columns import COLUMNS, Row
 from sparklod_cli.simulation.simulate import Simulation, Viewer
-from sparklod_cli.simulation.streaming import Network
-from sparklod_cli.world import TOTAL, Placement, Tree, World, read_world
-from tests.conftest import FIXTURES
-from tests.lod.forests import random_tree, transform
-from tests.references import frames as twin
-from tests.scenes import random_splats
-
-TOWN, HAND = FIXTURES / "traverse" / "town.spz", FIXTURES / "golden" / "hand-tree-v3.spz"
-SPARK = Cones(90, 120, 0.4, 0.2)
-UP = (0.0, -1.0, 0.0)
-
-#: Cells of which a frame by itself knows nothing.
-OF_THE_PAST = {"added", "removed", "churn", "chunks_new", "bytes_new", "chunks_resident", "traverse_ms"}
+from sparklod_cli.world import TOTAL, World
+from tests.simulation.worlds import OF_THE_PAST, SPARK, around, camera, path_of, resting, rows_of, viewers, without
 
 #: Cells that only the row of all instances has.
 OF_ALL = {
     *("stop_reason", "pixel_scale_min", "missing", "traverse_ms"),
     *("chunks_touched", "chunks_new", "bytes_new", "chunks_resident", "complete_in_s"),
 }
-
-
-def camera(
-    eye: Sequence[float],
-    target: Sequence[float] = (0, 0, 0),
-    *,
-    fov: float = 60.0,
-    size: tuple[int, int] = (640, 360),
-    time: float = 0.0,
-) -> Camera:
-    focal = size[1] / (2 * math.tan(math.radians(fov) / 2))
-    return Camera(look_at(eye, target, UP), *size, (focal, focal), (size[0] / 2, size[1] / 2), time)
-
-
-def path_of(cameras: Sequence[Camera]) -> CameraPath:
-    return CameraPath(tuple(cameras), "a test", (), tuple(range(len(cameras))))
-
-
-def around(count: int, distance: float = 3.0, seconds: float = 1.0) -> CameraPath:
-    turns = 2 * math.pi * np.arange(count) / count
-    return path_of(
-        [
-            camera((distance * math.sin(turn), -1, -distance * math.cos(turn)), time=seconds * number / count)
-            for number, turn in enumerate(turns)
-        ]
-    )
-
-
-def resting(count: int, fps: float = 30.0) -> CameraPath:
-    return path_of([camera((1.0, -1.0, -2.0), time=number / fps) for number in range(count)])
-
-
-def rows_of(
-    world: World, viewer: Viewer, path: CameraPath, *, by_instance: bool = False, threads: int = 1
-) -> list[Row]:
-    simulation = Simulation(world, viewer, by_instance=by_instance)
-    return [row for frame in simulation.run(path, threads=threads) for row in frame.rows]
-
-
-def without(row: Row, names: set[str]) -> Row:
-    return {name: cell for name, cell in row.items() if name not in names}
-
-
-@pytest.fixture(scope="module")
-def town() -> World:
-    """165,205 nodes in three chunks."""
-    return read_world([Placement(TOWN, "town")])
-
-
-@pytest.fixture(scope="module")
-def three() -> World:
-    """The town twice, once turned and larger, and a small tree."""
-    return read_world(
-        [
-            Placement(TOWN, "here"),
-            Placement(TOWN, "there", transform(np.random.default_rng(1), scale=1.5, spread=3), 0.5, Frustum(0.3, 0.1)),
-            Placement(HAND, "hand"),
-        ]
-    )
-
-
-def viewers() -> list[Viewer]:
-    return [
-        Viewer(20_000, SPARK),
-        Viewer(2_000, Cones(), chunk_cache=2),
-        Viewer(3, SPARK),
-        Viewer(10**9, SPARK, render_scale=40.0),
-        Viewer(10**9, Frustum(0.2, 0.1), pixel_scale_limit=0.1),
-        Viewer(1_000_000, Cones()),
-        Viewer(20_000, SPARK, network=Network(1e6, 0.03), chunk_cache=3),
-        Viewer(20_000, SPARK, network=Network(3e4, 0.1, 1)),
-    ]
 
 
 @pytest.mark.parametrize("viewer", viewers(), ids=str)
@@ -188,82 +99,6 @@ def test_every_reason_comes_up(three: World) -> None:
     }
 
 
-@pytest.mark.parametrize("capacity", [2, 3, 4])
-def test_a_cache_never_holds_more_than_fits(three: World, capacity: int) -> None:
-    """The town has three chunks, the small tree one; both roots are always there."""
-    for network in (Network(), Network(5e5, 0.02)):
-        viewer = Viewer(6_000, SPARK, network=network, chunk_cache=capacity)
-        rows: list[Any] = rows_of(three, viewer, around(30))
-        assert all(row["chunks_resident"] <= capacity for row in rows)
-        assert max(row["chunks_resident"] for row in rows) == capacity
-        assert sum(row["chunks_new"] for row in rows) >= capacity
-        if capacity == 4:
-            assert sum(row["chunks_new"] for row in rows) == 4
-            assert sum(row["bytes_new"] for row in rows) == TOWN.stat().st_size + HAND.stat().st_size
-        elif network.instant:
-            assert any(row["missing"] for row in rows)
-
-
-def test_what_fits_is_never_missing(three: World) -> None:
-    for cache in (None, 4):
-        rows = rows_of(three, Viewer(20_000, SPARK, chunk_cache=cache), around(20))
-        assert all(row["missing"] == 0 for row in rows)
-        assert all(row["complete_in_s"] is None for row in rows)
-
-
-def test_without_bandwidth_or_latency_all_comes_at_once(three: World) -> None:
-    timing = {"traverse_ms"}
-    for cache in (None, 2):
-        default, infinite = (
-            [
-                without(row, timing)
-                for row in rows_of(three, Viewer(9_000, SPARK, network=network, chunk_cache=cache), around(8))
-            ]
-            for network in (Network(), Network(math.inf, 0.0, 1))
-        )
-        assert default == infinite
-
-
-@pytest.mark.parametrize("network", [Network(6e4, 0.05), Network(2e4, 0.2, 1), Network(math.inf, 0.3)], ids=str)
-@pytest.mark.parametrize("budget", [300, 20_000])
-def test_a_resting_camera_gets_the_whole_cut(town: World, network: Network, budget: int) -> None:
-    """The first frame says when, at the soonest.
-
-    It reckons as if all chunks of the cut were known at once. The viewer knows of those that it has, so it may be
-    later: by the latency once more for each level of chunks, of which the town has two, and by the frames in between.
-    """
-    fps = 100.0
-    path = resting(700, fps)
-    (instant,) = rows_of(town, Viewer(budget, SPARK), path_of(path.cameras[:1]))
-    rows: list[Any] = rows_of(town, Viewer(budget, SPARK, network=network), path)
-    missing = [row["missing"] for row in rows]
-    assert missing[0] > 0
-    complete = missing.index(0)
-    assert not any(missing[complete:])
-    late = OF_THE_PAST | {"time_s", "frame", "complete_in_s"}
-    assert all(without(row, late) == without(instant, late) for row in rows[complete:])
-    promised = rows[0]["complete_in_s"]
-    assert promised > 0
-    assert promised <= rows[complete]["time_s"] + 1e-4
-    assert rows[complete]["time_s"] <= promised + network.latency + 3 / fps
-    for row in rows[:complete]:
-        assert row["complete_in_s"] > 0
-        assert row["time_s"] + row["complete_in_s"] >= promised - 1e-3  # never sooner than once promised
-    assert all(row["complete_in_s"] == 0 for row in rows[complete:])
-    assert all(row["churn"] == 0 for row in rows[complete + 1 :])
-
-
-def test_a_tree_of_one_chunk_is_there_when_it_was_promised() -> None:
-    world = read_world([Placement(HAND, "hand")])
-    size, latency, speed = HAND.stat().st_size, 0.1, 500.0
-    rows: list[Any] = rows_of(world, Viewer(100, SPARK, network=Network(speed, latency)), resting(60))
-    expected = latency + size / speed
-    for row in rows:
-        assert row["complete_in_s"] == pytest.approx(max(0, expected - row["time_s"]), abs=1e-4)
-        assert (row["selected"] == 0) == (row["time_s"] < expected)
-    assert [row["bytes_new"] for row in rows if row["bytes_new"]] == [size]
-
-
 def test_threads_change_nothing(three: World) -> None:
     for viewer in (viewers()[0], viewers()[6]):
         first, *others = (
@@ -341,56 +176,6 @@ def test_budgets_and_caches_that_are_too_small(three: World) -> None:
     many = World(three.trees, three.forest, three.placements[:1] * 65_536, three.instances[:1] * 65_536)
     with pytest.raises(ValueError, match="65,536 instances are more than 65,535"):
         Simulation(many, Viewer(10**6))
-
-
-def small_world(seed: int) -> tuple[World, list[twin.Placed]]:
-    """Two trees of a few hundred nodes and three instances of them, as the package and the twin have them."""
-    rng = np.random.default_rng(seed)
-    trees = [random_tree(rng, count, 5) for count in (300, 120)]
-    spots = [np.eye(4), transform(rng, scale=0.6, spread=2), transform(rng, scale=1.4, spread=4)]
-    of, weights = (0, 1, 0), (1.0, 2.5, 0.7)
-    own, of_all = Frustum(0.3, 0.1), SPARK
-    placements = [
-        Placement(Path(f"{tree}.spz"), f"{number}", spot, weight, own if number == 1 else None)
-        for number, (tree, spot, weight) in enumerate(zip(of, spots, weights, strict=True))
-    ]
-    as_nodes = [
-        twin.Nodes(tree.center.astype(float), tree.size.astype(float), tree.tree.child_count, tree.tree.child_start)
-        for tree in trees
-    ]
-    made = [
-        Tree(
-            Path(f"{number}.spz"), 1000, Scene(random_splats(len(nodes.size)), tree.tree), nodes.level.astype(np.int32)
-        )
-        for number, (tree, nodes) in enumerate(zip(trees, as_nodes, strict=True))
-    ]
-    instances = [Instance(tree, spot, weight) for tree, spot, weight in zip(of, spots, weights, strict=True)]
-    cones = twin.cones(of_all.fov0, of_all.fov, of_all.foveate, of_all.behind)
-    weighting = [cones, twin.frustum(own.outside, own.behind), cones]
-    placed = [
-        twin.Placed(as_nodes[tree], spot, weight, how)
-        for tree, spot, weight, how in zip(of, spots, weights, weighting, strict=True)
-    ]
-    return World(made, Forest(trees), placements, instances), placed
-
-
-@pytest.mark.parametrize("seed", range(6))
-def test_rows_are_as_worked_out_without_sparklod(seed: int) -> None:
-    world, placed = small_world(seed)
-    rng = np.random.default_rng(100 + seed)
-    for budget, render_scale in ((3, 1.0), (150, 1.0), (100_000, 40.0), (100_000, 0.0)):
-        eye, target = rng.normal(0, 2, 3), rng.normal(0, 1, 3)
-        at = camera(eye, target, fov=70, size=(500, 300))
-        right, up, back = at.camera_to_world[:3, :3].T
-        seen = twin.Eye(eye, right, up, -back, math.radians(70), 500, 300)
-        (row,) = rows_of(world, Viewer(budget, SPARK, render_scale=render_scale), path_of([at]))
-        drawn = twin.frame(placed, seen, budget, seen.pixel * render_scale)
-        assert twin.differing(drawn.cells, row) == []
-        simulation = Simulation(world, Viewer(budget, SPARK, render_scale=render_scale))
-        cut = simulation.cut(at).indices()
-        assert [set(part.tolist()) for part in cut] == [
-            {node for number, node in drawn.cut if number == instance} for instance in range(3)
-        ]
 
 
 def test_frames_tell_how_much_is_in_front(town: World) -> None:

@@ -17,7 +17,7 @@ from sparklod_cli.errors import FormatError
 from sparklod_cli.gaussian import normalized_quat
 from sparklod_cli.parallel import CHUNK
 from sparklod_cli.splats import Splats
-from tests.references import reference
+from tests.references import gaussians
 from tests.scenes import random_splats
 
 ROWS, COLUMNS = [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]
@@ -35,7 +35,7 @@ def round_trip(splats: Splats) -> data_texture.Texels:
 
 
 def true_covariance(splats: Splats) -> np.ndarray:
-    return reference.covariance(splats.scale, splats.quat_xyzw)[:, ROWS, COLUMNS]
+    return gaussians.covariance(splats.scale, splats.quat_xyzw)[:, ROWS, COLUMNS]
 
 
 def viewers_texels(splats: Splats, index: int) -> bytes:

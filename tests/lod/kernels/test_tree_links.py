@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from sparklod_cli.gaussian import spark_size
 from sparklod_cli.lod.kernels.walk import STEPS, find_cycles, find_parents, sizes_below, sum_levels, walk
 from tests.conftest import ROOT
-from tests.references import reference
+from tests.references import gaussians, tree_links
 from tests.scenes import random_splats
 
 Links = list[tuple[int, int]]
@@ -34,7 +34,7 @@ def arrays(links: Links) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def followed(links: Links) -> int:
     """Links to nodes that there are."""
-    return sum(map(len, reference.links_of(*arrays(links)[:2])))
+    return sum(map(len, tree_links.links_of(*arrays(links)[:2])))
 
 
 @st.composite
@@ -67,7 +67,7 @@ ANY = st.one_of(trees(), broken_trees(), ANY_LINKS)
 def test_every_node_is_visited_once_by_the_shortest_way(links: Links) -> None:
     count, start, size = arrays(links)
     depth, limit = walk(count, start, size)
-    expected = reference.walk(count, start, size)
+    expected = tree_links.walk(count, start, size)
     if followed(links) <= STEPS * len(links):
         assert depth.tolist() == expected.depth
         assert limit.tolist() == expected.limit
@@ -83,7 +83,7 @@ def test_every_node_is_visited_once_by_the_shortest_way(links: Links) -> None:
 def test_parents_are_those_that_have_a_node_as_a_child(links: Links) -> None:
     count, start, size = arrays(links)
     parent, references = find_parents(count, start)
-    expected = reference.walk(count, start, size).parents
+    expected = tree_links.walk(count, start, size).parents
     assert references.tolist() == [len(parents) for parents in expected]
     for found, parents in zip(parent.tolist(), expected, strict=True):
         assert found in parents or found == -1
@@ -95,7 +95,7 @@ def test_cycles_are_what_one_never_leaves_upwards(nodes: Links) -> None:
     parent = [above if above < len(nodes) else -1 for above, _ in nodes]
     depth = [edges for _, edges in nodes]
     found = find_cycles(np.array(parent, np.int32), np.array(depth, np.int32))
-    assert found.tolist() == reference.on_cycles(parent, depth)
+    assert found.tolist() == tree_links.on_cycles(parent, depth)
 
 
 @given(ANY, st.integers(0, 2**32 - 1))
@@ -112,7 +112,7 @@ def test_children_count_by_what_they_cover(links: Links, seed: int) -> None:
         if len(below):
             # The thinnest of needles count for something.
             scale = np.maximum(splats.scale[below], 1e-20 * splats.scale[below].max(axis=1, keepdims=True))
-            weight = splats.opacity[below] * reference.ellipsoid_area(scale)
+            weight = splats.opacity[below] * gaussians.ellipsoid_area(scale)
             assert found[node] == pytest.approx(np.average(size[below], weights=weight), rel=1e-4)
         else:
             assert found[node] == 0

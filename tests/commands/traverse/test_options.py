@@ -11,7 +11,7 @@ import pytest
 from sparklod_cli.cli import run
 from sparklod_cli.commands.traverse import traverse as command
 from sparklod_cli.simulation import plot
-from tests.commands.test_render_options import GIVEN as OF_RENDER
+from tests.commands.render.test_options import GIVEN as OF_RENDER
 from tests.conftest import FIXTURES
 
 TOWN = FIXTURES / "traverse" / "town.spz"

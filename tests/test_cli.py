@@ -1,0 +1,39 @@
+"""The command line: version, help and completion, and that they load nothing heavy."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+from sparklod_cli import __version__
+from sparklod_cli.cli import COMMANDS
+from tests.commands.build_lod.runs import sparklod
+from tests.conftest import ROOT
+
+
+def test_version_and_help_everywhere() -> None:
+    for arguments in (["--version"], ["build-lod", "--version"]):
+        assert sparklod(*arguments).stdout.decode() == f"sparklod, version {__version__}\n"
+    for arguments in (["--help"], *([command, "--help"] for command in COMMANDS)):
+        assert b"Usage: sparklod" in sparklod(*arguments).stdout
+    assert b"Examples:" in sparklod("build-lod", "--help").stdout
+
+
+def test_help_imports_nothing_heavy() -> None:
+    code = "import sys; from sparklod_cli.cli import run; run(sys.argv[1:]); print(*sys.modules, file=sys.stderr)"
+    for arguments in (["--help"], *([command, "--help"] for command in COMMANDS)):
+        result = subprocess.run(
+            [sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=True, cwd=ROOT
+        )
+        modules = set(result.stderr.split())
+        assert not modules & {"numpy", "numba", "plyfile", "zstandard", "tqdm", "PIL", "open3d", "pyvista"}
+
+
+def test_completion_knows_the_options() -> None:
+    words = {"COMP_WORDS": "sparklod build-lod --over", "COMP_CWORD": "2", "_SPARKLOD_COMPLETE": "bash_complete"}
+    code = "from sparklod_cli.cli import cli; cli(prog_name='sparklod')"
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=ROOT, env={**os.environ, **words}
+    )
+    assert "--overwrite" in result.stdout
