@@ -135,7 +135,7 @@ def test_a_budget_holds_the_roots(world: World) -> None:
         Comparison(world, VIEWER, parse_budgets("50%,1"), HOW)
 
 
-def test_backgrounds() -> None:
+def test_a_picture_lies_over_its_background_and_is_clamped() -> None:
     image = np.array([[[0.2, 0.1, 0.0, 0.5], [0.0, 0.0, 0.0, 0.0], [1.2, 0.5, 0.5, 1.0]]], np.float32)
     np.testing.assert_allclose(on_background(image, 0.0), [[[0.2, 0.1, 0], [0, 0, 0], [1, 0.5, 0.5]]], atol=1e-7)
     np.testing.assert_allclose(on_background(image, 1.0), [[[0.7, 0.6, 0.5], [1, 1, 1], [1, 0.5, 0.5]]], atol=1e-7)
@@ -214,7 +214,7 @@ def test_assertions_about_what_is_not_there(
         run(world, capsys, asserts=(text,))
 
 
-def test_charts(world: World, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_a_chart_of_a_comparison_is_a_picture(world: World, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     pytest.importorskip("matplotlib", reason="charts need the extra `render`")
     target = tmp_path / "plot.png"
     assert run(world, capsys, "5%,20%,500k", plot=target)[0] == 0

@@ -100,6 +100,8 @@ def test_what_is_no_tree_is_refused(tmp_path: Path, capsys: pytest.CaptureFixtur
         (["-o", "x.ply", "--spz-version", "2"], "--spz-version is of SPZ, not of .ply"),
     ],
 )
-def test_wrong_usage(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_options_that_do_not_suit_unlod_are_refused(
+    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert unlod("scene-lod.spz", *arguments) == 2
     assert message in capsys.readouterr().err

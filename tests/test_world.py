@@ -217,7 +217,7 @@ stems = st.sampled_from(["a", "a 2", "a 2 2", "a 3", "total", "total.spz", "tota
 
 
 @given(st.lists(stems, max_size=12), st.lists(stems, max_size=4))
-def test_names_are_unique(names: list[str], taken: list[str]) -> None:
+def test_instances_get_names_that_nobody_has(names: list[str], taken: list[str]) -> None:
     given_names = names_of([Path(f"{name}.spz") for name in names], taken)
     assert len(set(given_names)) == len(names)
     assert not {"total", *taken} & set(given_names)

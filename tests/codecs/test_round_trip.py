@@ -94,7 +94,7 @@ def test_writing_again_changes_nothing(name: str, version: int, lod: bool) -> No
 
 
 @pytest.mark.parametrize("antialiased", [False, True])
-def test_antialiased_is_kept(antialiased: bool) -> None:
+def test_spz_keeps_whether_a_scene_is_antialiased(antialiased: bool) -> None:
     data = b"".join(spz.encode(Scene(scene("sh0").splats, antialiased=antialiased), spz.Options()))
     assert spz.decode(io.BytesIO(data)).antialiased is antialiased
 

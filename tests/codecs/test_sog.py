@@ -147,7 +147,7 @@ def test_a_rotation_that_says_of_none_that_it_is_the_largest_is_not_a_number() -
 
 
 @pytest.mark.parametrize("antialias", [True, False, None])
-def test_antialiased_is_told(antialias: bool | None) -> None:
+def test_meta_tells_whether_a_scene_is_antialiased(antialias: bool | None) -> None:
     assert decode(with_meta(META | {"antialias": antialias})).antialiased is bool(antialias)
 
 
@@ -322,7 +322,7 @@ REFUSED: dict[str, tuple[Callable[[], Files], str]] = {
 
 
 @pytest.mark.parametrize("what", REFUSED)
-def test_refused_with_a_reason(what: str) -> None:
+def test_broken_sog_is_refused_with_a_reason(what: str) -> None:
     make, reason = REFUSED[what]
     with pytest.raises(FormatError, match=reason):
         decode(make())

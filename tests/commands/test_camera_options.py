@@ -100,7 +100,7 @@ def test_a_dolly_lasts_as_long_as_it_is_told() -> None:
     assert "more than" in usage_error("--dolly", "--seconds", "1e6")
 
 
-def test_one_view() -> None:
+def test_look_at_is_one_camera_that_looks_there() -> None:
     (camera,) = cameras("--look-at", "-1,2,-3:-1,2,5", scene=no_scene).cameras
     assert camera.position.tolist() == [-1, 2, -3]
     assert camera.forward.tolist() == [0, 0, 1]
@@ -108,7 +108,7 @@ def test_one_view() -> None:
 
 
 @pytest.mark.parametrize("between", [" ", ";", " ; "])
-def test_keyframes(between: str) -> None:
+def test_keyframes_are_passed_through_at_their_times(between: str) -> None:
     views = between.join(["0,0,-5:0,0,0", "5,0,0:0,0,0", "0,0,5:0,0,0"])
     path = cameras("--keyframes", views, "--seconds", "1", "--fps", "10", scene=no_scene)
     assert len(path.cameras) == 21
@@ -117,7 +117,7 @@ def test_keyframes(between: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["colmap-text", "colmap-binary", "colmap-binary/images.bin", "inria.json"])
-def test_a_file(name: str) -> None:
+def test_a_camera_path_has_the_cameras_of_its_file(name: str) -> None:
     path = cameras("--camera-path", FOLDER / name, scene=no_scene)
     for camera, known in zip(path.cameras, KNOWN, strict=True):
         check_pose(camera, known)
@@ -148,7 +148,7 @@ def test_a_world_transform_may_be_a_file(name: str, tmp_path: Path) -> None:
         assert path.notes == ()
 
 
-def test_usage() -> None:
+def test_wrong_camera_options_are_errors_that_name_them() -> None:
     assert "--orbit and --dolly cannot go together" in usage_error("--orbit", "3", "--dolly")
     assert "--camera-path and --look-at" in usage_error("--camera-path", "x", "--look-at", "0,0,0:1,1,1")
     assert "--camera-axes only means something with --camera-path" in usage_error("--camera-axes", "opencv-c2w")

@@ -158,7 +158,7 @@ NUMBERS: dict[str, tuple[Columns, list[str], str]] = {
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("what", NUMBERS)
-def test_numbers(what: str, method: str, bake: Bake) -> None:
+def test_hard_numbers_give_a_valid_tree_or_one_error(what: str, method: str, bake: Bake) -> None:
     values, options, expected = NUMBERS[what]
     if method != METHODS[0] and "--base" in options:
         pytest.skip("the base is the other method's")
@@ -193,7 +193,7 @@ def test_a_file_that_is_cut(name: str, bake: Bake) -> None:
 
 
 @pytest.mark.parametrize("name", WHOLE)
-def test_bits_that_flip(name: str, bake: Bake) -> None:
+def test_flipped_bits_give_a_valid_tree_or_one_error(name: str, bake: Bake) -> None:
     data = (FIXTURES / name).read_bytes()
     rng = np.random.default_rng(13)
     contents = []
@@ -235,7 +235,7 @@ FILES: dict[str, tuple[bytes, str]] = {
 
 
 @pytest.mark.parametrize("what", FILES)
-def test_files(what: str, bake: Bake) -> None:
+def test_files_that_are_no_scene_are_refused_with_a_reason(what: str, bake: Bake) -> None:
     content, reason = FILES[what]
     (result,) = bake(content)
     assert result.startswith("error: ")

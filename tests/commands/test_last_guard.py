@@ -48,7 +48,7 @@ def test_a_bug_is_one_line_that_asks_for_a_report(
     assert not list(tmp_path.iterdir())
 
 
-def test_verbose_shows_where(broken: Break, capsys: Said) -> None:
+def test_verbose_shows_the_traceback_before_the_error(broken: Break, capsys: Said) -> None:
     broken(ZeroDivisionError("division by zero"))
     assert run(["inspect", str(SCENE), "-v"]) == 1
     lines = capsys.readouterr().err.splitlines()

@@ -35,7 +35,7 @@ ONES = re.compile(r"(?<![\d.,])1 (?:\w+ )?(splats|nodes|levels|leaves|frames|cam
         ("8x²", "is not a width and a height"),
     ],
 )
-def test_sizes(size: str, said: str, capsys: Said) -> None:
+def test_a_wrong_size_is_said_with_its_value(size: str, said: str, capsys: Said) -> None:
     assert run(["render", str(TREE), "--size", size]) == 2
     err = capsys.readouterr().err
     assert said in err

@@ -103,7 +103,7 @@ def spoil(path: Path) -> None:
 STEPS = steps(blocks(CI, "yaml")[0])
 
 
-def test_the_workflow(project: Path, shell: Shell) -> None:
+def test_every_step_of_the_workflow_succeeds(project: Path, shell: Shell) -> None:
     assert next(iter(STEPS)) == "Install sparklod"
     assert re.fullmatch(r"python -m pip install \./sparklod", STEPS["Install sparklod"])
     for name, script in list(STEPS.items())[1:]:
@@ -165,7 +165,9 @@ def test_hooks_leave_other_files_alone(files: str, name: str) -> None:
 @pytest.mark.parametrize(
     "hook, more", [(OURS, ""), (OURS, THEIRS["args"]), (LOCAL, "")], ids=["ours", "ours with arguments", "local"]
 )
-def test_hooks_run(web: Path, shell: Shell, hook: dict[str, str], more: str) -> None:
+def test_a_hook_passes_good_files_and_fails_on_spoilt_ones(
+    web: Path, shell: Shell, hook: dict[str, str], more: str
+) -> None:
     """As pre-commit puts them together: the entry, its arguments, the files."""
     arguments = [word.strip().strip('"') for word in more.strip("[]").split(",") if word]
     command = [*shlex.split(hook["entry"]), *arguments, "web/demo-lod.spz", "web/sh0-lod.spz"]
@@ -188,7 +190,7 @@ def test_a_pointer_of_git_lfs_is_no_splat_file(project: Path, shell: Shell) -> N
 # --- Make and the shell -----------------------------------------------------------------------------------------------
 
 
-def test_the_makefile(project: Path, shell: Shell) -> None:
+def test_the_makefile_bakes_once_and_deletes_what_falls_short(project: Path, shell: Shell) -> None:
     if shutil.which("make") is None:
         pytest.skip("there is no make")
     (project / "Makefile").write_text(blocks(CI, "make")[0])
@@ -203,7 +205,7 @@ def test_the_makefile(project: Path, shell: Shell) -> None:
     assert not list((project / "web").iterdir())
 
 
-def test_the_script(project: Path, web: Path, shell: Shell) -> None:
+def test_the_script_bakes_and_reports(project: Path, web: Path, shell: Shell) -> None:
     script = blocks(CI, "sh")[0]
     done = shell(script)
     assert (done.returncode, done.stderr) == (0, "")

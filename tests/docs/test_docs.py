@@ -19,7 +19,7 @@ from tests.conftest import FIXTURES, ROOT
 
 
 @pytest.mark.parametrize("page", sorted(path.relative_to(ROOT).as_posix() for path in ROOT.glob("*.md")))
-def test_links_lead_somewhere(page: str) -> None:
+def test_every_link_leads_to_a_file_or_the_web(page: str) -> None:
     for link in re.findall(r"\]\(([^)#]+)\)", (ROOT / page).read_text()):
         assert link.startswith("https://") or (ROOT / link).exists(), link
 

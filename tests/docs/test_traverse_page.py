@@ -15,7 +15,7 @@ from tests.tables.rows import flight
 PAGE = ROOT / "docs" / "traverse.md"
 
 
-def test_the_page_lists_the_columns() -> None:
+def test_the_page_about_traverse_lists_the_columns() -> None:
     """Made by `python -m tests.docs.test_traverse_page`."""
     text = PAGE.read_text()
     assert with_columns(text) == text

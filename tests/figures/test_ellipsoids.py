@@ -14,7 +14,7 @@ from tests.scenes import random_splats
 
 
 @pytest.mark.parametrize(("rounds", "points", "triangles"), [(0, 12, 20), (1, 42, 80), (2, 162, 320)])
-def test_sphere(rounds: int, points: int, triangles: int) -> None:
+def test_a_sphere_is_closed_and_faces_outwards(rounds: int, points: int, triangles: int) -> None:
     sphere = shapes.sphere(rounds)
     assert (len(sphere.points), len(sphere.triangles)) == (points, triangles)
     assert np.allclose(np.linalg.norm(sphere.points, axis=1), 1)
@@ -46,7 +46,7 @@ def test_ellipsoids_are_not_thinner_than_a_pixel() -> None:
 
 
 @given(st.integers(0, 10**9), st.integers(1, 1000))
-def test_evenly(count: int, most: int) -> None:
+def test_no_more_than_the_most_are_chosen_evenly(count: int, most: int) -> None:
     if count > most:
         index = shapes.evenly(count, most)
         assert len(index) == most
@@ -60,17 +60,17 @@ def test_evenly_takes_all_of_few() -> None:
 
 
 @given(st.floats(1e-30, 1e30))
-def test_level_of_step(size: float) -> None:
+def test_the_level_of_a_step_is_the_smallest_not_below_it(size: float) -> None:
     level = shapes.level_of_step(size)
     assert 1.5 ** (level - 1) * (1 - 1e-6) <= size <= 1.5**level * (1 + 1e-6)
 
 
-def test_cells() -> None:
+def test_cells_are_the_corners_of_occupied_cubes_once_each() -> None:
     center = np.array([[0.1, 0.1, -0.1], [0.4, 0.3, -0.4], [0.6, 0.1, -0.1]], np.float32)
     assert shapes.cells(center, 0.5).tolist() == [[0, 0, -0.5], [0.5, 0, -0.5]]
 
 
-def test_box_lines() -> None:
+def test_a_box_has_twelve_edges_of_its_size() -> None:
     lines = shapes.box_lines(np.array([[1.0, 2, 3]]), np.array([[2.0, 4, 6]])).reshape(12, 2, 3)
     assert sorted(np.abs(np.diff(lines, axis=1)).sum(axis=(1, 2)).tolist()) == [1] * 4 + [2] * 4 + [3] * 4
 
@@ -89,13 +89,13 @@ def test_wall_lines_are_at_multiples_of_the_step() -> None:
 
 
 @given(st.floats(1e-12, 1e12))
-def test_nice_step(least: float) -> None:
+def test_a_nice_step_is_1_2_or_5_and_not_much_more_than_asked_for(least: float) -> None:
     step = shapes.nice_step(least)
     assert least * (1 - 1e-6) <= step <= 2.5 * least * (1 + 1e-6)
     assert f"{step:.0e}"[0] in "125"
 
 
-def test_ticks() -> None:
+def test_ticks_are_the_round_numbers_in_a_range() -> None:
     assert [text for _, text in shapes.ticks(-0.31, 0.52, 0.15)] == ["-0.2", "0.0", "0.2", "0.4"]
     assert [text for _, text in shapes.ticks(-3, 12, 4)] == ["0", "5", "10"]
     assert [text for _, text in shapes.ticks(0, 3e9, 1e9)] == ["0", "1e+09", "2e+09", "3e+09"]

@@ -43,7 +43,7 @@ def test_colors_of_splats_that_are_all_the_same() -> None:
         assert coloring.marks
 
 
-def test_colors_of_levels() -> None:
+def test_every_level_has_a_colour_and_a_mark() -> None:
     splats = random_splats(1000)
     depth = np.repeat(np.arange(10, dtype=np.int32), 100)
     depth[-1] = -1

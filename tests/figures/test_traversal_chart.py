@@ -132,7 +132,7 @@ class TestCharts:
             assert not np.array_equal(charts.draw(other), before), name
 
     @pytest.mark.parametrize("count", [1, 2, 3])
-    def test_short_paths(self, count: int) -> None:
+    def test_a_path_of_few_frames_has_a_chart_of_full_width(self, count: int) -> None:
         assert pixels(plot(flight(count), "scene.spz").png).shape[1] == charts.WIDTH
 
     @pytest.mark.parametrize(
@@ -154,7 +154,7 @@ class TestCharts:
     def test_any_name_is_a_title(self, title: str) -> None:
         assert plot(flight(3), title).png
 
-    def test_single_instances_are_left_out(self) -> None:
+    def test_a_chart_leaves_single_instances_out(self) -> None:
         rows = flight(20)
         assert plot([*rows, *(each | {"instance": "tree"} for each in rows)], "a") == plot(rows, "a")
 
@@ -174,7 +174,7 @@ class TestCharts:
         subprocess.run([sys.executable, "-c", program], check=True)
 
 
-def test_no_frames() -> None:
+def test_a_chart_of_no_frames_is_an_error() -> None:
     with pytest.raises(SparklodError, match="nothing to draw"):
         plot([], "scene.spz")
 

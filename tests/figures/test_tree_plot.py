@@ -91,7 +91,7 @@ class TestPictures:
         assert (f"grey: {leaves} leaves" in picture.description) == (leaves > 0)
         assert "boxes: chunks of 65,536 nodes, the 1 of 1" in picture.description
 
-    def test_a_plain_scene(self) -> None:
+    def test_a_plain_scene_is_coloured_by_size(self) -> None:
         picture = plot(Scene(random_splats(500)), size=SIZE)
         assert picture.description.startswith("500 splats; coloured by feature size")
         assert "chunks" not in picture.description
@@ -117,7 +117,7 @@ class TestPictures:
         assert "blue: the 1 voxel of" in plot(scene, level=0, size=SIZE).description
         assert "blue: on the walls, the grid of voxels of" in plot(scene, size=SIZE).description
 
-    def test_one_splat(self) -> None:
+    def test_a_scene_of_one_splat_is_drawn(self) -> None:
         picture = plot(Scene(random_splats(1)), size=SIZE)
         assert picture.description.startswith("1 splat;")
         assert drawn(picture).any()
@@ -141,21 +141,21 @@ class TestPictures:
         )
         assert pixels(plot(Scene(far), size=SIZE)).shape == (200, 320, 3)
 
-    def test_a_broken_tree(self, scene: Scene) -> None:
+    def test_a_broken_tree_is_drawn_as_far_as_it_goes(self, scene: Scene) -> None:
         assert scene.tree is not None
         count, start = scene.tree.child_count.copy(), scene.tree.child_start.copy()
         start[1] = 0  # a cycle
         count[2] = 65535  # past the end
         assert drawn(plot(dataclasses.replace(scene, tree=LodTree(count, start)), size=SIZE)).any()
 
-    def test_wrong_levels(self, scene: Scene) -> None:
+    def test_a_level_that_a_scene_does_not_have_is_an_error(self, scene: Scene) -> None:
         with pytest.raises(SparklodError, match=r"there is no level 99 to draw: the tree has levels 0 to \d+$"):
             plot(scene, level=99)
         with pytest.raises(SparklodError, match="not a Level-of-Detail tree"):
             plot(Scene(scene.splats), level=1)
 
     @pytest.mark.parametrize("count", [0, 3])
-    def test_nothing_to_draw(self, count: int) -> None:
+    def test_splats_of_no_size_are_an_error(self, count: int) -> None:
         splats = random_splats(count)
         with pytest.raises(SparklodError, match="nothing to draw"):
             plot(Scene(dataclasses.replace(splats, scale=np.zeros_like(splats.scale))))
@@ -183,6 +183,6 @@ class TestWhereNoneCanBeDrawn:
         with pytest.raises(SparklodError, match="apt install libegl1 libgl1-mesa-dri"):
             plot(scene)
 
-    def test_wrong_use(self, scene: Scene) -> None:
+    def test_an_unknown_colouring_is_an_error(self, scene: Scene) -> None:
         with pytest.raises(ValueError, match="not one of level, opacity, size, chunk"):
             plot(scene, by="colour")

@@ -35,7 +35,7 @@ def test_frames_come_in_order(form: str) -> None:
     assert times == [100] * 4
 
 
-def test_webp_keeps_alpha() -> None:
+def test_an_animated_webp_keeps_alpha() -> None:
     made = frames(channels=4)
     for frame in made:
         frame[:10, :, 3] = np.linspace(0, 128, 33)

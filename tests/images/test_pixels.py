@@ -102,7 +102,7 @@ def test_files_hold_every_pixel(form: str, channels: int) -> None:
         assert np.array_equal(np.asarray(picture), codes)
 
 
-def test_floats_are_kept() -> None:
+def test_a_picture_of_floats_is_kept_to_the_bit() -> None:
     image = np.random.default_rng(2).random((4, 5, 4)).astype(np.float32)
     again = np.load(io.BytesIO(pixels.encode_floats(image)))
     assert again.dtype == np.float32

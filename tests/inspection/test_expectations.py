@@ -118,7 +118,7 @@ def test_a_way_that_leads_nowhere_is_an_error(tree: Report, way: str) -> None:
         value_at(tree.as_dict(), way)
 
 
-def test_value_at(tree: Report) -> None:
+def test_a_way_leads_to_a_value_of_the_report(tree: Report) -> None:
     plain = tree.as_dict()
     assert value_at(plain, "tree.levels.0") == plain["tree"]["levels"][0]
     assert value_at(plain, "tree.levels.2.leaves") == 5

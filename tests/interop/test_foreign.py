@@ -243,7 +243,7 @@ LOSSES = {
 @pytest.mark.parametrize(
     "file", [row for row in WRITTEN if row.values[0][0].removesuffix(" in sections") in LOSSES], indirect=True
 )
-def test_near_the_source(file: File) -> None:
+def test_splats_of_other_writers_are_near_their_source(file: File) -> None:
     """What is read is what was written, to the steps of the format's codings."""
     loss = LOSSES[file.writer.removesuffix(" in sections")]
     got, source = read_scene(file.path).splats, read_scene(file.source).splats
@@ -261,5 +261,5 @@ def test_near_the_source(file: File) -> None:
 
 
 @pytest.mark.parametrize("file", [*WRITTEN[3::4], *FILES[len(WRITTEN) :]], indirect=True)
-def test_bakes(file: File, tmp_path: Path) -> None:
+def test_files_of_other_writers_can_be_baked(file: File, tmp_path: Path) -> None:
     assert run(["build-lod", str(file.path), "-o", str(tmp_path / "out.spz")]) == 0

@@ -152,7 +152,7 @@ def facing(backward: np.ndarray) -> np.ndarray:
     "name, method, views",
     [("demo.ply", "quick", 88), ("biker.spz", "quick", 88), ("playbot.sog", "quick", 48), ("demo.ply", "quality", 44)],
 )
-def test_one_tree(spark: Spark, name: str, method: str, views: int) -> None:
+def test_the_cut_of_one_tree_is_that_of_spark(spark: Spark, name: str, method: str, views: int) -> None:
     tree = baked(scene(name), method)
     both = Both(spark, [tree])
     reasons = set()
@@ -174,7 +174,7 @@ def test_every_cone_at_a_budget_that_is_used_up(spark: Spark) -> None:
             assert cut.reason == "budget" or foveation.behind == 0  # there, everything may count nothing
 
 
-def test_every_budget(spark: Spark) -> None:
+def test_the_cut_of_every_budget_is_that_of_spark(spark: Spark) -> None:
     """From a single node to all."""
     tree = baked(scene("demo.ply"))
     both = Both(spark, [tree])
@@ -205,7 +205,7 @@ def test_instances_compete_for_one_budget(spark: Spark, names: list[str], views:
 
 
 @pytest.mark.parametrize("name", ["demo.ply", "biker.ply"])
-def test_trees_of_spark(spark: Spark, name: str) -> None:
+def test_the_cut_of_a_tree_that_spark_built_is_that_of_spark(spark: Spark, name: str) -> None:
     """Its own builder's, which measures after another coding than ours; four words a node as they lie in memory."""
     words = spark.load_words("Packed", scene(name), lod=True)["lodTree"]
     tree = Tree.of(words)
@@ -235,7 +235,7 @@ def test_pixel_scales_are_those_of_spark_bit_for_bit(spark: Spark) -> None:
 
 
 @pytest.mark.parametrize("name", ["biker.spz", "playbot.sog"])
-def test_chunks(spark: Spark, name: str) -> None:
+def test_the_chunks_that_are_wanted_are_those_of_spark(spark: Spark, name: str) -> None:
     """Those of the largest nodes are looked into first."""
     tree = baked(scene(name))
     both = Both(spark, [tree])

@@ -71,7 +71,7 @@ NAMES = ("origin", "right", "up", "forward")
 
 
 @given(cases())
-def test_figures(case: Case) -> None:
+def test_the_figures_of_a_cut_are_those_of_numpy(case: Case) -> None:
     cut = case.find()
     waiting = expected_cut(case, cut).waiting
     whole, parts = told(case, cut)
@@ -124,7 +124,7 @@ def at_distance(center: list[float], size: float) -> Measured:
     return whole
 
 
-def test_one_splat() -> None:
+def test_one_splat_in_a_cut_has_the_size_and_overdraw_of_its_place() -> None:
     """At distance 1 the picture is 2 wide, 100 pixels."""
     ahead = at_distance([0, 0, -1], 0.1)
     assert (ahead.in_frustum, ahead.outside, ahead.behind) == (1, 0, 0)
@@ -144,7 +144,7 @@ def test_a_size_that_is_none_fills_the_picture(bad: float) -> None:
     assert at_distance([0, 0, -1], bad).overdraw == pytest.approx(1)
 
 
-def test_nothing_is_drawn() -> None:
+def test_a_cut_of_nothing_has_no_figures() -> None:
     tree = Nodes(np.zeros((1, 3), np.float32), np.ones(1, np.float32), links([]))
     case = Case([tree], [Instance()], View(np.eye(4), 1.0, 1.0), 1, 0.0)
     cut = case.find(resident=np.zeros(1, np.bool_))

@@ -72,13 +72,13 @@ def test_scenes_of_any_size_make_valid_trees(count: int, growth: float, seed: in
 
 @pytest.mark.parametrize("growth", GROWTHS)
 @pytest.mark.parametrize("name", hard_cases())
-def test_hard_scenes_make_valid_trees(name: str, growth: float) -> None:
+def test_quality_makes_valid_trees_of_hard_scenes(name: str, growth: float) -> None:
     check(hard_cases()[name], growth)
 
 
 @pytest.mark.parametrize("growth", GROWTHS)
 @pytest.mark.parametrize("count", [65_535, 65_536])
-def test_coincident_splats_do_not_wrap_the_child_count(count: int, growth: float) -> None:
+def test_coincident_splats_give_no_quality_node_many_children(count: int, growth: float) -> None:
     _, tree = check(coincident(count), growth)
     assert tree.child_count.max() < 1000  # where any pair is as good as another, no node has to have many
 
@@ -90,7 +90,7 @@ def test_one_splat_many_times_makes_a_shallow_tree() -> None:
 
 
 @pytest.mark.parametrize("growth", GROWTHS)
-def test_one_splat_is_the_root(growth: float) -> None:
+def test_quality_makes_one_splat_a_tree_of_one_node(growth: float) -> None:
     _, tree = check(random_splats(1, sh_degree=2), growth)
     assert len(tree) == 1
 
@@ -101,12 +101,12 @@ def test_two_splats_have_one_parent(growth: float) -> None:
     assert tree.child_count.tolist() == [2, 0, 0]
 
 
-def test_the_number_of_threads_does_not_change_a_bit() -> None:
+def test_threads_do_not_change_a_bit_of_a_quality_tree() -> None:
     check_threads(lambda: quality.build(random_splats(20_000, sh_degree=1, seed=3)))
 
 
 @pytest.mark.parametrize("growth", GROWTHS)
-def test_a_prefix_is_a_coarser_scene(growth: float) -> None:
+def test_a_prefix_of_a_quality_tree_is_a_coarser_scene(growth: float) -> None:
     nodes, tree = quality.build(random_splats(5_000, seed=4), growth)
     parent = parents(tree)
     assert (parent[1:] < np.arange(1, len(tree))).all()
@@ -174,7 +174,7 @@ def test_splats_farther_apart_than_float32_holds_make_a_node_as_large_as_it_hold
     assert nodes.scale.max() == np.finfo(np.float32).max
 
 
-def test_no_splat_is_an_error() -> None:
+def test_quality_makes_no_tree_of_no_splats() -> None:
     with pytest.raises(InvalidSplatsError, match="no splat"):
         quality.build(random_splats(0))
 

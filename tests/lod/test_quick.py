@@ -93,11 +93,11 @@ def test_the_tree_is_the_one_that_the_method_describes(count: int, base: float, 
     assert shape_of(tree, leaf_of) == expected
 
 
-def test_the_number_of_threads_does_not_change_a_bit() -> None:
+def test_threads_do_not_change_a_bit_of_a_quick_tree() -> None:
     check_threads(lambda: quick.build(random_splats(60_000, sh_degree=1, seed=3)))
 
 
-def test_a_prefix_is_a_coarser_scene() -> None:
+def test_a_prefix_of_a_quick_tree_is_a_coarser_scene() -> None:
     splats = random_splats(5_000, seed=4)
     nodes, tree = quick.build(splats)
     # Cells of a level are base times those of the level below, so what lies before has parents at least as coarse; the
@@ -110,14 +110,14 @@ def test_a_prefix_is_a_coarser_scene() -> None:
     assert (parents(tree)[1:] < np.arange(1, len(tree))).all()
 
 
-def test_one_splat_is_the_root() -> None:
+def test_quick_makes_one_splat_a_tree_of_one_node() -> None:
     splats = random_splats(1, sh_degree=2)
     nodes, tree = quick.build(splats)
     assert len(tree) == 1
     check_tree(splats, nodes, tree)
 
 
-def test_no_splat_is_an_error() -> None:
+def test_quick_makes_no_tree_of_no_splats() -> None:
     with pytest.raises(InvalidSplatsError, match="no splat"):
         quick.build(random_splats(0))
 
@@ -129,7 +129,7 @@ def test_a_base_out_of_range_is_an_error(base: float) -> None:
 
 
 @pytest.mark.parametrize("count", [MAX_CHILDREN, MAX_CHILDREN + 1, 3 * MAX_CHILDREN + 5])
-def test_coincident_splats_do_not_wrap_the_child_count(count: int) -> None:
+def test_coincident_splats_are_split_among_intermediate_nodes(count: int) -> None:
     splats = coincident(count)
     nodes, tree = quick.build(splats)
     check_tree(splats, nodes, tree)
@@ -144,7 +144,7 @@ def test_coincident_splats_do_not_wrap_the_child_count(count: int) -> None:
 
 @pytest.mark.parametrize("name", hard_cases())
 @pytest.mark.parametrize("base", [1.1, 2.0])
-def test_hard_scenes_make_valid_trees(name: str, base: float) -> None:
+def test_quick_makes_valid_trees_of_hard_scenes(name: str, base: float) -> None:
     splats = hard_cases()[name]
     nodes, tree = quick.build(splats, base)
     check_tree(splats, nodes, tree)

@@ -120,7 +120,7 @@ def large_case(seed: int, *, nodes: int = 150_000, instances: int = 3) -> Case:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_large_trees(seed: int) -> None:
+def test_the_cut_of_large_trees_is_that_of_one_queue(seed: int) -> None:
     case = large_case(seed)
     found = case.traversal()
     for budget, smallest in [(3, 0.0), (20_000, 0.0), (1_000, 0.0), (20_000, pixel_limit(math.radians(60), 100))]:
@@ -220,7 +220,7 @@ def test_pixel_scales_are_those_of_the_world(seed: int, foveation: Cones | Frust
     assert np.count_nonzero(~np.isclose(got, expected, rtol=1e-4)) <= 1
 
 
-def test_a_pixel() -> None:
+def test_the_pixel_limit_is_a_pixels_size_at_distance_1() -> None:
     """At distance 1 the picture is 2 * tan(fov_y / 2) high."""
     assert pixel_limit(math.radians(90), 1000) == pytest.approx(2 / 1000)
     assert pixel_limit(math.radians(60), 1080, 2.0) == pytest.approx(2 * pixel_limit(math.radians(60), 1080))
@@ -246,5 +246,5 @@ def children_of(nodes: Nodes, node: int) -> range:
     return range(start, start + int(nodes.tree.child_count[node]))
 
 
-def test_rotations_are_rotations() -> None:
+def test_random_rotations_do_not_mirror() -> None:
     assert np.linalg.det(rotation(np.random.default_rng(0))) == pytest.approx(1)

@@ -50,7 +50,7 @@ def test_a_splat_is_counted_once_by_the_first_reason() -> None:
     assert describe(dropped) == "3 zero opacity, 1 zero scale, 1 below --min-opacity"
 
 
-def test_cropping_keeps_borders() -> None:
+def test_cropping_keeps_what_lies_on_the_border() -> None:
     splats = random_splats(4)
     center = np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0], [3, 0, 4]], np.float32)
     splats = dataclasses.replace(splats, center=center)

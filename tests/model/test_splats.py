@@ -95,7 +95,7 @@ def test_quaternions_of_any_length_become_units(quat: np.ndarray, length: float)
 
 
 @given(arrays(np.float32, (3,), elements=st.floats(np.float32(1e-10), np.float32(1e10), width=32)))
-def test_area_is_thomsens(scale: np.ndarray) -> None:
+def test_the_area_of_an_ellipsoid_is_thomsens_formula(scale: np.ndarray) -> None:
     assert ellipsoid_area(*scale) == pytest.approx(gaussians.ellipsoid_area(scale), rel=1e-5)
 
 

@@ -99,7 +99,7 @@ def test_every_reason_comes_up(three: World) -> None:
     }
 
 
-def test_threads_change_nothing(three: World) -> None:
+def test_threads_do_not_change_a_row(three: World) -> None:
     for viewer in (viewers()[0], viewers()[6]):
         first, *others = (
             [

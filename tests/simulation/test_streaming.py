@@ -252,7 +252,7 @@ def test_the_default_network_brings_at_once_what_fits(data: st.DataObject, sizes
         assert stream.complete_in(wanted) == (0.0 if fits else None)
 
 
-def test_time_goes_forward() -> None:
+def test_a_stream_refuses_to_go_back_in_time() -> None:
     stream = Stream(Chunks([[1]]), start=1.0)
     for time in (0.5, math.nan, math.inf):
         with pytest.raises(ValueError, match="only go forward"):

@@ -35,14 +35,14 @@ from sparklod_cli.quantities import parse_bandwidth, parse_count, parse_latency
         ("1e3bit", 125.0),
     ],
 )
-def test_bandwidths(text: str, expected: float) -> None:
+def test_bandwidths_are_bytes_a_second(text: str, expected: float) -> None:
     assert parse_bandwidth(text) == expected
 
 
 @pytest.mark.parametrize(
     ("text", "expected"), [("60ms", 0.06), ("0ms", 0.0), ("0.1s", 0.1), ("2 s", 2.0), (" 1e2ms", 0.1)]
 )
-def test_latencies(text: str, expected: float) -> None:
+def test_latencies_are_seconds(text: str, expected: float) -> None:
     assert parse_latency(text) == expected
 
 
@@ -61,7 +61,7 @@ def test_latencies(text: str, expected: float) -> None:
         ("9007199254740993", 9_007_199_254_740_993),  # not a float
     ],
 )
-def test_counts(text: str, expected: int) -> None:
+def test_counts_may_have_the_units_k_m_and_g(text: str, expected: int) -> None:
     assert parse_count(text) == expected
 
 

@@ -31,7 +31,7 @@ def nested(depth: int, opening: str, closing: str, inner: str = "1") -> str:
 
 
 @pytest.mark.parametrize(("opening", "closing"), [("[", "]"), ('{"a":', "}"), ('[{"a":', "}]")])
-def test_depth_is_bounded(opening: str, closing: str) -> None:
+def test_json_nested_more_than_64_deep_is_refused(opening: str, closing: str) -> None:
     each = opening.count("[") + opening.count("{")
     repr(parse_json(nested(MAX_DEPTH // each, opening, closing)))
     for depth in (MAX_DEPTH // each + 1, 900, 3000, 100_000):

@@ -88,7 +88,7 @@ def test_without_a_statistic_every_frame_must_hold(values: list[float | None], s
         ("position_x>-1.5e-2", -0.015), ("churn<.5", 0.5), ("churn<1.", 1), ("churn<+1", 1),
     ],
 )  # fmt: skip
-def test_numbers(text: str, bound: float) -> None:
+def test_bounds_may_have_units_and_shares(text: str, bound: float) -> None:
     assert parse(text).bound == bound
 
 
@@ -142,7 +142,7 @@ def test_what_is_not_understood(text: str, message: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_the_worst_frame() -> None:
+def test_the_worst_frame_is_the_one_farthest_from_the_bound() -> None:
     rows = churns(None, 0.1, 0.9, 0.5)
     assert [asked(text, rows).worst for text in ("churn<0.2", "churn_max<0.2", "churn_p50<0.2")] == [rows[2]] * 3
     assert [asked(text, rows).worst for text in ("churn>0.2", "churn_mean>=3")] == [rows[1]] * 2
@@ -153,7 +153,7 @@ def test_the_worst_frame() -> None:
     assert asked("churn_count==3", rows).worst is None
 
 
-def test_messages() -> None:
+def test_a_message_names_the_frames_and_the_worst_one() -> None:
     rows = churns(None, 0.1, 0.9, 0.5)
     rows[2]["name"] = "the\ndoor"
     worst = "the worst is frame 2 at 0.067 s (the\\ndoor) with 0.9"
@@ -164,7 +164,7 @@ def test_messages() -> None:
     assert asked("churn_count>3", rows).message() == "churn_count>3: churn_count is 3"
 
 
-def test_single_instances_are_left_out() -> None:
+def test_assertions_leave_single_instances_out() -> None:
     rows = [*churns(0.1, 0.2), row(0, instance="tree", churn=0.9)]
     assert asked("churn<0.5", rows).held
     assert asked("churn_count==2", rows).held
@@ -178,7 +178,7 @@ def test_single_instances_are_left_out() -> None:
         ("traverse_ms_p95<16", "traverse_ms is empty: --no-timing leaves it out"),
     ],
 )
-def test_an_empty_column(text: str, why: str) -> None:
+def test_a_column_without_values_cannot_be_asserted(text: str, why: str) -> None:
     with pytest.raises(BadAssertionError, match=why):
         asked(text, flight(5, bandwidth=False, timing=False))
 
@@ -189,6 +189,6 @@ def test_the_churn_of_one_frame() -> None:
     assert asked("churn_count==0", flight(1)).held
 
 
-def test_no_frames() -> None:
+def test_no_frames_satisfy_no_assertion() -> None:
     with pytest.raises(BadAssertionError, match="no frames"):
         asked("churn<1", [])

@@ -97,7 +97,7 @@ def test_the_same_rows_give_the_same_bytes(form: str) -> None:
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_no_rows(form: str) -> None:
+def test_a_table_of_no_rows_is_read_as_none(form: str) -> None:
     data = encoded([], form)
     read = {"csv": from_csv, "json": lambda data: json.loads(data)["data"], "parquet": from_parquet}[form](data)
     assert read == []
@@ -113,7 +113,7 @@ def test_no_name_is_a_formula_and_every_number_stays_one(start: str) -> None:
     assert json.loads(encoded(rows, "json", columns))["data"] == [{"name": name, "churn": -0.25}]
 
 
-def test_csv_in_full() -> None:
+def test_csv_quotes_names_and_leaves_empty_cells() -> None:
     rows = [
         row(0, name='the "red", door', churn=None, selected=12, budget_used=1 / 3),
         row(1, name="two\r\nlines", churn=0.25, selected=13, budget_used=0.0),
@@ -178,27 +178,27 @@ def test_parquet_has_types_and_units() -> None:
         assert field.metadata[b"description"].decode() == column.meaning
 
 
-def test_parquet_without_pyarrow(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_extra_that_brings_pyarrow_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(SparklodError, match=r"pip install 'sparklod\[parquet\]'") as caught:
         encode([], COLUMNS, "parquet")
     assert "\n" not in str(caught.value)
 
 
-def test_an_unknown_form() -> None:
+def test_an_unknown_format_of_tables_is_an_error() -> None:
     with pytest.raises(ValueError, match="not one of csv, json, parquet"):
         encode([], COLUMNS, "xlsx")
 
 
 class TestSelect:
-    def test_none_are_all(self) -> None:
+    def test_no_selection_is_all_columns(self) -> None:
         assert select() == COLUMNS
         assert select(timing=False) == COLUMNS[:-1]
 
     def test_the_order_is_that_of_the_names(self) -> None:
         assert [column.name for column in select(["churn", "frame", "churn"])] == ["churn", "frame"]
 
-    def test_an_unknown_one(self) -> None:
+    def test_an_unknown_column_is_an_error_with_a_suggestion(self) -> None:
         with pytest.raises(UnknownColumnError, match=r"^there is no column 'chrun', did you mean churn\?$"):
             select(["frame", "chrun"])
         with pytest.raises(UnknownColumnError, match=r"^there is no column 'zzz'$"):

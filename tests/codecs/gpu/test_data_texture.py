@@ -65,7 +65,7 @@ def test_every_byte_is_that_of_the_slow_twin() -> None:
     assert not texture.reshape(-1, 8)[len(splats) :].any()
 
 
-def test_layout_by_hand() -> None:
+def test_a_splat_is_two_texels_of_these_bytes() -> None:
     """A quarter turn about z takes the local x axis to the world's y axis."""
     half = 0.5**0.5
     splats = splats_with(
@@ -79,7 +79,7 @@ def test_layout_by_hand() -> None:
 
 
 @pytest.mark.parametrize(("count", "height"), [(0, 1), (1, 1), (1024, 1), (1025, 2), (2048, 2)])
-def test_height(count: int, height: int) -> None:
+def test_a_texture_has_as_many_rows_as_its_splats_need(count: int, height: int) -> None:
     packed = data_texture.pack(random_splats(2048).take(slice(count)))
     assert packed["texture"].shape == (height, 2048, 4)
     assert len(data_texture.unpack(packed, count).center) == count
@@ -137,7 +137,7 @@ def test_rgba_is_clamped_and_centres_are_exact() -> None:
     np.testing.assert_array_equal(got.center, splats.center)
 
 
-def test_threads_and_chunks_change_nothing() -> None:
+def test_threads_and_chunks_do_not_change_a_texel() -> None:
     splats = random_splats(CHUNK + 1000)
     one, two = (data_texture.pack(splats, threads=threads)["texture"] for threads in (1, 2))
     np.testing.assert_array_equal(one, two)
@@ -156,6 +156,6 @@ def test_threads_and_chunks_change_nothing() -> None:
         ({"texture": np.zeros((2, 2048, 4), np.uint32)}, -1, "-1 splats"),
     ],
 )
-def test_wrong_arrays(packed: dict[str, np.ndarray], count: int, text: str) -> None:
+def test_textures_that_hold_no_splats_are_refused(packed: dict[str, np.ndarray], count: int, text: str) -> None:
     with pytest.raises(FormatError, match=text):
         data_texture.unpack(packed, count)

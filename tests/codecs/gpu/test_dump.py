@@ -33,7 +33,9 @@ def test_every_encoding_can_be_had() -> None:
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
-def test_npz(encoding: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_npz_has_the_arrays_that_the_codec_packs(
+    encoding: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     command = ["build-lod", str(SCENE), "--encoding", encoding, "--output-dir", str(tmp_path), "--json"]
     assert run(command) == 0
     record = json.loads(capsys.readouterr().out)
@@ -58,7 +60,7 @@ def test_npz(encoding: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
-def test_raw_words(encoding: str, tmp_path: Path) -> None:
+def test_a_bin_has_the_words_of_all_arrays_one_after_the_other(encoding: str, tmp_path: Path) -> None:
     path = tmp_path / "scene.bin"
     assert run(["build-lod", str(SCENE), "--encoding", encoding, "-o", str(path)]) == 0
     expected = np.concatenate([words.ravel() for words in dump.pack(baked(), encoding).values()])
@@ -73,6 +75,8 @@ def test_raw_words(encoding: str, tmp_path: Path) -> None:
         (["-o", "x.splat"], ".splat holds no tree"),
     ],
 )
-def test_wrong_usage(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_outputs_that_do_not_suit_an_encoding_are_refused(
+    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run(["build-lod", "scene.ply", *arguments]) == 2
     assert message in capsys.readouterr().err

@@ -44,7 +44,7 @@ def ramp(low: float, high: float, width: int) -> np.ndarray:
 # --- Layout -----------------------------------------------------------------------------------------------------------
 
 
-def test_layout_by_hand() -> None:
+def test_a_splat_is_eight_words_of_these_bytes() -> None:
     splats = splats_with(
         center=[1.1, -2e30, 3e-20],
         opacity=linear_opacity(np.float32(3)),
@@ -84,7 +84,7 @@ def test_sh_word_by_hand(rgb: list[float], expected: int) -> None:
 @pytest.mark.parametrize(
     ("sh_degree", "names"), [(0, []), (1, ["sh1"]), (2, ["sh1", "sh2"]), (3, ["sh1", "sh2", "sh3a", "sh3b"])]
 )
-def test_sh_arrays(sh_degree: int, names: list[str]) -> None:
+def test_sh_fill_as_many_arrays_as_their_degree_needs(sh_degree: int, names: list[str]) -> None:
     """The coefficients follow each other through the arrays, and what they do not fill is 0."""
     splats = random_splats(7, sh_degree=sh_degree)
     packed = ext_splats.pack(splats)
@@ -104,27 +104,27 @@ def test_center_is_exact(center: np.ndarray) -> None:
     np.testing.assert_array_equal(round_trip(splats_with(8, center=center)).center, center)
 
 
-def test_colour() -> None:
+def test_colours_keep_the_precision_of_float16() -> None:
     rgb = np.exp(ramp(-20, np.log(65504), 3))
     rgb[::2] *= -1
     error = np.abs(round_trip(splats_with(20_000, rgb=rgb)).rgb.astype(np.float64) - rgb)
     assert 0.99 <= (error / np.maximum(HALF * np.abs(rgb), TINY)).max() <= 1
 
 
-def test_opacity() -> None:
+def test_opacities_keep_the_precision_of_float16() -> None:
     opacity = np.exp(ramp(-20, 0, 1))[:, 0]
     error = np.abs(round_trip(splats_with(20_000, opacity=opacity)).opacity.astype(np.float64) - opacity)
     assert 0.99 <= (error / np.maximum(HALF * opacity, TINY)).max() <= 1
 
 
-def test_lod_opacity() -> None:
+def test_lod_opacities_from_1_to_5_are_within_a_step_of_float16() -> None:
     d = ramp(1, 5, 1)[:, 0]
     back = lod_opacity(round_trip(splats_with(20_000, opacity=linear_opacity(d))).opacity)
     assert 0.99 <= np.abs(back.astype(np.float64) - d).max() / 2.0**-9 <= ROUNDING
 
 
 @pytest.mark.parametrize(("low", "high", "stated"), [(-16, 16, 0.004), (-87, 88, 0.034)])
-def test_scale(low: float, high: float, stated: float) -> None:
+def test_logarithms_of_scales_keep_the_precision_of_float16(low: float, high: float, stated: float) -> None:
     log = ramp(low, high, 3)
     scale = np.exp(log.astype(np.float64)).astype(np.float32)
     log = np.log(scale.astype(np.float64))
@@ -133,7 +133,7 @@ def test_scale(low: float, high: float, stated: float) -> None:
     assert 0.9 * stated <= error.max() <= stated
 
 
-def test_rotation() -> None:
+def test_rotations_are_off_by_less_than_half_a_degree() -> None:
     quats = random_quats(100_000)
     error = degrees_between(quats, round_trip(splats_with(len(quats), quat_xyzw=quats)).quat_xyzw).max()
     assert 0.95 * 0.476 <= error <= 0.476
@@ -148,7 +148,7 @@ def sh_bound(sh: np.ndarray) -> np.ndarray:
     return np.where(magnitude <= power, power / 510, magnitude - power)
 
 
-def test_sh() -> None:
+def test_sh_are_within_their_shared_exponent_and_reach_its_bound() -> None:
     sh = np.exp(ramp(-10, 11.7, 45)).reshape(-1, 15, 3)
     sh *= np.array([1, -0.9, 0.3], np.float32)
     back = round_trip(splats_with(20_000, 3, sh=sh)).sh
@@ -160,7 +160,7 @@ def test_sh() -> None:
 
 
 @given(sh=arrays(np.float32, (4, 15, 3), elements=st.floats(-(2**17), 2**17, width=32)))
-def test_any_sh(sh: np.ndarray) -> None:
+def test_any_sh_are_within_their_shared_exponent_and_keep_their_sign(sh: np.ndarray) -> None:
     back = round_trip(splats_with(4, 3, sh=sh)).sh
     # float32's logarithm lifts what lies within its last bit below a power of two onto it.
     allowed = ROUNDING * np.maximum(sh_bound(sh), sh_bound(sh * np.float32(1.000001)))
@@ -172,7 +172,7 @@ def test_any_sh(sh: np.ndarray) -> None:
 
 
 @pytest.mark.filterwarnings("error")
-def test_extremes_are_quiet() -> None:
+def test_extreme_values_are_clamped_without_a_warning() -> None:
     extreme = splats_with(
         sh_degree=3, scale=[0, 1e-45, 3e38], opacity=1e3, rgb=[3e38, -3e38, 65519], center=3e38, sh=[-3e38, 0, 3e38]
     )
@@ -187,7 +187,7 @@ def test_extremes_are_quiet() -> None:
 
 @pytest.mark.filterwarnings("error")
 @given(words=arrays(np.uint32, (6, 5, 4)))
-def test_any_words_are_read_quietly(words: np.ndarray) -> None:
+def test_any_words_of_ext_splats_are_read_quietly(words: np.ndarray) -> None:
     names = ("ext0", "ext1", *ext_splats.SH_ARRAYS)
     splats = ext_splats.unpack(dict(zip(names, words, strict=True)))
     assert np.isfinite(splats.quat_xyzw).all()
@@ -203,7 +203,7 @@ def test_packing_again_changes_nothing() -> None:
         np.testing.assert_allclose(getattr(again, column), getattr(once, column), rtol=0, atol=atol)
 
 
-def test_threads_and_chunks_change_nothing() -> None:
+def test_threads_and_chunks_do_not_change_a_word_of_ext_splats() -> None:
     splats = random_splats(CHUNK + 1000, sh_degree=3)
     one, two = (ext_splats.pack(splats, threads=threads) for threads in (1, 2))
     last = ext_splats.pack(splats.take(slice(CHUNK, None)))
@@ -215,7 +215,7 @@ def test_threads_and_chunks_change_nothing() -> None:
         np.testing.assert_array_equal(ours, theirs)
 
 
-def test_no_splats() -> None:
+def test_ext_splats_of_no_splats_are_empty_arrays() -> None:
     packed = ext_splats.pack(Splats.empty(0, 3))
     assert {array.shape for array in packed.values()} == {(0, 4)}
     assert len(ext_splats.unpack(packed)) == 0
@@ -230,13 +230,13 @@ def test_no_splats() -> None:
         ({"sh3b": np.zeros((3, 2), np.uint32)}, r"sh3b is .*expected uint32\[3, 4\]"),
     ],
 )
-def test_wrong_arrays(change: dict[str, np.ndarray], text: str) -> None:
+def test_ext_splats_of_wrong_shapes_or_types_are_refused(change: dict[str, np.ndarray], text: str) -> None:
     with pytest.raises(FormatError, match=text):
         ext_splats.unpack(ext_splats.pack(random_splats(3, sh_degree=3)) | change)
 
 
 @pytest.mark.parametrize("name", ["ext0", "ext1", "sh1", "sh2", "sh3a", "sh3b"])
-def test_missing_arrays(name: str) -> None:
+def test_an_array_of_ext_splats_that_is_missing_is_named(name: str) -> None:
     packed = ext_splats.pack(random_splats(3, sh_degree=3))
     del packed[name]
     with pytest.raises(FormatError, match=f"no array {name}, only "):

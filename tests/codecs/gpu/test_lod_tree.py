@@ -38,7 +38,7 @@ def sized(size: np.ndarray) -> Splats:
     return splats_with(len(size), scale=(size / 2)[:, None], opacity=1)
 
 
-def test_layout_by_hand() -> None:
+def test_a_node_is_four_words_of_these_bytes() -> None:
     splats = splats_with(2, center=[1, -2, 0.5], scale=[0.25, 0.5, 0.75], opacity=[1, linear_opacity(np.float32(3))])
     packed = lod_tree.pack(splats, links([65535, 0], [2**32 - 1, 0]))
     assert list(packed) == ["lod_tree"]
@@ -97,7 +97,7 @@ def test_a_whole_tree_comes_back(threads: int) -> None:
     got.tree.validate()  # a copy
 
 
-def test_no_nodes() -> None:
+def test_a_tree_of_no_nodes_is_an_empty_array() -> None:
     packed = lod_tree.pack(Splats.empty(0, 0), links([], []))
     assert packed["lod_tree"].shape == (0, 4)
     assert len(lod_tree.unpack(packed).tree) == 0
@@ -112,12 +112,12 @@ def test_no_nodes() -> None:
         ({"lod_tree": np.uint32([[0, 0, 1, 1], [0, 0, 65536, 2]])}, "node 1 has 65,536 children, at most 65,535"),
     ],
 )
-def test_what_unpack_refuses(change: dict[str, np.ndarray], text: str) -> None:
+def test_arrays_that_are_no_tree_are_refused(change: dict[str, np.ndarray], text: str) -> None:
     with pytest.raises(FormatError, match=text):
         lod_tree.unpack(change)
 
 
-def test_what_pack_refuses() -> None:
+def test_trees_that_do_not_fit_into_the_words_are_refused() -> None:
     with pytest.raises(FormatError, match="2 nodes but 3 splats"):
         lod_tree.pack(random_splats(3), links([0, 0], [0, 0]))
     wide = LodTree(np.array([0, 70_000], np.uint32), np.zeros(2, np.uint32))  # type: ignore[arg-type]

@@ -52,7 +52,7 @@ def ramp(low: float, high: float, width: int) -> np.ndarray:
 # --- Layout -----------------------------------------------------------------------------------------------------------
 
 
-def test_layout_by_hand() -> None:
+def test_a_splat_is_four_words_of_these_bytes() -> None:
     splats = splats_with(
         rgb=[0, 1, 0.2],
         opacity=0.6,
@@ -92,7 +92,7 @@ def test_arrays_follow_the_degree(sh_degree: int) -> None:
 
 
 @pytest.mark.parametrize("encoding", [packed_splats.DEFAULT, WIDE])
-def test_colour(encoding: Encoding) -> None:
+def test_colours_are_within_half_a_step_of_their_range(encoding: Encoding) -> None:
     low, high = encoding.rgb_min, encoding.rgb_max
     bound = (high - low) / 510
     assert (
@@ -100,13 +100,13 @@ def test_colour(encoding: Encoding) -> None:
     )
 
 
-def test_opacity() -> None:
+def test_opacities_are_within_half_a_step() -> None:
     splats = splats_with(20_000, opacity=ramp(0, 1, 1)[:, 0])
     assert 0.99 / 510 <= largest_error("opacity", splats) <= ROUNDING / 510
 
 
 @pytest.mark.parametrize(("low", "high", "bound"), [(0, 0.99999, 1 / 255), (1, 5, 4 / 255)])
-def test_lod_opacity(low: float, high: float, bound: float) -> None:
+def test_lod_opacities_are_within_the_stated_bound(low: float, high: float, bound: float) -> None:
     d = ramp(low, high, 1)[:, 0]
     back = lod_opacity(round_trip(splats_with(20_000, opacity=linear_opacity(d)), LOD).opacity)
     error = np.abs(back.astype(np.float64) - d).max()
@@ -124,13 +124,13 @@ def test_center_on_a_grid() -> None:
 
 
 @given(center=arrays(np.float32, (8, 3), elements=st.floats(-65504, 65504, width=32)))
-def test_center(center: np.ndarray) -> None:
+def test_centers_keep_the_precision_of_float16(center: np.ndarray) -> None:
     back = round_trip(splats_with(8, center=center)).center.astype(np.float64)
     assert (np.abs(back - center) <= np.maximum(2.0**-11 * np.abs(center), 2.0**-25)).all()
 
 
 @pytest.mark.parametrize("encoding", [packed_splats.DEFAULT, WIDE])
-def test_scale(encoding: Encoding) -> None:
+def test_logarithms_of_scales_are_within_half_a_step_of_their_range(encoding: Encoding) -> None:
     log = ramp(encoding.ln_scale_min, encoding.ln_scale_max, 3).astype(np.float64)
     splats = splats_with(20_000, scale=np.exp(log))
     error = np.abs(np.log(round_trip(splats, encoding).scale) - log).max()
@@ -138,14 +138,14 @@ def test_scale(encoding: Encoding) -> None:
     assert 0.99 * bound <= error <= ROUNDING * bound
 
 
-def test_rotation() -> None:
+def test_rotations_are_off_by_less_than_two_degrees() -> None:
     quats = random_quats(100_000)
     error = degrees_between(quats, round_trip(splats_with(len(quats), quat_xyzw=quats)).quat_xyzw).max()
     assert 0.95 * 1.94 <= error <= 1.94
 
 
 @pytest.mark.parametrize("encoding", [packed_splats.DEFAULT, WIDE])
-def test_sh(encoding: Encoding) -> None:
+def test_sh_are_within_half_a_step_of_the_range_of_their_degree(encoding: Encoding) -> None:
     splats = random_splats(20_000, sh_degree=3)
     tops = {1: (encoding.sh1_max, 126), 2: (encoding.sh2_max, 254), 3: (encoding.sh3_max, 62)}
     for degree, (most, _) in tops.items():
@@ -200,7 +200,7 @@ def code(field: str, encoding: Encoding = packed_splats.DEFAULT, **columns: Any)
         (3e38, 255),
     ],
 )
-def test_scale_codes(scale: float, expected: int) -> None:
+def test_scales_are_coded_from_1_to_255_and_zero_as_0(scale: float, expected: int) -> None:
     assert code("log_scale", scale=scale) == [expected] * 3
 
 
@@ -227,7 +227,7 @@ def test_ties_of_sh_go_away_from_zero() -> None:
 
 
 @pytest.mark.parametrize(("opacity", "plain", "lod"), [(0, 0, 0), (0.5, 128, 64), (1, 255, 128), (7.5, 255, 177)])
-def test_opacity_codes(opacity: float, plain: int, lod: int) -> None:
+def test_opacities_are_coded_by_whether_they_are_of_a_tree(opacity: float, plain: int, lod: int) -> None:
     """1 is half-way between two codes of an LoD tree and goes up, to D = 1.016."""
     assert code("alpha", opacity=opacity) == plain
     assert code("alpha", LOD, opacity=opacity) == lod
@@ -247,7 +247,7 @@ def test_all_codes_come_back() -> None:
 
 @pytest.mark.filterwarnings("error")
 @given(packed=arrays(np.uint32, (9, 4)), sh1=arrays(np.uint32, (9, 2)), sh=arrays(np.uint32, (2, 9, 4)))
-def test_any_words_are_read_quietly(packed: np.ndarray, sh1: np.ndarray, sh: np.ndarray) -> None:
+def test_any_words_of_packed_splats_are_read_quietly(packed: np.ndarray, sh1: np.ndarray, sh: np.ndarray) -> None:
     splats = packed_splats.unpack({"packed": packed, "sh1": sh1, "sh2": sh[0], "sh3": sh[1]}, LOD)
     for column in ("scale", "quat_xyzw", "opacity", "rgb", "sh"):
         assert np.isfinite(getattr(splats, column)).all()
@@ -256,7 +256,7 @@ def test_any_words_are_read_quietly(packed: np.ndarray, sh1: np.ndarray, sh: np.
 # --- Chunks, threads, and what is refused -----------------------------------------------------------------------------
 
 
-def test_threads_and_chunks_change_nothing() -> None:
+def test_threads_and_chunks_do_not_change_a_word_of_packed_splats() -> None:
     splats = random_splats(CHUNK + 1000, sh_degree=3)
     one, two = (packed_splats.pack(splats, threads=threads) for threads in (1, 2))
     last = packed_splats.pack(splats.take(slice(CHUNK, None)))
@@ -268,7 +268,7 @@ def test_threads_and_chunks_change_nothing() -> None:
         np.testing.assert_array_equal(ours, theirs)
 
 
-def test_no_splats() -> None:
+def test_packed_splats_of_no_splats_are_empty_arrays() -> None:
     packed = packed_splats.pack(Splats.empty(0, 3))
     assert [array.shape for array in packed.values()] == [(0, 4), (0, 2), (0, 4), (0, 4)]
     assert len(packed_splats.unpack(packed)) == 0
@@ -283,12 +283,12 @@ def test_no_splats() -> None:
         ({"sh3": np.zeros((2, 4), np.uint32)}, r"sh3 is .*expected uint32\[3, 4\]"),
     ],
 )
-def test_wrong_arrays(change: dict[str, np.ndarray], text: str) -> None:
+def test_packed_splats_of_wrong_shapes_or_types_are_refused(change: dict[str, np.ndarray], text: str) -> None:
     with pytest.raises(FormatError, match=text):
         packed_splats.unpack(packed_splats.pack(random_splats(3, sh_degree=3)) | change)
 
 
-def test_a_missing_degree() -> None:
+def test_sh_of_a_degree_that_is_missing_are_refused() -> None:
     packed = packed_splats.pack(random_splats(3, sh_degree=3))
     del packed["sh1"]
     with pytest.raises(FormatError, match=r"SH arrays of degree \(2, 3\)"):

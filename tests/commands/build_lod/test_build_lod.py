@@ -166,7 +166,7 @@ def test_a_file_that_may_not_be_read_does_not_stop_the_others(
     assert run(["inspect", str(ONE), str(closed)]) == 1
 
 
-def test_an_input_is_never_an_output(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_build_lod_never_writes_over_its_input(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = scene.read_bytes()
     assert build(scene, "-o", scene, "--overwrite") == 2
     assert "is an input" in capsys.readouterr().err

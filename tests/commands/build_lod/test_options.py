@@ -127,6 +127,8 @@ def test_more_processors_than_threads_that_are_taken(scene: Path, monkeypatch: p
         (["a.ply", "--overwritten"], "--overwrite"),
     ],
 )
-def test_wrong_usage_is_exit_code_2(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_usage_of_build_lod_is_exit_code_2(
+    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert build(*arguments) == 2
     assert message in capsys.readouterr().err

@@ -16,7 +16,7 @@ from tests.commands.build_lod.runs import SMALL, sparklod
 from tests.conftest import FIXTURES, ROOT
 
 
-def test_closed_streams(tmp_path: Path) -> None:
+def test_a_closed_standard_output_is_an_error_and_a_closed_standard_error_is_none(tmp_path: Path) -> None:
     command = f"{sys.executable} -m sparklod_cli build-lod {SMALL}"
     done = subprocess.run(["bash", "-c", f"{command} -o - >&-"], capture_output=True, text=True, check=False, cwd=ROOT)
     assert (done.returncode, done.stderr) == (1, f"error: {SMALL}: standard output is closed\n")

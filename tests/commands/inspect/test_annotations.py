@@ -11,7 +11,7 @@ from sparklod_cli.inspection.findings import CODES, Finding
 from tests.commands.inspect.runs import BROKEN, CORRUPT, NOTED, TREE, WARNED, Said, inspect
 
 
-def test_annotations_of_github(capsys: Said) -> None:
+def test_every_finding_is_an_annotation_for_github(capsys: Said) -> None:
     assert inspect("--check", "--format", "github", CORRUPT, BROKEN, WARNED, NOTED, TREE) == 3
     out, err = capsys.readouterr()
     lines = out.splitlines()
@@ -20,7 +20,9 @@ def test_annotations_of_github(capsys: Said) -> None:
     assert err == f"{TREE}: nothing is wrong with its 9 nodes\n"
 
 
-def test_annotations_are_escaped(tmp_path: Path, capsys: Said, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_name_ends_an_annotation_or_begins_a_command(
+    tmp_path: Path, capsys: Said, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A name could end the annotation, or begin another command."""
     path = tmp_path / "50%, a:b\n::stop.spz"
     shutil.copy(BROKEN, path)

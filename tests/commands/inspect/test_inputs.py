@@ -19,7 +19,7 @@ from sparklod_cli.tree import LodTree
 from tests.commands.inspect.runs import FAULTS, FOLDER, TREE, Said, inspect, records
 
 
-def test_an_unpacked_sog(tmp_path: Path, capsys: Said) -> None:
+def test_an_unpacked_sog_counts_as_one_file(tmp_path: Path, capsys: Said) -> None:
     assert inspect(FOLDER, FOLDER / "meta.json", "--json") == 0
     folder, meta = records(capsys.readouterr().out)
     size = sum(path.stat().st_size for path in FOLDER.iterdir())

@@ -52,7 +52,9 @@ def test_histograms_are_asked_for_by_name(capsys: Said) -> None:
     [(TREE, 0, 0), (CORRUPT, 1, 3), (MISSING, 1, 3), (BROKEN, 0, 3), (WARNED, 0, 0), (NOTED, 0, 0)],
     ids=lambda value: getattr(value, "name", None),
 )
-def test_exit_codes(file: Path, without: int, with_check: int, capsys: Said) -> None:
+def test_the_exit_code_says_whether_a_file_was_read_and_checked(
+    file: Path, without: int, with_check: int, capsys: Said
+) -> None:
     assert inspect(file) == without
     assert inspect(file, "--json") == without
     assert inspect(file, "--check") == with_check
@@ -94,7 +96,7 @@ def test_exit_codes(file: Path, without: int, with_check: int, capsys: Said) -> 
         ([TREE, "--histogram", "beauty"], "--histogram knows"),
     ],
 )
-def test_wrong_usage_is_exit_code_2(arguments: list[object], message: str, capsys: Said) -> None:
+def test_wrong_usage_of_inspect_is_exit_code_2(arguments: list[object], message: str, capsys: Said) -> None:
     assert inspect(*arguments) == 2
     assert message in capsys.readouterr().err
 
@@ -144,7 +146,7 @@ def test_quiet_prints_what_is_asked_for_by_name_only(capsys: Said) -> None:
     assert capsys.readouterr().err.startswith(f"error: {CORRUPT}")
 
 
-def test_threads_change_nothing(capsys: Said) -> None:
+def test_threads_do_not_change_a_report(capsys: Said) -> None:
     printed = set()
     for threads in (1, 2, 5):
         assert inspect(FIXTURES / "demo.ply", TREE, "--json", "--stats", "--check", "--threads", threads) == 0
@@ -152,7 +154,7 @@ def test_threads_change_nothing(capsys: Said) -> None:
     assert len(printed) == 1
 
 
-def test_as_a_process() -> None:
+def test_a_process_prints_findings_and_exits_3() -> None:
     def sparklod(*arguments: object) -> subprocess.CompletedProcess[str]:
         command = [sys.executable, "-m", "sparklod_cli", "inspect", *map(str, arguments)]
         return subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)

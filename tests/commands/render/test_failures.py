@@ -61,7 +61,7 @@ from tests.commands.render.runs import CAMERAS, FAULTS, PLAIN, SIZE, TREE, Said,
         ([TREE, "--threads", "0"], "--threads"),
     ],
 )
-def test_wrong_usage_is_exit_code_2(
+def test_wrong_usage_of_render_is_exit_code_2(
     arguments: list[object], message: str, capsys: Said, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -87,7 +87,7 @@ def test_wrong_usage_is_exit_code_2(
     ],
     ids=str,
 )
-def test_a_file_that_fails_is_named_in_a_line(
+def test_a_file_that_cannot_be_drawn_is_named_in_a_line(
     arguments: list[object],
     named: object,
     message: str,
@@ -105,7 +105,7 @@ def test_a_file_that_fails_is_named_in_a_line(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_input_is_never_an_output(tmp_path: Path, capsys: Said) -> None:
+def test_render_never_writes_over_its_inputs(tmp_path: Path, capsys: Said) -> None:
     scene, path, sheet = tmp_path / "scene.png", tmp_path / "0001.png", tmp_path / "x.png"
     shutil.copy(PLAIN, scene)
     shutil.copy(CAMERAS / "sparklod.json", path)
@@ -122,7 +122,7 @@ def test_an_input_is_never_an_output(tmp_path: Path, capsys: Said) -> None:
     assert {each: each.read_bytes() for each in before} == before
 
 
-def test_what_exists_stays(tmp_path: Path, capsys: Said) -> None:
+def test_an_existing_frame_stays_without_overwrite(tmp_path: Path, capsys: Said) -> None:
     (tmp_path / "out.0002.png").write_text("precious")
     assert render(TREE, *SIZE, "--orbit", 3, "-o", tmp_path / "out.%04d.png") == 1
     assert "out.0002.png exists, add --overwrite to replace it" in capsys.readouterr().err
@@ -131,7 +131,9 @@ def test_what_exists_stays(tmp_path: Path, capsys: Said) -> None:
     assert len(list(tmp_path.iterdir())) == 3
 
 
-def test_a_failure_leaves_nothing_half_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Said) -> None:
+def test_an_interrupted_render_leaves_no_half_picture(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Said
+) -> None:
     draw, count = Painter.draw, []
 
     def falling(self: Painter, *arguments: Any) -> Any:

@@ -60,7 +60,7 @@ def test_several_views_make_a_contact_sheet(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("form", ["gif", "webp", "mp4"])
-def test_an_animation(form: str, tmp_path: Path, capsys: Said) -> None:
+def test_an_animation_has_the_frames_of_its_path(form: str, tmp_path: Path, capsys: Said) -> None:
     if form == "mp4":
         pytest.importorskip("imageio_ffmpeg", reason="the extra video is not installed")
     output = tmp_path / f"orbit.{form}"

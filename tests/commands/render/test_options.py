@@ -157,7 +157,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_every_option_is_used_or_refused(
+def test_every_option_of_render_is_used_or_refused(
     mode: str, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(folder)
@@ -204,5 +204,5 @@ def test_every_option_is_used_or_refused(
     assert " ".join(ignored) == ""
 
 
-def test_every_option_has_a_row() -> None:
+def test_every_option_of_render_has_a_row() -> None:
     assert {param.name for param in command.params} == set(GIVEN) | OF_WORK | {"version"}

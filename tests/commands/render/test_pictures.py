@@ -95,7 +95,7 @@ def test_standard_output_is_a_png(capfdbinary: pytest.CaptureFixture[bytes], tmp
     assert out == (tmp_path / "x.png").read_bytes()
 
 
-def test_two_runs_give_the_same_bytes(tmp_path: Path) -> None:
+def test_two_renders_give_the_same_bytes(tmp_path: Path) -> None:
     made = set()
     for threads in (1, 2):
         assert render(TOWN, PLAIN, *SIZE, "--threads", threads, "-o", tmp_path / f"{threads}.png", "-q") == 0
@@ -118,12 +118,12 @@ def test_colours_that_mean_something(by: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("style", limits.STYLES)
-def test_styles(style: str, tmp_path: Path) -> None:
+def test_every_style_draws_something(style: str, tmp_path: Path) -> None:
     assert render(TOWN, "--budget", "4k", *SIZE, "-q", "--style", style, "-o", tmp_path / "x.png") == 0
     assert pixels(tmp_path / "x.png").any()
 
 
-def test_a_scene_file_says_what_stands_where(tmp_path: Path, capsys: Said) -> None:
+def test_every_file_of_an_instances_file_is_drawn(tmp_path: Path, capsys: Said) -> None:
     shutil.copy(TREE, tmp_path / "tree.spz")
     shutil.copy(PLAIN, tmp_path / "plain.ply")
     scene = tmp_path / "scene.json"

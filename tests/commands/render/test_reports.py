@@ -44,7 +44,7 @@ def test_the_time_that_is_said_is_the_whole_time(tmp_path: Path, monkeypatch: py
     assert float(err.rsplit(" ", 2)[1]) >= 0.5
 
 
-def test_help_shows_how(capsys: Said) -> None:
+def test_help_of_render_has_examples(capsys: Said) -> None:
     assert render("--help") == 0
     out = capsys.readouterr().out
     assert "Examples:" in out
@@ -53,7 +53,7 @@ def test_help_shows_how(capsys: Said) -> None:
         assert option in out
 
 
-def test_as_a_process(tmp_path: Path) -> None:
+def test_a_process_writes_a_png_and_says_nothing(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "sparklod_cli", "render", str(TREE), "--size", "64x48", "-o", "-", "-q"]
     done = subprocess.run(command, capture_output=True, check=False, cwd=ROOT)
     assert done.returncode == 0

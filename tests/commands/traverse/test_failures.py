@@ -67,14 +67,14 @@ from tests.conftest import FIXTURES, ROOT
         ([TREE, OTHER, "--chunk-cache", "1"], "cannot hold the roots of 2 trees"),
     ],
 )
-def test_wrong_usage_is_exit_code_2(arguments: list[object], message: str, capsys: Said) -> None:
+def test_wrong_usage_of_traverse_is_exit_code_2(arguments: list[object], message: str, capsys: Said) -> None:
     assert traverse(*arguments) == 2
     out, err = capsys.readouterr()
     assert message in err
     assert out == ""
 
 
-def test_an_input_is_never_an_output(tmp_path: Path, capsys: Said) -> None:
+def test_traverse_never_writes_over_its_inputs(tmp_path: Path, capsys: Said) -> None:
     tree, cameras = tmp_path / "tree.spz", tmp_path / "path.json"
     shutil.copy(TREE, tree)
     shutil.copy(CAMERAS / "sparklod.json", cameras)
@@ -115,7 +115,7 @@ def test_an_input_is_never_an_output(tmp_path: Path, capsys: Said) -> None:
     ],
     ids=str,
 )
-def test_a_file_that_fails_is_named_in_a_line(
+def test_a_file_that_cannot_be_traversed_is_named_in_a_line(
     arguments: list[object], named: object, message: str, capsys: Said
 ) -> None:
     assert traverse(*arguments) == 1
@@ -126,7 +126,9 @@ def test_a_file_that_fails_is_named_in_a_line(
     assert (out, err.count("\n")) == ("", 1)
 
 
-def test_a_failure_leaves_nothing_half_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Said) -> None:
+def test_an_interrupted_traversal_leaves_no_half_table(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Said
+) -> None:
     fly = Simulation.run
 
     def falling(self: Simulation, *arguments: Any, **settings: Any) -> Any:

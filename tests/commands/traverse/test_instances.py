@@ -19,7 +19,7 @@ def test_files_of_one_name_get_numbers(tmp_path: Path, capsys: Said) -> None:
     assert names[:4] == ["total", "door", "door 2", "door 3"]
 
 
-def test_a_scene_file_says_what_stands_where(tmp_path: Path, capsys: Said) -> None:
+def test_an_instance_farther_away_has_fewer_nodes(tmp_path: Path, capsys: Said) -> None:
     shutil.copy(TREE, tmp_path / "tree.spz")
     scene = scene_file(tmp_path, {"file": "tree.spz", "name": "near"}, {"file": "tree.spz", "translation": [0, 0, 500]})
     assert traverse("--scene", scene, "--look-at", "0,0,-9:0,0,0", "--per-instance") == 0
@@ -36,7 +36,9 @@ def test_a_scene_names_what_is_missing_beside_it(tmp_path: Path, capsys: Said) -
     assert f"error: {tmp_path / 'scene.json'}: instance 1 has scale 'big'" in capsys.readouterr().err
 
 
-def test_a_city(built: Path, tmp_path: Path, capsys: Said) -> None:
+def test_a_walk_through_a_city_has_a_row_for_every_instance_and_frame(
+    built: Path, tmp_path: Path, capsys: Said
+) -> None:
     """Three trees, five instances, ten seconds on foot, over a network."""
     for name in ("demo-lod.spz", "sh3-lod.spz"):
         shutil.copy(built / name, tmp_path / name)

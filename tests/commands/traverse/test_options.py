@@ -76,7 +76,7 @@ def tidy(text: str, *, table: bool) -> Any:
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_every_option_is_used_or_refused(
+def test_every_option_of_traverse_is_used_or_refused(
     mode: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -113,5 +113,5 @@ def test_every_option_is_used_or_refused(
     assert " ".join(ignored) == ""
 
 
-def test_every_option_has_a_row() -> None:
+def test_every_option_of_traverse_has_a_row() -> None:
     assert {param.name for param in command.params} == set(GIVEN) | OF_WORK | {"version"}

@@ -25,7 +25,7 @@ def test_a_table_comes_on_standard_output_and_nothing_else_is_said(capsys: Said)
     assert err == ""
 
 
-def test_two_runs_give_the_same_bytes(capsys: Said) -> None:
+def test_two_traversals_give_the_same_bytes(capsys: Said) -> None:
     outs = set()
     for threads in (1, 2, 5):
         assert traverse(TOWN, *ORBIT, "--budget", "4k", "--no-timing", "--threads", threads, "--per-instance") == 0
@@ -105,7 +105,7 @@ def test_json_is_the_summary_and_the_table_goes_to_its_file(tmp_path: Path, caps
     assert json.loads(capsys.readouterr().out)["frames"] == 3
 
 
-def test_what_must_hold(tmp_path: Path, capsys: Said) -> None:
+def test_an_assertion_that_does_not_hold_is_exit_code_3(tmp_path: Path, capsys: Said) -> None:
     output = tmp_path / "out.csv"
     settings = (TOWN, *ORBIT, "--budget", "4k", "-o", output, "--overwrite")
     assert traverse(*settings, "--assert", "selected<=4k", "--assert", "missing==0") == 0
@@ -126,7 +126,7 @@ def test_what_must_hold(tmp_path: Path, capsys: Said) -> None:
     assert json.loads(capsys.readouterr().out)["asserts"][0]["held"] is False
 
 
-def test_help_shows_how(capsys: Said) -> None:
+def test_help_of_traverse_has_examples(capsys: Said) -> None:
     assert traverse("--help") == 0
     out = capsys.readouterr().out
     assert "Examples:" in out
@@ -142,7 +142,7 @@ def test_verbose_says_how_long_it_took(capsys: Said) -> None:
     assert "holds: selected>0" in err
 
 
-def test_as_a_process() -> None:
+def test_a_process_writes_a_row_for_a_view() -> None:
     command = [sys.executable, "-m", "sparklod_cli", "traverse", str(TREE), "--look-at", "0,-1,-9:0,0,0"]
     done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
     assert done.returncode == 0

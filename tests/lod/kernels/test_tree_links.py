@@ -119,7 +119,7 @@ def test_children_count_by_what_they_cover(links: Links, seed: int) -> None:
 
 
 @given(ANY)
-def test_levels_are_counted(links: Links) -> None:
+def test_sums_over_levels_count_every_node_once(links: Links) -> None:
     count, start, size = arrays(links)
     depth, _ = walk(count, start, size)
     nodes, leaves, logs, children = sum_levels(depth, count, size)
@@ -163,7 +163,7 @@ def test_it_runs_as_python() -> None:
         test_every_node_is_visited_once_by_the_shortest_way,
         test_parents_are_those_that_have_a_node_as_a_child,
         test_cycles_are_what_one_never_leaves_upwards,
-        test_levels_are_counted,
+        test_sums_over_levels_count_every_node_once,
     )
     tests = [f"{__file__}::{test.__name__}" for test in twins]
     done = subprocess.run(

@@ -68,7 +68,7 @@ def test_missing_libraries_are_named(tmp_path: Path) -> None:
     assert "apt install libosmesa6 or libegl1" in done.stdout and done.stdout.count("\n") == 1
 
 
-def test_moderngl_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_extra_that_brings_moderngl_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "moderngl", None)
     with pytest.raises(BackendError, match=r"pip install 'sparklod\[render\]'"):
         osmesa.open_context.__wrapped__()

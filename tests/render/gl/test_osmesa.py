@@ -111,7 +111,7 @@ def test_draws_what_the_reference_draws(name: str, eye: str, profile: str) -> No
 @needs_opengl
 @pytest.mark.parametrize("sort", SORTS)
 @pytest.mark.parametrize("eye", [(0, 0, 9), (4, 3, 4), (0.5, 0.5, 0.5)])
-def test_demo(eye: tuple[float, ...], sort: str) -> None:
+def test_the_demo_is_drawn_as_the_reference_draws_it(eye: tuple[float, ...], sort: str) -> None:
     """The scene of the fixtures, through Backend, and with spherical harmonics of the camera's direction."""
     splats = read_scene(FIXTURES / "demo.ply", threads=2).splats
     seen = camera(eye, target=tuple(np.median(splats.center, axis=0)), size=(320, 200))
@@ -137,7 +137,7 @@ def test_near_and_far_and_what_is_beside_the_picture() -> None:
 @needs_opengl
 @pytest.mark.parametrize("size", [(1, 1), (17, 300), (300, 17)])
 @pytest.mark.parametrize("precision", texture.PRECISIONS)
-def test_sizes_of_pictures(size: tuple[int, int], precision: str) -> None:
+def test_pictures_of_any_size_are_those_of_the_reference(size: tuple[int, int], precision: str) -> None:
     seen = camera((0, 0, 3), size=size)
     reference = rasterizer.draw(SPLATS["large"], seen, Look())
     image = osmesa.draw(SPLATS["large"], seen, Look(), precision=precision)
@@ -160,7 +160,7 @@ def one(**columns: list[float]) -> Shown:
 
 @needs_opengl
 @pytest.mark.parametrize("precision", texture.PRECISIONS)
-def test_one_splat(precision: str) -> None:
+def test_one_splat_is_the_gaussian_of_the_textbook(precision: str) -> None:
     """By the textbook: 20 pixels of standard deviation, in the middle; the first row is the uppermost."""
     straight = np.eye(4)
     straight[2, 3] = 5
@@ -181,7 +181,7 @@ def test_one_splat(precision: str) -> None:
 @pytest.mark.parametrize("precision", texture.PRECISIONS)
 @pytest.mark.parametrize("sorting", order.SORTINGS)
 @pytest.mark.parametrize("throttle", [0.0, 0.01])
-def test_empty(precision: str, sorting: str, throttle: float) -> None:
+def test_a_picture_of_no_splats_is_empty(precision: str, sorting: str, throttle: float) -> None:
     image = osmesa.draw(
         random_shown(0), CAMERAS["front"], Look(), precision=precision, sorting=sorting, throttle=throttle
     )
@@ -257,7 +257,7 @@ def turned(degrees: float, *, away: float = 0.0) -> Camera:
 
 
 @needs_opengl
-def test_throttle() -> None:
+def test_a_throttle_sorts_anew_only_after_a_large_turn() -> None:
     shown = SPLATS["plausible"]
     lazy = osmesa.Renderer(throttle=0.01)
     for degrees, sorts in ((0, 1), (5, 1), (8, 1), (8.2, 2), (3, 2), (0, 3)):
@@ -285,7 +285,7 @@ def test_throttle() -> None:
     assert eager.sorts == 3
 
 
-def test_sorting() -> None:
+def test_keys_are_sorted_upwards_and_equal_ones_backwards() -> None:
     rng = np.random.default_rng(0)
     key = np.concatenate([rng.normal(0, 100, 5000), np.repeat(rng.normal(0, 100, 50), 20)]).astype(np.float32)
     rng.shuffle(key)
@@ -301,7 +301,7 @@ def test_sorting() -> None:
 
 
 @needs_opengl
-def test_counting16_against_exact() -> None:
+def test_sorting_by_16_bits_hardly_changes_a_picture() -> None:
     for name in ("plausible", "merged"):
         images = [osmesa.draw(SPLATS[name], CAMERAS["beside"], Look(), sorting=sorting) for sorting in order.SORTINGS]
         assert psnr(*images) >= 60

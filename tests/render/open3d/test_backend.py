@@ -147,7 +147,7 @@ def test_landmarks_are_where_they_belong(at: tuple[float, float, float]) -> None
 
 
 @pytest.mark.usefixtures("open3d")
-def test_colors_come_back() -> None:
+def test_open3d_draws_the_colours_it_is_given() -> None:
     seen = straight(400, 100)
     colors = np.array([[0.9, 0.5, 0.1], [0.02, 0.3, 1], [1, 1, 1], [0.2, 0.2, 0.2]], np.float32)
     column = np.array([50, 150, 250, 350])
