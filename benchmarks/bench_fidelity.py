@@ -29,10 +29,11 @@ from sparklod_cli.cameras.path import GENERATED, cameras_of
 from sparklod_cli.codecs import spz
 from sparklod_cli.codecs.gpu import ext_splats, lod_tree
 from sparklod_cli.codecs.gpu.lod_tree import Nodes
-from sparklod_cli.compare import Budget, on_background, parse_budgets
+from sparklod_cli.compare import on_background
 from sparklod_cli.images.metrics import psnr
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod import quality, quick
+from sparklod_cli.lod.budget import Budget, parse_budgets
 from sparklod_cli.lod.traversal import Forest, Instance, Traversal
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene

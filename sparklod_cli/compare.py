@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from fractions import Fraction
+from dataclasses import replace
 
 import numpy as np
 
 from .cameras.path import CameraPath
 from .images.metrics import check_covered, psnr, ssim, worst_tile
+from .lod.budget import Budget
 from .lod.settings import LodSettings
 from .render.rasterizer import Image
 from .render.renderer import Renderer
@@ -20,59 +19,12 @@ from .scenes.loaded import Scenes
 from .support.errors import SparklodError
 from .support.parallel import ordered_map
 from .support.progress import Progress, silent
-from .support.units import parse_count
 from .tables.columns import Row
 from .tables.comparison import COLUMNS
 from .tables.statistics import numbers
 
-#: What a budget can be a share of: the splats of full detail.
-SHARE = re.compile(r"([0-9]{1,3}(?:\.[0-9]{1,9})?|\.[0-9]{1,9})\s*%")
-
 #: Threads that measure pictures; each has a few that wait, which take memory.
 MEASURERS = 4
-
-
-@dataclass(frozen=True)
-class Budget:
-    """How many splats are drawn at most.
-
-    Attributes:
-        text: as people write it, "5%" or "500k".
-        share: of full detail; None for a count.
-        count: None for a share.
-    """
-
-    text: str
-    share: Fraction | None
-    count: int | None
-
-    def of(self, leaves: int) -> int:
-        """Splats, where full detail has so many."""
-        if self.count is not None:
-            return self.count
-        assert self.share is not None
-        return max(1, int(self.share * leaves))
-
-
-def parse_budgets(text: str) -> tuple[Budget, ...]:
-    """Budgets from a text such as "2%,5%,500k": shares of the splats of full detail, or counts.
-
-    Raises:
-        ValueError: one is neither, or nothing.
-    """
-    budgets = []
-    for part in filter(None, map(str.strip, text.split(","))):
-        found = SHARE.fullmatch(part)
-        try:
-            budget = Budget(part, Fraction(found[1]) / 100, None) if found else Budget(part, None, parse_count(part))
-        except ValueError:
-            raise ValueError(f"{part!r} is neither a share such as 5% nor a count such as 500k") from None
-        if not (budget.share or budget.count):
-            raise ValueError(f"{part!r} leaves nothing to draw")
-        budgets.append(budget)
-    if not budgets:
-        raise ValueError("there is no budget in it, such as 5% or 500k")
-    return tuple(budgets)
 
 
 class Comparison:

@@ -15,12 +15,14 @@ import click
 
 from ..support import defaults
 from .console import Console, count_of, for_screen, is_terminal
-from .options import Command, Quantity, table_form
+from .options.common import Command, table_form
+from .options.types import Quantity
 from .paths import OutputPath
 
 if TYPE_CHECKING:
     from ..cameras.path import CameraPath
-    from ..compare import Budget, Comparison
+    from ..compare import Comparison
+    from ..lod.budget import Budget
     from ..lod.settings import LodSettings
     from ..render.settings import RenderSettings
     from ..scenes.loaded import Scenes
@@ -36,7 +38,7 @@ ABOUT = ":"
 
 
 def _budgets(text: str) -> Any:
-    from ..compare import parse_budgets
+    from ..lod.budget import parse_budgets
 
     return parse_budgets(text)
 
@@ -166,7 +168,7 @@ def run(
     """
     from ..compare import Comparison
     from ..io import write_stdout, write_whole
-    from ..tables.comparison import COLUMNS
+    from ..tables.comparison import COLUMNS, rows_by_budget
     from ..tables.files import encode
 
     wanted.check()
@@ -195,8 +197,9 @@ def run(
     if wanted.plot is not None:
         from ..figures.comparison_chart import plot
 
-        texts = [budget.text for budget in wanted.budgets]
-        write_whole(wanted.plot, [plot(rows, texts, world.title)], overwrite=wanted.overwrite)
+        texts = (budget.text for budget in wanted.budgets)
+        series = list(zip(texts, rows_by_budget(rows, len(wanted.budgets)), strict=True))
+        write_whole(wanted.plot, [plot(series, world.title)], overwrite=wanted.overwrite)
     return _report(console, wanted, comparison, path, rows)
 
 

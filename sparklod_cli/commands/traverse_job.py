@@ -15,17 +15,17 @@ import click
 import numpy as np
 
 from ..io import check_writable, write_stdout, write_whole
+from ..simulation.summary import Lookout
 from ..support.progress import Progress, silent
-from ..tables.summary import Lookout
 from .console import Console, for_screen, is_terminal
 from .traverse_text import lines
 
 if TYPE_CHECKING:
     from ..cameras.path import CameraPath
     from ..simulation.frames import Frame, Simulation
+    from ..simulation.summary import Summary
     from ..tables.assertions import Assertion
     from ..tables.columns import Column, Row
-    from ..tables.summary import Summary
 
 #: Nodes of a row of Spark's index texture.
 ROW = 16_384
@@ -115,11 +115,12 @@ class Job:
 
     def report(self) -> int:
         """Says what is asked for; the exit status."""
+        from ..simulation.columns import EMPTY
+        from ..simulation.summary import summarize
         from ..tables.assertions import check
-        from ..tables.summary import summarize
 
         wanted = self.wanted
-        outcomes = check(wanted.asserts, self.rows)
+        outcomes = check(wanted.asserts, self.rows, empty=EMPTY)
         summary = summarize(self.rows)
         if wanted.as_json:
             asserts = [{"assert": each.assertion.text, "held": each.held, "value": each.value} for each in outcomes]
@@ -188,7 +189,8 @@ class Job:
             np.concatenate([part.depth for part in cut.parts]),
             at,
         )
-        drawn = plot(self.rows, scenes.title, scenery)
+        marked = {moment.what: moment.frame for moment in self._lookout.moments()}
+        drawn = plot(self.rows, marked, scenes.title, scenery)
         if drawn.note:
             self.console.say(f"{target}: {drawn.note}")
         write_whole(target, [drawn.png], overwrite=self.wanted.overwrite)

@@ -9,7 +9,7 @@ from ..support.printable import printable
 from .console import count_of, size_of
 
 if TYPE_CHECKING:
-    from ..tables.summary import Moment, Quantity, Summary
+    from ..simulation.summary import Moment, Quantity, Summary
 
 #: No line is longer; names of frames are cut to fit.
 WIDTH = 100

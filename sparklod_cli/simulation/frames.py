@@ -19,8 +19,9 @@ from ..scenes.finder import view_of
 from ..scenes.loaded import Scenes
 from ..support.parallel import ordered_map
 from ..support.progress import Progress, silent
-from ..tables.columns import COLUMNS, Row
+from ..tables.columns import Row
 from .chunk_cache import Chunks
+from .columns import COLUMNS
 from .streaming import Stream, StreamingSettings
 
 

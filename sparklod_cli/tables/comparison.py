@@ -6,15 +6,11 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from .columns import COLUMNS as OF_SIMULATION
-from .columns import Column, Row
+from .columns import FRAME, Column, Row
 from .statistics import numbers, statistic
 
-#: Columns that it shares with the table of a simulation.
-WHERE = ("frame", "time_s", "name")
-
 COLUMNS = (
-    *(column for column in OF_SIMULATION if column.name in WHERE),
+    *FRAME,
     Column("budget", int, "", "splats", "the most that may be drawn, all instances together"),
     Column("share", float, ".6g", "share", "budget over the splats of full detail"),
     Column("selected", int, "", "splats", "what is drawn; with `--continuous` more than the budget, as some fade"),

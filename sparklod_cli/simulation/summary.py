@@ -1,0 +1,209 @@
+"""What a simulation comes to: statistics of its frames, its totals, and the frames that are worth a look."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from ..tables.columns import Row
+from ..tables.statistics import Number, numbers, statistic, totals
+from .columns import COLUMNS
+
+UNITS = {column.name: column.unit for column in COLUMNS}
+
+#: The share of the cut that is in the picture, which is no column, but two.
+IN_FRUSTUM = "in_frustum_share"
+
+#: What statistics are made of, in this order.
+QUANTITIES = (
+    "selected", "budget_used", "pixel_scale_min", "projected_px_p95", "overdraw_estimate", IN_FRUSTUM,
+    "chunks_new", "bytes_new", "missing", "complete_in_s", "churn", "traverse_ms",
+)  # fmt: skip
+
+SHOWN = ("min", "p50", "p95", "max")
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """Statistics over the frames.
+
+    Attributes:
+        name: of a column, or `IN_FRUSTUM`.
+        unit: of the four; empty for a plain number.
+        frames: those with a value.
+        min, p50, p95, max: over these.
+    """
+
+    name: str
+    unit: str
+    frames: int
+    min: Number
+    p50: Number
+    p95: Number
+    max: Number
+
+
+@dataclass(frozen=True)
+class Moment:
+    """A frame that is worth a look.
+
+    Attributes:
+        what: the reason, as a name: one of `MOMENTS`.
+        frame: its number.
+        time_s: seconds on the path.
+        name: of the frame; None where it has none.
+        value: that it has the most of.
+        unit: of the value; "limit" is a multiple of the pixel scale limit.
+    """
+
+    what: str
+    frame: int
+    time_s: float | None
+    name: str | None
+    value: Number
+    unit: str
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What a simulation comes to.
+
+    Attributes:
+        frames: their number.
+        seconds: from the first to the last.
+        chunks, bytes: that were fetched in all.
+        chunks_first, bytes_first: of them, those of the first frame.
+        stop_reasons: shares of the frames, 0..1, the most frequent first.
+        quantities: statistics; those without a value on any frame are left out.
+        moments: the frames to look at; those where there is nothing to see are left out.
+    """
+
+    frames: int
+    seconds: float
+    chunks: int
+    bytes: int
+    chunks_first: int
+    bytes_first: int
+    stop_reasons: dict[str, float]
+    quantities: tuple[Quantity, ...]
+    moments: tuple[Moment, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """As plain lists, dicts and numbers, for JSON; quantities and moments by their names."""
+        plain = asdict(self)
+        for group, name in (("quantities", "name"), ("moments", "what")):
+            plain[group] = {each.pop(name): each for each in plain[group]}
+        return plain
+
+
+def summarize(rows: Iterable[Row]) -> Summary:
+    """Summary of the rows of all frames, in their order; those of single instances are left out."""
+    frames = totals(rows)
+    times = numbers(frames, "time_s")
+    reasons = Counter(str(row["stop_reason"]) for row in frames if row["stop_reason"] is not None)
+    chunks, size = numbers(frames, "chunks_new"), numbers(frames, "bytes_new")
+    return Summary(
+        frames=len(frames),
+        seconds=round(times[-1] - times[0], 6) if times else 0.0,
+        chunks=int(sum(chunks)),
+        bytes=int(sum(size)),
+        chunks_first=int(sum(numbers(frames[:1], "chunks_new"))),
+        bytes_first=int(sum(numbers(frames[:1], "bytes_new"))),
+        stop_reasons={reason: round(count / reasons.total(), 6) for reason, count in reasons.most_common()},
+        quantities=tuple(quantity for name in QUANTITIES if (quantity := _quantity(name, frames)) is not None),
+        moments=tuple(look_at(frames)),
+    )
+
+
+def _quantity(name: str, frames: Sequence[Row]) -> Quantity | None:
+    values = [share for row in frames if (share := _share(row)) is not None]
+    if name != IN_FRUSTUM:
+        values = numbers(frames, name)
+    if not values:
+        return None
+    found = {each: _rounded(statistic(each, values)) for each in SHOWN}
+    return Quantity(name, UNITS.get(name, "share"), len(values), **found)
+
+
+def _share(row: Row) -> Number | None:
+    seen, selected = row["in_frustum"], row["selected"]
+    return seen / selected if isinstance(seen, int) and isinstance(selected, int) and selected else None
+
+
+def _rounded(value: Number) -> Number:
+    """To nine digits, so that no figure ends in what floats leave behind."""
+    return value if isinstance(value, int) else float(f"{value:.9g}")
+
+
+def coarseness(row: Row) -> Number | None:
+    """How many times the limit the pixel scale is, down to which everything has been divided; None without either."""
+    scale, limit = row["pixel_scale_min"], row["pixel_scale_limit"]
+    return scale / limit if isinstance(scale, (int, float)) and isinstance(limit, (int, float)) and limit else None
+
+
+def _cell(name: str) -> Callable[[Row], Number | None]:
+    return lambda row: next(iter(numbers([row], name)), None)
+
+
+#: What can be the reason to look at a frame: how much there is of it, above how much, and the unit.
+MOMENTS: dict[str, tuple[Callable[[Row], Number | None], Number, str]] = {
+    "churn": (_cell("churn"), 0, "share"),
+    "bytes": (_cell("bytes_new"), 0, "bytes"),
+    "coarsest": (coarseness, 1, "limit"),
+    "missing": (_cell("missing"), 0, "splats"),
+    "incomplete": (_cell("complete_in_s"), 0, "s"),
+    "overdraw": (_cell("overdraw_estimate"), 0, ""),
+}
+
+
+class Lookout:
+    """Finds the frames with the most of each reason to look at them, one frame after the other.
+
+    Of those with as much it is the first. What the first frame fetches is no such reason: it has to fetch everything.
+    """
+
+    def __init__(self) -> None:
+        self._most: dict[str, tuple[Number, Row]] = {}
+        self._frames = 0
+
+    def add(self, row: Row) -> list[str]:
+        """Takes the row of the next frame; of which of `MOMENTS` it has more than all before."""
+        found = []
+        for what, (measure, above, _) in MOMENTS.items():
+            value = None if what == "bytes" and not self._frames else measure(row)
+            if value is not None and value > (self._most[what][0] if what in self._most else above):
+                self._most[what] = value, row
+                found.append(what)
+        self._frames += 1
+        return found
+
+    def moments(self) -> list[Moment]:
+        """Those of the frames until now, in the order of `MOMENTS`."""
+        return [
+            _moment(what, row, _rounded(value), unit)
+            for what, (_, _, unit) in MOMENTS.items()
+            for value, row in [self._most.get(what, (None, {}))]
+            if value is not None
+        ]
+
+
+def look_at(frames: Sequence[Row]) -> list[Moment]:
+    """The frames with the most of each reason to look at them."""
+    lookout = Lookout()
+    for row in frames:
+        lookout.add(row)
+    return lookout.moments()
+
+
+def _moment(what: str, row: Row, value: Number, unit: str) -> Moment:
+    frame, time, name = row["frame"], row["time_s"], row["name"]
+    return Moment(
+        what,
+        frame if isinstance(frame, int) else 0,
+        time if isinstance(time, float) else None,
+        str(name) if name else None,
+        value,
+        unit,
+    )
