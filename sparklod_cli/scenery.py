@@ -180,7 +180,7 @@ def read_scenery(
     Args:
         placements: at least one.
         viewer: whose cuts are drawn; None draws all leaves.
-        through: one of `defaults.THROUGH`, the encoding after which splats are drawn; cuts are those of the file.
+        through: one of `rounding.ROUND_TRIPS`, the encoding after which splats are drawn; cuts are those of the file.
         blend: width of continuous cuts, see `continuous`; None for ordinary ones.
         precision: one of `PRECISIONS`, of what cuts are found with.
         threads: to work on.
