@@ -20,7 +20,7 @@ from .printable import printable
 QUOTED = 200
 
 #: Sub-commands, each a module of `commands` with a function of its name; imported when it is called for.
-COMMANDS = {name: name.replace("-", "_") for name in ("build-lod", "inspect", "traverse", "render", "warmup")}
+COMMANDS = {name: name.replace("-", "_") for name in ("build-lod", "inspect", "traverse", "render", "warmup", "doctor")}
 
 EPILOG = """
 \b
