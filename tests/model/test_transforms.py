@@ -97,6 +97,7 @@ def test_a_turned_splat_has_its_colour_in_the_turned_direction(transform: Transf
 
 def test_half_turns_twice_give_the_same_bits() -> None:
     splats = random_splats(500, sh_degree=3)
+    splats.sh[:, ::2] *= np.float32(1e-12)  # which the rounding errors of its large neighbours would change
     for turn in (Transform.from_euler(180, 0, 0), Transform.from_euler(0, 180, 0), Transform.from_euler(0, 0, -180)):
         once = turn.apply(splats)
         assert not np.array_equal(once.sh, splats.sh)
