@@ -20,8 +20,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from . import __version__
-from .parallel import processors
 from .support import machine
+from .support.parallel import processors
 from .support.requirements import required_by
 
 #: ok: works. note: something optional is missing, or could be better. problem: baking does not work.
@@ -142,7 +142,8 @@ def _extras() -> Iterator[Check]:
 
 def _print_kernels() -> None:
     """Loads all that a bake takes, starts the threads of kernels, and prints what there is of kernels, as JSON."""
-    from . import bake, jit, warmup  # noqa: F401
+    from . import bake, warmup  # noqa: F401
+    from .support import jit
 
     about = {
         "folder": None if jit.CACHE_FOLDER is None else str(jit.CACHE_FOLDER.resolve()),
@@ -228,8 +229,8 @@ def _open3d() -> Iterator[Check]:
         yield Check("Open3D", "note", "not tried, since it is not installed", "pip install 'sparklod[render]'")
         return
     try:
-        from .render.open3d_child import PACKAGES
-        from .render.open3d_process import COMMAND
+        from .render.open3d.child import PACKAGES
+        from .render.open3d.process import COMMAND
     except ImportError as error:  # numpy
         yield Check("Open3D", "note", f"not tried ({error})", _INSTALL)
         return

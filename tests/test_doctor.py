@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from sparklod_cli import doctor, jit, warmup
+from sparklod_cli import doctor, warmup
 from sparklod_cli.doctor import Check, check_all
 from sparklod_cli.render.gl import context
-from sparklod_cli.support import machine
+from sparklod_cli.support import jit, machine
 from sparklod_cli.support.requirements import Required
 
 HEALTHY = {"folder": "/nowhere/kernels-1", "wanted": 35, "missing": 0, "layer": "omp", "threads": 4}

@@ -5,30 +5,29 @@ from __future__ import annotations
 import dataclasses
 import functools
 import json
-import os
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from .. import limits
-from ..printable import MOST, shortened
-from .console import Console, is_terminal
-from .options import AutoOr, Ball, Numbers, Real, common_options, is_given
-from .paths import InputPath, OutputPath, keep_apart
+from ..support import defaults
+from ..support.printable import MOST, shortened
+from .command import Command
+from .console import Console
+from .options.common import common_options, overwrite_option
+from .options.types import AutoOr, Ball, Numbers, Real
+from .paths import DASH, InputPath, OutputPath, claim_stdout, keep_apart
 from .reports import report_baked, report_unbaked
+from .usage import is_given, refuse
 
 if TYPE_CHECKING:
     from ..bake import Baked
+    from ..extract_leaves import Unbaked
     from ..io import Sink
-    from ..unlod import Unbaked
 
     #: Makes the output of an input through a sink, and reports what came of it.
     Work = Callable[[Path, Path, Sink], Baked | Unbaked]
-
-STDOUT = Path("-")
 
 #: Options that only mean something for a tree that is built, and for SPZ.
 OF_BAKING = (
@@ -57,7 +56,7 @@ Examples:
 """
 
 
-@click.command("build-lod", epilog=EXAMPLES, context_settings={"show_default": True})
+@click.command("build-lod", cls=Command, epilog=EXAMPLES, context_settings={"show_default": True})
 @click.argument("inputs", metavar="INPUT...", nargs=-1, required=True, type=InputPath())
 @click.option(
     "-o",
@@ -75,33 +74,33 @@ Examples:
     help="Directory for the outputs; made if it is not there.",
     show_default=False,
 )
-@click.option("--overwrite", is_flag=True, help="Replace outputs that exist.")
+@overwrite_option
 @click.option(
     "--method",
-    type=click.Choice(limits.METHODS),
-    default=limits.METHODS[0],
+    type=click.Choice(defaults.METHODS),
+    default=defaults.METHODS[0],
     help="How to merge: quick takes next to no time, cuts of quality are nearer to full detail.",
 )
 @click.option(
     "--base",
     metavar="N",
-    type=Real(limits.MIN_BASE, limits.MAX_BASE),
-    default=limits.DEFAULT_BASE,
+    type=Real(defaults.MIN_BASE, defaults.MAX_BASE),
+    default=defaults.DEFAULT_BASE,
     help="With --method quick: growth of the voxel grid from level to level; nearer 1, smoother transitions and more"
     " nodes.",
 )
 @click.option(
     "--growth",
     metavar="N",
-    type=Real(limits.MIN_GROWTH, limits.MAX_GROWTH),
-    default=limits.DEFAULT_GROWTH,
+    type=Real(defaults.MIN_GROWTH, defaults.MAX_GROWTH),
+    default=defaults.DEFAULT_GROWTH,
     help="With --method quality: at most so many nodes a leaf.",
 )
 @click.option(
     "--max-sh",
     metavar="N",
-    type=click.IntRange(0, limits.MAX_SH_DEGREE),
-    default=limits.MAX_SH_DEGREE,
+    type=click.IntRange(0, defaults.MAX_SH_DEGREE),
+    default=defaults.MAX_SH_DEGREE,
     help="Leave out spherical harmonics above this degree.",
 )
 @click.option("--min-opacity", metavar="N", type=Real(0, 1), default=0.0, help="Leave out splats of lower opacity.")
@@ -122,7 +121,7 @@ Examples:
 )
 @click.option(
     "--encoding",
-    type=click.Choice(limits.ENCODINGS),
+    type=click.Choice(defaults.ENCODINGS),
     help="Write the tree as arrays in a viewer's memory layout: .npz, or the words alone if FILE is .bin or .raw.",
 )
 @click.option(
@@ -132,21 +131,21 @@ Examples:
 )
 @click.option(
     "--spz-version",
-    type=click.Choice([str(version) for version in limits.SPZ_VERSIONS]),
-    default=str(limits.DEFAULT_SPZ_VERSION),
+    type=click.Choice([str(version) for version in defaults.SPZ_VERSIONS]),
+    default=str(defaults.DEFAULT_SPZ_VERSION),
     help="2 is 4 to 8 % smaller, 3 keeps rotations ten times as exact.",
 )
 @click.option(
     "--fractional-bits",
-    type=AutoOr(0, limits.MAX_FRACTIONAL_BITS),
+    type=AutoOr(0, defaults.MAX_FRACTIONAL_BITS),
     default="auto",
     help="Bits after the binary point of a position; auto suits the extent and the smallest splats.",
 )
 @click.option(
     "--compression-level",
     metavar="N",
-    type=click.IntRange(limits.MIN_COMPRESSION, limits.MAX_COMPRESSION),
-    default=limits.DEFAULT_COMPRESSION,
+    type=click.IntRange(defaults.MIN_COMPRESSION, defaults.MAX_COMPRESSION),
+    default=defaults.DEFAULT_COMPRESSION,
     help="1 is fast, 9 small.",
 )
 @common_options
@@ -174,19 +173,16 @@ def build_lod(
     outputs = _outputs(inputs, output, output_dir, settings)
     keep_apart(ctx, {"output" if output_dir is None else "output_dir": outputs})
     _check_usage(ctx, inputs, output, settings)
-    if output == STDOUT and as_json:
-        raise click.UsageError("--json and -o - both want standard output")
-    if output == STDOUT and is_terminal(sys.stdout):
-        raise click.UsageError("-o - writes binary data; redirect it to a file or a pipe")
+    claim_stdout(ctx, "output", as_json=as_json, binary=True)
     failed = False
     with Console(quiet=quiet, verbose=verbose) as console:
         work = _unlod(ctx, settings, console) if settings["unlod"] else _bake(settings, output, console)
         from .. import io
-        from ..errors import SparklodError
+        from ..support.errors import SparklodError
 
         for source, target in zip(inputs, outputs, strict=True):
             try:
-                if target == STDOUT:
+                if target == DASH:
                     write: Sink = io.write_stdout
                 else:
                     io.check_writable(target, overwrite=overwrite, make_parent=output_dir is not None)
@@ -206,33 +202,27 @@ def build_lod(
 
 def _check_usage(ctx: click.Context, inputs: tuple[Path, ...], output: Path | None, settings: dict[str, Any]) -> None:
     """A usage error where options contradict each other or the name of the output."""
-
-    def refuse(names: tuple[str, ...], why: str) -> None:
-        for name in names:
-            if is_given(ctx, name):
-                raise click.UsageError(f"--{name.replace('_', '-')} {why}")
-
-    suffix = output.suffix.lower() if output is not None and output != STDOUT else ""
+    suffix = output.suffix.lower() if output is not None and output != DASH else ""
     if settings["unlod"]:
-        refuse(OF_BAKING, "is of no use with --unlod, which writes what there is")
-        if suffix and suffix not in limits.PLAIN_SUFFIXES:
-            raise click.UsageError(f"--unlod writes {', '.join(limits.PLAIN_SUFFIXES)}, not {suffix}")
+        refuse(ctx, OF_BAKING, "is of no use with --unlod, which writes what there is")
+        if suffix and suffix not in defaults.PLAIN_SUFFIXES:
+            raise click.UsageError(f"--unlod writes {', '.join(defaults.PLAIN_SUFFIXES)}, not {suffix}")
         if suffix not in ("", ".spz"):
-            refuse(OF_SPZ, f"is of SPZ, not of {suffix}")
+            refuse(ctx, OF_SPZ, f"is of SPZ, not of {suffix}")
     elif settings["encoding"]:
-        refuse(OF_SPZ, "is of SPZ, not of --encoding")
-        if suffix not in ("", ".npz", *limits.RAW_SUFFIXES):
-            known = ", ".join((".npz", *limits.RAW_SUFFIXES))
+        refuse(ctx, OF_SPZ, "is of SPZ, not of --encoding")
+        if suffix not in ("", ".npz", *defaults.RAW_SUFFIXES):
+            known = ", ".join((".npz", *defaults.RAW_SUFFIXES))
             raise click.UsageError(f"--encoding writes {known}, not {suffix}")
     elif suffix in OTHER_SUFFIXES:
         raise click.UsageError(f"{suffix} holds no tree, which is written as SPZ; name the output .spz")
-    elif suffix in (".npz", *limits.RAW_SUFFIXES):
+    elif suffix in (".npz", *defaults.RAW_SUFFIXES):
         raise click.UsageError(f"a {suffix} output needs --encoding")
     elif suffix not in ("", ".spz"):
         raise click.UsageError(f"a tree is written as SPZ, not as {suffix}; name the output .spz")
     for method, names in OF_METHOD.items():
         if method != settings["method"]:
-            refuse(names, f"is of --method {method}, not of {settings['method']}")
+            refuse(ctx, names, f"is of --method {method}, not of {settings['method']}")
     if settings["rgba"] is not None and len(inputs) > 1:
         raise click.UsageError(f"--rgba takes one input, not {len(inputs)}")
 
@@ -249,12 +239,6 @@ def _outputs(
         outputs = [output]
     else:
         outputs = [(output_dir or source.parent) / _output_name(source, settings) for source in inputs]
-    first: dict[str, Path] = {}
-    for source, target in zip(inputs, outputs, strict=True):
-        place = os.path.realpath(target)
-        if place in first:
-            raise click.UsageError(f"{first[place]} and {source} would both be written to {target}")
-        first[place] = source
     return outputs
 
 
@@ -268,10 +252,10 @@ def _output_name(source: Path, settings: dict[str, Any]) -> str:
 
 def _bake(settings: dict[str, Any], output: Path | None, console: Console) -> Work:
     """What bakes a file and reports it; the point where numpy and numba are loaded."""
-    from .. import jit
     from ..bake import Recipe, bake
     from ..codecs import spz
-    from ..selection import Selection
+    from ..model.selection import Selection
+    from ..support import jit
 
     jit.use_threads(settings["threads"])
     console.announce_compiling(settings["method"])
@@ -308,13 +292,13 @@ def _bake(settings: dict[str, Any], output: Path | None, console: Console) -> Wo
 
 def _unlod(ctx: click.Context, settings: dict[str, Any], console: Console) -> Work:
     """What writes the leaves of a file and reports it."""
-    from ..unlod import Target, unlod
+    from ..extract_leaves import Target, unlod
 
-    chosen = ctx.get_parameter_source("spz_version") != click.core.ParameterSource.DEFAULT
+    chosen = is_given(ctx, "spz_version")
 
     def work(source: Path, target: Path, write: Sink) -> Unbaked:
         how = Target(
-            suffix=".spz" if target == STDOUT else target.suffix.lower() or ".spz",
+            suffix=".spz" if target == DASH else target.suffix.lower() or ".spz",
             version=int(settings["spz_version"]) if chosen else None,
             fractional_bits=settings["fractional_bits"],
             compression_level=settings["compression_level"],

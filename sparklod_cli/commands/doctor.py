@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING
 import click
 
 from .. import __version__
-from ..printable import printable
+from ..support.printable import printable
+from .command import GENERAL, Command, option
 from .console import Console, count_of
-from .options import verbose_option
+from .options.common import verbose_option
 
 if TYPE_CHECKING:
     from ..doctor import Check
@@ -25,10 +26,10 @@ Examples:
 """
 
 
-@click.command("doctor", epilog=EXAMPLES)
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object on standard output.")
-@click.option("-q", "--quiet", is_flag=True, help="Print problems only.")
-@verbose_option("Say what is being checked.")
+@click.command("doctor", cls=Command, epilog=EXAMPLES)
+@option("--json", "as_json", heading=GENERAL, is_flag=True, help="Print one JSON object on standard output.")
+@option("-q", "--quiet", heading=GENERAL, is_flag=True, help="Print problems only.")
+@verbose_option("Print what is being checked.")
 @click.version_option(__version__, package_name="sparklod")
 @click.pass_context
 def doctor(ctx: click.Context, as_json: bool, quiet: bool, verbose: bool) -> None:

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..errors import OutOfMemoryError, SparklodError, StdoutError, memory_told
-from ..printable import printable
+from ..support.errors import OutOfMemoryError, SparklodError, StdoutError, memory_told
+from ..support.printable import printable
 from .console import Console, count_of, size_of
 from .inspect_text import finding_line, lines
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from ..inspection.findings import Finding
     from ..inspection.html import Section
     from ..inspection.report import Report, Wanted
-    from ..scene import Scene
+    from ..model.scene import Scene
 
 
 @dataclass
@@ -117,9 +117,9 @@ class Job:
         plot, html = self.settings["plot"], self.settings["html"]
         if plot is None and html is None:
             return
-        from ..inspection import histograms, values
+        from ..figures import tree_plot as plots
         from ..inspection import html as pages
-        from ..inspection import plot as plots
+        from ..inspection import values
         from ..io import write_whole
 
         picture = None
@@ -137,7 +137,7 @@ class Job:
             drawn = {}
             if scene is not None and len(scene.splats):
                 names = values.names_of(scene.splats)
-                drawn = {name: histograms.of_quantity(scene.splats, name) for name in names}
+                drawn = {name: values.histogram_of(scene.splats, name) for name in names}
             self.sections.append(pages.Section(report.as_dict(), picture, drawn))
 
     def write_page(self) -> None:
@@ -158,10 +158,10 @@ def _fails(findings: list[Finding], fail_on: str) -> bool:
 
 def _print_histograms(scene: Scene, names: tuple[str, ...]) -> None:
     from ..inspection import values
-    from ..inspection.histograms import as_text, of_quantity
+    from ..tables.histograms import as_text
 
     for name in names:
         if name not in values.names_of(scene.splats):
             continue  # SH of a degree that this file has not
         click.echo(f"\n  {name}")
-        click.echo(as_text(of_quantity(scene.splats, name)))
+        click.echo(as_text(values.histogram_of(scene.splats, name)))

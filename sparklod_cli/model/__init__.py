@@ -1,1 +1,1 @@
-"""The data model: splats, scenes, trees, and what is done to them before anything is encoded, drawn or measured."""
+"""What splats, scenes and Level-of-Detail trees are, whatever file they come from."""

@@ -26,11 +26,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..gaussian import quat_of_rotation, rotation_matrices
-from ..limits import UP_AXES
-from ..parallel import chunks_of
-from ..sh import COEFFICIENTS, SH_C1, SH_C2, SH_C3
-from ..splats import FloatArray, Splats
+from ..support.defaults import UP_AXES
+from ..support.parallel import chunks_of
+from .gaussian import quat_of_rotation, rotation_matrices
+from .sh import COEFFICIENTS, SH_C1, SH_C2, SH_C3
+from .splats import FloatArray, Splats
 
 Matrix = NDArray[np.float64]
 

@@ -1,48 +1,15 @@
-"""The columns of a simulation's table: names, units, precision and meaning, each told once."""
+"""The columns of the table of a traversal, a row for each frame: names, units, precision and meaning."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
 
-#: What a cell holds; None where there is nothing to say, such as the churn of the first frame.
-Cell = int | float | str | None
-
-
-@dataclass(frozen=True)
-class Column:
-    """One column.
-
-    Attributes:
-        name: as in the header.
-        kind: the type of its cells, where they are not empty: int, float or str.
-        digits: format of a float (".6f" is fixed, ".6g" significant digits); empty otherwise.
-        unit: for people; empty for a plain number, count or text.
-        meaning: one phrase.
-    """
-
-    name: str
-    kind: type
-    digits: str
-    unit: str
-    meaning: str
-
-    def rounded(self, value: Cell) -> Cell:
-        """A value as precise as this column is: rows hold these, so every format tells the same numbers."""
-        if not self.digits or value is None:
-            return value
-        return float(format(value, self.digits)) + 0.0  # which makes -0 a 0
-
-    def text(self, value: Cell) -> str:
-        """A cell of a CSV file."""
-        if value is None:
-            return ""
-        return format(value, self.digits) if self.digits else str(value)
-
+from ..support.errors import SparklodError
+from ..tables.columns import FRAME, Column
+from ..tables.files import near
 
 COLUMNS = (
-    Column("frame", int, "", "", "number of the frame on the path, from 0; `--every` leaves gaps"),
-    Column("time_s", float, ".6f", "s", "time on the path"),
-    Column("name", str, "", "", "of the frame, where the path's file has names"),
+    *FRAME,
     Column("instance", str, "", "", "name of an instance, or `total` for all of them together"),
     Column("position_x", float, ".6f", "world units", "where the camera is"),
     Column("position_y", float, ".6f", "world units", "where the camera is"),
@@ -110,5 +77,36 @@ COLUMNS = (
 #: Columns that differ from run to run.
 TIMING = ("traverse_ms",)
 
-#: The columns of one row, by name.
-Row = dict[str, Cell]
+#: Why all cells of a column can be empty.
+EMPTY = {
+    "time_s": "the path has no times",
+    "complete_in_s": "it needs --bandwidth",
+    "traverse_ms": "--no-timing leaves it out",
+    "added": "it compares a frame with the one before, and there is only one frame",
+    "removed": "it compares a frame with the one before, and there is only one frame",
+    "churn": "it compares a frame with the one before, and there is only one frame",
+    "projected_px_p50": "no splat is inside the frustum on any frame",
+    "projected_px_p95": "no splat is inside the frustum on any frame",
+}
+
+
+class UnknownColumnError(SparklodError):
+    """There is no column of such a name."""
+
+
+def select(names: Sequence[str] = (), *, timing: bool = True) -> tuple[Column, ...]:
+    """Columns by their names, in this order; all of them, in the order of `COLUMNS`, for no names.
+
+    Args:
+        names: of columns; one that comes twice is taken once.
+        timing: with those that differ from run to run.
+
+    Raises:
+        UnknownColumnError: there is no such column; names those that come near.
+    """
+    every = {column.name: column for column in COLUMNS}
+    for name in names:
+        if name not in every:
+            raise UnknownColumnError(f"there is no column {name!r}{near(name, every)}")
+    chosen = dict.fromkeys(names) if names else every
+    return tuple(every[name] for name in chosen if timing or name not in TIMING)

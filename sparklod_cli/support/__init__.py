@@ -1,1 +1,1 @@
-"""What every other part may use: errors, units, progress, compiled kernels, and what the machine has."""
+"""What everything else stands on: errors, defaults, units, compiled kernels, threads, progress."""

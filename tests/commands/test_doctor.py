@@ -14,8 +14,7 @@ import pytest
 from sparklod_cli import doctor
 from sparklod_cli.cli import run
 from sparklod_cli.doctor import Check
-
-from ..conftest import ROOT
+from tests.conftest import ROOT
 
 FINE = Check("sparklod", "ok", "0.1.0")
 NOTE = Check("extra video", "note", "imageio is missing", "pip install 'sparklod[video]'")

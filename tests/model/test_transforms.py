@@ -10,19 +10,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sparklod_cli.gaussian import covariance
-from sparklod_cli.limits import UP_AXES
+from sparklod_cli.cameras.camera import Camera
+from sparklod_cli.cameras.pose import look_at
+from sparklod_cli.images.metrics import psnr
+from sparklod_cli.model.gaussian import covariance
+from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.model.transforms import LARGEST, ROWS, Transform, sh_basis, sh_rotations
-from sparklod_cli.preview.metrics import psnr
-from sparklod_cli.render.camera import Camera
-from sparklod_cli.render.look import Look
-from sparklod_cli.render.pose import look_at
 from sparklod_cli.render.rasterizer import Image, draw
-from sparklod_cli.render.shown import show
-from sparklod_cli.splats import COLUMNS, Splats
-
-from .. import reference
-from ..scenes import random_splats
+from sparklod_cli.render.settings import RasterSettings
+from sparklod_cli.render.shading import show
+from sparklod_cli.support.defaults import UP_AXES
+from tests.references.gaussians import covariance as reference_covariance
+from tests.references.gaussians import rotation_matrix
+from tests.references.spark_pictures import spherical_harmonics
+from tests.scenes import random_splats
 
 #: Least PSNR of pictures that float32 alone makes differ, in dB; those of SH that are not turned are far below it.
 SAME, OTHER = 60.0, 40.0
@@ -54,7 +55,7 @@ def assert_near(found: Splats, expected: Splats, most: float) -> None:
 
 def colors(splats: Splats, directions: np.ndarray) -> np.ndarray:
     """(N, 3) of each splat from one direction, by the reference's own harmonics."""
-    basis = [reference.spherical_harmonics(direction, splats.sh_degree) for direction in directions]
+    basis = [spherical_harmonics(direction, splats.sh_degree) for direction in directions]
     return np.einsum("nk,nkc->nc", np.array(basis), splats.sh.astype(np.float64))
 
 
@@ -65,9 +66,7 @@ def colors(splats: Splats, directions: np.ndarray) -> np.ndarray:
 def test_the_basis_is_that_of_the_reference(seed: int, degree: int) -> None:
     direction = np.random.default_rng(seed).normal(size=3)
     direction /= np.linalg.norm(direction)
-    np.testing.assert_allclose(
-        sh_basis(direction[None], degree)[0], reference.spherical_harmonics(direction, degree), atol=1e-12
-    )
+    np.testing.assert_allclose(sh_basis(direction[None], degree)[0], spherical_harmonics(direction, degree), atol=1e-12)
 
 
 @given(quats, st.integers(0, 3))
@@ -117,8 +116,8 @@ def test_centres_and_covariances_follow_the_matrix(transform: Transform, seed: i
     expected = np.c_[splats.center, np.ones(30)] @ transform.matrix[:3].T
     np.testing.assert_allclose(moved.center, expected, rtol=1e-6, atol=1e-6 * np.abs(expected).max())
     axes = transform.matrix[:3, :3]
-    before = reference.covariance(splats.scale, splats.quat_xyzw)
-    after = reference.covariance(moved.scale, moved.quat_xyzw)
+    before = reference_covariance(splats.scale, splats.quat_xyzw)
+    after = reference_covariance(moved.scale, moved.quat_xyzw)
     np.testing.assert_allclose(after, axes @ before @ axes.T, atol=1e-5 * np.abs(after).max())
     np.testing.assert_array_equal(moved.rgb, splats.rgb)
     np.testing.assert_array_equal(moved.opacity, splats.opacity)
@@ -226,7 +225,7 @@ def test_euler_angles_are_those_of_splat_transform(x: float, y: float, z: float)
 
 @given(quats, st.floats(1e-200, 1e200))
 def test_a_quaternion_of_any_length_is_its_rotation(quat: tuple[float, ...], length: float) -> None:
-    expected = reference.rotation_matrix(np.array(quat) / math.hypot(*quat))
+    expected = rotation_matrix(np.array(quat) / math.hypot(*quat))
     np.testing.assert_allclose(Transform.from_quat(np.array(quat) * length).rotation, expected, atol=1e-12)
 
 
@@ -312,9 +311,8 @@ def picture(splats: Splats, transform: Transform) -> Image:
     moved[:3, :3] = transform.rotation @ pose[:3, :3]
     moved[:3, 3] = transform.scale * transform.rotation @ pose[:3, 3] + transform.translation
     camera = Camera(moved, 160, 120, (150.0, 150.0), (80.0, 60.0))
-    return draw(
-        show([(splats, np.eye(4))], camera), camera, Look(near=0.01 * transform.scale, far=100 * transform.scale)
-    )
+    settings = RasterSettings(near=0.01 * transform.scale, far=100 * transform.scale)
+    return draw(show([(splats, np.eye(4))], camera), camera, settings)
 
 
 MOVES = [

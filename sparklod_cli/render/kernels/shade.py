@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numba import prange
 
-from ...jit import kernel
-from ...sh import SH_C1, SH_C2, SH_C3
+from ...model.sh import SH_C1, SH_C2, SH_C3
+from ...support.jit import kernel
 
 f32 = np.float32
 
