@@ -5,10 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
-import numpy as np
-
 from .cameras.path import CameraPath
-from .images.metrics import check_covered, psnr, ssim, worst_tile
+from .images.metrics import check_covered, on_background, psnr, ssim, worst_tile
 from .lod.budget import Budget
 from .lod.settings import LodSettings
 from .render.rasterizer import Image
@@ -94,11 +92,6 @@ class Comparison:
                     "selected": drawn.splats,
                 }
                 yield row, drawn.image, full
-
-
-def on_background(image: Image, gray: float) -> Image:
-    """(H, W, 3), 0..1: an image of which red, green and blue are multiplied by alpha, on a background 0..1."""
-    return np.clip(image[..., :3] + np.float32(gray) * (1 - image[..., 3:]), 0, 1)
 
 
 def _measured(picture: tuple[Row, Image, Image]) -> Row:
