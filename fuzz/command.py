@@ -58,7 +58,7 @@ def _faults(done: CommandResult) -> Iterator[tuple[str, str]]:
         yield fault, text
     if done.code == 1 and not done.err.strip():
         yield "silence", "exit code 1 without a word"
-    if done.code == 2 and "Error:" not in done.err:
+    if done.code == 2 and "error: " not in done.err:
         yield "silence", f"exit code 2 without an error: {done.err[:100]!r}"
 
 

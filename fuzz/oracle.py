@@ -85,7 +85,7 @@ def stderr_fault(text: str) -> tuple[str, str]:
             fault = "a warning"
         elif line and not line.isprintable():
             fault = "control characters"
-        elif len(re.sub("^[Ee]rror: ", "", line)) > LONGEST:
+        elif len(re.sub("^error: ", "", line)) > LONGEST:
             fault = "a long line"
         elif line.startswith("::"):
             fault = "what a CI takes for a command"
