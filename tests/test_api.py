@@ -100,7 +100,8 @@ def test_its_names_are_there_and_typed() -> None:
 
 
 def test_functions_stay_where_modules_have_their_names() -> None:
-    code = "import sparklod_cli as s; import sparklod_cli.render.settings, sparklod_cli.compare; print(s.render, s.compare)"
+    both = "sparklod_cli.render.settings, sparklod_cli.compare"
+    code = f"import sparklod_cli as s; import {both}; print(s.render, s.compare)"
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert said.count("<function ") == 2
 
