@@ -1,0 +1,105 @@
+"""Where pictures go, and as what: one file, a file a frame, an animation or a contact sheet."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from ..io import check_writable
+
+#: Forms of single pictures, of several in one file, and of contact sheets.
+STILL = ("png", "jpg", "webp", "npy")
+MOVING = ("webp", "gif", "mp4", "webm")
+SHEETS = ("png", "jpg", "webp")
+
+#: Forms that keep alpha.
+WITH_ALPHA = ("png", "webp", "npy")
+
+#: Forms by suffix, where that has another name.
+SUFFIXES = {"jpeg": "jpg"}
+
+#: What the number of a frame stands for in a name.
+NUMBER = re.compile(r"%(?:0\d{1,2})?d")
+
+
+@dataclass(frozen=True)
+class Output:
+    """Where pictures go.
+
+    Attributes:
+        name: of the file; of many, with a place for the number; None for standard output.
+        form: one of `STILL` or `MOVING`.
+        kind: "picture", "frames", "animation" or "sheet".
+    """
+
+    name: Path | None
+    form: str
+    kind: str
+
+    def path(self, number: int = 0) -> Path:
+        """Of the file, or of that of a frame."""
+        assert self.name is not None
+        if self.kind != "frames":
+            return self.name
+        return self.name.with_name(NUMBER.sub(lambda match: match[0] % number, self.name.name))
+
+    def paths(self, numbers: Sequence[int]) -> list[Path]:
+        """Of all files that will be written."""
+        if self.name is None:
+            return []
+        return [self.path(number) for number in (numbers if self.kind == "frames" else [0])]
+
+    def check(self, numbers: Sequence[int], *, overwrite: bool) -> None:
+        """Raises an `OutputError` where a file cannot be written, before work goes into it."""
+        for path in self.paths(numbers):
+            check_writable(path, overwrite=overwrite)
+
+
+def output_for(name: Path | None, default: str, cameras: int, *, sheet: bool) -> Output:
+    """Where the pictures of some cameras go.
+
+    Args:
+        name: that was asked for; "-" for standard output; None for one made of `default`, in the current directory.
+        default: the name of the scene.
+        cameras: how many there are.
+        sheet: all in one picture.
+
+    Raises:
+        ValueError: the cameras do not fit into what was asked for.
+    """
+    several = cameras > 1 and not sheet
+    if name is not None and str(name) == "-":
+        if several:
+            raise ValueError(f"standard output takes one picture, not {cameras:,}; name a file with --output")
+        return Output(None, "png", "sheet" if sheet else "picture")
+    if name is None:
+        name = Path(f"{default.replace('%', '_')}{'.%04d' if several else ''}.png")
+    form = name.suffix.lower().removeprefix(".")
+    form = SUFFIXES.get(form, form)
+    if form not in STILL + MOVING:
+        raise ValueError(f"--output {name} does not end in {_suffixes(dict.fromkeys(STILL + MOVING))}")
+    places = len(NUMBER.findall(name.name))
+    if sheet:
+        if form not in SHEETS or places:
+            raise ValueError(f"a contact sheet is one {_suffixes(SHEETS)}, which --output {name} is not")
+        return Output(name, form, "sheet")
+    if places:
+        if places > 1 or form not in STILL:
+            stills = _suffixes(STILL, "out.%04d")
+            raise ValueError(f"--output {name} does not name frames; write {stills}")
+        return Output(name, form, "frames")
+    if form not in STILL or (several and form in MOVING):
+        return Output(name, form, "animation")
+    if several:
+        raise ValueError(
+            f"--output {name} is one picture, and there are {cameras:,} cameras: write frames"
+            f" ({name.stem}.%04d{name.suffix}), an animation ({_suffixes(MOVING)}) or a --sheet"
+        )
+    return Output(name, form, "picture")
+
+
+def _suffixes(forms: Sequence[str] | dict[str, None], stem: str = "") -> str:
+    *some, last = (f"{stem}.{form}" for form in forms)
+    return f"{', '.join(some)} or {last}"
