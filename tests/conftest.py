@@ -16,6 +16,8 @@ ROOT = Path(__file__).resolve().parents[1]
 FIXTURES = ROOT / "fixtures"
 #: Real scenes, which are not part of the repository: where SPARKLOD_SCENES says, or beside the checkout.
 SCENES = Path(os.environ.get("SPARKLOD_SCENES") or ROOT.parent / "shared" / "scenes")
+#: Root may read and write everything, whatever the permissions.
+IS_ROOT = hasattr(os, "geteuid") and os.geteuid() == 0
 
 
 def real_scene(name: str) -> Path:

@@ -12,8 +12,7 @@ import pytest
 
 from sparklod_cli import jit, warmup
 from sparklod_cli.cli import run
-
-from .conftest import ROOT
+from tests.conftest import ROOT
 
 #: Runs a command line of JSON and prints which kernels Python has called, since numba knows what it has code for.
 CALLED = """

@@ -18,9 +18,8 @@ from sparklod_cli.codecs import clamps, quantize, spz
 from sparklod_cli.errors import FormatError
 from sparklod_cli.scene import Scene
 from sparklod_cli.splats import COLUMNS, Splats
-
-from ..conftest import FIXTURES
-from ..scenes import random_splats
+from tests.conftest import FIXTURES
+from tests.scenes import random_splats
 
 GOLDEN = FIXTURES / "golden"
 
@@ -274,7 +273,7 @@ REFUSED: dict[str, tuple[Callable[[], bytes], str]] = {
 
 
 @pytest.mark.parametrize("what", REFUSED)
-def test_refused_with_a_reason(what: str) -> None:
+def test_broken_spz_is_refused_with_a_reason(what: str) -> None:
     make, reason = REFUSED[what]
     with pytest.raises(FormatError, match=reason):
         spz.decode(io.BytesIO(make()))

@@ -18,8 +18,7 @@ from sparklod_cli.errors import FormatError
 from sparklod_cli.parallel import CHUNK, ordered_map
 from sparklod_cli.scene import Scene
 from sparklod_cli.splats import COLUMNS, Splats
-
-from ..scenes import random_splats
+from tests.scenes import random_splats
 
 COUNT = 12 * CHUNK
 
@@ -50,7 +49,7 @@ EXTRA = {"ply": 12e6, "splat": 3e6, "spz 3": 9e6, "spz 4": 9e6}
 
 
 @pytest.mark.parametrize("kind", WRITERS)
-def test_peak_memory(kind: str) -> None:
+def test_decoding_takes_little_memory_beside_the_splats(kind: str) -> None:
     file = io.BytesIO(WRITERS[kind](random_splats(COUNT, sh_degree=3)))
     head = file.read(HEAD)
     file.seek(0)

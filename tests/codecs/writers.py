@@ -16,8 +16,7 @@ from sparklod_cli.codecs import ply, splat, spz
 from sparklod_cli.scene import Scene
 from sparklod_cli.sh import SH_C0
 from sparklod_cli.splats import Splats
-
-from .test_quantize import stated_degrees
+from tests.codecs.test_quantize import stated_degrees
 
 Array = NDArray[np.float64]
 Content = bytes | dict[str, bytes]

@@ -22,9 +22,8 @@ from sparklod_cli.lod import quick
 from sparklod_cli.scene import Scene
 from sparklod_cli.splats import Splats
 from sparklod_cli.tree import LodTree
-
-from ..conftest import FIXTURES, real_scene
-from ..scenes import random_splats
+from tests.conftest import FIXTURES, real_scene
+from tests.scenes import random_splats
 
 
 def baked(source: Path, folder: Path, *options: object) -> Scene:

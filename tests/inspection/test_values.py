@@ -19,8 +19,7 @@ from sparklod_cli.scene import Scene
 from sparklod_cli.sh import COEFFICIENTS
 from sparklod_cli.splats import COLUMNS, Splats
 from sparklod_cli.tree import LodTree
-
-from ..scenes import random_splats
+from tests.scenes import random_splats
 
 NAN, INF = math.nan, math.inf
 EXACT = 1e-5  # of six digits

@@ -14,8 +14,7 @@ from sparklod_cli.scene import Scene
 from sparklod_cli.sh import SH_C0
 from sparklod_cli.splats import Splats
 from sparklod_cli.tree import LodTree
-
-from .spark import ExtSplats, Spark
+from tests.interop.spark import ExtSplats, Spark
 
 Floats = NDArray[np.floating]
 

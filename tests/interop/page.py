@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from sparklod_cli.render.camera import Camera
 from sparklod_cli.render.look import Look
-
-from .node import Node
+from tests.interop.node import Node
 
 PROGRAM = Path(__file__).with_name("spark_page.mjs")
 

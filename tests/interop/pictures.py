@@ -21,8 +21,7 @@ from sparklod_cli.render.rasterizer import draw
 from sparklod_cli.render.shown import show
 from sparklod_cli.scene import Scene
 from sparklod_cli.splats import Splats
-
-from .page import Page
+from tests.interop.page import Page
 
 FOV_Y = math.radians(50)
 

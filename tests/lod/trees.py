@@ -11,8 +11,7 @@ from sparklod_cli import jit
 from sparklod_cli.gaussian import MAX_OPACITY, MIN_OPACITY
 from sparklod_cli.splats import COLUMNS, Splats
 from sparklod_cli.tree import LodTree
-
-from ..scenes import random_splats
+from tests.scenes import random_splats
 
 
 def children(tree: LodTree, node: int) -> slice:

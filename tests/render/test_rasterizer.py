@@ -20,9 +20,8 @@ from sparklod_cli.render.pose import look_at
 from sparklod_cli.render.rasterizer import Image, draw
 from sparklod_cli.render.shown import Shown, show
 from sparklod_cli.splats import Splats
-
-from .. import reference
-from ..scenes import random_splats
+from tests.references import spark_pictures
+from tests.scenes import random_splats
 
 #: Largest difference to the twin, which computes in float64, at pixels of which float32 can tell what they are in.
 MOST = 1e-3
@@ -80,7 +79,7 @@ def check(of: Shown, camera: Camera, look: Look | None = None, *, most: float = 
         unsure: the share of pixels that may be left out, because a splat ends there.
     """
     look = look or Look()
-    image, twin = draw(of, camera, look), reference.picture(of, camera, look)
+    image, twin = draw(of, camera, look), spark_pictures.picture(of, camera, look)
     assert image.shape == (camera.height, camera.width, 4) and image.dtype == np.float32
     assert twin.unsure.mean() <= unsure
     difference = (image - twin.rgba)[~twin.unsure]
@@ -108,7 +107,7 @@ def test_it_draws_what_the_twin_draws(most: float, profile: str, sort: str) -> N
 
 
 @pytest.mark.parametrize("size", [(1, 1), (17, 33), (16, 16), (64, 3), (2, 70)])
-def test_sizes(size: tuple[int, int]) -> None:
+def test_pictures_of_any_size_are_those_of_the_twin(size: tuple[int, int]) -> None:
     count = 10 if size == (1, 1) else 100  # so that no splat ends at that one pixel
     check(shown(count, most=3.0), camera_at(size=size, focal=(0.8 * size[0], 0.8 * size[1])), unsure=0.3)
 
@@ -120,7 +119,7 @@ def test_a_principal_point_that_is_not_in_the_middle(principal: tuple[float, flo
     assert image[..., 3].mean() > 0.02
 
 
-def test_needles() -> None:
+def test_needles_are_drawn_as_the_twin_draws_them() -> None:
     """A thousand times longer than they are thick."""
     needles = shown(40, seed=5, most=3.0)
     needles.scale[:] = np.float32([0.5, 0.0005, 0.0005])
@@ -143,13 +142,13 @@ def test_the_edge_of_a_huge_splat_is_512_pixels_from_its_centre() -> None:
     assert 511 <= 600 - seen.min() <= 512 and 511 <= seen.max() - 600 <= 512
 
 
-def test_tiny_splats() -> None:
+def test_splats_below_a_pixel_are_drawn_as_the_twin_draws_them() -> None:
     """Blur makes them half a pixel large, and opacity as much lower."""
     check(shown(500, scale=0.003, seed=7), camera_at())
     check(shown(500, scale=1e-9, seed=8), camera_at())
 
 
-def test_planes() -> None:
+def test_splats_before_near_and_beyond_far_are_not_drawn() -> None:
     look = Look(near=3.7, far=4.3)
     near_and_far = shown(300, seed=9)
     image = check(near_and_far, camera_at(), look)
@@ -160,7 +159,7 @@ def test_planes() -> None:
     assert not nothing.any()
 
 
-def test_the_clip() -> None:
+def test_a_splat_is_dropped_when_its_center_is_beyond_the_clip() -> None:
     """A splat is drawn as long as its centre is within 1.4 times the picture's half width, and then not at all."""
     camera = camera_at((0, 0, 5), size=(40, 30), focal=(50.0, 50.0))
     for pixels, drawn in ((1.39 * 20, True), (1.41 * 20, False)):
@@ -179,11 +178,11 @@ def test_more_than_opaque_is_never_more_than_five() -> None:
 
 
 @pytest.mark.parametrize("sh_degree", range(4))
-def test_spherical_harmonics(sh_degree: int) -> None:
+def test_colours_follow_the_direction_by_spherical_harmonics(sh_degree: int) -> None:
     splats = random_splats(200, sh_degree=sh_degree)
     eye = (1.0, -2.0, 3.0)
     seen = show([(splats, np.eye(4))], camera_at(eye))
-    np.testing.assert_allclose(seen.rgb, reference.seen_rgb(splats, np.array(eye)), atol=2e-6)
+    np.testing.assert_allclose(seen.rgb, spark_pictures.seen_rgb(splats, np.array(eye)), atol=2e-6)
     check(seen, camera_at(eye))
 
 
@@ -209,7 +208,7 @@ def test_several_objects_are_drawn_as_one() -> None:
 
 
 @pytest.mark.parametrize("profile", PROFILES)
-def test_the_number_of_threads_does_not_change_a_bit(profile: str) -> None:
+def test_threads_do_not_change_a_bit_of_a_picture(profile: str) -> None:
     camera = camera_at(size=(200, 150), focal=(200.0, 200.0))
     scene = shown(5000, most=3.0, seed=11)
     pictures = []
