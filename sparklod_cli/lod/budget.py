@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 
 from ..support.units import parse_count
@@ -20,23 +20,28 @@ class Budget:
         text: as it was written: "5%" or "500k".
         share: of the leaves of all instances together; None for a count.
         count: splats; None for a share.
+        scale: multiplies it, Spark's `lodSplatScale`.
     """
 
     text: str
     share: Fraction | None
     count: int | None
+    scale: float = 1.0
 
     @classmethod
     def of_count(cls, count: int) -> Budget:
         """A budget of so many splats."""
         return cls(f"{count}", None, count)
 
+    def scaled(self, scale: float) -> Budget:
+        """The budget times a factor."""
+        return replace(self, scale=self.scale * scale)
+
     def of(self, leaves: int) -> int:
         """Splats, where all instances together have so many leaves; at least 1."""
-        if self.count is not None:
-            return self.count
-        assert self.share is not None
-        return max(1, int(self.share * leaves))
+        splats = self.count if self.share is None else self.share * leaves
+        assert splats is not None
+        return max(1, int(splats if self.scale == 1 else float(splats) * self.scale))
 
 
 def parse_budget(text: str) -> Budget:
