@@ -19,17 +19,18 @@ from hypothesis import strategies as st
 from fixtures import by_hand, by_hand_ksplat, by_hand_splat
 from sparklod_cli.bake import Recipe, bake
 from sparklod_cli.codecs import ply, spz
-from sparklod_cli.errors import InvalidSplatsError, SparklodError
-from sparklod_cli.gaussian import normalized_quat
-from sparklod_cli.inspection import histograms, leaves, values
+from sparklod_cli.inspection import leaves, values
 from sparklod_cli.inspection.findings import ERROR, NOTE, Finding
 from sparklod_cli.inspection.report import Wanted, inspect
 from sparklod_cli.io import read_scene
-from sparklod_cli.limits import ENCODINGS, MAX_FRACTIONAL_BITS, METHODS, SPZ_VERSIONS
-from sparklod_cli.scene import Scene
-from sparklod_cli.selection import Selection
-from sparklod_cli.sh import COEFFICIENTS
-from sparklod_cli.splats import Splats
+from sparklod_cli.model.gaussian import normalized_quat
+from sparklod_cli.model.scene import Scene
+from sparklod_cli.model.selection import Selection
+from sparklod_cli.model.sh import COEFFICIENTS
+from sparklod_cli.model.splats import Splats
+from sparklod_cli.support.defaults import ENCODINGS, MAX_FRACTIONAL_BITS, METHODS, SPZ_VERSIONS
+from sparklod_cli.support.errors import InvalidSplatsError, SparklodError
+from sparklod_cli.tables import histograms
 from tests.conftest import FIXTURES, real_scene
 from tests.scenes import random_splats, splat_columns
 

@@ -16,25 +16,33 @@ from PIL import Image
 
 from sparklod_cli import bake
 from sparklod_cli import io as files
+from sparklod_cli.cameras.camera import Camera
+from sparklod_cli.cameras.path import CameraPath
+from sparklod_cli.cameras.pose import look_at
 from sparklod_cli.commands import render_compare
 from sparklod_cli.commands.console import Console
-from sparklod_cli.errors import SparklodError
+from sparklod_cli.compare import (
+    COLUMNS,
+    Comparison,
+    ComparisonSettings,
+    on_background,
+    parse_budgets,
+    rows_of,
+    summarize,
+)
+from sparklod_cli.images.metrics import MOST_PSNR
 from sparklod_cli.lod.traversal import Cones
-from sparklod_cli.preview.compare import COLUMNS, Comparison, How, on_background, parse_budgets, rows_of, summarize
-from sparklod_cli.preview.metrics import MOST_PSNR
+from sparklod_cli.model.splats import COLUMNS as ALL
 from sparklod_cli.render.backends import BACKENDS
-from sparklod_cli.render.camera import Camera
-from sparklod_cli.render.camera_path import CameraPath
-from sparklod_cli.render.look import Look
-from sparklod_cli.render.pose import look_at
-from sparklod_cli.simulation.columns import Row
-from sparklod_cli.simulation.simulate import Viewer
-from sparklod_cli.splats import COLUMNS as ALL
+from sparklod_cli.render.settings import RasterSettings
+from sparklod_cli.simulation.frames import LodSettings
+from sparklod_cli.support.errors import SparklodError
+from sparklod_cli.tables.columns import Row
 from sparklod_cli.world import Placement, World, read_world
 from tests.conftest import FIXTURES
 
-VIEWER = Viewer(1, Cones(), pixel_scale_limit=0.0)
-HOW = How(BACKENDS["numba"].draw, Look())
+VIEWER = LodSettings(1, Cones(), pixel_scale_limit=0.0)
+HOW = ComparisonSettings(BACKENDS["numba"].draw, RasterSettings())
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +64,7 @@ def path_of(count: int, size: tuple[int, int] = (96, 70)) -> CameraPath:
     return CameraPath(tuple(cameras), "a test", (), tuple(range(5, 5 + count)))
 
 
-def rows(world: World, budgets: str, *, count: int = 3, how: How = HOW, threads: int = 1) -> list[Row]:
+def rows(world: World, budgets: str, *, count: int = 3, how: ComparisonSettings = HOW, threads: int = 1) -> list[Row]:
     return list(Comparison(world, VIEWER, parse_budgets(budgets), how).run(path_of(count), threads=threads))
 
 
@@ -162,7 +170,7 @@ def run(
         settings, parse_budgets(budgets), output=settings["output"], as_json=settings["as_json"]
     )
     with Console(quiet=False, verbose=False) as console:
-        status = render_compare.run(console, world, Viewer(1, Cones()), path_of(2), HOW, wanted, threads=1)
+        status = render_compare.run(console, world, LodSettings(1, Cones()), path_of(2), HOW, wanted, threads=1)
     said = capsys.readouterr()
     return status, said.out, said.err
 

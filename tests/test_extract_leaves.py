@@ -13,8 +13,8 @@ from sparklod_cli.codecs import spz
 from sparklod_cli.codecs.splat import importance_order
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod import quick
-from sparklod_cli.scene import Scene
-from sparklod_cli.splats import COLUMNS, Splats
+from sparklod_cli.model.scene import Scene
+from sparklod_cli.model.splats import COLUMNS, Splats
 from tests.conftest import FIXTURES
 from tests.scenes import random_splats
 

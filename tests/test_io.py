@@ -11,8 +11,8 @@ import pytest
 from sparklod_cli import io
 from sparklod_cli.cli import run
 from sparklod_cli.codecs.formats import FORMATS
-from sparklod_cli.errors import FormatError, UnreadableError
 from sparklod_cli.io import read_scene
+from sparklod_cli.support.errors import FormatError, UnreadableError
 from tests.conftest import FIXTURES, IS_ROOT
 
 SAMPLES = {"PLY": "sh1.ply", "PLY ascii": "sh1-ascii.ply", "SPZ": "golden/sh3-v3.spz", "SPZ 4": "golden/hand-v4.spz"}

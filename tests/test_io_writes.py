@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from sparklod_cli import whole
-from sparklod_cli.errors import OutputError
 from sparklod_cli.io import check_writable, write_stdout, write_whole
+from sparklod_cli.support import atomic
+from sparklod_cli.support.errors import OutputError
 from tests.conftest import FIXTURES, IS_ROOT
 from tests.support.test_atomic import has_unnamed_files
 
@@ -65,7 +65,7 @@ def test_an_interruption_leaves_nothing_and_spoils_nothing(
 @pytest.mark.parametrize("named", [False, True])
 def test_the_file_is_not_there_before_it_is_whole(named: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     if named:
-        monkeypatch.setattr(whole, "UNNAMED", None)
+        monkeypatch.setattr(atomic, "UNNAMED", None)
     elif not has_unnamed_files(tmp_path):
         pytest.skip("no files without names here")
     target = tmp_path / "out.spz"
@@ -166,7 +166,7 @@ def test_a_file_that_may_not_grow_leaves_nothing(tmp_path: Path) -> None:
     """A limit of the file's size is the nearest to a full disk that can be had without one."""
     code = (
         "import resource, signal, sys, pathlib\n"
-        "from sparklod_cli.errors import OutputError\n"
+        "from sparklod_cli.support.errors import OutputError\n"
         "from sparklod_cli.io import write_whole\n"
         "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))\n"

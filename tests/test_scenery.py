@@ -7,17 +7,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sparklod_cli.codecs import ext_splats, packed_splats, ply
-from sparklod_cli.errors import FormatError, InvalidSplatsError
-from sparklod_cli.gaussian import moved
-from sparklod_cli.preview.coloring import values_of
-from sparklod_cli.preview.metrics import psnr
-from sparklod_cli.preview.pictures import Manner, Painter
-from sparklod_cli.preview.scenery import Scenery, read_scenery
-from sparklod_cli.render.camera import Camera
-from sparklod_cli.render.framing import COVERED, covered, fitted
-from sparklod_cli.scene import Scene
-from sparklod_cli.simulation.simulate import Simulation, Viewer
+from sparklod_cli.cameras.camera import Camera
+from sparklod_cli.cameras.framing import COVERED, covered, fitted
+from sparklod_cli.codecs import ply
+from sparklod_cli.codecs.gpu import ext_splats, packed_splats
+from sparklod_cli.images.metrics import psnr
+from sparklod_cli.model.gaussian import moved
+from sparklod_cli.model.scene import Scene
+from sparklod_cli.render.color_by import values_of
+from sparklod_cli.render.renderer import Renderer, RenderSettings
+from sparklod_cli.scenery import Scenery, read_scenery
+from sparklod_cli.simulation.frames import LodSettings, Simulation
+from sparklod_cli.support.errors import FormatError, InvalidSplatsError
 from sparklod_cli.world import Placement, read_world
 from tests.conftest import FIXTURES
 from tests.render.sceneries import camera
@@ -36,7 +37,7 @@ def seen(scenery: Scenery, size: tuple[int, int] = (160, 120)) -> Camera:
 
 
 def test_a_cut_is_that_of_the_simulation() -> None:
-    viewer = Viewer(3000)
+    viewer = LodSettings(3000)
     scenery = read_scenery(at(TOWN, PLAIN, TREE), viewer)
     world = read_world(at(TOWN, TREE))
     view = seen(scenery)
@@ -52,9 +53,9 @@ def test_a_cut_is_that_of_the_simulation() -> None:
 @pytest.mark.parametrize("by", ["level", "chunk"])
 @pytest.mark.parametrize("budget", [50, 3000, 50_000])
 def test_colours_of_whole_numbers_span_what_the_cuts_have(by: str, budget: int) -> None:
-    scenery = read_scenery(at(TOWN, TREE), Viewer(budget))
+    scenery = read_scenery(at(TOWN, TREE), LodSettings(budget))
     views = [camera(160, 120, z) for z in (3.0, 20.0)]
-    scale = Painter(scenery, Manner(color_by=by), views).scale
+    scale = Renderer(scenery, RenderSettings(color_by=by), views).scale
     assert scale is not None
     pieces = [piece for view in views for piece in scenery.pieces(view)]
     values = np.concatenate([values_of(by, piece) for piece in pieces])
@@ -91,7 +92,7 @@ def test_a_file_stands_in_several_places() -> None:
 
 
 def test_through_an_encoding_splats_are_rounded_and_the_cut_stays() -> None:
-    viewer = Viewer(2000)
+    viewer = LodSettings(2000)
     scenes = {through: read_scenery(at(TOWN), viewer, through=through) for through in (None, "packed", "ext", "spz")}
     view = seen(scenes[None])
     cuts = [scenery.pieces(view)[0].index for scenery in scenes.values()]
@@ -107,7 +108,9 @@ def test_through_an_encoding_splats_are_rounded_and_the_cut_stays() -> None:
     rounded = scenes["spz"].sources[0].splats
     assert np.allclose(rounded.center, original.center, atol=2**-9)
     assert np.array_equal(rounded.scale, original.scale)
-    images = {through: Painter(scenery, Manner(), [view]).draw(view).image for through, scenery in scenes.items()}
+    images = {
+        through: Renderer(scenery, RenderSettings(), [view]).draw(view).image for through, scenery in scenes.items()
+    }
     qualities = {through: psnr(images[None][..., :3], image[..., :3]) for through, image in images.items()}
     assert qualities[None] > qualities["spz"] > 30
     assert 30 < qualities["packed"] < qualities["ext"]

@@ -12,8 +12,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from sparklod_cli.errors import FormatError, SparklodError
 from sparklod_cli.lod.traversal import Cones, Frustum
+from sparklod_cli.support.errors import FormatError, SparklodError
 from sparklod_cli.world import Placement
 from sparklod_cli.world_file import KEYS, WorldFileError, read_placements
 

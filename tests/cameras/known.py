@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from sparklod_cli.cameras.camera import Camera
+from sparklod_cli.cameras.formats.source import Files
+from sparklod_cli.cameras.formats.table import NAMES
+from sparklod_cli.cameras.frame import Settings
+from sparklod_cli.cameras.path import CameraPath, read
 from sparklod_cli.io import read_together
-from sparklod_cli.render.camera import Camera
-from sparklod_cli.render.camera_path import CameraPath, read
-from sparklod_cli.render.frame import Settings
-from sparklod_cli.render.paths.formats import NAMES
-from sparklod_cli.render.paths.source import Files
 from tests.conftest import FIXTURES
 
 FOLDER = FIXTURES / "cameras"

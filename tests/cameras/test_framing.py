@@ -9,10 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sparklod_cli.errors import InvalidSplatsError
-from sparklod_cli.render.camera import Camera
-from sparklod_cli.render.frame import DEFAULT_UP, Settings, camera_of
-from sparklod_cli.render.framing import (
+from sparklod_cli.cameras.camera import Camera
+from sparklod_cli.cameras.frame import DEFAULT_UP, Settings, camera_of
+from sparklod_cli.cameras.framing import (
     FILLED,
     OUTSIDE,
     Balls,
@@ -24,9 +23,10 @@ from sparklod_cli.render.framing import (
     middle_of,
     with_reach,
 )
-from sparklod_cli.render.generate import orbit
-from sparklod_cli.render.look import Look
-from sparklod_cli.splats import Splats
+from sparklod_cli.cameras.generators import orbit
+from sparklod_cli.model.splats import Splats
+from sparklod_cli.render.settings import RasterSettings
+from sparklod_cli.support.errors import InvalidSplatsError
 
 SIZES = st.sampled_from([(1280, 720), (720, 1280), (500, 500), (2000, 100)])
 
@@ -146,11 +146,11 @@ def test_a_scene_of_any_size_is_in_reach(size: float) -> None:
     scene = covered(Balls(np.random.default_rng(0).normal(size=(500, 3)) * size, np.zeros(500)))
     frames = orbit(5, (0, 0, 0), 1, 0, DEFAULT_UP)
     cameras = [fitted(camera_of(frame.matrix, frame.lens, 0, "", Settings()), scene) for frame in frames]
-    look = with_reach(Look(), cameras, scene)
+    look = with_reach(RasterSettings(), cameras, scene)
     for camera in cameras:
         depth = (scene.center - camera.position) @ camera.forward
         assert look.near < depth.min()
         assert look.far > depth.max()
-    assert look.near <= Look().near
-    assert look.far >= Look().far
+    assert look.near <= RasterSettings().near
+    assert look.far >= RasterSettings().far
     assert np.isfinite(np.float32(look.far))

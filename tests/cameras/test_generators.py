@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sparklod_cli.errors import CameraPathError
-from sparklod_cli.render.camera_path import GENERATED, cameras_of
-from sparklod_cli.render.frame import Frame, Lens, Settings
-from sparklod_cli.render.generate import Key, between, dolly, orbit
-from sparklod_cli.render.paths.source import Parsed
-from sparklod_cli.render.pose import look_at
-from sparklod_cli.render.spline import cardinal_tangents, catmull_rom_tangents, centripetal_knots, hermite
+from sparklod_cli.cameras.formats.source import Parsed
+from sparklod_cli.cameras.frame import Frame, Lens, Settings
+from sparklod_cli.cameras.generators import Key, between, dolly, orbit
+from sparklod_cli.cameras.path import GENERATED, cameras_of
+from sparklod_cli.cameras.pose import look_at
+from sparklod_cli.cameras.spline import cardinal_tangents, catmull_rom_tangents, centripetal_knots, hermite
+from sparklod_cli.support.errors import CameraPathError
 
 DOWN_Y = (0.0, -1.0, 0.0)
 

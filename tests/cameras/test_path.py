@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sparklod_cli.errors import CameraPathError
-from sparklod_cli.render.axes import Axes
-from sparklod_cli.render.camera import Camera
-from sparklod_cli.render.camera_path import CameraPath, read
-from sparklod_cli.render.frame import Settings
+from sparklod_cli.cameras.axes import Axes
+from sparklod_cli.cameras.camera import Camera
+from sparklod_cli.cameras.frame import Settings
+from sparklod_cli.cameras.path import CameraPath, read
+from sparklod_cli.support.errors import CameraPathError
 from tests.cameras.known import KNOWN, LANDMARK, check_pose, pixel, read_fixture, text_file
 
 HALF_TURN = np.diag([1.0, -1.0, -1.0, 1.0])

@@ -13,10 +13,10 @@ import pytest
 
 from fixtures import by_hand_compressed_ply
 from sparklod_cli.codecs import compressed_ply
-from sparklod_cli.errors import FormatError
 from sparklod_cli.io import read_scene
-from sparklod_cli.scene import Scene
-from sparklod_cli.splats import COLUMNS
+from sparklod_cli.model.scene import Scene
+from sparklod_cli.model.splats import COLUMNS
+from sparklod_cli.support.errors import FormatError
 from tests.codecs.writers import linear
 from tests.conftest import FIXTURES
 from tests.scenes import random_splats

@@ -18,8 +18,8 @@ import pytest
 
 from fixtures import by_hand, by_hand_sog
 from sparklod_cli.codecs.formats import FORMATS, HEAD, Format, sniff
-from sparklod_cli.errors import FormatError
-from sparklod_cli.scene import Scene
+from sparklod_cli.model.scene import Scene
+from sparklod_cli.support.errors import FormatError
 from tests.conftest import FIXTURES
 
 #: Files to damage: small ones of every kind that is read.

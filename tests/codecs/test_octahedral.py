@@ -12,8 +12,8 @@ from hypothesis.extra.numpy import arrays
 
 from sparklod_cli.codecs import octahedral
 from sparklod_cli.codecs.octahedral import STEPS_8_8_8, STEPS_10_10_12
-from sparklod_cli.errors import FormatError
-from sparklod_cli.gaussian import normalized_quat
+from sparklod_cli.model.gaussian import normalized_quat
+from sparklod_cli.support.errors import FormatError
 
 Steps = tuple[int, int]
 BOTH = pytest.mark.parametrize("steps", [STEPS_8_8_8, STEPS_10_10_12])

@@ -15,9 +15,9 @@ from plyfile import PlyElement
 
 from fixtures import by_hand
 from sparklod_cli.codecs import ply
-from sparklod_cli.errors import FormatError
-from sparklod_cli.scene import Scene
-from sparklod_cli.splats import COLUMNS
+from sparklod_cli.model.scene import Scene
+from sparklod_cli.model.splats import COLUMNS
+from sparklod_cli.support.errors import FormatError
 from tests.conftest import FIXTURES
 
 SH_C0 = 0.28209479177387814

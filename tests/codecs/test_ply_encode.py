@@ -10,10 +10,10 @@ from plyfile import PlyData
 
 from fixtures import by_hand
 from sparklod_cli.codecs import ply
-from sparklod_cli.errors import FormatError
-from sparklod_cli.scene import Scene
-from sparklod_cli.splats import COLUMNS, Splats
-from sparklod_cli.tree import LodTree
+from sparklod_cli.model.lod_tree import LodTree
+from sparklod_cli.model.scene import Scene
+from sparklod_cli.model.splats import COLUMNS, Splats
+from sparklod_cli.support.errors import FormatError
 from tests.scenes import random_splats, splat_columns
 
 SH_C0 = 0.28209479177387814

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from sparklod_cli.codecs import quantize
-from sparklod_cli.gaussian import linear_opacity, lod_opacity, normalized_quat
-from sparklod_cli.sh import SH_C0
+from sparklod_cli.model.gaussian import linear_opacity, lod_opacity, normalized_quat
+from sparklod_cli.model.sh import SH_C0
 
 CODES = np.arange(256, dtype=np.uint8)
 ROUNDING = 1.001  # float32's own errors, which no docstring counts

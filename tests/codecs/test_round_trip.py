@@ -11,11 +11,11 @@ import pytest
 
 from sparklod_cli.codecs import spz
 from sparklod_cli.codecs.formats import FORMATS
-from sparklod_cli.gaussian import linear_opacity, lod_opacity
 from sparklod_cli.io import read_scene
-from sparklod_cli.scene import Scene
-from sparklod_cli.splats import COLUMNS, Splats
-from sparklod_cli.tree import LodTree
+from sparklod_cli.model.gaussian import linear_opacity, lod_opacity
+from sparklod_cli.model.lod_tree import LodTree
+from sparklod_cli.model.scene import Scene
+from sparklod_cli.model.splats import COLUMNS, Splats
 from tests.codecs.test_quantize import rotation_degrees
 from tests.codecs.writers import WRITERS, Precision, put
 from tests.conftest import FIXTURES

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from sparklod_cli.codecs import splat
-from sparklod_cli.errors import FormatError
 from sparklod_cli.io import read_scene
-from sparklod_cli.scene import Scene
-from sparklod_cli.splats import Splats
-from sparklod_cli.tree import LodTree
+from sparklod_cli.model.lod_tree import LodTree
+from sparklod_cli.model.scene import Scene
+from sparklod_cli.model.splats import Splats
+from sparklod_cli.support.errors import FormatError
 from tests.conftest import FIXTURES
 from tests.scenes import random_splats
 

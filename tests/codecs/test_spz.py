@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 
 from fixtures import by_hand
 from sparklod_cli.codecs import clamps, quantize, spz
-from sparklod_cli.errors import FormatError
-from sparklod_cli.scene import Scene
-from sparklod_cli.splats import COLUMNS, Splats
+from sparklod_cli.model.scene import Scene
+from sparklod_cli.model.splats import COLUMNS, Splats
+from sparklod_cli.support.errors import FormatError
 from tests.conftest import FIXTURES
 from tests.scenes import random_splats
 

@@ -14,10 +14,10 @@ from fixtures import by_hand
 from sparklod_cli.codecs import ply, splat, spz
 from sparklod_cli.codecs.formats import HEAD, sniff
 from sparklod_cli.codecs.stream import rows_of
-from sparklod_cli.errors import FormatError
-from sparklod_cli.parallel import CHUNK, ordered_map
-from sparklod_cli.scene import Scene
-from sparklod_cli.splats import COLUMNS, Splats
+from sparklod_cli.model.scene import Scene
+from sparklod_cli.model.splats import COLUMNS, Splats
+from sparklod_cli.support.errors import FormatError
+from sparklod_cli.support.parallel import CHUNK, ordered_map
 from tests.scenes import random_splats
 
 COUNT = 12 * CHUNK

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
+from sparklod_cli.cameras import generators
+from sparklod_cli.cameras.framing import FILLED, Balls
+from sparklod_cli.cameras.path import CameraPath
 from sparklod_cli.commands.camera_options import camera_options, cameras_from
-from sparklod_cli.errors import CameraPathError
-from sparklod_cli.render import generate
-from sparklod_cli.render.camera_path import CameraPath
-from sparklod_cli.render.framing import FILLED, Balls
+from sparklod_cli.support.errors import CameraPathError
 from tests.cameras.known import FOLDER, KNOWN, SIZE, check_pose
 
 #: A ball around (1, 2, 3), of which nine in ten are nearer than 2.
@@ -205,13 +205,13 @@ def test_a_file_of_gigabytes_is_not_read(monkeypatch: pytest.MonkeyPatch) -> Non
 )
 def test_no_more_cameras_are_made_than_are_taken(options: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:
     made = []
-    whole = generate.frame_looking
+    whole = generators.frame_looking
 
     def counted(*arguments: Any) -> Any:
         made.append(1)
         return whole(*arguments)
 
-    monkeypatch.setattr(generate, "frame_looking", counted)
+    monkeypatch.setattr(generators, "frame_looking", counted)
     output = " ".join(usage_error(*options).split())
     assert f"{options[0]}: it has 1," in output
     assert "cameras, more than 65,536; see --every" in output

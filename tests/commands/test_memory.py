@@ -12,11 +12,11 @@ import pytest
 
 from sparklod_cli.cli import run
 from sparklod_cli.codecs import spz
-from sparklod_cli.errors import OutOfMemoryError, memory_told, out_of_memory
-from sparklod_cli.parallel import ordered_map
-from sparklod_cli.scene import Scene
-from sparklod_cli.splats import Splats
-from sparklod_cli.tree import LodTree
+from sparklod_cli.model.lod_tree import LodTree
+from sparklod_cli.model.scene import Scene
+from sparklod_cli.model.splats import Splats
+from sparklod_cli.support.errors import OutOfMemoryError, memory_told, out_of_memory
+from sparklod_cli.support.parallel import ordered_map
 from tests.conftest import FIXTURES, ROOT
 
 #: Runs a command twice: with something small HERE, so that all code is loaded and compiled, then with something large

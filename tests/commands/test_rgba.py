@@ -14,8 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sparklod_cli.cli import run
-from sparklod_cli.errors import FormatError
 from sparklod_cli.io import read_rgba, read_scene
+from sparklod_cli.support.errors import FormatError
 from tests.conftest import FIXTURES
 
 SCENE = FIXTURES / "sh2.ply"

@@ -7,9 +7,9 @@ import re
 import numpy as np
 import pytest
 
-from sparklod_cli.render.camera_path import read
-from sparklod_cli.render.paths.colmap_models import MODELS
-from sparklod_cli.render.paths.formats import FORMATS, PLAYCANVAS
+from sparklod_cli.cameras.formats.colmap_models import MODELS
+from sparklod_cli.cameras.formats.table import FORMATS, PLAYCANVAS
+from sparklod_cli.cameras.path import read
 from tests.cameras.known import text_file
 from tests.conftest import ROOT
 

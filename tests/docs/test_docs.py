@@ -9,12 +9,13 @@ from pathlib import Path
 import click
 import pytest
 
-from sparklod_cli import io, printable, untrusted
+from sparklod_cli import io
+from sparklod_cli.cameras import frame
 from sparklod_cli.cli import COMMANDS, cli
 from sparklod_cli.cli import run as cli_run
 from sparklod_cli.codecs import compression
 from sparklod_cli.inspection import tree
-from sparklod_cli.render import frame
+from sparklod_cli.support import printable, untrusted
 from tests.conftest import FIXTURES, ROOT
 
 

@@ -6,9 +6,9 @@ import re
 
 import pytest
 
-from sparklod_cli.simulation.assertions import check, parse
 from sparklod_cli.simulation.columns import COLUMNS
 from sparklod_cli.simulation.summary import MOMENTS, QUANTITIES
+from sparklod_cli.tables.assertions import check, parse
 from tests.conftest import ROOT
 from tests.tables.rows import flight
 

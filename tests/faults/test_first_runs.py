@@ -6,7 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from sparklod_cli.jit_cache import SUFFIX
+from sparklod_cli.support.jit_cache import SUFFIX
 from tests.conftest import ROOT
 from tests.faults.runs import ENVIRONMENT
 

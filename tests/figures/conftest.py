@@ -6,8 +6,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from sparklod_cli.errors import SparklodError
-from sparklod_cli.render import stage
+from sparklod_cli.figures import pyvista_scene
+from sparklod_cli.support.errors import SparklodError
 
 
 @pytest.fixture
@@ -21,7 +21,7 @@ def drawing() -> None:
     """Skips where pictures cannot be drawn."""
     pytest.importorskip("pyvista", reason="pictures need the extra `render`")
     try:
-        stage.load_pyvista()
+        pyvista_scene.load_pyvista()
     except SparklodError as error:
         pytest.skip(str(error))
 
@@ -29,6 +29,6 @@ def drawing() -> None:
 @pytest.fixture
 def fresh() -> Iterator[None]:
     """Makes pyvista be looked for again."""
-    stage.load_pyvista.cache_clear()
+    pyvista_scene.load_pyvista.cache_clear()
     yield
-    stage.load_pyvista.cache_clear()
+    pyvista_scene.load_pyvista.cache_clear()

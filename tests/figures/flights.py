@@ -8,8 +8,8 @@ import math
 import numpy as np
 from PIL import Image
 
-from sparklod_cli.render.camera import Camera
-from sparklod_cli.simulation.plot import Scenery
+from sparklod_cli.cameras.camera import Camera
+from sparklod_cli.figures.traversal_chart import Scenery
 from tests.scenes import random_splats
 
 SIZE = (400, 250)

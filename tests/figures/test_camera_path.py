@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sparklod_cli.errors import SparklodError
-from sparklod_cli.simulation import charts
-from sparklod_cli.simulation.path_picture import FRAME, _above, frustum_lines, picture_of_path
-from sparklod_cli.simulation.plot import plot
+from sparklod_cli.figures import charts
+from sparklod_cli.figures.camera_path import FRAME, _above, frustum_lines, picture_of_path
+from sparklod_cli.figures.traversal_chart import plot
+from sparklod_cli.support.errors import SparklodError
 from tests.figures.flights import SIZE, circle, count_of, looking, pixels, scenery
 from tests.scenes import random_splats
 from tests.tables.rows import flight

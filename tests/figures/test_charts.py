@@ -8,9 +8,9 @@ import sys
 import numpy as np
 import pytest
 
-from sparklod_cli.simulation import charts
-from sparklod_cli.simulation.columns import Row
-from sparklod_cli.simulation.plot import plot
+from sparklod_cli.figures import charts
+from sparklod_cli.figures.traversal_chart import plot
+from sparklod_cli.tables.columns import Row
 from tests.figures.flights import count_of, pixels
 from tests.tables.rows import flight, row
 
@@ -100,7 +100,7 @@ class TestCharts:
     def test_pyplot_is_left_alone(self) -> None:
         """It would keep every figure, and ask for a display."""
         program = (
-            "import sys; from tests.tables.rows import flight; from sparklod_cli.simulation import charts\n"
+            "import sys; from tests.tables.rows import flight; from sparklod_cli.figures import charts\n"
             "charts.draw(flight(3)); assert 'matplotlib.pyplot' not in sys.modules"
         )
         subprocess.run([sys.executable, "-c", program], check=True)

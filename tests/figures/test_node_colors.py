@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sparklod_cli.gaussian import spark_size
-from sparklod_cli.inspection.colors import color_by
-from sparklod_cli.render.colors import MAGMA, PLASMA, VIRIDIS, ramp
+from sparklod_cli.figures.node_colors import color_by
+from sparklod_cli.model.gaussian import spark_size
+from sparklod_cli.render.color_scales import MAGMA, PLASMA, VIRIDIS, ramp
 from tests.scenes import random_splats
 
 

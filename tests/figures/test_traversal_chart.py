@@ -6,8 +6,8 @@ import sys
 
 import pytest
 
-from sparklod_cli.errors import SparklodError
-from sparklod_cli.simulation.plot import plot
+from sparklod_cli.figures.traversal_chart import plot
+from sparklod_cli.support.errors import SparklodError
 from tests.figures.flights import scenery
 from tests.tables.rows import flight
 

@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sparklod_cli.errors import SparklodError
-from sparklod_cli.inspection import plot as plotting
-from sparklod_cli.inspection.plot import Picture, plot
+from sparklod_cli.figures import pyvista_scene
+from sparklod_cli.figures import tree_plot as plotting
+from sparklod_cli.figures.labels import BACKGROUND
+from sparklod_cli.figures.tree_plot import Picture, plot
 from sparklod_cli.lod import quick
-from sparklod_cli.render import stage
-from sparklod_cli.render.labels import BACKGROUND
-from sparklod_cli.scene import Scene
-from sparklod_cli.tree import LodTree
+from sparklod_cli.model.lod_tree import LodTree
+from sparklod_cli.model.scene import Scene
+from sparklod_cli.support.errors import SparklodError
 from tests.scenes import random_splats
 
 SIZE = (320, 200)
@@ -30,7 +30,7 @@ def drawing() -> None:
     """Skips where pictures cannot be drawn."""
     pytest.importorskip("pyvista")
     try:
-        stage.load_pyvista()
+        pyvista_scene.load_pyvista()
     except SparklodError as error:
         pytest.skip(str(error))
 
@@ -99,7 +99,7 @@ class TestPictures:
         assert "boxes" in plot(Scene(random_splats(50)), by="chunk", size=SIZE).description
 
     def test_many_are_points_and_more_are_a_sample(self, scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(stage, "MOST_ELLIPSOIDS", 100)
+        monkeypatch.setattr(pyvista_scene, "MOST_ELLIPSOIDS", 100)
         picture = plot(scene, size=SIZE)
         assert "points" in picture.description
         assert drawn(picture).any()
@@ -164,9 +164,9 @@ class TestPictures:
 @pytest.fixture
 def fresh() -> Iterator[None]:
     """Makes pyvista be looked for again."""
-    stage.load_pyvista.cache_clear()
+    pyvista_scene.load_pyvista.cache_clear()
     yield
-    stage.load_pyvista.cache_clear()
+    pyvista_scene.load_pyvista.cache_clear()
 
 
 @pytest.mark.usefixtures("fresh")
@@ -179,7 +179,7 @@ class TestWhereNoneCanBeDrawn:
 
     def test_there_is_no_opengl(self, scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setitem(sys.modules, "pyvista", subprocess)  # any module: it is not asked for anything
-        monkeypatch.setattr(stage, "PROBE", "import os; os.abort()")
+        monkeypatch.setattr(pyvista_scene, "PROBE", "import os; os.abort()")
         with pytest.raises(SparklodError, match="apt install libegl1 libgl1-mesa-dri"):
             plot(scene)
 

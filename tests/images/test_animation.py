@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from PIL import Image, ImageSequence
 
-from sparklod_cli.errors import SparklodError
-from sparklod_cli.preview import animation
+from sparklod_cli.images import animation
+from sparklod_cli.support.errors import SparklodError
 
 COLORS = [(250, 10, 10), (10, 250, 10), (10, 10, 250), (240, 240, 10)]
 

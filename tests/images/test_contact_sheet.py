@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image, ImageDraw, ImageFont
 
-from sparklod_cli.preview.sheet import _fitting, cells, grid, sheet
+from sparklod_cli.images.contact_sheet import _fitting, cells, grid, sheet
 
 
 def pictures(count: int, width: int, height: int, channels: int = 3) -> list[np.ndarray]:

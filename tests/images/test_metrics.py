@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from sparklod_cli.preview.metrics import C1, MOST_PSNR, Tile, psnr, ssim, worst_tile
+from sparklod_cli.images.metrics import C1, MOST_PSNR, Tile, psnr, ssim, worst_tile
 
 
 def pictures(height: int = 45, width: int = 37, noise: float = 0.1, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:

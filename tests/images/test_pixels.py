@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from PIL import Image
 
-from sparklod_cli.preview import pixels
-from sparklod_cli.preview.pictures import averaged, finer
-from sparklod_cli.render.colors import VIRIDIS, smooth
+from sparklod_cli.images import pixels
+from sparklod_cli.render.color_scales import VIRIDIS, smooth
+from sparklod_cli.render.renderer import averaged, finer
 from tests.render.sceneries import camera
 
 UNIT = st.floats(0, 1, width=32)

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from sparklod_cli.cli import run
-from sparklod_cli.errors import SparklodError
 from sparklod_cli.inspection.expectations import ExpectationError, Expectations, check, read
 from sparklod_cli.inspection.report import Report
+from sparklod_cli.support.errors import SparklodError
 from tests.inspection.expected import TREE, written
 
 EVERY = Expectations(

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from sparklod_cli.inspection.histograms import Histogram, as_text, histogram, of_quantity
+from sparklod_cli.tables.histograms import Histogram, as_text, histogram, of_quantity
 from tests.scenes import random_splats
 
 FLOATS = arrays.arrays(np.float32, st.integers(0, 300), elements=st.floats(width=32))

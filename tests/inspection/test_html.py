@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sparklod_cli.inspection.charts import children_groups
-from sparklod_cli.inspection.histograms import histogram, of_quantity
+from sparklod_cli.figures.svg import children_groups
+from sparklod_cli.figures.tree_plot import Picture
 from sparklod_cli.inspection.html import Section, page
-from sparklod_cli.inspection.plot import Picture
 from sparklod_cli.inspection.report import Wanted, inspect
 from sparklod_cli.inspection.values import names_of
+from sparklod_cli.tables.histograms import histogram, of_quantity
 from tests.conftest import FIXTURES
 from tests.scenes import random_splats
 

@@ -23,8 +23,8 @@ from sparklod_cli.inspection.expectations import value_at
 from sparklod_cli.inspection.findings import CODES
 from sparklod_cli.inspection.report import SCHEMA_VERSION, Wanted, inspect
 from sparklod_cli.lod import quick
-from sparklod_cli.scene import Scene
-from sparklod_cli.tree import MAX_CHILDREN, LodTree
+from sparklod_cli.model.lod_tree import MAX_CHILDREN, LodTree
+from sparklod_cli.model.scene import Scene
 from tests.conftest import FIXTURES, ROOT
 from tests.scenes import random_splats
 

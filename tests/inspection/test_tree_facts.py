@@ -11,14 +11,14 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from sparklod_cli.gaussian import design_size, spark_size
 from sparklod_cli.inspection import tree as facts_of
 from sparklod_cli.inspection.findings import Finding
 from sparklod_cli.inspection.tree import TreeFacts, examine
 from sparklod_cli.lod import quick
-from sparklod_cli.lod.kernels.walk import find_parents, walk
-from sparklod_cli.splats import Splats
-from sparklod_cli.tree import LodTree
+from sparklod_cli.lod.kernels.tree_links import find_parents, walk
+from sparklod_cli.model.gaussian import design_size, spark_size
+from sparklod_cli.model.lod_tree import LodTree
+from sparklod_cli.model.splats import Splats
 from tests.references import tree_links
 from tests.scenes import random_splats
 

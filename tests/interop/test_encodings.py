@@ -19,15 +19,16 @@ import pytest
 from numpy.typing import NDArray
 
 from fixtures import by_hand
-from sparklod_cli import gaussian
-from sparklod_cli.codecs import ext_splats, lod_tree, packed_splats, spz
-from sparklod_cli.codecs.packed_splats import Encoding
-from sparklod_cli.gaussian import lod_opacity
+from sparklod_cli.codecs import spz
+from sparklod_cli.codecs.gpu import ext_splats, lod_tree, packed_splats
+from sparklod_cli.codecs.gpu.packed_splats import Encoding
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod import quick
-from sparklod_cli.scene import Scene
-from sparklod_cli.sh import SH_C0
-from sparklod_cli.splats import Splats
+from sparklod_cli.model import gaussian
+from sparklod_cli.model.gaussian import lod_opacity
+from sparklod_cli.model.scene import Scene
+from sparklod_cli.model.sh import SH_C0
+from sparklod_cli.model.splats import Splats
 from tests.conftest import real_scene
 from tests.interop import ties
 from tests.interop.spark import Spark

@@ -9,10 +9,10 @@ import pytest
 
 from sparklod_cli.bake import BUILDERS
 from sparklod_cli.codecs import spz
-from sparklod_cli.limits import METHODS
-from sparklod_cli.scene import Scene
-from sparklod_cli.splats import Splats
-from sparklod_cli.tree import MAX_CHILDREN
+from sparklod_cli.model.lod_tree import MAX_CHILDREN
+from sparklod_cli.model.scene import Scene
+from sparklod_cli.model.splats import Splats
+from sparklod_cli.support.defaults import METHODS
 from tests.interop import laws
 from tests.interop.spark import Spark
 from tests.scenes import random_splats

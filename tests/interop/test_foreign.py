@@ -15,7 +15,7 @@ import pytest
 from sparklod_cli.cli import run
 from sparklod_cli.codecs import ply, splat
 from sparklod_cli.io import read_scene
-from sparklod_cli.splats import Splats
+from sparklod_cli.model.splats import Splats
 from tests.conftest import FIXTURES, real_scene
 from tests.interop.foreign import Foreign
 from tests.interop.laws import EXT_DEGREES, HALF, TINY, Floats, degrees_between, held_by_ext_sh, within

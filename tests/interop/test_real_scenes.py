@@ -10,7 +10,7 @@ import pytest
 from sparklod_cli.bake import BUILDERS
 from sparklod_cli.codecs import spz
 from sparklod_cli.io import read_scene
-from sparklod_cli.scene import Scene
+from sparklod_cli.model.scene import Scene
 from tests.conftest import real_scene
 from tests.interop import laws
 from tests.interop.spark import Spark

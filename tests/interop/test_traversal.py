@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from sparklod_cli.bake import BUILDERS
-from sparklod_cli.codecs import ext_splats, lod_tree
-from sparklod_cli.codecs.lod_tree import Nodes
+from sparklod_cli.codecs.gpu import ext_splats, lod_tree
+from sparklod_cli.codecs.gpu.lod_tree import Nodes
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod.traversal import CHUNK_NODES, Cones, Cut, Forest, Instance, Traversal, View, pixel_limit, views_of
 from tests.conftest import FIXTURES, real_scene

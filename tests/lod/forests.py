@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from hypothesis import strategies as st
 
-from sparklod_cli.codecs.lod_tree import Nodes
+from sparklod_cli.codecs.gpu.lod_tree import Nodes
 from sparklod_cli.lod.traversal import Cones, Cut, Forest, Frustum, Instance, Traversal, View
-from sparklod_cli.tree import LodTree
+from sparklod_cli.model.lod_tree import LodTree
 from tests.references import budgeted_cuts
 
 FOVEATIONS = (

@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sparklod_cli.gaussian import lod_opacity
+from sparklod_cli.lod.continuous import BlendedCut, ContinuousCuts, faded, find_threshold, pixel_scales, shares
 from sparklod_cli.lod.traversal import Cones, Forest, Instance, Traversal, View
-from sparklod_cli.preview.continuous import BlendedCut, ContinuousCuts, faded, find_threshold, pixel_scales, shares
+from sparklod_cli.model.gaussian import lod_opacity
 from tests.lod.forests import Case, cases, random_tree, transform
 from tests.references import budgeted_cuts
 

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sparklod_cli.codecs.lod_tree import Nodes
-from sparklod_cli.lod.cut_measure import Changes, Measured, measure
+from sparklod_cli.codecs.gpu.lod_tree import Nodes
+from sparklod_cli.lod.cut_statistics import Changes, Measured, measure
 from sparklod_cli.lod.traversal import Cut, Instance, Traversal, View, pixel_limit
 from tests.lod.forests import Case, cases, drawn, expected_cut, links, views
 

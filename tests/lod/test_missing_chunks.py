@@ -13,9 +13,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sparklod_cli import jit
 from sparklod_cli.lod import traversal
 from sparklod_cli.lod.traversal import Forest, Instance, View
+from sparklod_cli.support import jit
 from tests.lod.forests import Case, ancestors_drawn, cases, check, random_tree, transform
 
 #: Nodes of a chunk in tests of small trees, as a power of 2; so large that no node's children are in three.

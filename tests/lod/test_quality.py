@@ -12,29 +12,29 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sparklod_cli import jit
-from sparklod_cli.codecs import lod_tree
-from sparklod_cli.errors import InvalidSplatsError
-from sparklod_cli.gaussian import spark_size
+from sparklod_cli.cameras.camera import Camera
+from sparklod_cli.cameras.formats.source import Parsed
+from sparklod_cli.cameras.frame import DEFAULT_UP, Settings
+from sparklod_cli.cameras.framing import framing
+from sparklod_cli.cameras.generators import orbit
+from sparklod_cli.cameras.path import GENERATED, cameras_of
+from sparklod_cli.codecs.gpu import lod_tree
+from sparklod_cli.compare import on_background
+from sparklod_cli.images.metrics import psnr
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod import quality, quick
-from sparklod_cli.lod.kernels.keep import MOST_CHILDREN, STEPS
+from sparklod_cli.lod.kernels.prune import MOST_CHILDREN, STEPS
 from sparklod_cli.lod.traversal import Forest, Instance, Traversal
-from sparklod_cli.preview.compare import on_background
-from sparklod_cli.preview.metrics import psnr
-from sparklod_cli.render.camera import Camera
-from sparklod_cli.render.camera_path import GENERATED, cameras_of
-from sparklod_cli.render.frame import DEFAULT_UP, Settings
-from sparklod_cli.render.framing import framing
-from sparklod_cli.render.generate import orbit
-from sparklod_cli.render.look import Look
-from sparklod_cli.render.paths.source import Parsed
+from sparklod_cli.model.gaussian import spark_size
+from sparklod_cli.model.lod_tree import LodTree
+from sparklod_cli.model.selection import Selection
+from sparklod_cli.model.splats import Splats
 from sparklod_cli.render.rasterizer import Image, draw
-from sparklod_cli.render.shown import show
-from sparklod_cli.selection import Selection
-from sparklod_cli.simulation.simulate import view_of
-from sparklod_cli.splats import Splats
-from sparklod_cli.tree import LodTree
+from sparklod_cli.render.settings import RasterSettings
+from sparklod_cli.render.shading import show
+from sparklod_cli.simulation.frames import view_of
+from sparklod_cli.support import jit
+from sparklod_cli.support.errors import InvalidSplatsError
 from tests.conftest import real_scene
 from tests.lod.trees import check_threads, check_tree, children, coincident, hard_cases, parents
 from tests.references import gaussians
@@ -210,7 +210,7 @@ def cameras_around(splats: Splats) -> tuple[Camera, ...]:
 
 
 def picture(splats: Splats, camera: Camera) -> Image:
-    return draw(show([(splats, np.eye(4))], camera), camera, Look())
+    return draw(show([(splats, np.eye(4))], camera), camera, RasterSettings())
 
 
 def fidelity(splats: Splats, built: tuple[Splats, LodTree], share: float) -> float:

@@ -11,11 +11,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sparklod_cli.errors import InvalidSplatsError
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod import quick
-from sparklod_cli.splats import Splats
-from sparklod_cli.tree import MAX_CHILDREN, LodTree
+from sparklod_cli.model.lod_tree import MAX_CHILDREN, LodTree
+from sparklod_cli.model.splats import Splats
+from sparklod_cli.support.errors import InvalidSplatsError
 from tests.conftest import real_scene
 from tests.lod.trees import check_threads, check_tree, children, coincident, hard_cases, parents
 from tests.references import gaussians, quick_trees

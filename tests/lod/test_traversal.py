@@ -12,18 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sparklod_cli.codecs.lod_tree import Nodes
-from sparklod_cli.lod.traversal import (
-    CHUNK_NODES,
-    LOOKS,
-    Cones,
-    Forest,
-    Frustum,
-    Instance,
-    View,
-    pixel_limit,
-    views_of,
-)
+from sparklod_cli.codecs.gpu.lod_tree import Nodes
+from sparklod_cli.lod.traversal import CHUNK_NODES, LOOKS, Cones, Forest, Frustum, Instance, View, pixel_limit, views_of
 from tests.lod.forests import Case, ancestors_drawn, cases, check, drawn, links, random_tree, rotation, transform, views
 from tests.references import budgeted_cuts
 

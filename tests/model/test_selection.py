@@ -7,9 +7,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from sparklod_cli.errors import InvalidSplatsError
-from sparklod_cli.selection import Selection, describe
-from sparklod_cli.splats import COLUMNS, Splats
+from sparklod_cli.model.selection import Selection, describe
+from sparklod_cli.model.splats import COLUMNS, Splats
+from sparklod_cli.support.errors import InvalidSplatsError
 from tests.scenes import random_splats
 
 

@@ -10,11 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from sparklod_cli.errors import FormatError
-from sparklod_cli.gaussian import linear_opacity, lod_opacity, normalized_quat
 from sparklod_cli.lod.kernels.geometry import ellipsoid_area
-from sparklod_cli.sh import COEFFICIENTS, degree_of
-from sparklod_cli.splats import COLUMNS, Splats
+from sparklod_cli.model.gaussian import linear_opacity, lod_opacity, normalized_quat
+from sparklod_cli.model.sh import COEFFICIENTS, degree_of
+from sparklod_cli.model.splats import COLUMNS, Splats
+from sparklod_cli.support.errors import FormatError
 from tests.references import gaussians
 from tests.scenes import random_splats
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from sparklod_cli.lod.kernels.sight import CONE, FRUSTUM
+from sparklod_cli.lod.kernels.pixel_scale import CONE, FRUSTUM
 
 
 def pixel_scale(node: np.void, view: np.void) -> np.float32:

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sparklod_cli.gaussian import MAX_OPACITY, MIN_OPACITY, THOMSEN_P
-from sparklod_cli.splats import Splats
+from sparklod_cli.model.gaussian import MAX_OPACITY, MIN_OPACITY, THOMSEN_P
+from sparklod_cli.model.splats import Splats
 
 
 def ellipsoid_area(scale: np.ndarray) -> np.ndarray:

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sparklod_cli.render.camera import Camera
-from sparklod_cli.render.look import Look
-from sparklod_cli.render.shown import Shown
-from sparklod_cli.splats import Splats
+from sparklod_cli.cameras.camera import Camera
+from sparklod_cli.model.splats import Splats
+from sparklod_cli.render.settings import RasterSettings
+from sparklod_cli.render.shading import ShadedSplats
 from tests.references.gaussians import covariance
 
 
@@ -51,7 +51,7 @@ class Drawn:
     unsure: np.ndarray
 
 
-def picture(shown: Shown, camera: Camera, look: Look) -> Drawn:
+def picture(shown: ShadedSplats, camera: Camera, look: RasterSettings) -> Drawn:
     """Splats as Spark's shaders draw them, from far to near, each over the whole picture."""
     to_camera = np.linalg.inv(camera.camera_to_world)
     (fx, fy), (cx, cy), width, height = camera.focal, camera.principal, camera.width, camera.height

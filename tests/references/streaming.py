@@ -7,7 +7,7 @@ import math
 from dataclasses import dataclass, field
 from fractions import Fraction
 
-from sparklod_cli.simulation.chunks import Chunks
+from sparklod_cli.simulation.chunk_cache import Chunks
 from sparklod_cli.simulation.streaming import Network
 
 #: Nearer than this to each other, rounding decides which of two events comes first.

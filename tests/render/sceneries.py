@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from sparklod_cli.preview.scenery import Scenery, Source
-from sparklod_cli.render.camera import Camera
-from sparklod_cli.splats import Splats
+from sparklod_cli.cameras.camera import Camera
+from sparklod_cli.model.splats import Splats
+from sparklod_cli.scenery import Scenery, Source
 from sparklod_cli.world import Placement
 
 

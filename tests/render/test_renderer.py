@@ -8,14 +8,14 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from sparklod_cli.errors import SparklodError
-from sparklod_cli.limits import COLOR_BY, STYLES
-from sparklod_cli.preview.pictures import Drawn, Manner, Painter
-from sparklod_cli.preview.scenery import Scenery
-from sparklod_cli.preview.styles import BILLBOARD_ALPHA
 from sparklod_cli.render.backends import BACKENDS
-from sparklod_cli.render.look import Look
-from sparklod_cli.render.shown import show
+from sparklod_cli.render.renderer import Drawn, Renderer, RenderSettings
+from sparklod_cli.render.settings import RasterSettings
+from sparklod_cli.render.shading import show
+from sparklod_cli.render.styles import BILLBOARD_ALPHA
+from sparklod_cli.scenery import Scenery
+from sparklod_cli.support.defaults import COLOR_BY, STYLES
+from sparklod_cli.support.errors import SparklodError
 from tests.render.sceneries import balls, camera, plain
 from tests.scenes import random_splats
 
@@ -24,18 +24,18 @@ MIDDLE = (24, 32)
 
 
 def drawn(scenery: Scenery, **how: object) -> Drawn:
-    return Painter(scenery, Manner(**how), [camera()]).draw(camera())
+    return Renderer(scenery, RenderSettings(**how), [camera()]).draw(camera())
 
 
 def test_splats_are_what_the_backend_draws() -> None:
     splats, at = random_splats(300, sh_degree=2), camera()
-    image = Painter(plain(splats), Manner(), [at]).draw(at).image
-    assert np.array_equal(image, BACKENDS["numba"].draw(show([(splats, np.eye(4))], at), at, Look()))
+    image = Renderer(plain(splats), RenderSettings(), [at]).draw(at).image
+    assert np.array_equal(image, BACKENDS["numba"].draw(show([(splats, np.eye(4))], at), at, RasterSettings()))
 
 
 def test_several_threads_draw_the_same() -> None:
     at = camera()
-    painter = Painter(plain(random_splats(2000)), Manner(), [at])
+    painter = Renderer(plain(random_splats(2000)), RenderSettings(), [at])
     expected = painter.draw(at).image
     with ThreadPoolExecutor(4) as pool:
         for drawn in pool.map(painter.draw, [at] * 12):
@@ -71,13 +71,15 @@ def test_sorted_billboards_have_the_nearest_on_top() -> None:
     expected = BILLBOARD_ALPHA * (1 - BILLBOARD_ALPHA) * RED + BILLBOARD_ALPHA * GREEN
     for centers, rgb in (((far, near), [RED, GREEN]), ((near, far), [GREEN, RED])):
         for sort in ("radial", "z"):
-            image = drawn(plain(balls(*centers, rgb=rgb)), style="sorted-billboards", look=Look(sort=sort)).image
+            image = drawn(
+                plain(balls(*centers, rgb=rgb)), style="sorted-billboards", look=RasterSettings(sort=sort)
+            ).image
             assert np.allclose(image[MIDDLE][:3], expected)
 
 
 def test_a_billboard_is_as_wide_as_its_splat() -> None:
     at = camera(640, 480)
-    image = Painter(plain(balls((0, 0, 0), size=0.5)), Manner(style="billboards"), [at]).draw(at).image
+    image = Renderer(plain(balls((0, 0, 0), size=0.5)), RenderSettings(style="billboards"), [at]).draw(at).image
     radius = 0.5 * at.focal[0] / 5
     assert np.count_nonzero(image[240, :, 3]) == pytest.approx(2 * radius, abs=2)
     assert np.count_nonzero(image[..., 3]) == pytest.approx(np.pi * radius**2, rel=0.02)
@@ -87,9 +89,9 @@ def test_a_billboard_is_as_wide_as_its_splat() -> None:
 @pytest.mark.parametrize("style", STYLES)
 def test_what_is_too_near_or_too_far_is_not_drawn(style: str) -> None:
     scenery = plain(balls((0, 0, 0)))
-    for look in (Look(near=5.1), Look(far=4.9)):
+    for look in (RasterSettings(near=5.1), RasterSettings(far=4.9)):
         assert not drawn(scenery, style=style, look=look).image.any()
-    assert drawn(scenery, style=style, look=Look(near=4.9, far=5.1)).image.any()
+    assert drawn(scenery, style=style, look=RasterSettings(near=4.9, far=5.1)).image.any()
     assert not drawn(plain(balls((0, 0, 9))), style=style).image.any()
 
 
@@ -97,7 +99,7 @@ def test_what_is_too_near_or_too_far_is_not_drawn(style: str) -> None:
 def test_colours_are_those_of_the_scale(by: str) -> None:
     left, right = (-1.0, 0.0, 0.0), (1.0, 0.0, 0.0)
     first, second = balls(left, opacity=1.0, size=0.25), balls(right, opacity=30.0, size=0.4)
-    painter = Painter(plain(first, second), Manner(color_by=by), [camera()])
+    painter = Renderer(plain(first, second), RenderSettings(color_by=by), [camera()])
     assert painter.scale is not None
     image = painter.draw(camera()).image
     values = {"lod-opacity": (1.0, np.sqrt(1 + np.e * np.log(30))), "chunk": (0, 1)}
@@ -134,11 +136,11 @@ def test_depth_is_how_far_along_the_axis(style: str) -> None:
 
 def test_a_scale_is_of_all_cameras() -> None:
     near, far = camera(z=3.0), camera(z=30.0)
-    scale = Painter(plain(balls((0, 0, 0), (0.1, 0, 0))), Manner(color_by="depth"), [near, far]).scale
+    scale = Renderer(plain(balls((0, 0, 0), (0.1, 0, 0))), RenderSettings(color_by="depth"), [near, far]).scale
     assert scale is not None
     assert (scale.low, scale.high) == pytest.approx((3, 30))
     for by in ("overdraw", "size"):
-        painter = Painter(plain(random_splats(500)), Manner(color_by=by), [near, far])
+        painter = Renderer(plain(random_splats(500)), RenderSettings(color_by=by), [near, far])
         before = painter.scale
         painter.draw(near)
         assert painter.scale is before
@@ -165,9 +167,9 @@ def test_overdraw_counts_splats_a_pixel() -> None:
 def test_overdraw_is_where_something_is_drawn(profile: str) -> None:
     splats = random_splats(40, seed=4)
     splats.opacity[::4] = 20  # merged ones, too
-    at, look = camera(200, 150), Look(profile=profile)
+    at, look = camera(200, 150), RasterSettings(profile=profile)
     counted, image = (
-        Painter(plain(splats), Manner(look=look, color_by=by), [at]).draw(at) for by in ("overdraw", None)
+        Renderer(plain(splats), RenderSettings(look=look, color_by=by), [at]).draw(at) for by in ("overdraw", None)
     )
     assert counted.values is not None
     differ = (counted.values > 0) != (image.image[..., 3] > 0)

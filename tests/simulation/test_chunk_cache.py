@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sparklod_cli.simulation.chunks import ChunkCache, Chunks, by_priority
+from sparklod_cli.simulation.chunk_cache import ChunkCache, Chunks, by_priority
 from tests.references.streaming import NaiveCache, roots_first
 
 

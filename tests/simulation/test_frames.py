@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sparklod_cli.render.camera_path import CameraPath
-from sparklod_cli.simulation.columns import COLUMNS, Row
-from sparklod_cli.simulation.simulate import Simulation, Viewer
+from sparklod_cli.cameras.path import CameraPath
+from sparklod_cli.simulation.columns import COLUMNS
+from sparklod_cli.simulation.frames import LodSettings, Simulation
+from sparklod_cli.tables.columns import Row
 from sparklod_cli.world import TOTAL, World
 from tests.simulation.worlds import OF_THE_PAST, SPARK, around, camera, path_of, resting, rows_of, viewers, without
 
@@ -23,7 +24,7 @@ OF_ALL = {
 
 
 @pytest.mark.parametrize("viewer", viewers(), ids=str)
-def test_laws_of_all_rows(three: World, viewer: Viewer) -> None:
+def test_laws_of_all_rows(three: World, viewer: LodSettings) -> None:
     path = around(12)
     rows = rows_of(three, viewer, path, by_instance=True)
     assert len(rows) == 12 * 4
@@ -78,7 +79,7 @@ def test_laws_of_all_rows(three: World, viewer: Viewer) -> None:
 
 
 @pytest.mark.parametrize("viewer", viewers(), ids=str)
-def test_a_cut_stops_for_the_reason_it_says(three: World, viewer: Viewer) -> None:
+def test_a_cut_stops_for_the_reason_it_says(three: World, viewer: LodSettings) -> None:
     for cell in map(dict[str, Any], rows_of(three, viewer, around(6))):
         assert cell["pixel_scale_limit"] == pytest.approx(viewer.smallest(around(6).cameras[0]), rel=1e-5)
         if cell["stop_reason"] == "exhausted":
@@ -112,7 +113,7 @@ def test_threads_do_not_change_a_row(three: World) -> None:
 
 
 def test_a_frame_does_not_depend_on_those_before(three: World) -> None:
-    path, viewer = around(9), Viewer(5_000, SPARK)
+    path, viewer = around(9), LodSettings(5_000, SPARK)
     rows = rows_of(three, viewer, path, by_instance=True)
     for number, at in enumerate(path.cameras):
         alone = rows_of(three, viewer, CameraPath((at,), "a test", (), (number,)), by_instance=True)
@@ -132,7 +133,7 @@ def test_numbers_and_names_are_those_of_the_path(town: World) -> None:
         dataclasses.replace(camera((1, -2, -4), (0, 0, 1), time=2), name="door"),
     )
     path = CameraPath((first, second), "a test", (), (7, 14))
-    rows: list[Any] = rows_of(town, Viewer(500), path)
+    rows: list[Any] = rows_of(town, LodSettings(500), path)
     assert [(row["frame"], row["time_s"], row["name"] or "") for row in rows] == [(7, 0.5, ""), (14, 2.0, "door")]
     for row, at in zip(rows, path.cameras, strict=True):
         assert [row[f"position_{axis}"] for axis in "xyz"] == np.round(at.position, 6).tolist()
@@ -145,24 +146,24 @@ def test_the_limit_follows_each_camera(town: World) -> None:
     """A pixel's size over its distance: 2 tan(fov / 2) over the height."""
     lenses = [(60.0, (640, 360)), (60.0, (640, 720)), (90.0, (640, 360)), (20.0, (100, 50))]
     path = path_of([camera((0, -1, -3), fov=fov, size=size) for fov, size in lenses])
-    rows: list[Any] = rows_of(town, Viewer(10**6, render_scale=3.0), path)
+    rows: list[Any] = rows_of(town, LodSettings(10**6, render_scale=3.0), path)
     for row, (fov, (width, height)) in zip(rows, lenses, strict=True):
         assert (row["fov_y_deg"], row["width"], row["height"]) == (fov, width, height)
         limit = 3 * 2 * math.tan(math.radians(fov) / 2) / height
         assert row["pixel_scale_limit"] == float(f"{limit:.6g}")
         assert row["pixel_scale_min"] > limit
     assert len({row["pixel_scale_limit"] for row in rows}) == 4
-    fixed: list[Any] = rows_of(town, Viewer(10**6, pixel_scale_limit=0.02), path)
+    fixed: list[Any] = rows_of(town, LodSettings(10**6, pixel_scale_limit=0.02), path)
     assert {row["pixel_scale_limit"] for row in fixed} == {0.02}
     assert len({row["selected"] for row in fixed}) == 1  # without foveation it is all that counts
 
 
 def test_churn_of_one_who_rests_and_of_one_who_jumps(town: World) -> None:
-    rows: list[Any] = rows_of(town, Viewer(4_000, SPARK), resting(4))
+    rows: list[Any] = rows_of(town, LodSettings(4_000, SPARK), resting(4))
     assert [(row["added"], row["removed"], row["churn"]) for row in rows[1:]] == [(0, 0, 0.0)] * 3
     assert (rows[0]["added"], rows[0]["removed"], rows[0]["churn"]) == (rows[0]["selected"], 0, None)
     far, near = camera((0, -1e5, 0), (0, 0, 1)), camera((0, -1, -3))
-    root, cut, again = map(dict[str, Any], rows_of(town, Viewer(4_000), path_of([far, near, far])))
+    root, cut, again = map(dict[str, Any], rows_of(town, LodSettings(4_000), path_of([far, near, far])))
     assert (root["selected"], again["selected"]) == (1, 1)
     assert (cut["added"], cut["removed"], cut["churn"]) == (cut["selected"], 1, 1.0)
     assert (again["added"], again["removed"], again["churn"]) == (1, cut["selected"], 1.0)
@@ -170,17 +171,17 @@ def test_churn_of_one_who_rests_and_of_one_who_jumps(town: World) -> None:
 
 def test_budgets_and_caches_that_are_too_small(three: World) -> None:
     with pytest.raises(ValueError, match="a budget of 2 splats is less than one for each of 3 instances"):
-        Simulation(three, Viewer(2))
+        Simulation(three, LodSettings(2))
     with pytest.raises(ValueError, match="cannot hold the roots of 2 trees"):
-        Simulation(three, Viewer(3, chunk_cache=1))
+        Simulation(three, LodSettings(3, chunk_cache=1))
     many = World(three.trees, three.forest, three.placements[:1] * 65_536, three.instances[:1] * 65_536)
     with pytest.raises(ValueError, match="65,536 instances are more than 65,535"):
-        Simulation(many, Viewer(10**6))
+        Simulation(many, LodSettings(10**6))
 
 
 def test_frames_tell_how_much_is_in_front(town: World) -> None:
     at, away = camera((0, -1, -6)), camera((0, -1, -6), (0, -1, -20))
-    first, second = Simulation(town, Viewer(5_000)).run(path_of([at, away]))
+    first, second = Simulation(town, LodSettings(5_000)).run(path_of([at, away]))
     assert (first.in_front, second.in_front) == (1.0, 0.0)
     assert (first.number, second.number) == (0, 1)
     assert second.rows[0]["behind"] == second.rows[0]["selected"] == len(second.cut)

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from sparklod_cli.lod.traversal import Forest, Frustum, Instance
-from sparklod_cli.scene import Scene
-from sparklod_cli.simulation.simulate import Simulation, Viewer
+from sparklod_cli.model.scene import Scene
+from sparklod_cli.simulation.frames import LodSettings, Simulation
 from sparklod_cli.world import Placement, Tree, World
 from tests.lod.forests import random_tree, transform
 from tests.references import frames as twin
@@ -58,10 +58,10 @@ def test_rows_are_as_worked_out_without_sparklod(seed: int) -> None:
         at = camera(eye, target, fov=70, size=(500, 300))
         right, up, back = at.camera_to_world[:3, :3].T
         seen = twin.Eye(eye, right, up, -back, math.radians(70), 500, 300)
-        (row,) = rows_of(world, Viewer(budget, SPARK, render_scale=render_scale), path_of([at]))
+        (row,) = rows_of(world, LodSettings(budget, SPARK, render_scale=render_scale), path_of([at]))
         drawn = twin.frame(placed, seen, budget, seen.pixel * render_scale)
         assert twin.differing(drawn.cells, row) == []
-        simulation = Simulation(world, Viewer(budget, SPARK, render_scale=render_scale))
+        simulation = Simulation(world, LodSettings(budget, SPARK, render_scale=render_scale))
         cut = simulation.cut(at).indices()
         assert [set(part.tolist()) for part in cut] == [
             {node for number, node in drawn.cut if number == instance} for instance in range(3)

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from sparklod_cli.simulation.simulate import Viewer
+from sparklod_cli.simulation.frames import LodSettings
 from sparklod_cli.simulation.streaming import Network
 from sparklod_cli.world import Placement, World, read_world
 from tests.simulation.worlds import HAND, OF_THE_PAST, SPARK, TOWN, around, path_of, resting, rows_of, without
@@ -17,7 +17,7 @@ from tests.simulation.worlds import HAND, OF_THE_PAST, SPARK, TOWN, around, path
 def test_a_cache_never_holds_more_than_fits(three: World, capacity: int) -> None:
     """The town has three chunks, the small tree one; both roots are always there."""
     for network in (Network(), Network(5e5, 0.02)):
-        viewer = Viewer(6_000, SPARK, network=network, chunk_cache=capacity)
+        viewer = LodSettings(6_000, SPARK, network=network, chunk_cache=capacity)
         rows: list[Any] = rows_of(three, viewer, around(30))
         assert all(row["chunks_resident"] <= capacity for row in rows)
         assert max(row["chunks_resident"] for row in rows) == capacity
@@ -31,7 +31,7 @@ def test_a_cache_never_holds_more_than_fits(three: World, capacity: int) -> None
 
 def test_what_fits_is_never_missing(three: World) -> None:
     for cache in (None, 4):
-        rows = rows_of(three, Viewer(20_000, SPARK, chunk_cache=cache), around(20))
+        rows = rows_of(three, LodSettings(20_000, SPARK, chunk_cache=cache), around(20))
         assert all(row["missing"] == 0 for row in rows)
         assert all(row["complete_in_s"] is None for row in rows)
 
@@ -42,7 +42,7 @@ def test_without_bandwidth_or_latency_all_comes_at_once(three: World) -> None:
         default, infinite = (
             [
                 without(row, timing)
-                for row in rows_of(three, Viewer(9_000, SPARK, network=network, chunk_cache=cache), around(8))
+                for row in rows_of(three, LodSettings(9_000, SPARK, network=network, chunk_cache=cache), around(8))
             ]
             for network in (Network(), Network(math.inf, 0.0, 1))
         )
@@ -59,8 +59,8 @@ def test_a_resting_camera_gets_the_whole_cut(town: World, network: Network, budg
     """
     fps = 100.0
     path = resting(700, fps)
-    (instant,) = rows_of(town, Viewer(budget, SPARK), path_of(path.cameras[:1]))
-    rows: list[Any] = rows_of(town, Viewer(budget, SPARK, network=network), path)
+    (instant,) = rows_of(town, LodSettings(budget, SPARK), path_of(path.cameras[:1]))
+    rows: list[Any] = rows_of(town, LodSettings(budget, SPARK, network=network), path)
     missing = [row["missing"] for row in rows]
     assert missing[0] > 0
     complete = missing.index(0)
@@ -81,7 +81,7 @@ def test_a_resting_camera_gets_the_whole_cut(town: World, network: Network, budg
 def test_a_tree_of_one_chunk_is_there_when_it_was_promised() -> None:
     world = read_world([Placement(HAND, "hand")])
     size, latency, speed = HAND.stat().st_size, 0.1, 500.0
-    rows: list[Any] = rows_of(world, Viewer(100, SPARK, network=Network(speed, latency)), resting(60))
+    rows: list[Any] = rows_of(world, LodSettings(100, SPARK, network=Network(speed, latency)), resting(60))
     expected = latency + size / speed
     for row in rows:
         assert row["complete_in_s"] == pytest.approx(max(0, expected - row["time_s"]), abs=1e-4)

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from sparklod_cli.commands.traverse_text import WIDTH, lines
-from sparklod_cli.simulation.assertions import check, parse
 from sparklod_cli.simulation.columns import COLUMNS
 from sparklod_cli.simulation.summary import IN_FRUSTUM, MOMENTS, QUANTITIES, summarize
+from sparklod_cli.tables.assertions import check, parse
 from tests.tables.rows import flight, row
 
 

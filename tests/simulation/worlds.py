@@ -7,13 +7,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from sparklod_cli.cameras.camera import Camera
+from sparklod_cli.cameras.path import CameraPath
+from sparklod_cli.cameras.pose import look_at
 from sparklod_cli.lod.traversal import Cones, Frustum
-from sparklod_cli.render.camera import Camera
-from sparklod_cli.render.camera_path import CameraPath
-from sparklod_cli.render.pose import look_at
-from sparklod_cli.simulation.columns import Row
-from sparklod_cli.simulation.simulate import Simulation, Viewer
+from sparklod_cli.simulation.frames import LodSettings, Simulation
 from sparklod_cli.simulation.streaming import Network
+from sparklod_cli.tables.columns import Row
 from sparklod_cli.world import World
 from tests.conftest import FIXTURES
 
@@ -55,7 +55,7 @@ def resting(count: int, fps: float = 30.0) -> CameraPath:
 
 
 def rows_of(
-    world: World, viewer: Viewer, path: CameraPath, *, by_instance: bool = False, threads: int = 1
+    world: World, viewer: LodSettings, path: CameraPath, *, by_instance: bool = False, threads: int = 1
 ) -> list[Row]:
     simulation = Simulation(world, viewer, by_instance=by_instance)
     return [row for frame in simulation.run(path, threads=threads) for row in frame.rows]
@@ -65,14 +65,14 @@ def without(row: Row, names: set[str]) -> Row:
     return {name: cell for name, cell in row.items() if name not in names}
 
 
-def viewers() -> list[Viewer]:
+def viewers() -> list[LodSettings]:
     return [
-        Viewer(20_000, SPARK),
-        Viewer(2_000, Cones(), chunk_cache=2),
-        Viewer(3, SPARK),
-        Viewer(10**9, SPARK, render_scale=40.0),
-        Viewer(10**9, Frustum(0.2, 0.1), pixel_scale_limit=0.1),
-        Viewer(1_000_000, Cones()),
-        Viewer(20_000, SPARK, network=Network(1e6, 0.03), chunk_cache=3),
-        Viewer(20_000, SPARK, network=Network(3e4, 0.1, 1)),
+        LodSettings(20_000, SPARK),
+        LodSettings(2_000, Cones(), chunk_cache=2),
+        LodSettings(3, SPARK),
+        LodSettings(10**9, SPARK, render_scale=40.0),
+        LodSettings(10**9, Frustum(0.2, 0.1), pixel_scale_limit=0.1),
+        LodSettings(1_000_000, Cones()),
+        LodSettings(20_000, SPARK, network=Network(1e6, 0.03), chunk_cache=3),
+        LodSettings(20_000, SPARK, network=Network(3e4, 0.1, 1)),
     ]

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from sparklod_cli import whole
+from sparklod_cli.support import atomic
 from tests.conftest import ROOT
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="POSIX only")
@@ -38,7 +38,7 @@ KILLS = 12
 
 def has_unnamed_files(folder: Path) -> bool:
     target = folder / "out"
-    found = whole._open_unnamed(target, False)
+    found = atomic._open_unnamed(target, False)
     if found is not None:
         os.close(found)
     return found is not None
@@ -47,9 +47,9 @@ def has_unnamed_files(folder: Path) -> bool:
 @pytest.fixture(params=[True, False], ids=["unnamed", "named"])
 def unnamed(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> bool:
     """Whether files have no name before they are complete."""
-    whole._sweep.cache_clear()
+    atomic._sweep.cache_clear()
     if not request.param:
-        monkeypatch.setattr(whole, "UNNAMED", None)
+        monkeypatch.setattr(atomic, "UNNAMED", None)
     elif not has_unnamed_files(tmp_path):
         pytest.skip("no files without names here")
     return bool(request.param)
@@ -79,8 +79,8 @@ def test_a_writer_that_is_killed_leaves_whole_files_only(overwrite: bool, unname
             data = (folder / name).read_bytes()
             assert data == data[:1] * SIZE
             seen += 1
-        whole._sweep.cache_clear()  # what another run begins with
-        whole.write(folder / "out-last", [b"x"], overwrite=True)
+        atomic._sweep.cache_clear()  # what another run begins with
+        atomic.write(folder / "out-last", [b"x"], overwrite=True)
         assert [name for name in names(folder) if not name.startswith("out")] == []
         for path in folder.glob("out-*"):
             path.unlink()
@@ -88,39 +88,39 @@ def test_a_writer_that_is_killed_leaves_whole_files_only(overwrite: bool, unname
 
 
 def test_what_the_living_write_is_left_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(whole, "UNNAMED", None)
+    monkeypatch.setattr(atomic, "UNNAMED", None)
     target = tmp_path / "out"
 
     def pieces() -> Iterator[bytes]:
         yield b"outer"
         before = names(tmp_path)
         assert len(before) == 1
-        whole._sweep.cache_clear()
-        whole.write(tmp_path / "other", [b"inner"], overwrite=False)
+        atomic._sweep.cache_clear()
+        atomic.write(tmp_path / "other", [b"inner"], overwrite=False)
         assert names(tmp_path) == sorted([*before, "other"])
 
-    whole.write(target, pieces(), overwrite=False)
+    atomic.write(target, pieces(), overwrite=False)
     assert names(tmp_path) == ["other", "out"]
     assert target.read_bytes() == b"outer"
 
 
 def test_what_the_dead_have_left_is_removed_and_nothing_else(tmp_path: Path, unnamed: bool) -> None:
-    left = tmp_path / whole.PARTS.format("0123456789abcdef")
+    left = tmp_path / atomic.PARTS.format("0123456789abcdef")
     left.write_bytes(b"half a")
     kept = [tmp_path / name for name in (".sparklod-notes.txt", "a.part", ".sparklod-link.part", ".sparklod-dir.part")]
     for path in kept[:2]:
         path.write_bytes(b"precious")
     kept[2].symlink_to(kept[1])
     kept[3].mkdir()
-    whole.write(tmp_path / "out", [b"x"], overwrite=False)
+    atomic.write(tmp_path / "out", [b"x"], overwrite=False)
     assert names(tmp_path) == sorted(["out", *(path.name for path in kept)])
     assert kept[1].read_bytes() == b"precious"
 
 
 def modes_of_parts(folder: Path) -> list[int]:
     """Permissions of all files of a folder that are not complete, with names or without."""
-    modes = [stat.S_IMODE(path.stat().st_mode) for path in folder.glob(whole.PARTS.format("*"))]
-    for number in whole.OPEN_FILES.iterdir() if whole.OPEN_FILES.exists() else ():
+    modes = [stat.S_IMODE(path.stat().st_mode) for path in folder.glob(atomic.PARTS.format("*"))]
+    for number in atomic.OPEN_FILES.iterdir() if atomic.OPEN_FILES.exists() else ():
         with contextlib.suppress(OSError):
             about = number.stat()
             if not about.st_nlink and str(number.readlink()).startswith(str(folder)):
@@ -146,7 +146,7 @@ def test_no_part_has_more_permissions_than_the_file(
 
     umask = os.umask(mask)
     try:
-        whole.write(target, pieces(), overwrite=True)
+        atomic.write(target, pieces(), overwrite=True)
     finally:
         os.umask(umask)
     assert len(seen) == 1
@@ -166,22 +166,22 @@ def test_a_file_system_without_links(
     target = tmp_path / "out"
     if overwrite:
         target.write_bytes(b"old")
-    assert whole.write(target, [b"a" * 3_000_000, b"b"], overwrite=overwrite) == 3_000_001
+    assert atomic.write(target, [b"a" * 3_000_000, b"b"], overwrite=overwrite) == 3_000_001
     assert target.read_bytes() == b"a" * 3_000_000 + b"b"
     with pytest.raises(FileExistsError):
-        whole.write(target, [b"c"], overwrite=False)
+        atomic.write(target, [b"c"], overwrite=False)
     assert names(tmp_path) == ["out"]
 
 
 def swept(folder: Path) -> None:
     """As another process that starts in a folder."""
-    for path in folder.glob(whole.PARTS.format("*")):
+    for path in folder.glob(atomic.PARTS.format("*")):
         path.unlink()
 
 
 def test_a_part_that_is_swept_before_it_is_locked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(whole, "UNNAMED", None)
-    lock: Callable[[int], None] = whole._lock
+    monkeypatch.setattr(atomic, "UNNAMED", None)
+    lock: Callable[[int], None] = atomic._lock
     rounds = []
 
     def late(descriptor: int) -> None:
@@ -190,8 +190,8 @@ def test_a_part_that_is_swept_before_it_is_locked(tmp_path: Path, monkeypatch: p
         rounds.append(descriptor)
         lock(descriptor)
 
-    monkeypatch.setattr(whole, "_lock", late)
-    whole.write(tmp_path / "out", [b"x"], overwrite=False)
+    monkeypatch.setattr(atomic, "_lock", late)
+    atomic.write(tmp_path / "out", [b"x"], overwrite=False)
     assert len(rounds) == 2
     assert (tmp_path / "out").read_bytes() == b"x"
 

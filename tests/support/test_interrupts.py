@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from sparklod_cli.jit_cache import SUFFIX, is_whole
+from sparklod_cli.support.jit_cache import SUFFIX, is_whole
 from sparklod_cli.warmup import JOBS
 from tests.conftest import FIXTURES, ROOT
 

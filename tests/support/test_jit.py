@@ -12,7 +12,7 @@ from pathlib import Path
 import numba
 import pytest
 
-from sparklod_cli import jit
+from sparklod_cli.support import jit
 from tests.conftest import ROOT
 
 PACKAGE = ROOT / "sparklod_cli"

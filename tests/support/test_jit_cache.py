@@ -12,8 +12,8 @@ from typing import Any
 import numba
 import pytest
 
-from sparklod_cli import whole
-from sparklod_cli.jit_cache import SUFFIX, KernelCache, pattern_of
+from sparklod_cli.support import atomic
+from sparklod_cli.support.jit_cache import SUFFIX, KernelCache, pattern_of
 from tests.conftest import ROOT
 
 DAMAGE: dict[str, Callable[[bytes], bytes]] = {
@@ -44,7 +44,7 @@ def was_cached(kernel: Any) -> bool:
 def test_what_was_compiled_for_another_processor_is_not_there(tmp_path: Path) -> None:
     compiled(tmp_path, [])(2.0)
     assert list(tmp_path.glob(pattern_of("test_jit_cache.twice")))
-    code = "from sparklod_cli.jit_cache import pattern_of; print(pattern_of('test_jit_cache.twice'))"
+    code = "from sparklod_cli.support.jit_cache import pattern_of; print(pattern_of('test_jit_cache.twice'))"
     environment = {**os.environ, "NUMBA_CPU_NAME": "generic"}
     other = subprocess.run([sys.executable, "-c", code], cwd=ROOT, env=environment, capture_output=True, text=True)
     assert other.stdout.startswith("test_jit_cache.twice-")
@@ -58,7 +58,7 @@ def test_memory_that_runs_out_is_no_damage(tmp_path: Path, monkeypatch: pytest.M
     def starved(*arguments: object) -> None:
         raise MemoryError
 
-    monkeypatch.setattr("sparklod_cli.jit_cache.pickle.loads", starved)
+    monkeypatch.setattr("sparklod_cli.support.jit_cache.pickle.loads", starved)
     with pytest.raises(MemoryError):
         compiled(tmp_path, told)(2.0)
     assert told == []
@@ -112,7 +112,7 @@ def test_a_full_disk_leaves_no_part_of_a_file(tmp_path: Path, monkeypatch: pytes
     def full(file: object, pieces: object) -> int:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(whole, "_fill", full)
+    monkeypatch.setattr(atomic, "_fill", full)
     told: list[str] = []
     assert compiled(tmp_path, told)(2.0) == 4
     assert "no space left on device" in told[0]

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sparklod_cli.quantities import parse_bandwidth, parse_count, parse_latency
+from sparklod_cli.support.units import parse_bandwidth, parse_count, parse_latency
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 
-from sparklod_cli.simulation.columns import COLUMNS, Cell, Row
+from sparklod_cli.simulation.columns import COLUMNS
+from sparklod_cli.tables.columns import Cell, Row
 
 
 def row(frame: int = 0, **cells: Cell) -> Row:

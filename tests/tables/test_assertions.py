@@ -9,9 +9,10 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from sparklod_cli.simulation.assertions import COMPARISONS, BadAssertionError, Outcome, check, parse
-from sparklod_cli.simulation.columns import COLUMNS, Row
-from sparklod_cli.simulation.statistics import STATISTICS
+from sparklod_cli.simulation.columns import COLUMNS
+from sparklod_cli.tables.assertions import COMPARISONS, BadAssertionError, Outcome, check, parse
+from sparklod_cli.tables.columns import Row
+from sparklod_cli.tables.statistics import STATISTICS
 from tests.tables.rows import flight, row
 
 NUMERIC = [column.name for column in COLUMNS if column.kind is not str]

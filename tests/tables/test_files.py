@@ -14,9 +14,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sparklod_cli.errors import SparklodError
-from sparklod_cli.simulation.columns import COLUMNS, Cell, Column, Row
-from sparklod_cli.simulation.tables import FORMS, TYPES, UnknownColumnError, encode, select
+from sparklod_cli.simulation.columns import COLUMNS
+from sparklod_cli.support.errors import SparklodError
+from sparklod_cli.tables.columns import Cell, Column, Row
+from sparklod_cli.tables.files import FORMS, TYPES, UnknownColumnError, encode, select
 from tests.tables.rows import flight, row
 
 NAMES = st.none() | st.text(min_size=1, max_size=20)

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sparklod_cli.render.camera_path import read
-from sparklod_cli.render.frame import Settings
+from sparklod_cli.cameras.frame import Settings
+from sparklod_cli.cameras.path import read
 from tests.cameras.known import FOLDER, KNOWN, LANDMARK, files_at, pixel
 from tests.interop import npm
 

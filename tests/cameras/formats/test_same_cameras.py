@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sparklod_cli.render.camera_path import read
-from sparklod_cli.render.frame import Settings
-from sparklod_cli.render.paths.formats import FORMATS
-from sparklod_cli.render.paths.source import Files
+from sparklod_cli.cameras.formats.source import Files
+from sparklod_cli.cameras.formats.table import FORMATS
+from sparklod_cli.cameras.frame import Settings
+from sparklod_cli.cameras.path import read
 from tests.cameras.known import (
     FOCAL,
     FOLDER,

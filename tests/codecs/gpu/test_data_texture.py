@@ -12,11 +12,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from sparklod_cli.codecs import data_texture
-from sparklod_cli.errors import FormatError
-from sparklod_cli.gaussian import normalized_quat
-from sparklod_cli.parallel import CHUNK
-from sparklod_cli.splats import Splats
+from sparklod_cli.codecs.gpu import data_texture
+from sparklod_cli.model.gaussian import normalized_quat
+from sparklod_cli.model.splats import Splats
+from sparklod_cli.support.errors import FormatError
+from sparklod_cli.support.parallel import CHUNK
 from tests.references import gaussians
 from tests.scenes import random_splats
 

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from sparklod_cli.cli import run
-from sparklod_cli.codecs import dump
+from sparklod_cli.codecs.gpu import dump
 from sparklod_cli.io import read_scene
-from sparklod_cli.limits import ENCODINGS
 from sparklod_cli.lod import quick
-from sparklod_cli.scene import Scene
+from sparklod_cli.model.scene import Scene
+from sparklod_cli.support.defaults import ENCODINGS
 from tests.conftest import FIXTURES
 
 SCENE = FIXTURES / "sh3.ply"

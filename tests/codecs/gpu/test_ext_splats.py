@@ -12,11 +12,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from sparklod_cli.codecs import ext_splats
-from sparklod_cli.errors import FormatError
-from sparklod_cli.gaussian import linear_opacity, lod_opacity
-from sparklod_cli.parallel import CHUNK
-from sparklod_cli.splats import COLUMNS, Splats
+from sparklod_cli.codecs.gpu import ext_splats
+from sparklod_cli.model.gaussian import linear_opacity, lod_opacity
+from sparklod_cli.model.splats import COLUMNS, Splats
+from sparklod_cli.support.errors import FormatError
+from sparklod_cli.support.parallel import CHUNK
 from tests.codecs.test_octahedral import degrees_between, random_quats
 from tests.scenes import random_splats
 

@@ -11,14 +11,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from sparklod_cli import gaussian
-from sparklod_cli.codecs import lod_tree
-from sparklod_cli.errors import FormatError
-from sparklod_cli.gaussian import linear_opacity
+from sparklod_cli.codecs.gpu import lod_tree
 from sparklod_cli.lod import quick
-from sparklod_cli.parallel import CHUNK
-from sparklod_cli.splats import Splats
-from sparklod_cli.tree import LodTree
+from sparklod_cli.model import gaussian
+from sparklod_cli.model.gaussian import linear_opacity
+from sparklod_cli.model.lod_tree import LodTree
+from sparklod_cli.model.splats import Splats
+from sparklod_cli.support.errors import FormatError
+from sparklod_cli.support.parallel import CHUNK
 from tests.scenes import random_splats
 
 

@@ -13,10 +13,10 @@ from sparklod_cli.cli import run
 from sparklod_cli.codecs import spz
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod import quality, quick
-from sparklod_cli.progress import Progress
-from sparklod_cli.scene import Scene
-from sparklod_cli.splats import Splats
-from sparklod_cli.tree import LodTree
+from sparklod_cli.model.lod_tree import LodTree
+from sparklod_cli.model.scene import Scene
+from sparklod_cli.model.splats import Splats
+from sparklod_cli.support.progress import Progress
 from tests.commands.build_lod.runs import ONE, SMALL, build
 from tests.conftest import FIXTURES
 

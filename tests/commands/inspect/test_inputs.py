@@ -13,9 +13,9 @@ import pytest
 
 from sparklod_cli.codecs import spz
 from sparklod_cli.inspection import report as reports
-from sparklod_cli.scene import Scene
-from sparklod_cli.splats import Splats
-from sparklod_cli.tree import LodTree
+from sparklod_cli.model.lod_tree import LodTree
+from sparklod_cli.model.scene import Scene
+from sparklod_cli.model.splats import Splats
 from tests.commands.inspect.runs import FAULTS, FOLDER, TREE, Said, inspect, records
 
 

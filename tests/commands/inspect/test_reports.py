@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from sparklod_cli.cli import run
-from sparklod_cli.inspection import plot
+from sparklod_cli.figures import tree_plot
 from tests.commands.inspect.runs import BROKEN, CORRUPT, MISSING, NOTED, PLAIN, TREE, WARNED, Said, inspect, records
 from tests.conftest import FIXTURES, ROOT
 
@@ -167,10 +167,10 @@ def test_a_process_prints_findings_and_exits_3() -> None:
 
 
 def test_a_page_and_a_picture_are_said(tmp_path: Path, capsys: Said, monkeypatch: pytest.MonkeyPatch) -> None:
-    def drawn(*args: object, **kwargs: object) -> plot.Picture:
-        return plot.Picture(b"\x89PNG" * 100, "all leaves: 6 nodes; coloured by level")
+    def drawn(*args: object, **kwargs: object) -> tree_plot.Picture:
+        return tree_plot.Picture(b"\x89PNG" * 100, "all leaves: 6 nodes; coloured by level")
 
-    monkeypatch.setattr(plot, "plot", drawn)
+    monkeypatch.setattr(tree_plot, "plot", drawn)
     page, picture = tmp_path / "page.html", tmp_path / "picture.png"
     assert inspect(TREE, "--plot", picture, "--html", page) == 0
     first, second = capsys.readouterr().err.splitlines()

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from sparklod_cli.preview.pictures import Painter
+from sparklod_cli.render.renderer import Renderer
 from tests.commands.render.runs import CAMERAS, FAULTS, PLAIN, SIZE, TREE, Said, pixels, render
 
 
@@ -134,15 +134,15 @@ def test_an_existing_frame_stays_without_overwrite(tmp_path: Path, capsys: Said)
 def test_an_interrupted_render_leaves_no_half_picture(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Said
 ) -> None:
-    draw, count = Painter.draw, []
+    draw, count = Renderer.draw, []
 
-    def falling(self: Painter, *arguments: Any) -> Any:
+    def falling(self: Renderer, *arguments: Any) -> Any:
         count.append(1)
         if len(count) == 3:
             raise KeyboardInterrupt
         return draw(self, *arguments)
 
-    monkeypatch.setattr(Painter, "draw", falling)
+    monkeypatch.setattr(Renderer, "draw", falling)
     for name in ("x.gif", "out.%04d.png"):
         count.clear()
         assert render(TREE, *SIZE, "--orbit", 5, "--jobs", 1, "-o", tmp_path / name) == 130

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sparklod_cli.preview.pictures import Painter
-from sparklod_cli.preview.sheet import cells
+from sparklod_cli.images.contact_sheet import cells
+from sparklod_cli.render.renderer import Renderer
 from tests.commands.render.runs import CAMERAS, DEMO, SIZE, TOWN, TREE, Said, pixels, render
 
 
@@ -78,7 +78,7 @@ def test_mp4_without_imageio_is_an_error_before_the_work(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Said
 ) -> None:
     monkeypatch.setitem(sys.modules, "imageio", None)
-    monkeypatch.setattr(Painter, "draw", None)
+    monkeypatch.setattr(Renderer, "draw", None)
     assert render(DEMO, "--orbit", 3, "-o", tmp_path / "x.mp4") == 1
     assert "pip install 'sparklod[video]'" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []

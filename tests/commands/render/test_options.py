@@ -13,15 +13,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.cli import run
 from sparklod_cli.codecs import ply
 from sparklod_cli.commands.render import render as command
+from sparklod_cli.model.scene import Scene
 from sparklod_cli.render.backends import Backend
-from sparklod_cli.render.camera import Camera
-from sparklod_cli.render.look import Look
 from sparklod_cli.render.rasterizer import Image
-from sparklod_cli.render.shown import Shown
-from sparklod_cli.scene import Scene
+from sparklod_cli.render.settings import RasterSettings
+from sparklod_cli.render.shading import ShadedSplats
 from tests.conftest import FIXTURES
 from tests.scenes import random_splats
 
@@ -166,7 +166,7 @@ def test_every_option_of_render_is_used_or_refused(
     asked: list[Any] = []
     draw = Backend.draw
 
-    def told(self: Backend, shown: Shown, camera: Camera, look: Look, **options: Any) -> Image:
+    def told(self: Backend, shown: ShadedSplats, camera: Camera, look: RasterSettings, **options: Any) -> Image:
         asked.append((self.name, look, options))  # pictures of 8 bits do not show it all
         return draw(self, shown, camera, look, **options)
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from sparklod_cli.preview import scenery
+from sparklod_cli import scenery
 from tests.commands.render.runs import PLAIN, SIZE, TOWN, TREE, Said, pixels, render
 from tests.conftest import ROOT
 

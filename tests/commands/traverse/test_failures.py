@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from sparklod_cli.simulation.simulate import Simulation
+from sparklod_cli.simulation.frames import Simulation
 from tests.commands.traverse.runs import CAMERAS, FAULTS, ORBIT, OTHER, TOWN, TREE, Said, scene_file, traverse
 from tests.conftest import FIXTURES, ROOT
 

@@ -10,7 +10,7 @@ import pytest
 
 from sparklod_cli.cli import run
 from sparklod_cli.commands.traverse import traverse as command
-from sparklod_cli.simulation import plot
+from sparklod_cli.figures import traversal_chart
 from tests.commands.render.test_options import GIVEN as OF_RENDER
 from tests.conftest import FIXTURES
 
@@ -80,7 +80,9 @@ def test_every_option_of_traverse_is_used_or_refused(
     mode: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(plot, "plot", lambda *arguments: plot.Plot(b"a plot", None))  # takes seconds, and has its tests
+    monkeypatch.setattr(
+        traversal_chart, "plot", lambda *arguments: traversal_chart.Plot(b"a plot", None)
+    )  # takes seconds, and has its tests
     (tmp_path / "town.spz").write_bytes(TOWN.read_bytes())
     (tmp_path / "scene.json").write_text(json.dumps({"instances": [{"file": "town.spz", "scale": 3}]}))
     inputs = {path.name for path in tmp_path.iterdir()}

@@ -26,15 +26,15 @@ def test_a_plot_is_a_picture(tmp_path: Path, capsys: Said) -> None:
 def test_a_plot_shows_what_the_frame_had(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Over a slow network few chunks are there; the picture is of what was drawn with these."""
     pytest.importorskip("matplotlib", reason="charts need the extra `render`")
-    from sparklod_cli.simulation import plot
+    from sparklod_cli.figures import traversal_chart
 
-    shown: list[plot.Scenery] = []
+    shown: list[traversal_chart.Scenery] = []
 
-    def drawn(rows: object, title: str, scenery: plot.Scenery) -> plot.Plot:
+    def drawn(rows: object, title: str, scenery: traversal_chart.Scenery) -> traversal_chart.Plot:
         shown.append(scenery)
-        return plot.Plot(b"a plot", None)
+        return traversal_chart.Plot(b"a plot", None)
 
-    monkeypatch.setattr(plot, "plot", drawn)
+    monkeypatch.setattr(traversal_chart, "plot", drawn)
     slow = ("--bandwidth", "0.1Mbit", "--latency", "50ms")
     for number, network in enumerate(((), slow)):
         table = tmp_path / f"{number}.csv"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sparklod_cli.lod.kernels.order import merge_colors, places_of_merged
+from sparklod_cli.lod.kernels.final_order import merge_colors, places_of_merged
 
 
 def test_merged_nodes_are_found_in_the_final_order() -> None:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sparklod_cli.gaussian import spark_size
-from sparklod_cli.lod.kernels import pairs, profile, state
-from sparklod_cli.lod.kernels.pairs import CENTER, COLOR, COVERED, DENSITY, WEIGHT
+from sparklod_cli.lod.kernels import node_rows, pair_cost, profile
+from sparklod_cli.lod.kernels.pair_cost import CENTER, COLOR, COVERED, DENSITY, WEIGHT
+from sparklod_cli.model.gaussian import spark_size
 from tests.references import gaussians
 from tests.references import quality as twin
 from tests.scenes import random_splats
@@ -16,11 +16,11 @@ from tests.scenes import random_splats
 def test_rows_of_leaves_are_their_splats_in_units() -> None:
     splats = random_splats(100, seed=9)
     index = np.random.default_rng(1).permutation(100).astype(np.uint32)
-    rows = np.zeros((120, pairs.WIDTH), np.float32)
+    rows = np.zeros((120, pair_cost.WIDTH), np.float32)
     middle, unit = np.array([0.5, -1.0, 2.0]), 2.0**-6
     columns = splats.center, splats.scale, splats.quat_xyzw, splats.opacity, splats.rgb
     size = np.zeros(120, np.float32)
-    state.fill_state(index, *columns, middle, unit, rows, size)
+    node_rows.fill_state(index, *columns, middle, unit, rows, size)
     assert not rows[100:].any() and not size[100:].any()
     np.testing.assert_allclose(size[:100] * unit, spark_size(splats)[index], rtol=1e-5)
     for row, i in zip(rows, index, strict=False):
@@ -40,7 +40,7 @@ def test_merged_nodes_are_drawn_with_the_variance_and_coverage_of_their_rows() -
     middle, unit = np.array([0.5, -1.0, 2.0]), 2.0**-6
     out = random_splats(100, seed=11)
     before = out.take(np.arange(100))
-    state.fill_merged(order, 40, rows, middle, unit, out.center, out.scale, out.quat_xyzw, out.opacity)
+    node_rows.fill_merged(order, 40, rows, middle, unit, out.center, out.scale, out.quat_xyzw, out.opacity)
     for i, node in enumerate(order):
         if node < 40:  # a leaf
             assert np.array_equal(out.center[i], before.center[i])
@@ -59,10 +59,14 @@ def test_keys_are_places_on_a_morton_curve_and_what_is_outside_is_at_its_edge() 
     rows = twin.random_rows(100, seed=12)
     low, step = np.array([-1.0, -1.5, -2.0]), 1e-3
     nodes = np.arange(100, dtype=np.uint32)[::-1].copy()
-    most = (1 << state.CURVE_BITS) - 1
+    most = (1 << node_rows.CURVE_BITS) - 1
     cells = np.clip((rows[nodes, CENTER : CENTER + 3].astype(np.float64) - low) / step, 0, most).astype(int)
     expected = [
-        sum(((int(axis) >> bit) & 1) << (3 * bit + k) for k, axis in enumerate(cell) for bit in range(state.CURVE_BITS))
+        sum(
+            ((int(axis) >> bit) & 1) << (3 * bit + k)
+            for k, axis in enumerate(cell)
+            for bit in range(node_rows.CURVE_BITS)
+        )
         for cell in cells
     ]
-    assert state.curve_keys(rows, nodes, low, step).tolist() == expected
+    assert node_rows.curve_keys(rows, nodes, low, step).tolist() == expected

@@ -9,19 +9,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sparklod_cli.gaussian import lod_opacity
-from sparklod_cli.lod.kernels import pairs, profile, union
-from sparklod_cli.lod.kernels.pairs import CENTER, COLOR, COVARIANCE, COVERED, DENSITY, LOG_DET, WEIGHT
+from sparklod_cli.lod.kernels import pair_cost, pair_merge, profile
+from sparklod_cli.lod.kernels.pair_cost import CENTER, COLOR, COVARIANCE, COVERED, DENSITY, LOG_DET, WEIGHT
+from sparklod_cli.model.gaussian import lod_opacity
 from tests.references import gaussians
 from tests.references import quality as twin
 
-PLANES = {(0, 1): union.PLANES[0], (0, 2): union.PLANES[1], (1, 2): union.PLANES[2]}
+PLANES = {(0, 1): pair_merge.PLANES[0], (0, 2): pair_merge.PLANES[1], (1, 2): pair_merge.PLANES[2]}
 
 
 def test_semi_axes_are_roots_of_eigenvalues() -> None:
     rows = twin.random_rows(200, seed=4)
     for row in rows:
-        got = union.semi_axes(*row[COVARIANCE : COVARIANCE + 6].astype(np.float64))
+        got = pair_merge.semi_axes(*row[COVARIANCE : COVARIANCE + 6].astype(np.float64))
         expected = np.sqrt(np.linalg.eigvalsh(twin.matrix(row)))[::-1]
         np.testing.assert_allclose(got, expected, rtol=1e-7)
 
@@ -32,9 +32,9 @@ def test_semi_axes_are_roots_of_eigenvalues() -> None:
 def test_semi_axes_of_what_is_round_or_flat(variances: tuple[float, float, float]) -> None:
     xx, yy, zz = variances[1], variances[2], variances[0]
     largest = math.sqrt(max(variances))
-    got = union.semi_axes(xx, yy, zz, 0.0, 0.0, 0.0)
-    np.testing.assert_allclose(got, np.sqrt(variances), atol=1e-7 * largest + union.SHORTEST)
-    assert min(got) >= union.SHORTEST
+    got = pair_merge.semi_axes(xx, yy, zz, 0.0, 0.0, 0.0)
+    np.testing.assert_allclose(got, np.sqrt(variances), atol=1e-7 * largest + pair_merge.SHORTEST)
+    assert min(got) >= pair_merge.SHORTEST
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -42,7 +42,7 @@ def test_products_on_planes_are_integrals(seed: int) -> None:
     a, b = twin.random_rows(2, seed, spread=0.7)
     for axes, plane in PLANES.items():
         expected = np.array(twin.integrals(a, b, axes)) / (2 * math.pi)
-        np.testing.assert_allclose(union.product(a, b, plane), expected, rtol=1e-5)
+        np.testing.assert_allclose(pair_merge.product(a, b, plane), expected, rtol=1e-5)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -54,7 +54,7 @@ def test_the_shared_share_is_that_of_integrals(seed: int) -> None:
         area_a, area_b = a[DENSITY] * area_a, b[DENSITY] * area_b
         shared += min(a[DENSITY] * b[DENSITY] * both, area_a, area_b)
         alone += area_a + area_b
-    assert union.shared_share(a, b) == pytest.approx(shared / alone, rel=1e-5)
+    assert pair_merge.shared_share(a, b) == pytest.approx(shared / alone, rel=1e-5)
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -71,18 +71,18 @@ def test_the_error_of_a_picture_is_an_integral(seed: int) -> None:
             total += high[0] ** 2 * over(a, a) + high[1] ** 2 * over(b, b) + high[2] ** 2 * over(merged, merged)
             total += 2 * high[0] * high[1] * over(a, b)
             total -= 2 * high[2] * (high[0] * over(a, merged) + high[1] * over(b, merged))
-    assert union.picture_error(a, b, merged) == pytest.approx(total / (2 * math.pi), rel=1e-4)
+    assert pair_merge.picture_error(a, b, merged) == pytest.approx(total / (2 * math.pi), rel=1e-4)
 
 
 def test_a_merged_node_that_looks_as_its_two_is_without_error() -> None:
     a, nothing = twin.random_rows(2, seed=5)
     nothing[DENSITY] = 0
-    assert union.picture_error(a, nothing, a) == pytest.approx(0, abs=1e-5)
+    assert pair_merge.picture_error(a, nothing, a) == pytest.approx(0, abs=1e-5)
 
 
 def united(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     merged = np.zeros_like(a)
-    union.unite(a, b, merged)
+    pair_merge.unite(a, b, merged)
     return merged
 
 
@@ -92,7 +92,7 @@ def test_a_quarter_of_what_two_equals_cover_both_do() -> None:
     a[COVERED] /= a[DENSITY]
     a[DENSITY] = 1
     merged = united(a, a)
-    assert union.shared_share(a, a) == pytest.approx(1 / 4)
+    assert pair_merge.shared_share(a, a) == pytest.approx(1 / 4)
     assert merged[COVERED] == pytest.approx(1.5 * a[COVERED], rel=1e-6)
     np.testing.assert_allclose(merged[CENTER : CENTER + 3], a[CENTER : CENTER + 3], atol=1e-6)
     expected = 7 / 6 * twin.matrix(a)
@@ -163,12 +163,12 @@ def test_needles_side_by_side_are_as_long_together_as_each(thickness: float) -> 
 
 
 def test_pairs_become_rows_that_cover_as_much_and_are_as_large_as_they_are_drawn() -> None:
-    rows = np.zeros((30, pairs.WIDTH), np.float32)
+    rows = np.zeros((30, pair_cost.WIDTH), np.float32)
     rows[:20] = twin.random_rows(20, seed=8, spread=0.5)
     joined = np.arange(20, dtype=np.uint32).reshape(10, 2)[::-1].copy()
     children = np.zeros((30, 2), np.uint32)
     size, error = np.zeros(30, np.float32), np.zeros(30, np.float32)
-    union.unite_pairs(joined, 20, rows, children, size, error)
+    pair_merge.unite_pairs(joined, 20, rows, children, size, error)
     assert np.array_equal(children[20:], joined)
     for (a, b), row, seen, off in zip(rows[joined], rows[20:], size[20:], error[20:], strict=True):
         expected = united(a, b)
@@ -183,4 +183,4 @@ def test_pairs_become_rows_that_cover_as_much_and_are_as_large_as_they_are_drawn
         opacity, spread = profile.profile_of(float(row[DENSITY]))
         larger = 1 + 0.7 * max(0.0, float(lod_opacity(np.float32([opacity]))[0]) - 1)
         assert seen == pytest.approx(2 * axes.mean() / math.sqrt(spread) * larger, rel=1e-5)
-        assert off == pytest.approx(union.picture_error(a, b, row), rel=1e-6)
+        assert off == pytest.approx(pair_merge.picture_error(a, b, row), rel=1e-6)

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sparklod_cli.gaussian import MIN_OPACITY, lod_opacity, spark_size
 from sparklod_cli.lod.kernels import profile
+from sparklod_cli.model.gaussian import MIN_OPACITY, lod_opacity, spark_size
 from tests.references import quality as twin
 from tests.scenes import random_splats
 

@@ -11,8 +11,8 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from sparklod_cli.gaussian import spark_size
-from sparklod_cli.lod.kernels.walk import STEPS, find_cycles, find_parents, sizes_below, sum_levels, walk
+from sparklod_cli.lod.kernels.tree_links import STEPS, find_cycles, find_parents, sizes_below, sum_levels, walk
+from sparklod_cli.model.gaussian import spark_size
 from tests.conftest import ROOT
 from tests.references import gaussians, tree_links
 from tests.scenes import random_splats

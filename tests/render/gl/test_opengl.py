@@ -10,12 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sparklod_cli.errors import SparklodError
-from sparklod_cli.render import osmesa
+from sparklod_cli.figures.pyvista_scene import load_pyvista
 from sparklod_cli.render.backends import BackendError
-from sparklod_cli.render.gl import context
-from sparklod_cli.render.look import Look
-from sparklod_cli.render.stage import load_pyvista
+from sparklod_cli.render.gl import context, osmesa
+from sparklod_cli.render.settings import RasterSettings
+from sparklod_cli.support.errors import SparklodError
 from tests.render.gl.test_osmesa import CAMERAS, SPLATS, needs_opengl, opengl
 
 __all__ = ["opengl"]  # a fixture
@@ -34,11 +33,11 @@ def child(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
 
 DRAW_ONE = """
 import numpy as np
-from sparklod_cli.errors import SparklodError
+from sparklod_cli.support.errors import SparklodError
 from sparklod_cli.render import osmesa
-from sparklod_cli.render.camera import Camera
-from sparklod_cli.render.look import Look
-from sparklod_cli.render.shown import Shown
+from sparklod_cli.cameras.camera import Camera
+from sparklod_cli.render.settings import Look
+from sparklod_cli.render.shading import Shown
 rows = [[0, 0, -5]], [[0.1] * 3], [[0, 0, 0, 1]], [0.5], [[1, 1, 1]]
 shown = Shown(*(np.array(row, np.float32) for row in rows))
 try:
@@ -102,9 +101,9 @@ def test_leaves_others_their_opengl() -> None:
     plotter.add_mesh(pyvista.Sphere())
     before, image = (
         plotter.screenshot(None, return_img=True),
-        osmesa.draw(SPLATS["plausible"], CAMERAS["front"], Look()),
+        osmesa.draw(SPLATS["plausible"], CAMERAS["front"], RasterSettings()),
     )
     plotter.render()
     assert np.array_equal(plotter.screenshot(None, return_img=True), before)
     plotter.close()
-    assert np.array_equal(osmesa.draw(SPLATS["plausible"], CAMERAS["front"], Look()), image)
+    assert np.array_equal(osmesa.draw(SPLATS["plausible"], CAMERAS["front"], RasterSettings()), image)

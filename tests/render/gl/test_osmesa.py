@@ -8,18 +8,18 @@ import math
 import numpy as np
 import pytest
 
-from sparklod_cli.codecs import data_texture
-from sparklod_cli.gaussian import normalized_quat
+from sparklod_cli.cameras.camera import Camera
+from sparklod_cli.cameras.pose import look_at
+from sparklod_cli.codecs.gpu import data_texture
 from sparklod_cli.io import read_scene
-from sparklod_cli.render import osmesa, rasterizer
+from sparklod_cli.model.gaussian import normalized_quat
+from sparklod_cli.model.splats import FloatArray
+from sparklod_cli.render import rasterizer
 from sparklod_cli.render.backends import BACKENDS, BackendError
-from sparklod_cli.render.camera import Camera
-from sparklod_cli.render.gl import order, texture
-from sparklod_cli.render.look import MIN_ALPHA, PROFILES, SORTS, Look
-from sparklod_cli.render.pose import look_at
+from sparklod_cli.render.gl import order, osmesa, texture
 from sparklod_cli.render.rasterizer import Image
-from sparklod_cli.render.shown import Shown, show
-from sparklod_cli.splats import FloatArray
+from sparklod_cli.render.settings import MIN_ALPHA, PROFILES, SORTS, RasterSettings
+from sparklod_cli.render.shading import ShadedSplats, show
 from tests.conftest import FIXTURES
 from tests.scenes import random_splats
 
@@ -59,11 +59,11 @@ def random_shown(
     most_opaque: float = 1.0,
     brightest: float = 1.0,
     seed: int = 0,
-) -> Shown:
+) -> ShadedSplats:
     """Splats around the origin; the logarithms of their scales are normal, so a spread of 2 has needles and disks."""
     rng = np.random.default_rng(seed)
     f32 = np.float32
-    return Shown(
+    return ShadedSplats(
         rng.normal(0, 0.8, (count, 3)).astype(f32),
         np.exp(rng.normal(math.log(size), spread, (count, 3))).astype(f32),
         normalized_quat(rng.normal(size=(count, 4)).astype(f32)),
@@ -98,7 +98,7 @@ def psnr(image: Image, reference: Image) -> float:
 @pytest.mark.parametrize("eye", CAMERAS)
 @pytest.mark.parametrize("name", SPLATS)
 def test_draws_what_the_reference_draws(name: str, eye: str, profile: str) -> None:
-    look = Look(profile=profile)
+    look = RasterSettings(profile=profile)
     reference = rasterizer.draw(SPLATS[name], CAMERAS[eye], look)
     assert reference.any()
     image = osmesa.draw(SPLATS[name], CAMERAS[eye], look)
@@ -116,22 +116,22 @@ def test_the_demo_is_drawn_as_the_reference_draws_it(eye: tuple[float, ...], sor
     splats = read_scene(FIXTURES / "demo.ply", threads=2).splats
     seen = camera(eye, target=tuple(np.median(splats.center, axis=0)), size=(320, 200))
     shown = show([(splats, np.eye(4))], seen)
-    reference = rasterizer.draw(shown, seen, Look(sort=sort))
-    assert psnr(BACKENDS["osmesa"].draw(shown, seen, Look(sort=sort)), reference) >= FLOAT
-    assert psnr(osmesa.draw(shown, seen, Look(sort=sort), precision="half"), reference) >= HALF
-    assert psnr(osmesa.draw(shown, seen, Look(sort=sort), sorting="counting16"), reference) >= HALF
+    reference = rasterizer.draw(shown, seen, RasterSettings(sort=sort))
+    assert psnr(BACKENDS["osmesa"].draw(shown, seen, RasterSettings(sort=sort)), reference) >= FLOAT
+    assert psnr(osmesa.draw(shown, seen, RasterSettings(sort=sort), precision="half"), reference) >= HALF
+    assert psnr(osmesa.draw(shown, seen, RasterSettings(sort=sort), sorting="counting16"), reference) >= HALF
 
 
 @needs_opengl
 def test_near_and_far_and_what_is_beside_the_picture() -> None:
-    for look in (Look(near=3.5), Look(far=4.0), Look(near=3.9, far=4.1)):
+    for look in (RasterSettings(near=3.5), RasterSettings(far=4.0), RasterSettings(near=3.9, far=4.1)):
         reference = rasterizer.draw(SPLATS["large"], CAMERAS["front"], look)
         assert psnr(osmesa.draw(SPLATS["large"], CAMERAS["front"], look), reference) >= FLOAT
     # Centres on both sides of the picture's edges, and of those of the clip.
     width = np.linspace(-2, 2, 400, dtype=np.float32)
     row = dataclasses.replace(random_shown(400, size=0.05), center=np.stack([width, 0.7 * width, 0 * width], axis=1))
-    reference = rasterizer.draw(row, CAMERAS["front"], Look())
-    assert psnr(osmesa.draw(row, CAMERAS["front"], Look()), reference) >= FLOAT
+    reference = rasterizer.draw(row, CAMERAS["front"], RasterSettings())
+    assert psnr(osmesa.draw(row, CAMERAS["front"], RasterSettings()), reference) >= FLOAT
 
 
 @needs_opengl
@@ -139,13 +139,13 @@ def test_near_and_far_and_what_is_beside_the_picture() -> None:
 @pytest.mark.parametrize("precision", texture.PRECISIONS)
 def test_pictures_of_any_size_are_those_of_the_reference(size: tuple[int, int], precision: str) -> None:
     seen = camera((0, 0, 3), size=size)
-    reference = rasterizer.draw(SPLATS["large"], seen, Look())
-    image = osmesa.draw(SPLATS["large"], seen, Look(), precision=precision)
+    reference = rasterizer.draw(SPLATS["large"], seen, RasterSettings())
+    image = osmesa.draw(SPLATS["large"], seen, RasterSettings(), precision=precision)
     assert image.shape == (size[1], size[0], 4)
     assert psnr(image, reference) >= HALF
 
 
-def one(**columns: list[float]) -> Shown:
+def one(**columns: list[float]) -> ShadedSplats:
     """A round splat at the origin."""
     given: dict[str, list[float]] = {
         "center": [0, 0, 0],
@@ -155,7 +155,7 @@ def one(**columns: list[float]) -> Shown:
     }
     given |= columns
     opacity = np.array(given.pop("lod_opacity", [0.5]), np.float32)
-    return Shown(lod_opacity=opacity, **{name: np.array([value], np.float32) for name, value in given.items()})
+    return ShadedSplats(lod_opacity=opacity, **{name: np.array([value], np.float32) for name, value in given.items()})
 
 
 @needs_opengl
@@ -165,16 +165,16 @@ def test_one_splat_is_the_gaussian_of_the_textbook(precision: str) -> None:
     straight = np.eye(4)
     straight[2, 3] = 5
     seen = Camera(straight, 200, 100, (1000.0, 1000.0), (100.5, 50.5))
-    image = osmesa.draw(one(), seen, Look(), precision=precision)
+    image = osmesa.draw(one(), seen, RasterSettings(), precision=precision)
     alpha = 0.5 * 400 / 400.3
     tolerance = 1e-5 if precision == "float" else 4e-3
     assert image[50, 100] == pytest.approx([alpha, alpha / 2, alpha / 4, alpha], abs=tolerance)
     assert image[50, 120, 3] == pytest.approx(alpha * math.exp(-0.5 * 400 / 400.3), abs=tolerance)
-    upper = osmesa.draw(one(center=[0, 0.2, 0]), seen, Look(), precision=precision)[..., 3]
+    upper = osmesa.draw(one(center=[0, 0.2, 0]), seen, RasterSettings(), precision=precision)[..., 3]
     assert np.unravel_index(upper.argmax(), upper.shape) == (10, 100)
-    assert not osmesa.draw(one(lod_opacity=[MIN_ALPHA / 2]), seen, Look(), precision=precision).any()
+    assert not osmesa.draw(one(lod_opacity=[MIN_ALPHA / 2]), seen, RasterSettings(), precision=precision).any()
     behind = one(center=[0, 0, 6])
-    assert not osmesa.draw(behind, seen, Look(), precision=precision).any()
+    assert not osmesa.draw(behind, seen, RasterSettings(), precision=precision).any()
 
 
 @needs_opengl
@@ -183,7 +183,7 @@ def test_one_splat_is_the_gaussian_of_the_textbook(precision: str) -> None:
 @pytest.mark.parametrize("throttle", [0.0, 0.01])
 def test_a_picture_of_no_splats_is_empty(precision: str, sorting: str, throttle: float) -> None:
     image = osmesa.draw(
-        random_shown(0), CAMERAS["front"], Look(), precision=precision, sorting=sorting, throttle=throttle
+        random_shown(0), CAMERAS["front"], RasterSettings(), precision=precision, sorting=sorting, throttle=throttle
     )
     assert image.shape == (151, 203, 4) and not image.any()
 
@@ -196,10 +196,10 @@ def test_broken_splats_are_not_drawn() -> None:
     broken.center[20:30] = np.inf
     broken.center[30:40] = 3e38
     broken.scale[40:50] = np.nan
-    kept = Shown(**{field.name: getattr(shown, field.name)[50:] for field in dataclasses.fields(Shown)})
+    kept = ShadedSplats(**{field.name: getattr(shown, field.name)[50:] for field in dataclasses.fields(ShadedSplats)})
     for throttle in (0.0, 0.01):
-        image = osmesa.draw(broken, CAMERAS["front"], Look(), throttle=throttle)
-        assert np.array_equal(image, osmesa.draw(kept, CAMERAS["front"], Look()))
+        image = osmesa.draw(broken, CAMERAS["front"], RasterSettings(), throttle=throttle)
+        assert np.array_equal(image, osmesa.draw(kept, CAMERAS["front"], RasterSettings()))
 
 
 @needs_opengl
@@ -207,46 +207,49 @@ def test_broken_splats_are_not_drawn() -> None:
 def test_the_order_of_the_input_does_not_matter(precision: str) -> None:
     shown = SPLATS["plausible"]
     shuffle = np.random.default_rng(1).permutation(len(shown))
-    shuffled = Shown(**{field.name: getattr(shown, field.name)[shuffle] for field in dataclasses.fields(Shown)})
-    images = [osmesa.draw(each, CAMERAS["beside"], Look(), precision=precision) for each in (shown, shuffled)]
+    shuffled = ShadedSplats(
+        **{field.name: getattr(shown, field.name)[shuffle] for field in dataclasses.fields(ShadedSplats)}
+    )
+    images = [osmesa.draw(each, CAMERAS["beside"], RasterSettings(), precision=precision) for each in (shown, shuffled)]
     assert psnr(*images) >= FLOAT
 
 
 @needs_opengl
 def test_of_equally_far_ones_the_last_is_in_front() -> None:
-    both = Shown(
+    both = ShadedSplats(
         *(
             np.concatenate(pair)
             for pair in zip(_columns(one(lod_opacity=[1])), _columns(one(rgb=[0, 1, 0])), strict=True)
         )
     )
     for sorting in order.SORTINGS:
-        image = osmesa.draw(both, CAMERAS["front"], Look(), sorting=sorting)
-        assert psnr(image, rasterizer.draw(both, CAMERAS["front"], Look())) >= FLOAT
+        image = osmesa.draw(both, CAMERAS["front"], RasterSettings(), sorting=sorting)
+        assert psnr(image, rasterizer.draw(both, CAMERAS["front"], RasterSettings())) >= FLOAT
 
 
-def _columns(shown: Shown) -> list[FloatArray]:
-    return [getattr(shown, field.name) for field in dataclasses.fields(Shown)]
+def _columns(shown: ShadedSplats) -> list[FloatArray]:
+    return [getattr(shown, field.name) for field in dataclasses.fields(ShadedSplats)]
 
 
 @needs_opengl
 def test_frames_share_what_they_can() -> None:
     shown, other = SPLATS["plausible"], SPLATS["merged"]
     renderer = osmesa.Renderer()
-    first = renderer.draw(shown, CAMERAS["front"], Look())
-    again = Shown(*(column.copy() for column in _columns(shown)))
-    renderer.draw(again, CAMERAS["beside"], Look())
+    first = renderer.draw(shown, CAMERAS["front"], RasterSettings())
+    again = ShadedSplats(*(column.copy() for column in _columns(shown)))
+    renderer.draw(again, CAMERAS["beside"], RasterSettings())
     assert (renderer.uploads, renderer.sorts) == (1, 2)
     recolored = dataclasses.replace(shown, rgb=shown.rgb[::-1].copy())
     assert np.array_equal(
-        renderer.draw(recolored, CAMERAS["front"], Look()), osmesa.draw(recolored, CAMERAS["front"], Look())
+        renderer.draw(recolored, CAMERAS["front"], RasterSettings()),
+        osmesa.draw(recolored, CAMERAS["front"], RasterSettings()),
     )
     assert renderer.uploads == 2
-    renderer.draw(other, CAMERAS["front"], Look())
+    renderer.draw(other, CAMERAS["front"], RasterSettings())
     assert renderer.uploads == 3
-    renderer.draw(other, camera((0, 0, 4), size=(64, 48)), Look())
+    renderer.draw(other, camera((0, 0, 4), size=(64, 48)), RasterSettings())
     assert renderer.uploads == 3
-    assert np.array_equal(renderer.draw(shown, CAMERAS["front"], Look()), first)
+    assert np.array_equal(renderer.draw(shown, CAMERAS["front"], RasterSettings()), first)
 
 
 def turned(degrees: float, *, away: float = 0.0) -> Camera:
@@ -261,27 +264,32 @@ def test_a_throttle_sorts_anew_only_after_a_large_turn() -> None:
     shown = SPLATS["plausible"]
     lazy = osmesa.Renderer(throttle=0.01)
     for degrees, sorts in ((0, 1), (5, 1), (8, 1), (8.2, 2), (3, 2), (0, 3)):
-        image = lazy.draw(shown, turned(degrees), Look(sort="z"))
+        image = lazy.draw(shown, turned(degrees), RasterSettings(sort="z"))
         assert lazy.sorts == sorts, degrees
         # Nothing is missing, though it was out of sight when the splats were sorted.
-        assert psnr(image, rasterizer.draw(shown, turned(degrees), Look(sort="z"))) >= 25
+        assert psnr(image, rasterizer.draw(shown, turned(degrees), RasterSettings(sort="z"))) >= 25
     # Along its axis as beside it, every depth changes alike.
     assert (
-        psnr(lazy.draw(shown, turned(0, away=-2), Look(sort="z")), rasterizer.draw(shown, turned(0, away=-2), Look()))
+        psnr(
+            lazy.draw(shown, turned(0, away=-2), RasterSettings(sort="z")),
+            rasterizer.draw(shown, turned(0, away=-2), RasterSettings()),
+        )
         >= 25
     )
     assert lazy.sorts == 3
-    lazy.draw(shown, turned(0), Look(sort="radial"))
+    lazy.draw(shown, turned(0), RasterSettings(sort="radial"))
     assert lazy.sorts == 4
-    lazy.draw(shown, turned(0, away=0.2), Look(sort="radial"))
+    lazy.draw(shown, turned(0, away=0.2), RasterSettings(sort="radial"))
     assert lazy.sorts == 4
-    lazy.draw(shown, turned(0, away=1), Look(sort="radial"))  # the middle splat is about 4 away; 0.14 of that is 0.57
+    lazy.draw(
+        shown, turned(0, away=1), RasterSettings(sort="radial")
+    )  # the middle splat is about 4 away; 0.14 of that is 0.57
     assert lazy.sorts == 5
-    lazy.draw(SPLATS["merged"], turned(0, away=1), Look(sort="radial"))
+    lazy.draw(SPLATS["merged"], turned(0, away=1), RasterSettings(sort="radial"))
     assert lazy.sorts == 6
     eager = osmesa.Renderer()
     for _ in range(3):
-        eager.draw(shown, turned(0), Look())
+        eager.draw(shown, turned(0), RasterSettings())
     assert eager.sorts == 3
 
 
@@ -303,7 +311,10 @@ def test_keys_are_sorted_upwards_and_equal_ones_backwards() -> None:
 @needs_opengl
 def test_sorting_by_16_bits_hardly_changes_a_picture() -> None:
     for name in ("plausible", "merged"):
-        images = [osmesa.draw(SPLATS[name], CAMERAS["beside"], Look(), sorting=sorting) for sorting in order.SORTINGS]
+        images = [
+            osmesa.draw(SPLATS[name], CAMERAS["beside"], RasterSettings(), sorting=sorting)
+            for sorting in order.SORTINGS
+        ]
         assert psnr(*images) >= 60
 
 
@@ -324,6 +335,6 @@ def test_halves_are_the_texture_of_the_viewer() -> None:
 def test_more_than_opengl_takes() -> None:
     wide = dataclasses.replace(CAMERAS["front"], width=1 << 20)
     with pytest.raises(BackendError, match="1048576 x 151 pixels are more than this OpenGL takes"):
-        osmesa.draw(SPLATS["plausible"], wide, Look())
-    image = osmesa.draw(SPLATS["plausible"], CAMERAS["front"], Look())
-    assert psnr(image, rasterizer.draw(SPLATS["plausible"], CAMERAS["front"], Look())) >= FLOAT
+        osmesa.draw(SPLATS["plausible"], wide, RasterSettings())
+    image = osmesa.draw(SPLATS["plausible"], CAMERAS["front"], RasterSettings())
+    assert psnr(image, rasterizer.draw(SPLATS["plausible"], CAMERAS["front"], RasterSettings())) >= FLOAT

@@ -8,16 +8,17 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sparklod_cli.gaussian import lod_opacity
-from sparklod_cli.render import open3d_backend, rasterizer
+from sparklod_cli.cameras.camera import Camera
+from sparklod_cli.model.gaussian import lod_opacity
+from sparklod_cli.render import rasterizer
 from sparklod_cli.render.backends import BACKENDS, BackendError
-from sparklod_cli.render.camera import Camera
-from sparklod_cli.render.look import Look
-from sparklod_cli.render.open3d_child import PIECE
-from sparklod_cli.render.shown import Shown
+from sparklod_cli.render.open3d import backend
+from sparklod_cli.render.open3d.child import PIECE
+from sparklod_cli.render.settings import RasterSettings
+from sparklod_cli.render.shading import ShadedSplats
 from tests.render.open3d.test_process import forget
 
-BY_DEPTH = Look(sort="z")
+BY_DEPTH = RasterSettings(sort="z")
 
 
 def camera(width: int = 320, height: int = 200, *, at: tuple[float, float, float] = (0, 0, 0)) -> Camera:
@@ -39,9 +40,11 @@ def in_front(camera: Camera, right: object, down: object, away: object) -> NDArr
     return (local.reshape(-1, 3) @ camera.camera_to_world[:3, :3].T + camera.position).astype(np.float32)
 
 
-def shown(center: NDArray[np.float32], *, scale: object = 0.05, opacity: object = 0.99, rgb: object = 0.5) -> Shown:
+def shown(
+    center: NDArray[np.float32], *, scale: object = 0.05, opacity: object = 0.99, rgb: object = 0.5
+) -> ShadedSplats:
     count = len(center)
-    return Shown(
+    return ShadedSplats(
         center,
         np.broadcast_to(np.asarray(scale, np.float32), (count, 3)).copy(),
         np.tile(np.array([0, 0, 0, 1], np.float32), (count, 1)),
@@ -50,7 +53,7 @@ def shown(center: NDArray[np.float32], *, scale: object = 0.05, opacity: object 
     )
 
 
-def crowd(camera: Camera, count: int, most_opacity: float) -> Shown:
+def crowd(camera: Camera, count: int, most_opacity: float) -> ShadedSplats:
     rng = np.random.default_rng(count)
     away = rng.uniform(1, 6, count)
     at = in_front(camera, *(rng.uniform(-0.8, 0.8, (2, count)) * away), away)
@@ -70,8 +73,8 @@ def psnr(one: NDArray[np.float32], other: NDArray[np.float32]) -> float:
 # What Open3D is asked for
 
 
-def requests(splats: Shown, camera: Camera, most: int = 1 << 25) -> list[tuple[tuple[int, int], dict, NDArray]]:
-    return list(open3d_backend.pieces(splats, camera, BY_DEPTH, most))
+def requests(splats: ShadedSplats, camera: Camera, most: int = 1 << 25) -> list[tuple[tuple[int, int], dict, NDArray]]:
+    return list(backend.pieces(splats, camera, BY_DEPTH, most))
 
 
 def test_merged_splats_are_inflated_and_opaque() -> None:
@@ -121,7 +124,7 @@ def open3d() -> Iterator[None]:
     try:
         forget()
         seen = straight(32, 32)
-        BACKENDS["open3d"].draw(shown(in_front(seen, 0, 0, 1)), seen, Look())
+        BACKENDS["open3d"].draw(shown(in_front(seen, 0, 0, 1)), seen, RasterSettings())
     except BackendError as error:
         pytest.skip(f"Open3D cannot draw here: {error}")
     yield
@@ -135,7 +138,7 @@ def test_landmarks_are_where_they_belong(at: tuple[float, float, float]) -> None
     right, down, away = np.array([-0.9, 0.7, 0.1]), np.array([-0.3, -0.25, 0.4]), np.array([2.0, 1.5, 2.5])
     colors = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
     splats = shown(in_front(seen, right, down, away), scale=0.02, rgb=colors)
-    image = open3d_backend.draw(splats, seen, BY_DEPTH)
+    image = backend.draw(splats, seen, BY_DEPTH)
     local = (splats.center - seen.position) @ seen.camera_to_world[:3, :3]
     for color in range(3):
         weight = image[..., color]
@@ -152,7 +155,7 @@ def test_open3d_draws_the_colours_it_is_given() -> None:
     colors = np.array([[0.9, 0.5, 0.1], [0.02, 0.3, 1], [1, 1, 1], [0.2, 0.2, 0.2]], np.float32)
     column = np.array([50, 150, 250, 350])
     splats = shown(in_front(seen, (column - 200) / 200, 0.0, 1), scale=0.05, opacity=1, rgb=colors)
-    image = open3d_backend.draw(splats, seen, Look())
+    image = backend.draw(splats, seen, RasterSettings())
     np.testing.assert_allclose(image[50, column, :3], colors, atol=3 / 255)
     np.testing.assert_allclose(image[50, column, 3], 1, atol=3 / 255)
     assert not image[5, :, :].any()
@@ -163,7 +166,7 @@ def test_a_splat_that_is_not_oblique_is_drawn() -> None:
     """Its covariance on the screen is a multiple of the axes, for which Open3D by itself divides by 0."""
     seen = straight(120, 80)
     splats = shown(in_front(seen, [0.0, 0.2], 0.0, [1, 1]), scale=[[0.08, 0.02, 0.02], [0.02, 0.02, 0.02]], rgb=0.8)
-    ours, theirs = rasterizer.draw(splats, seen, BY_DEPTH), open3d_backend.draw(splats, seen, BY_DEPTH)
+    ours, theirs = rasterizer.draw(splats, seen, BY_DEPTH), backend.draw(splats, seen, BY_DEPTH)
     assert psnr(ours, theirs) > 45
 
 
@@ -171,7 +174,7 @@ def test_a_splat_that_is_not_oblique_is_drawn() -> None:
 def test_a_splat_larger_than_the_picture_is_drawn() -> None:
     seen = straight(600, 400)
     splats = shown(in_front(seen, 0, 0, 1), scale=0.9, opacity=1, rgb=0.6)
-    ours, theirs = rasterizer.draw(splats, seen, BY_DEPTH), open3d_backend.draw(splats, seen, BY_DEPTH)
+    ours, theirs = rasterizer.draw(splats, seen, BY_DEPTH), backend.draw(splats, seen, BY_DEPTH)
     assert theirs[..., 3].min() > 0.1
     assert psnr(ours, theirs) > 45
 
@@ -182,7 +185,7 @@ def test_it_agrees_with_the_reference(count: int, most_opacity: float, least: fl
     """Measured: 56 dB, and 25 dB with merged splats, which it has no way to draw as they are."""
     seen = camera(500, 280)
     splats = crowd(seen, count, most_opacity)
-    ours, theirs = rasterizer.draw(splats, seen, BY_DEPTH), open3d_backend.draw(splats, seen, BY_DEPTH)
+    ours, theirs = rasterizer.draw(splats, seen, BY_DEPTH), backend.draw(splats, seen, BY_DEPTH)
     assert psnr(ours, theirs) > least
     assert psnr(ours[:, ::-1], theirs) < 20 and psnr(ours[::-1], theirs) < 20
 
@@ -190,5 +193,5 @@ def test_it_agrees_with_the_reference(count: int, most_opacity: float, least: fl
 @pytest.mark.usefixtures("open3d")
 def test_nothing_is_an_empty_picture() -> None:
     seen = straight(33, 17)
-    image = open3d_backend.draw(shown(in_front(seen, 0, 0, -1)), seen, Look())
+    image = backend.draw(shown(in_front(seen, 0, 0, -1)), seen, RasterSettings())
     assert image.shape == (17, 33, 4) and image.dtype == np.float32 and not image.any()

@@ -13,24 +13,24 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sparklod_cli.render import open3d_backend, open3d_process
+from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.render.backends import BackendError
-from sparklod_cli.render.camera import Camera
-from sparklod_cli.render.look import Look
-from sparklod_cli.render.shown import Shown
+from sparklod_cli.render.open3d import backend, process
+from sparklod_cli.render.settings import RasterSettings
+from sparklod_cli.render.shading import ShadedSplats
 from tests.conftest import ROOT
 
 
 def forget() -> None:
-    if open3d_backend._child is not None:
-        open3d_backend._child.close()
-        open3d_backend._child = None
+    if backend._child is not None:
+        backend._child.close()
+        backend._child = None
 
 
 PREAMBLE = """
 import os, sys, time
 import numpy as np
-from sparklod_cli.render.open3d_child import send, receive
+from sparklod_cli.render.open3d.child import send, receive
 inn, out = sys.stdin.buffer, sys.stdout.buffer
 """
 
@@ -40,7 +40,7 @@ def play(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str], None]]:
     """Puts another program in the place of Open3D's."""
 
     def put(text: str) -> None:
-        monkeypatch.setattr(open3d_process, "COMMAND", [sys.executable, "-c", PREAMBLE + textwrap.dedent(text)])
+        monkeypatch.setattr(process, "COMMAND", [sys.executable, "-c", PREAMBLE + textwrap.dedent(text)])
 
     forget()
     yield put
@@ -51,7 +51,7 @@ def draw_one(width: int = 60) -> NDArray[np.float32]:
     """A splat in the middle."""
     rows = np.array([[0, 0, -1]]), np.array([[0.1, 0.1, 0.1]]), np.array([[0, 0, 0, 1]]), np.ones(1), np.ones((1, 3))
     camera = Camera(np.eye(4), width, 40, (200.0, 200.0), (width / 2, 20.0))
-    return open3d_backend.draw(Shown(*(column.astype(np.float32) for column in rows)), camera, Look())
+    return backend.draw(ShadedSplats(*(column.astype(np.float32) for column in rows)), camera, RasterSettings())
 
 
 @pytest.mark.parametrize(
@@ -70,7 +70,7 @@ def test_a_failing_process_is_an_error(
     play: Callable[[str], None], monkeypatch: pytest.MonkeyPatch, text: str, message: str
 ) -> None:
     play(text)
-    monkeypatch.setattr(open3d_process, "DRAW_LIMIT", 1.5)
+    monkeypatch.setattr(process, "DRAW_LIMIT", 1.5)
     with pytest.raises(BackendError, match=message):
         draw_one()
     with pytest.raises(BackendError, match=message):  # and again, by a new one
@@ -78,7 +78,7 @@ def test_a_failing_process_is_an_error(
 
 
 def test_a_missing_package_is_named(play: Callable[[str], None]) -> None:
-    play("sys.modules['open3d'] = None; from sparklod_cli.render.open3d_child import main; main()")
+    play("sys.modules['open3d'] = None; from sparklod_cli.render.open3d.child import main; main()")
     with pytest.raises(BackendError, match=r"package open3d, which is not installed: pip install 'open3d>=0.20'"):
         draw_one()
 
@@ -90,7 +90,7 @@ def test_a_missing_library_is_named(play: Callable[[str], None]) -> None:
             if name == "open3d":
                 raise ImportError("libusb-1.0.so.0: cannot open shared object file")
     sys.meta_path.insert(0, Finder())
-    from sparklod_cli.render.open3d_child import main
+    from sparklod_cli.render.open3d.child import main
     main()
     """
     play(text)
@@ -103,7 +103,7 @@ def test_an_open3d_that_knows_no_splats_is_too_old(play: Callable[[str], None]) 
     from types import SimpleNamespace as Space
     rendering = Space(MaterialRecord=lambda: Space())
     sys.modules["open3d"] = Space(__version__="0.19.0", visualization=Space(rendering=rendering))
-    from sparklod_cli.render.open3d_child import main
+    from sparklod_cli.render.open3d.child import main
     main()
     """
     play(text)
@@ -127,29 +127,29 @@ while True:
 def test_one_process_draws_all_pictures(play: Callable[[str], None]) -> None:
     play(NUMBER)
     first, second = draw_one(), draw_one(300)
-    process = open3d_backend._child
-    assert process is not None and process.most_entries == open3d_process.MOST_ENTRIES
-    grey = (process._process.pid % 251 + 1) / 255
+    child = backend._child
+    assert child is not None and child.most_entries == process.MOST_ENTRIES
+    grey = (child._process.pid % 251 + 1) / 255
     assert first.shape == (40, 60, 4) and second.shape == (40, 300, 4)
     np.testing.assert_allclose(first[..., :3], grey, rtol=1e-6)
     np.testing.assert_allclose(first[..., 3], 1)
     forget()
-    assert process._process.returncode == 0  # it ended by itself
+    assert child._process.returncode == 0  # it ended by itself
 
 
 def test_an_old_mesa_gets_small_pieces(play: Callable[[str], None]) -> None:
     play("print('Vulkan device driver: llvmpipe Mesa 22.3.6', file=sys.stderr, flush=True)" + NUMBER)
     draw_one()
-    process = open3d_backend._child
-    assert process is not None and process.most_entries == open3d_process.MOST_ENTRIES_OF_OLD_MESA
+    child = backend._child
+    assert child is not None and child.most_entries == process.MOST_ENTRIES_OF_OLD_MESA
 
 
 def test_the_process_ends_with_its_parent() -> None:
     program = f"""
     import sys
-    from sparklod_cli.render import open3d_process
-    open3d_process.COMMAND = [sys.executable, "-c", {PREAMBLE + NUMBER!r}]
-    print(open3d_process.Child()._process.pid, "open3d" in sys.modules)
+    from sparklod_cli.render.open3d import process
+    process.COMMAND = [sys.executable, "-c", {PREAMBLE + NUMBER!r}]
+    print(process.Child()._process.pid, "open3d" in sys.modules)
     """
     command = [sys.executable, "-c", textwrap.dedent(program)]
     said = subprocess.run(command, check=True, capture_output=True, text=True, cwd=ROOT, timeout=120).stdout.split()
