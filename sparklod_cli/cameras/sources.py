@@ -23,7 +23,7 @@ from .path import GENERATED, CameraPath, cameras_of, read
 from .world_transform import similarity
 
 if TYPE_CHECKING:
-    from .framing import Balls
+    from ..model.balls import Balls
 
 #: Bytes of a camera path's file. COLMAP's images.txt has all points that its images see.
 LARGEST = 1 << 31

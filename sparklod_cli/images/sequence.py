@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ..cameras.frame import DEFAULT_FPS
 from ..io import write_stdout, write_whole
+from ..render.renderer import Renderer
 from ..support import jit
 from ..support.defaults import OF_PIXELS
 from ..support.parallel import ordered_map
@@ -26,7 +27,9 @@ if TYPE_CHECKING:
     from ..cameras.camera import Camera
     from ..cameras.path import CameraPath
     from ..render.color_scales import Coloring
-    from ..render.renderer import Drawn, Renderer
+    from ..render.renderer import Drawn
+    from ..render.settings import RenderSettings
+    from ..scenes.finder import CutSource
     from .output import Output
     from .pixels import Color, Pixels
 
@@ -84,32 +87,38 @@ class _Frame:
 
 
 def write_pictures(
-    renderer: Renderer,
+    source: CutSource,
     path: CameraPath,
     output: Output,
+    render: RenderSettings,
     settings: PictureSettings,
     *,
-    reference: Renderer | None = None,
+    reference: CutSource | None = None,
     overwrite: bool = False,
     progress: Progress = silent,
 ) -> Pictures:
     """Draws and writes the pictures of a camera path.
 
     Args:
-        renderer: draws them.
+        source: what is drawn.
         path: the cameras; all of one size for an animation or a contact sheet.
         output: where the pictures go.
+        render: how they are drawn.
         settings: how they become files.
-        reference: draws what they are compared with: what is written is the difference.
+        reference: what they are compared with: the difference is written.
         overwrite: replace files that exist.
-        progress: is told how many frames are compared, drawn and encoded.
+        progress: is told how many frames are looked at for the colours, compared, drawn and encoded.
 
     Raises:
         BackendError: the backend cannot draw here.
         OutputError: a file cannot be written.
-        SparklodError: the reference covers no pixel of a frame, or an animation cannot be encoded here.
+        SparklodError: there is nothing to colour by, the reference covers no pixel of a frame, or an animation cannot
+            be encoded here.
     """
-    return _Writer(renderer, path, output, settings, reference, overwrite, progress).run()
+    jit.use_threads(settings.threads)
+    renderer = Renderer(source, render, path.cameras, progress=progress)
+    other = None if reference is None else Renderer(reference, render, path.cameras, progress=progress)
+    return _Writer(renderer, path, output, settings, other, overwrite, progress).run()
 
 
 def frame_rate(path: CameraPath) -> float:
@@ -233,7 +242,7 @@ class _Writer:
 
     def _floats(self, drawn: Drawn, image: NDArray[np.float32]) -> NDArray[np.float32]:
         """What a .npy holds: the numbers behind the colours where those are of pixels, else the colours."""
-        by = self._renderer.manner.color_by
+        by = self._renderer.settings.color_by
         return drawn.values if by in OF_PIXELS and drawn.values is not None else image
 
     def _encode(self, pixels: Pixels) -> bytes:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ...render.settings import PROFILES, SORTS, RasterSettings
+from ...render.settings import PROFILES, SORTS, RasterSettings, RenderSettings
 from ...support import defaults
 from ...support.defaults import OF_PIXELS
 from ..command import COMMON, option
@@ -19,7 +19,6 @@ from .types import Real
 
 if TYPE_CHECKING:
     from ...images.pixels import Color
-    from ...render.renderer import RenderSettings
 
 HEADING = "Appearance"
 
@@ -124,20 +123,20 @@ class Appearance:
             raise click.UsageError(f".{form} has no alpha; write .png or .webp, or name a --background such as black")
         return None if self.keeps_alpha or (form == "npy" and not is_given(ctx, "background")) else self.background
 
-    def settings(self, supersample: int | None = None) -> RenderSettings:
+    def settings(self, *, supersample: int | None = None, max_sh: int = defaults.MAX_SH_DEGREE) -> RenderSettings:
         """How pictures are drawn.
 
         Args:
             supersample: in place of --supersample.
+            max_sh: degrees of spherical harmonics above this are left out.
         """
-        from ...render.renderer import RenderSettings
-
         return RenderSettings(
-            look=RasterSettings(self.near, self.far, self.profile, self.sort),
+            raster=RasterSettings(self.near, self.far, self.profile, self.sort),
             style=self.style,
             backend=self.backend,
             color_by=self.color_by,
             supersample=supersample or self.supersample,
+            max_sh=max_sh,
             options={
                 called: getattr(self, name) for name, called in OF_OSMESA.items() if getattr(self, name) is not None
             },

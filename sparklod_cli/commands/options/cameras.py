@@ -25,9 +25,9 @@ from .views import Size, View, Views
 if TYPE_CHECKING:
     from ...cameras.camera import Matrix
     from ...cameras.frame import Settings
-    from ...cameras.framing import Balls
     from ...cameras.path import CameraPath
     from ...cameras.sources import CameraSource
+    from ...model.balls import Balls
 
 HEADING = "Cameras"
 

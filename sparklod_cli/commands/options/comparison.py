@@ -88,8 +88,8 @@ class Comparison:
         Raises:
             click.UsageError: an assertion cannot be understood.
         """
-        from ...compare import COLUMNS
         from ...tables import assertions
+        from ...tables.comparison import COLUMNS
 
         found = []
         for text in self.asserts:

@@ -17,7 +17,8 @@ from .types import Quantity, Real
 
 if TYPE_CHECKING:
     from ...lod.budget import Budget
-    from ...lod.traversal import Cones, Frustum
+    from ...lod.settings import LodSettings
+    from ...model.foveation import Foveation
 
 HEADING = "Cut"
 
@@ -117,9 +118,25 @@ class Cut:
                 raise click.UsageError(f"the budget must be from 1 to 2^53, not {budget.text}")
         return budgets
 
-    def foveation(self) -> Cones | Frustum:
-        """How much nodes count by direction."""
-        from ...lod.traversal import Cones, Frustum
+    def settings(self, budget: int) -> LodSettings:
+        """How a viewer of a budget finds its cuts."""
+        from ...lod.settings import LodSettings
+
+        return LodSettings(
+            budget=budget,
+            foveation=self._foveation(),
+            pixel_scale_limit=self.pixel_scale_limit,
+            render_scale=self.lod_render_scale,
+            continuous=self.width,
+        )
+
+    @property
+    def width(self) -> float | None:
+        """The width of continuous cuts; None for ordinary ones."""
+        return None
+
+    def _foveation(self) -> Foveation:
+        from ...model.foveation import Cones, Frustum
 
         behind = self.behind_foveate
         if self.outside_foveate is not None:
@@ -151,7 +168,6 @@ class PictureCut(Cut):
 
     @property
     def width(self) -> float | None:
-        """The width of continuous cuts; None for ordinary ones."""
         return (self.blend or defaults.BLEND) if self.continuous else None
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,7 +14,7 @@ from ..paths import InputPath
 from .common import Command
 
 if TYPE_CHECKING:
-    from ...world import Placement
+    from ...model.instances import Instance
 
 HEADING = "Inputs"
 
@@ -30,23 +31,27 @@ class Inputs:
     files: tuple[Path, ...]
     scene: Path | None
 
-    def instances(self) -> list[Placement]:
+    def instances(self) -> list[Instance]:
         """What stands where: each FILE once, as it is, or all that --scene says.
 
         Raises:
             click.UsageError: there is neither, or there are both.
-            FormatError: the instances file cannot be read.
+            InstancesFileError: the instances file cannot be read.
         """
-        from ...world import Placement, names_of
-        from ...world_file import read_placements
+        from ...model.instances import instances_of
+        from ...scenes.instances_file import read_instances
 
         if not self.files and self.scene is None:
             raise click.UsageError("a FILE is missing; name one, or an instances file with --scene")
         if self.files and self.scene is not None:
             raise click.UsageError("FILE cannot be used with --scene, which names the files")
         if self.scene is not None:
-            return read_placements(self.scene)
-        return [Placement(file, name) for file, name in zip(self.files, names_of(self.files), strict=True)]
+            return read_instances(self.scene)
+        return instances_of(self.files)
+
+    def read(self, instances: Sequence[Instance]) -> list[Path]:
+        """The splat files, which are read without being parameters themselves where --scene names them."""
+        return [instance.file for instance in instances if instance.file is not None]
 
 
 def input_options(command: Command) -> Command:

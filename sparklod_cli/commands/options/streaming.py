@@ -16,7 +16,7 @@ from .common import Command
 from .types import Quantity
 
 if TYPE_CHECKING:
-    from ...simulation.streaming import Network
+    from ...simulation.streaming import StreamingSettings
 
 HEADING = "Streaming"
 
@@ -45,13 +45,14 @@ class Streaming:
         if self.bandwidth is None:
             require(ctx, OF_BANDWIDTH, "--bandwidth")
 
-    def network(self) -> Network:
-        """What brings chunks."""
-        from ...simulation.streaming import Network
+    def settings(self) -> StreamingSettings:
+        """How chunks get to a viewer and stay with it."""
+        from ...simulation.streaming import Network, StreamingSettings
 
         if self.bandwidth is None:
-            return Network()
-        return Network(self.bandwidth, self.latency or 0.0, self.fetchers or defaults.FETCHERS)
+            return StreamingSettings(chunk_cache=self.chunk_cache)
+        network = Network(self.bandwidth, self.latency or 0.0, self.fetchers or defaults.FETCHERS)
+        return StreamingSettings(network, self.chunk_cache)
 
 
 def streaming_options(command: Command) -> Command:
