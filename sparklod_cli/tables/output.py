@@ -20,7 +20,7 @@ class TableOutput:
 
     Attributes:
         path: of its file; None for standard output, or for nowhere.
-        form: one of `defaults.TABLES`; None for nowhere: rows are made, and not written.
+        form: a key of `files.FORMS`; None for nowhere: rows are made, and not written.
         columns: of the table.
         overwrite: replace a file that exists.
     """

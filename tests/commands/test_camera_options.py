@@ -16,7 +16,8 @@ from click.testing import CliRunner, Result
 from sparklod_cli.cameras import generators
 from sparklod_cli.cameras.framing import FILLED, Balls
 from sparklod_cli.cameras.path import CameraPath
-from sparklod_cli.commands.camera_options import camera_options, cameras_from
+from sparklod_cli.commands.options.cameras import Cameras, camera_options
+from sparklod_cli.commands.usage import options_of
 from sparklod_cli.support.errors import CameraPathError
 from tests.cameras.known import FOLDER, KNOWN, SIZE, check_pose
 
@@ -39,8 +40,11 @@ def run(*arguments: str | Path, scene: Any = scene_of_shells) -> tuple[Result, l
     @click.command()
     @camera_options
     @click.argument("inputs", nargs=-1)
-    def command(inputs: tuple[str, ...], **settings: Any) -> None:
-        found.append(cameras_from(settings, scene))
+    @click.pass_context
+    def command(ctx: click.Context, **_: Any) -> None:
+        asked = options_of(ctx, Cameras)
+        asked.check(ctx)
+        found.append(asked.read(scene))
 
     return CliRunner().invoke(command, [str(argument) for argument in arguments]), found
 
@@ -190,7 +194,7 @@ def test_files_that_are_not_what_they_should_be(tmp_path: Path) -> None:
 
 
 def test_a_file_of_gigabytes_is_not_read(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sparklod_cli.commands.camera_options.LARGEST", 100)
+    monkeypatch.setattr("sparklod_cli.cameras.sources.LARGEST", 100)
     assert "inria.json is larger than 0 MiB" in file_error("--camera-path", FOLDER / "inria.json")
     assert "it is a pipe or a device" in file_error("--camera-path", "/dev/null")
 
@@ -230,7 +234,7 @@ def test_the_help_names_what_there_is() -> None:
 
 def test_help_needs_nothing_heavy() -> None:
     code = (
-        "import sys, sparklod_cli.commands.camera_options; print([m for m in ('numpy', 'numba') if m in sys.modules])"
+        "import sys, sparklod_cli.commands.options.cameras; print([m for m in ('numpy', 'numba') if m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "[]\n"

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ...model.gaussian import spark_size
 from ...model.lod_tree import MAX_CHILDREN, LodTree
 from ...model.nodes import Nodes
+from ...model.scene import Scene
 from ...model.splats import FloatArray, Splats
 from ...support.errors import FormatError
 from ...support.parallel import for_chunks
@@ -57,6 +58,17 @@ def pack(
 
     for_chunks(encode, len(splats), threads, lambda _: None)
     return {"lod_tree": words}
+
+
+def dump(scene: Scene, *, threads: int = 1) -> dict[str, Words]:
+    """The words of a scene that is a tree.
+
+    Raises:
+        ValueError: it is none.
+    """
+    if scene.tree is None:
+        raise ValueError("the scene has no tree")
+    return pack(scene.splats, scene.tree, threads=threads)
 
 
 def unpack(arrays: Mapping[str, NDArray[Any]]) -> Nodes:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from ...codecs.rounding import ROUND_TRIPS
 from ...render.settings import PROFILES, SORTS, RasterSettings, RenderSettings
 from ...support import defaults
 from ...support.defaults import OF_PIXELS
@@ -69,7 +70,7 @@ class Appearance:
         style: one of `defaults.STYLES`.
         color_by: one of `defaults.COLOR_BY`.
         no_bar: leave the colour bar out.
-        through: one of `defaults.THROUGH`.
+        through: a key of `rounding.ROUND_TRIPS`.
         profile: one of `PROFILES`.
         sort: one of `SORTS`.
         backend: one of `defaults.BACKENDS`.
@@ -202,7 +203,7 @@ def appearance_options(command: Command) -> Command:
             ),
             add(
                 "--through",
-                type=click.Choice(defaults.THROUGH),
+                type=click.Choice(list(ROUND_TRIPS)),
                 help="Draw splats as Spark's PackedSplats or ExtSplats, or SPZ, round them; cuts stay those of the"
                 " file.  [default: as in the file]",
             ),

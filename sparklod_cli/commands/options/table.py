@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ...support import defaults
+from ...tables.files import FORMS
 from ..command import COMMON, option
 from ..console import is_terminal
 from ..paths import DASH, OutputPath
@@ -34,7 +34,7 @@ class Table:
     Attributes:
         output: file of the table, or -.
         overwrite: replace files that exist.
-        form: one of `defaults.TABLES`.
+        form: a key of `FORMS`.
         per_instance: rows for single instances, too.
         no_timing: leave out the column of the time that traversals took.
         summary: print what the frames come to.
@@ -135,7 +135,7 @@ def table_options(command: Command) -> Command:
             add(
                 "--format",
                 "form",
-                type=click.Choice(defaults.TABLES),
+                type=click.Choice(list(FORMS)),
                 help="Format of the table.  [default: by the suffix of --output, or csv]",
             ),
             add("--per-instance", is_flag=True, help="Write a row for each instance, besides that of all together."),
