@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 def compare(ctx: click.Context, asked: Asked) -> int:
     """Compares, writes the table and the charts, and says what they come to; the exit status."""
-    budgets = asked.cut.checked(asked.comparison.budgets(asked.cut.budget))
+    budgets = asked.comparison.budgets(asked.cut.budget)
     asserts = asked.comparison.assertions(budgets)
     table = _table(asked)
     instances = asked.inputs.instances()

@@ -73,6 +73,7 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
     instances = files.instances()
     besides = {"scene": files.read(instances), "world_transform": where.files()}
     keep_apart(ctx, besides)
+    table = place.table(ctx, as_json=general.as_json)
     asserts = place.assertions()
     with general.console() as console:
         from ..model.splats import COLUMNS
@@ -81,7 +82,7 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
         from ..simulation.outputs import FrameOutputs, write_frames
 
         outputs = FrameOutputs(
-            table=place.table(ctx, as_json=general.as_json),
+            table=table,
             indices=place.indices_out,
             padded=place.padded,
             plot=place.plot,
@@ -108,7 +109,7 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
             console.say(note)
         keep_apart(ctx, {**besides, "indices_out": outputs.index_files(path.numbers, len(instances))})
         start = time.perf_counter()
-        screen = outputs.table.on_stdout and is_terminal(sys.stdout)
+        screen = table.on_stdout and is_terminal(sys.stdout)
         written = write_frames(
             simulation,
             path,
@@ -116,7 +117,7 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
             threads=general.threads,
             # A bar and a table do not go together on one screen.
             **({} if screen else {"progress": console.progress}),
-            passed=for_screen if screen and outputs.table.form != "parquet" else None,
+            passed=for_screen if screen and table.form != "parquet" else None,
         )
         console.clear()
         console.detail(f"  {len(path.cameras):,} frames of {path.format}, {time.perf_counter() - start:.2f} s")

@@ -11,6 +11,9 @@ from ..support.units import parse_count
 #: A share of the leaves, in percent, with at most nine digits after the point.
 SHARE = re.compile(r"([0-9]{1,3}(?:\.[0-9]{1,9})?|\.[0-9]{1,9})\s*%")
 
+#: The largest count: all up to it are whole numbers in every format of a table.
+LARGEST = 1 << 53
+
 
 @dataclass(frozen=True)
 class Budget:
@@ -48,7 +51,7 @@ def parse_budget(text: str) -> Budget:
     """The budget of a text such as "5%" or "500k".
 
     Raises:
-        ValueError: it is neither a share nor a count, or it is 0.
+        ValueError: it is neither a share nor a count, or it is 0 or a count beyond `LARGEST`.
     """
     text = text.strip()
     found = SHARE.fullmatch(text)
@@ -56,8 +59,10 @@ def parse_budget(text: str) -> Budget:
         budget = Budget(text, Fraction(found[1]) / 100, None) if found else Budget(text, None, parse_count(text))
     except ValueError:
         raise ValueError(f"{text!r} is neither a share such as 5% nor a count such as 500k") from None
-    if not (budget.share or budget.count):
-        raise ValueError(f"a budget of {text!r} leaves nothing to draw; give more than 0")
+    if budget.share == 0:
+        raise ValueError(f"a budget of {text} leaves nothing to draw; give more than 0%")
+    if budget.count is not None and not 1 <= budget.count <= LARGEST:
+        raise ValueError(f"the budget must be from 1 to 2^53, not {text}")
     return budget
 
 

@@ -153,22 +153,22 @@ def test_a_world_transform_may_be_a_file(name: str, tmp_path: Path) -> None:
 
 
 def test_wrong_camera_options_are_errors_that_name_them() -> None:
-    assert "--orbit and --dolly cannot go together" in usage_error("--orbit", "3", "--dolly")
-    assert "--camera-path and --look-at" in usage_error("--camera-path", "x", "--look-at", "0,0,0:1,1,1")
-    assert "--camera-axes only means something with --camera-path" in usage_error("--camera-axes", "opencv-c2w")
-    assert "--center only means something with --orbit or --dolly" in usage_error(
+    assert "--orbit and --dolly cannot be used together" in usage_error("--orbit", "3", "--dolly")
+    assert "--camera-path and --look-at cannot" in usage_error("--camera-path", "x", "--look-at", "0,0,0:1,1,1")
+    assert "--camera-axes can only be used with --camera-path" in usage_error("--camera-axes", "opencv-c2w")
+    assert "--center can only be used with --orbit or --dolly" in usage_error(
         "--center", "0,0,0", "--look-at", "0,0,0:1,1,1"
     )
-    assert "--seconds only means something with --dolly or --keyframes" in usage_error("--seconds", "3")
+    assert "--seconds can only be used with --dolly or --keyframes" in usage_error("--seconds", "3")
     for wrong in ("1,2,3", "1,2,3:1,2", "1,2,3:1,2,3", "a:b", "1,2,3:4,5,nan"):
         assert "Invalid value for '--look-at'" in usage_error("--look-at", wrong)
-    assert "takes two keyframes" in usage_error("--keyframes", "1,2,3:4,5,6")
+    assert "fewer than two keyframes" in usage_error("--keyframes", "1,2,3:4,5,6")
     for wrong in ("640", "640x", "0x480", "640x99999", "640x4.8", "-640x480", "6\u00b2x7"):
         assert "such as 1280x720" in usage_error("--size", wrong)
     for option, wrong in {"--fov": "180", "--fps": "0", "--every": "0", "--orbit": "0", "--elevation": "90"}.items():
         assert f"Invalid value for '{option}'" in usage_error(option, wrong)
     assert "is no direction" in usage_error("--up", "0,0,0")
-    assert "--world-transform only means something with" in usage_error("--orbit", "3", "--world-transform", TURN)
+    assert "--world-transform can only be used with" in usage_error("--orbit", "3", "--world-transform", TURN)
     for wrong, said in {
         TURN.replace("-1", "1", 1): "has a matrix that mirrors",
         TURN.replace("-1", "-2", 1): "has axes that are not at right angles, or not of one length",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -44,10 +43,7 @@ CONES = ("cone_fov0", "cone_fov", "cone_foveate")
 
 #: Options of numbers that the traversal multiplies in float32, and the most that each may be.
 MULTIPLIED = ("lod_render_scale", "pixel_scale_limit", "cone_foveate", "outside_foveate", "behind_foveate")
-LARGEST = 1e12
-
-#: The largest budget: all up to it are whole numbers in every format of the table.
-LARGEST_BUDGET = 1 << 53
+MOST_MULTIPLIED = 1e12
 
 
 def _budgets(text: str) -> tuple[Budget, ...]:
@@ -93,8 +89,10 @@ class Cut:
             exclude(ctx, ["lod_render_scale"], "--pixel-scale-limit")
         for name in MULTIPLIED:
             value = getattr(self, name)
-            if value is not None and value > LARGEST:
-                raise click.UsageError(f"{flag_of(ctx, name)} {value:g} is too large; it must be at most {LARGEST:g}")
+            if value is not None and value > MOST_MULTIPLIED:
+                raise click.UsageError(
+                    f"{flag_of(ctx, name)} {value:g} is too large; it must be at most {MOST_MULTIPLIED:g}"
+                )
 
     def one_budget(self) -> Budget:
         """The budget, or that of the preset, times --lod-splat-scale.
@@ -102,21 +100,18 @@ class Cut:
         Raises:
             click.UsageError: several are given, or it is out of reach.
         """
-        from ...lod.budget import Budget
+        from ...lod.budget import LARGEST, Budget
 
         if self.budget is not None and len(self.budget) > 1:
             texts = ",".join(budget.text for budget in self.budget)
             raise click.UsageError(f"--budget {texts} names several, which only render --compare takes; give one")
         budget = self.budget[0] if self.budget else Budget.of_count(defaults.PRESETS[self.preset])
-        return self.checked([budget.scaled(self.lod_splat_scale)])[0]
-
-    @staticmethod
-    def checked(budgets: Sequence[Budget]) -> Sequence[Budget]:
-        """The budgets; raises a `click.UsageError` where a count is beyond `LARGEST_BUDGET`."""
-        for budget in budgets:
-            if budget.count is not None and not budget.count * budget.scale <= LARGEST_BUDGET:
-                raise click.UsageError(f"the budget must be from 1 to 2^53, not {budget.text}")
-        return budgets
+        scaled = budget.scaled(self.lod_splat_scale)
+        if scaled.count is not None and not scaled.count * scaled.scale <= LARGEST:
+            raise click.UsageError(
+                f"the budget must be from 1 to 2^53, not {budget.text} times --lod-splat-scale {scaled.scale:g}"
+            )
+        return scaled
 
     def settings(self, budget: int) -> LodSettings:
         """How a viewer of a budget finds its cuts."""

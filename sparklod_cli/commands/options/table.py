@@ -61,10 +61,6 @@ class Table:
             exclude(ctx, OF_TABLES, "--json without --output, which writes no table")
         if self.indices_out is None:
             require(ctx, ["padded"], "--indices-out")
-        self._form()
-
-    def _form(self) -> str:
-        return table_form("--output", self.output, self.form)
 
     def summary_on_stdout(self, ctx: click.Context, *, as_json: bool) -> bool:
         """Whether the summary takes the place of a table that would scroll by on a terminal, and nobody asked for."""
@@ -72,14 +68,18 @@ class Table:
         return not asked and is_terminal(sys.stdout)
 
     def table(self, ctx: click.Context, *, as_json: bool) -> TableOutput:
-        """Where the table goes."""
+        """Where the table goes.
+
+        Raises:
+            click.UsageError: the suffix of --output promises something else.
+        """
         from ...simulation import columns
         from ...tables.output import TableOutput
 
         nowhere = self.output is None and (as_json or self.summary_on_stdout(ctx, as_json=as_json))
         return TableOutput(
             path=None if self.output == DASH else self.output,
-            form=None if nowhere else self._form(),
+            form=None if nowhere else table_form("--output", self.output, self.form),
             columns=columns.select(timing=not self.no_timing),
             overwrite=self.overwrite,
         )
