@@ -247,7 +247,7 @@ def _lod(
 ) -> LodSettings:
     settings = settings or LodSettings(next(iter(PRESETS.values())))
     if budget is not None:
-        settings = replace(settings, budget=_budget(budget).of(len(scenes.full())))
+        settings = replace(settings, budget=_budget(budget).of(scenes.leaves))
     if continuous:
         settings = replace(settings, continuous=BLEND if continuous is True else float(continuous))
     return settings
