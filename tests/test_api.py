@@ -390,10 +390,23 @@ def test_progress_is_told_to_a_function_and_to_bars(scene: sparklod.Scene) -> No
     assert all(bar.closed and bar.n == bar.total for bar in bars)
 
 
-def test_threads_are_left_as_they_were(scene: sparklod.Scene) -> None:
+def test_work_is_done_on_the_threads_that_are_asked_for(
+    scene: sparklod.Scene, held: sparklod.Tree, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from sparklod_cli.render import rasterizer
     from sparklod_cli.support import jit
 
-    before = jit.threads_in_use()
+    before, used = jit.threads_in_use(), set()
+    draw = rasterizer.draw
+
+    def noted(*arguments: Any) -> Any:
+        used.add(jit.threads_in_use())
+        return draw(*arguments)
+
+    monkeypatch.setattr(rasterizer, "draw", noted)
+    sparklod.render(scene, camera(), threads=1)
+    sparklod.compare(held, None, [camera()], budgets=[50, 0.5], threads=1)
+    assert used == {1}
     sparklod.build_lod(scene, threads=1)
     assert jit.threads_in_use() == before
 
