@@ -1,43 +1,45 @@
-"""Baking: from a splat file to a Level-of-Detail file. What `sparklod build-lod` calls, and a program can call."""
+"""Baking: from a splat file to a Level-of-Detail file."""
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from .codecs import clamps, spz
+from .codecs import formats
+from .codecs.clamps import Clamp
+from .codecs.encoded import EncodeOptions
 from .codecs.gpu import dump
-from .io import Sink, read_rgba, read_scene
-from .lod import quality, quick
+from .io import read_rgba, read_scene, sink
+from .lod.builders import BUILDERS, METHODS
+from .model.lod_tree import LodTree
 from .model.scene import Scene
 from .model.selection import Selection
 from .model.splats import Splats
-from .support.defaults import DEFAULT_BASE, DEFAULT_GROWTH, MAX_SH_DEGREE, METHODS
+from .support import jit
+from .support.defaults import DEFAULT_BASE, DEFAULT_GROWTH, MAX_SH_DEGREE
 from .support.errors import FormatError, memory_told
 from .support.progress import Progress, silent
 
-#: What has `build`, by method, and what of a recipe it takes.
-BUILDERS = {"quick": (quick, "base"), "quality": (quality, "growth")}
-
 
 @dataclass(frozen=True)
-class Recipe:
+class BakeSettings:
     """How to bake.
 
     Attributes:
-        method: one of `defaults.METHODS`.
-        base: of quick, growth of the cells from level to level, 1.1 to 2.0.
-        growth: of quality, the most nodes a leaf, 1.05 to 2.0.
-        max_sh: SH degrees above this are left out.
-        selection: which splats to keep.
-        rgba: a file of colours and opacities that take the place of the splats' own, see `io.read_rgba`.
-        encoding: one of `defaults.ENCODINGS`, to write the arrays of that instead of SPZ.
-        raw: write their words alone, rather than as .npz.
-        spz: how to write SPZ, and on how many threads to work.
+        method: of `lod.builders.BUILDERS`.
+        base: of quick, growth of the voxel grid from level to level, 1.1 to 2.0.
+        growth: of quality, the largest number of nodes for each leaf, 1.05 to 2.0.
+        max_sh: the highest SH degree that is kept.
+        selection: which splats are kept; its coordinates are those of the input.
+        rgba: a file of colours and opacities that replace the splats' own, see `io.read_rgba`.
+        output: how to write; with an `encoding`, arrays instead of SPZ. `threads` is for all stages.
     """
 
     method: str = METHODS[0]
@@ -46,25 +48,29 @@ class Recipe:
     max_sh: int = MAX_SH_DEGREE
     selection: Selection = field(default_factory=Selection)
     rgba: Path | None = None
-    encoding: str | None = None
-    raw: bool = False
-    spz: spz.Options = field(default_factory=spz.Options)
+    output: EncodeOptions = field(default_factory=EncodeOptions)
+
+    def builder(self) -> Callable[..., tuple[Splats, LodTree]]:
+        """What makes `(nodes, tree)` of splats; takes `progress`, too."""
+        row = BUILDERS[self.method]
+        return functools.partial(row.load().build, **{row.setting: getattr(self, row.setting)})
 
 
 @dataclass(frozen=True)
 class Baked:
-    """What came of it.
+    """What was baked.
 
     Attributes:
         format: of the input, for people.
-        splats, sh_degree: of the input as far as it was kept; `read` counts what was in the file.
-        dropped: how many splats were left out, by reason (`selection.REASONS`).
+        read: the number of splats in the input.
+        splats, sh_degree: of those that were kept.
+        dropped: the number of splats that were left out, by reason (`selection.REASONS`).
         method: that built the tree.
         nodes, levels: of the tree; a tree of one node has one level.
         bytes: of the output.
         version, fractional_bits: of an SPZ output, else None.
         arrays: shapes of the arrays of another output, in its order.
-        clamped: nodes with a value that the output cannot hold, by the column of `Splats` where there are any.
+        clamped: by the column of `Splats`, the number of nodes with a value that the output cannot hold.
         clamps: at which ends, and how far beyond.
         notes: what the reader had to leave out, for people.
         seconds: by stage (read, build, write).
@@ -83,74 +89,76 @@ class Baked:
     fractional_bits: int | None
     arrays: dict[str, tuple[int, ...]]
     clamped: dict[str, int]
-    clamps: tuple[clamps.Clamp, ...]
+    clamps: tuple[Clamp, ...]
     notes: tuple[str, ...]
     seconds: dict[str, float]
 
 
-def bake(source: Path, write: Sink, recipe: Recipe, *, progress: Progress = silent) -> Baked:
-    """Reads `source`, builds its tree and hands the LoD file to `write`.
+def bake(
+    source: Path,
+    target: Path,
+    settings: BakeSettings,
+    *,
+    overwrite: bool = False,
+    make_parent: bool = False,
+    progress: Progress = silent,
+) -> Baked:
+    """Reads a splat file, builds its tree and writes a Level-of-Detail file.
+
+    Args:
+        source: of any format that is read; - is standard input.
+        target: an SPZ file, or one of arrays, whatever its name; - is standard output.
+        settings: how.
+        overwrite: replace a file that exists.
+        make_parent: make the folder of the output if there is none.
+        progress: told of the stages.
 
     Raises:
-        FormatError, InvalidSplatsError, OutputError: see `io.read_scene`, `Selection.apply` and `write`.
+        FormatError, InvalidSplatsError, OutputError: see `io.read_scene`, `Selection.apply` and `io.sink`.
         OutOfMemoryError: it does not fit into memory.
     """
     with memory_told():
-        return _bake(source, write, recipe, progress)
-
-
-def _bake(source: Path, write: Sink, recipe: Recipe, progress: Progress) -> Baked:
-    threads = recipe.spz.threads
-    start = time.perf_counter()
-    scene = read_scene(source, threads=threads, progress=progress)
-    if scene.tree is not None:
-        raise FormatError("it is a Level-of-Detail file already; --unlod writes its splats back out")
-    total = len(scene.splats)
-    kept, dropped = recipe.selection.apply(_recolored(scene.splats, recipe.rgba).with_max_sh(recipe.max_sh))
-    read_done = time.perf_counter()
-    antialiased, name, notes = scene.antialiased, scene.format, scene.notes
-    count, degree = len(kept), kept.sh_degree
-    # Before building, so that what does not fit is said at once.
-    bits = None if recipe.encoding else spz.fractional_bits(kept, recipe.spz)
-    # The builder frees its input as it goes, if nobody else holds it: a third of the peak.
-    handed_over = [kept]
-    del scene, kept
-    builder, setting = BUILDERS[recipe.method]
-    nodes, tree = builder.build(handed_over.pop(), getattr(recipe, setting), progress=progress)
-    if bits is not None and recipe.spz.fractional_bits is None:
-        # The quality builder's nodes may lie a little outside of the box of the splats.
-        bits = min(bits, spz.largest_fractional_bits(nodes.center))
-    levels = int(tree.depths().max()) + 1
-    build_done = time.perf_counter()
-    output = Scene(nodes, tree, antialiased)
-    arrays = dump.pack(output, recipe.encoding, threads) if recipe.encoding else {}
-    if arrays:
-        size = write(dump.encode_raw(arrays) if recipe.raw else dump.encode_npz(arrays))
-    else:
-        size = write(spz.encode(output, dataclasses.replace(recipe.spz, fractional_bits=bits), progress=progress))
-    clamped = {} if arrays else spz.clamped(nodes, threads)
-    ends = tuple(clamps.clamps(nodes, clamped))
-    seconds = {
-        "read": read_done - start,
-        "build": build_done - read_done,
-        "write": time.perf_counter() - build_done,
-    }
+        write = sink(target, overwrite=overwrite, make_parent=make_parent)
+        start = time.perf_counter()
+        scene = read_scene(source, threads=settings.output.threads, progress=progress)
+        if scene.tree is not None:
+            raise FormatError("it is a Level-of-Detail file already; --unlod writes its splats back out")
+        facts: dict[str, Any] = {"format": scene.format, "notes": scene.notes, "read": len(scene.splats)}
+        kept, facts["dropped"] = settings.selection.apply(
+            _recolored(scene.splats, settings.rgba).with_max_sh(settings.max_sh)
+        )
+        read_done = time.perf_counter()
+        facts |= {"splats": len(kept), "sh_degree": kept.sh_degree}
+        codec: Any = dump if settings.output.encoding else formats.writers(tree=True)[0].codec()
+        antialiased = scene.antialiased
+        # Before building, so that what does not fit is said at once.
+        codec.check(Scene(kept, antialiased=antialiased), settings.output)
+        jit.use_threads(settings.output.threads)
+        # The builder frees its input as it goes, if nobody else holds it: a third of the peak.
+        handed_over = [kept]
+        del scene, kept
+        nodes, tree = settings.builder()(handed_over.pop(), progress=progress)
+        levels = int(tree.depths().max()) + 1
+        build_done = time.perf_counter()
+        encoded = codec.encode(Scene(nodes, tree, antialiased), settings.output, progress=progress)
+        size = write(encoded)
+        clamps = encoded.clamps()
+        seconds = {
+            "read": read_done - start,
+            "build": build_done - read_done,
+            "write": time.perf_counter() - build_done,
+        }
     return Baked(
-        format=name,
-        read=total,
-        splats=count,
-        sh_degree=degree,
-        dropped=dropped,
-        method=recipe.method,
+        **facts,
+        method=settings.method,
         nodes=len(nodes),
         levels=levels,
         bytes=size,
-        version=None if arrays else recipe.spz.version,
-        fractional_bits=bits,
-        arrays={array: words.shape for array, words in arrays.items()},
-        clamped=clamped,
-        clamps=ends,
-        notes=notes,
+        version=encoded.header.get("version"),
+        fractional_bits=encoded.header.get("fractional_bits"),
+        arrays=dict(encoded.arrays),
+        clamped=clamps.splats,
+        clamps=clamps.ends,
         seconds={stage: round(value, 4) for stage, value in seconds.items()},
     )
 

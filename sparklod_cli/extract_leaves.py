@@ -1,44 +1,25 @@
-"""From a Level-of-Detail file back to its splats. What `sparklod build-lod --unlod` calls, and a program can call."""
+"""From a Level-of-Detail file back to its splats, which are the leaves of its tree."""
 
 from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from .codecs import ply, splat, spz
-from .io import Sink, read_scene
+from .codecs import formats
+from .codecs.encoded import EncodeOptions
+from .io import read_scene, sink
 from .model.scene import Scene
-from .support.defaults import DEFAULT_COMPRESSION, PLAIN_SUFFIXES, SPZ_VERSIONS
 from .support.errors import FormatError, memory_told
 from .support.progress import Progress, silent
 
 
 @dataclass(frozen=True)
-class Target:
-    """How to write.
-
-    Attributes:
-        suffix: one of `defaults.PLAIN_SUFFIXES`.
-        version, fractional_bits: of SPZ; None takes those of the input, which keeps its values as they are.
-        compression_level: of SPZ.
-        threads: to work on.
-    """
-
-    suffix: str = ".spz"
-    version: int | None = None
-    fractional_bits: int | None = None
-    compression_level: int = DEFAULT_COMPRESSION
-    threads: int = 1
-
-
-@dataclass(frozen=True)
-class Unbaked:
-    """What came of it.
+class Extracted:
+    """What was written.
 
     Attributes:
         format: of the input, for people.
@@ -56,50 +37,60 @@ class Unbaked:
     seconds: dict[str, float]
 
 
-def unlod(source: Path, write: Sink, target: Target, *, progress: Progress = silent) -> Unbaked:
-    """Reads the tree at `source` and hands its leaves to `write`, in their order, as a file of plain splats.
+def leaves_of(scene: Scene) -> Scene:
+    """The splats that the tree of a scene was built of, as a scene without a tree.
 
     Raises:
-        FormatError, OutputError: see `io.read_scene` and `write`; the file has no tree.
+        FormatError: it has no tree.
+    """
+    if scene.tree is None:
+        raise FormatError("it has no Level-of-Detail tree whose leaves could be written")
+    leaves = scene.splats.take(scene.tree.is_leaf)
+    # A leaf is an input splat. One whose opacity is above 1 comes from a writer that rounds up.
+    leaves = dataclasses.replace(leaves, opacity=np.minimum(leaves.opacity, np.float32(1)))
+    return dataclasses.replace(scene, splats=leaves, tree=None)
+
+
+def extract_leaves(
+    source: Path,
+    target: Path,
+    options: EncodeOptions,
+    *,
+    overwrite: bool = False,
+    make_parent: bool = False,
+    progress: Progress = silent,
+) -> Extracted:
+    """Reads the tree of a Level-of-Detail file and writes its leaves, in their order, as a file of plain splats.
+
+    Args:
+        source: a Level-of-Detail file; - is standard input.
+        target: its suffix tells the format, which is SPZ where it has none; - is standard output.
+        options: how to write; what is None is taken from the input, which keeps its values as they are.
+        overwrite: replace a file that exists.
+        make_parent: make the folder of the output if there is none.
+        progress: told of the stages.
+
+    Raises:
+        FormatError, OutputError: see `io.read_scene` and `io.sink`; the file has no tree.
         OutOfMemoryError: it does not fit into memory.
+        ValueError: no format of plain splats has that suffix.
     """
     with memory_told():
-        return _unlod(source, write, target, progress)
-
-
-def _unlod(source: Path, write: Sink, target: Target, progress: Progress) -> Unbaked:
-    start = time.perf_counter()
-    scene = read_scene(source, threads=target.threads, progress=progress)
-    if scene.tree is None:
-        raise FormatError("it has no Level-of-Detail tree that could be undone")
-    leaves = scene.splats.take(scene.tree.is_leaf)
-    read_done = time.perf_counter()
-    # A leaf is an input splat. One that is more than opaque comes from a writer that rounds up.
-    leaves = dataclasses.replace(leaves, opacity=np.minimum(leaves.opacity, np.float32(1)))
-    plain = Scene(leaves, antialiased=scene.antialiased, header=scene.header)
-    size = write(_encode(plain, target, progress))
-    seconds = {"read": read_done - start, "write": time.perf_counter() - read_done}
-    return Unbaked(
+        write = sink(target, overwrite=overwrite, make_parent=make_parent)
+        form = formats.writer(target.suffix.lower(), tree=False)
+        if form is None:
+            raise ValueError(f"no format that is written ends in {target.suffix}")
+        start = time.perf_counter()
+        scene = read_scene(source, threads=options.threads, progress=progress)
+        leaves = leaves_of(scene)
+        read_done = time.perf_counter()
+        size = write(form.codec().encode(leaves, options.like(scene.header), progress=progress))
+        seconds = {"read": read_done - start, "write": time.perf_counter() - read_done}
+    return Extracted(
         format=scene.format,
         nodes=len(scene.splats),
-        splats=len(leaves),
-        sh_degree=leaves.sh_degree,
+        splats=len(leaves.splats),
+        sh_degree=leaves.splats.sh_degree,
         bytes=size,
         seconds={stage: round(value, 4) for stage, value in seconds.items()},
     )
-
-
-def _encode(scene: Scene, target: Target, progress: Progress) -> Iterator[bytes]:
-    if target.suffix not in PLAIN_SUFFIXES:
-        raise ValueError(f"{target.suffix} is not one of {PLAIN_SUFFIXES}")
-    if target.suffix != ".spz":
-        codec = {".ply": ply, ".splat": splat}[target.suffix]
-        return codec.encode(scene, threads=target.threads, progress=progress)
-    version = target.version or scene.header["version"]
-    options = spz.Options(
-        version=version if version in SPZ_VERSIONS else max(SPZ_VERSIONS),
-        fractional_bits=scene.header["fractional_bits"] if target.fractional_bits is None else target.fractional_bits,
-        compression_level=target.compression_level,
-        threads=target.threads,
-    )
-    return spz.encode(scene, options, progress=progress)

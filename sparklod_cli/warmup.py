@@ -199,4 +199,4 @@ def _write_inputs(folder: Path) -> None:
     children[0], starts[0] = count, 1
     tree = Scene(root, LodTree(children, starts))
     write_whole(folder / "scene.ply", ply.encode(Scene(leaves)), overwrite=True)
-    write_whole(folder / "tree.spz", spz.encode(tree, spz.Options()), overwrite=True)
+    write_whole(folder / "tree.spz", spz.encode(tree), overwrite=True)

@@ -9,6 +9,7 @@ from ..model.scene import Scene
 from ..model.splats import Splats
 from ..support.errors import FormatError
 from . import spz
+from .encoded import EncodeOptions
 from .gpu import ext_splats, packed_splats
 
 
@@ -35,7 +36,7 @@ def after(through: str | None, file: Path, scene: Scene, threads: int = 1) -> Sp
     if through == "spz":
         try:
             # The bytes live for a moment only, so they need not be small.
-            data = b"".join(spz.encode(scene, spz.Options(compression_level=1, threads=threads)))
+            data = b"".join(spz.encode(scene, EncodeOptions(compression_level=1, threads=threads)))
         except FormatError as error:
             raise FormatError(f"{file}: {error}") from None
         return spz.decode(io.BytesIO(data), threads=threads).splats

@@ -6,10 +6,10 @@ versions 2 and 3. `docs/formats.md` lays the extension out byte by byte.
 
 from __future__ import annotations
 
+import functools
 import math
 import struct
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 from ..model.lod_tree import LodTree
 from ..model.scene import Scene
 from ..model.sh import notes_on_degree
-from ..model.splats import COLUMNS, FloatArray, Splats
+from ..model.splats import COLUMNS, Splats
 from ..support.defaults import (
-    DEFAULT_COMPRESSION,
     DEFAULT_SPZ_VERSION,
     MAX_FRACTIONAL_BITS,
     MAX_SH_DEGREE,
@@ -29,7 +28,8 @@ from ..support.defaults import (
 from ..support.errors import FormatError, MembersError, NotSplatsError, TreeError, TruncatedError, VersionError
 from ..support.parallel import chunks_of, for_chunks, ordered_map
 from ..support.progress import Progress, silent
-from . import compression, quantize
+from . import clamps, compression, quantize
+from .encoded import DEFAULTS, Encoded, EncodeOptions
 from .spz_layout import ANTIALIASED, EXTENSIONS, LOD, Layout, Stream, StreamRows
 from .stream import Read, rows_of, size_of
 
@@ -49,23 +49,6 @@ STEPS_A_SPLAT, SMALL_QUANTILE = 16, 0.01
 LAST_CODE = quantize.FIXED24_MAX - 1
 
 
-@dataclass(frozen=True)
-class Options:
-    """How to write.
-
-    Attributes:
-        version: 2 (rotations in 3 bytes) or 3 (in 4, ten times as exact).
-        fractional_bits: of positions, 0 to 24; None takes what suits the scene, see `fractional_bits`.
-        compression_level: 1 (fast) to 9 (small).
-        threads: to encode and compress with.
-    """
-
-    version: int = DEFAULT_SPZ_VERSION
-    fractional_bits: int | None = None
-    compression_level: int = DEFAULT_COMPRESSION
-    threads: int = 1
-
-
 def largest_fractional_bits(center: NDArray[np.float32]) -> int:
     """The most fractional bits, 0 to 24, with which every coordinate fits 24-bit fixed point.
 
@@ -82,45 +65,37 @@ def largest_fractional_bits(center: NDArray[np.float32]) -> int:
     return bits
 
 
-def fractional_bits(splats: Splats, options: Options) -> int:
-    """The fractional bits that these splats get with these options.
+def check(scene: Scene, options: EncodeOptions) -> None:
+    """Raises the `FormatError` that `encode` would raise of this scene, before a tree is built of it, say."""
+    _header_of(scene, options)
+
+
+def _header_of(scene: Scene, options: EncodeOptions) -> dict[str, int]:
+    """Version, fractional bits and flags that a scene gets.
 
     Raises:
         FormatError: a coordinate does not fit the fractional bits; the text names the most that would.
     """
-    if options.version not in SPZ_VERSIONS:
-        raise ValueError(f"SPZ version {options.version} is not one of {SPZ_VERSIONS}")
-    most = largest_fractional_bits(splats.center)
-    if options.fractional_bits is None:
-        return _enough_bits(splats, most)
-    if options.fractional_bits > most:
-        raise FormatError(
-            f"a coordinate does not fit {options.fractional_bits} fractional bits, at most {most} would do"
-        )
-    return options.fractional_bits
+    version = DEFAULT_SPZ_VERSION if options.version is None else options.version
+    if version not in SPZ_VERSIONS:
+        raise ValueError(f"SPZ version {version} is not one of {SPZ_VERSIONS}")
+    most = largest_fractional_bits(scene.splats.center)
+    bits = _enough_bits(scene, most) if options.fractional_bits is None else options.fractional_bits
+    if bits > most:
+        raise FormatError(f"a coordinate does not fit {bits} fractional bits, at most {most} would do")
+    flags = (ANTIALIASED if scene.antialiased else 0) | (LOD if scene.tree is not None else 0)
+    return {"version": version, "fractional_bits": bits, "flags": flags}
 
 
-def _enough_bits(splats: Splats, most: int) -> int:
-    """As many bits as the extent allows, up to where a step is far below the smallest splats.
+def _enough_bits(scene: Scene, most: int) -> int:
+    """As many bits as the extent allows, up to where a step is far below the smallest splats; of a tree, its leaves.
 
     Small splats are measured by the 1 % quantile of their largest scales; a step is at most 1/16 of that.
     """
-    small = float(np.quantile(splats.scale.max(axis=1), SMALL_QUANTILE))
+    scale = scene.splats.scale
+    largest = scale.max(axis=1) if scene.tree is None else scale[scene.tree.is_leaf].max(axis=1)
+    small = float(np.quantile(largest, SMALL_QUANTILE))
     return max(0, min(most, math.ceil(math.log2(STEPS_A_SPLAT / small))))
-
-
-def clamped(splats: Splats, threads: int = 1) -> dict[str, int]:
-    """How many splats have a value that its code cannot hold, by the column (scale, rgb, sh) where there are any."""
-    counts = {}
-    for name, (low, high) in quantize.CLAMPS.items():
-        column = getattr(splats, name).reshape(len(splats), -1)
-
-        def outside(part: slice, column: FloatArray = column, low: float = low, high: float = high) -> int:
-            values = column[part]
-            return int(np.count_nonzero(((values < low) | (values > high)).any(axis=1)))
-
-        counts[name] = sum(ordered_map(outside, chunks_of(len(splats)), threads))
-    return {name: count for name, count in counts.items() if count}
 
 
 def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> Scene:
@@ -186,22 +161,31 @@ def _column(splats: Splats, tree: LodTree | None, stream: Stream) -> NDArray[Any
     return column
 
 
-def encode(scene: Scene, options: Options, *, progress: Progress = silent) -> Iterator[bytes]:
-    """The bytes of a file, piece by piece: an LoD file where the scene has a tree, else a plain one.
+def encode(scene: Scene, options: EncodeOptions = DEFAULTS, *, progress: Progress = silent) -> Encoded:
+    """A file: an LoD file where the scene has a tree, else a plain one.
 
     The same scene and options give the same bytes for any number of threads.
 
     Raises:
         FormatError: a coordinate does not fit the fractional bits; the text names the most that would.
     """
-    splats, tree = scene.splats, scene.tree
-    bits = fractional_bits(splats, options)
-    flags = (ANTIALIASED if scene.antialiased else 0) | (LOD if tree is not None else 0)
-    layout = Layout(options.version, len(splats), splats.sh_degree, bits, flags)
-    data = np.empty(HEADER.size + layout.total, np.uint8)
-    data[: HEADER.size] = np.frombuffer(
-        HEADER.pack(MAGIC, layout.version, layout.count, layout.sh_degree, bits, flags, 0), np.uint8
+    header = _header_of(scene, options)
+    layout = Layout(
+        header["version"], len(scene.splats), scene.splats.sh_degree, header["fractional_bits"], header["flags"]
     )
+    return Encoded(
+        _pieces(scene, layout, options, progress),
+        header,
+        clamps=functools.partial(clamps.find, scene.splats, options.threads),
+    )
+
+
+def _pieces(scene: Scene, layout: Layout, options: EncodeOptions, progress: Progress) -> Iterator[bytes]:
+    data = np.empty(HEADER.size + layout.total, np.uint8)
+    head = HEADER.pack(
+        MAGIC, layout.version, layout.count, layout.sh_degree, layout.fractional_bits, layout.flags, 0
+    )
+    data[: HEADER.size] = np.frombuffer(head, np.uint8)
     codes, at = {}, HEADER.size
     for stream in layout.streams():
         codes[stream] = data[at : at + stream.size * layout.count].reshape(layout.count, stream.size)
@@ -209,7 +193,7 @@ def encode(scene: Scene, options: Options, *, progress: Progress = silent) -> It
 
     def fill(part: slice) -> None:
         for stream, out in codes.items():
-            values = np.ascontiguousarray(stream.encode(_column(splats, tree, stream)[part]))
+            values = np.ascontiguousarray(stream.encode(_column(scene.splats, scene.tree, stream)[part]))
             out[part] = values.view(np.uint8).reshape(-1, stream.size)
 
     for_chunks(fill, layout.count, options.threads, lambda done: progress("encoding", done, layout.count, "splat"))

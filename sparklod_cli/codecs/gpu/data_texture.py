@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...model.gaussian import covariance
+from ...model.scene import Scene
 from ...model.splats import FloatArray, Splats
 from ...support.errors import FormatError
 from ...support.parallel import for_chunks
@@ -31,6 +32,11 @@ assert SPLAT.itemsize == 32
 
 #: What the covariance is multiplied by, and the largest number that a float16 holds of the product.
 GAIN, LARGEST = 4, 65504
+
+
+def arrays(scene: Scene, *, threads: int = 1) -> dict[str, Words]:
+    """The arrays of a scene."""
+    return pack(scene.splats, threads=threads)
 
 
 def pack(splats: Splats, *, threads: int = 1) -> dict[str, Words]:

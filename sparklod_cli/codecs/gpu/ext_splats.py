@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...model.scene import Scene
 from ...model.splats import FloatArray, Splats
 from ...support.parallel import for_chunks
 from .. import octahedral
@@ -41,6 +42,11 @@ EXPONENT_BIAS, EXPONENT_MOST = 15, 31
 #: Bits of a word of SH: of r g b the byte of magnitude and the sign, and the exponent.
 _BITS = tuple((np.uint32(byte), np.uint32(sign)) for byte, sign in ((0, 24), (8, 25), (16, 26)))
 _EXPONENT = np.uint32(27)
+
+
+def arrays(scene: Scene, *, threads: int = 1) -> dict[str, Words]:
+    """The arrays of a scene."""
+    return pack(scene.splats, threads=threads)
 
 
 def pack(splats: Splats, *, threads: int = 1) -> dict[str, Words]:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ...model.gaussian import spark_size
 from ...model.lod_tree import MAX_CHILDREN, LodTree
+from ...model.scene import Scene
 from ...model.splats import FloatArray, Splats
 from ...support.errors import FormatError
 from ...support.parallel import for_chunks
@@ -25,6 +26,13 @@ NODE = np.dtype(
     ]
 )
 assert NODE.itemsize == 16
+
+
+def arrays(scene: Scene, *, threads: int = 1) -> dict[str, Words]:
+    """The array of a scene that is a tree."""
+    if scene.tree is None:
+        raise ValueError("the scene has no tree")
+    return pack(scene.splats, scene.tree, threads=threads)
 
 
 def pack(

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...model.scene import Scene
 from ...model.sh import COEFFICIENTS
 from ...model.splats import FloatArray, Splats
 from ...support.errors import FormatError
@@ -78,6 +79,11 @@ class Encoding:
 
 
 DEFAULT = Encoding()
+
+
+def arrays(scene: Scene, *, threads: int = 1) -> dict[str, Words]:
+    """The arrays of a scene, with LoD opacity if it is a tree."""
+    return pack(scene.splats, Encoding(lod_opacity=scene.tree is not None), threads=threads)
 
 
 def pack(splats: Splats, encoding: Encoding = DEFAULT, *, threads: int = 1) -> dict[str, Words]:
