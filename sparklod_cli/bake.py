@@ -22,9 +22,10 @@ from .model.lod_tree import LodTree
 from .model.scene import Scene
 from .model.selection import Selection
 from .model.splats import Splats
+from .model.transforms import Transform
 from .support import jit
 from .support.defaults import DEFAULT_BASE, DEFAULT_GROWTH, MAX_SH_DEGREE
-from .support.errors import FormatError, memory_told
+from .support.errors import FormatError, InvalidSplatsError, memory_told
 from .support.progress import Progress, silent
 
 
@@ -38,6 +39,7 @@ class BakeSettings:
         growth: of quality, the largest number of nodes for each leaf, 1.05 to 2.0.
         max_sh: the highest SH degree that is kept.
         selection: which splats are kept; its coordinates are those of the input.
+        transform: turns, scales and moves the splats that are kept.
         rgba: a file of colours and opacities that replace the splats' own, see `io.read_rgba`.
         output: how to write; with an `encoding`, arrays instead of SPZ. `threads` is for all stages.
     """
@@ -47,6 +49,7 @@ class BakeSettings:
     growth: float = DEFAULT_GROWTH
     max_sh: int = MAX_SH_DEGREE
     selection: Selection = field(default_factory=Selection)
+    transform: Transform = field(default_factory=Transform)
     rgba: Path | None = None
     output: EncodeOptions = field(default_factory=EncodeOptions)
 
@@ -127,6 +130,7 @@ def bake(
         kept, facts["dropped"] = settings.selection.apply(
             _recolored(scene.splats, settings.rgba).with_max_sh(settings.max_sh)
         )
+        kept = _transformed(kept, settings.transform)
         read_done = time.perf_counter()
         facts |= {"splats": len(kept), "sh_degree": kept.sh_degree}
         codec: Any = dump if settings.output.encoding else formats.writers(tree=True)[0].codec()
@@ -161,6 +165,20 @@ def bake(
         clamps=clamps.ends,
         seconds={stage: round(value, 4) for stage, value in seconds.items()},
     )
+
+
+def _transformed(splats: Splats, transform: Transform) -> Splats:
+    """Splats turned, scaled and moved.
+
+    Raises:
+        InvalidSplatsError: one leaves the range of float32.
+    """
+    turned = transform.apply(splats)
+    if turned is not splats and turned.invalid():
+        raise InvalidSplatsError(
+            "scaled and moved like this, it leaves the range of float32; give a smaller --scale or --translate"
+        )
+    return turned
 
 
 def _recolored(splats: Splats, rgba: Path | None) -> Splats:

@@ -82,7 +82,7 @@ JOBS = {
     ),
     "render": Job(
         (
-            *("bands.count_fragments", "bands.draw_discs", "cut.find_cut", "cut_statistics.measure", "project.arrange"),
+            *("bands.count_fragments", "bands.draw_discs", "cut.find_cut", "project.arrange"),
             *("project.project", "raster.draw_tiles", "raster.sort_into_tiles"),
         ),
         (

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
+from sparklod_cli.world import Placement, World, read_world
 
 from sparklod_cli import bake
-from sparklod_cli import io as files
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.cameras.path import CameraPath
 from sparklod_cli.cameras.pose import look_at
@@ -38,7 +38,6 @@ from sparklod_cli.render.settings import RasterSettings
 from sparklod_cli.simulation.frames import LodSettings
 from sparklod_cli.support.errors import SparklodError
 from sparklod_cli.tables.columns import Row
-from sparklod_cli.world import Placement, World, read_world
 from tests.conftest import FIXTURES
 
 VIEWER = LodSettings(1, Cones(), pixel_scale_limit=0.0)
@@ -49,7 +48,7 @@ HOW = ComparisonSettings(BACKENDS["numba"].draw, RasterSettings())
 def world(tmp_path_factory: pytest.TempPathFactory) -> World:
     """A few hundred splats with SH, as a tree, twice."""
     baked = tmp_path_factory.mktemp("compare") / "sh3.spz"
-    bake.bake(FIXTURES / "sh3.ply", lambda pieces: files.write_whole(baked, pieces, overwrite=True), bake.Recipe())
+    bake.bake(FIXTURES / "sh3.ply", baked, bake.BakeSettings())
     there = np.eye(4)
     there[:3, 3] = 3, 0, 1
     return read_world([Placement(baked, "here"), Placement(baked, "there", there)], columns=ALL)

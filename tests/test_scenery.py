@@ -6,6 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from sparklod_cli.scenery import Scenery, read_scenery
+from sparklod_cli.world import Placement, read_world
 
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.cameras.framing import COVERED, covered, fitted
@@ -16,10 +18,8 @@ from sparklod_cli.model.gaussian import moved
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.render.color_by import values_of
 from sparklod_cli.render.renderer import Renderer, RenderSettings
-from sparklod_cli.scenery import Scenery, read_scenery
 from sparklod_cli.simulation.frames import LodSettings, Simulation
 from sparklod_cli.support.errors import FormatError, InvalidSplatsError
-from sparklod_cli.world import Placement, read_world
 from tests.conftest import FIXTURES
 from tests.render.sceneries import camera
 from tests.scenes import random_splats

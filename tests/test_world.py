@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from sparklod_cli.world import Placement, World, names_of, read_world
 
 from sparklod_cli import world
 from sparklod_cli.io import read_scene
@@ -18,7 +19,6 @@ from sparklod_cli.lod.traversal import CHUNK_NODES, Cones, Frustum
 from sparklod_cli.model.gaussian import moved, placed, spark_size
 from sparklod_cli.model.splats import COLUMNS
 from sparklod_cli.support.errors import FormatError, SparklodError, TreeError
-from sparklod_cli.world import Placement, World, names_of, read_world
 from tests.conftest import FIXTURES
 from tests.lod.forests import transform
 from tests.references import gaussians

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from sparklod_cli.world import Placement
+from sparklod_cli.world_file import KEYS, WorldFileError, read_placements
 
 from sparklod_cli.lod.traversal import Cones, Frustum
 from sparklod_cli.support.errors import FormatError, SparklodError
-from sparklod_cli.world import Placement
-from sparklod_cli.world_file import KEYS, WorldFileError, read_placements
 
 
 def written(path: Path, *instances: object) -> list[Placement]:

@@ -54,7 +54,7 @@ def find(splats: Splats, threads: int = 1) -> Clamps:
         def look(part: slice, column: FloatArray = column, low: float = low, high: float = high) -> tuple[float, ...]:
             least, most = column[part].min(axis=1), column[part].max(axis=1)
             below, above = least < low, most > high
-            counted = (np.count_nonzero(mask) for mask in (below | above, below, above))
+            counted = (int(np.count_nonzero(mask)) for mask in (below | above, below, above))
             return *counted, float(least.min()), float(most.max())
 
         either, below, above, least, most = zip(*ordered_map(look, chunks_of(len(splats)), threads), strict=True)

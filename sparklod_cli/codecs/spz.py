@@ -26,7 +26,7 @@ from ..support.defaults import (
     SPZ_VERSIONS,
 )
 from ..support.errors import FormatError, MembersError, NotSplatsError, TreeError, TruncatedError, VersionError
-from ..support.parallel import chunks_of, for_chunks, ordered_map
+from ..support.parallel import for_chunks, ordered_map
 from ..support.progress import Progress, silent
 from . import clamps, compression, quantize
 from .encoded import DEFAULTS, Encoded, EncodeOptions
@@ -67,10 +67,10 @@ def largest_fractional_bits(center: NDArray[np.float32]) -> int:
 
 def check(scene: Scene, options: EncodeOptions) -> None:
     """Raises the `FormatError` that `encode` would raise of this scene, before a tree is built of it, say."""
-    _header_of(scene, options)
+    header_of(scene, options)
 
 
-def _header_of(scene: Scene, options: EncodeOptions) -> dict[str, int]:
+def header_of(scene: Scene, options: EncodeOptions) -> dict[str, int]:
     """Version, fractional bits and flags that a scene gets.
 
     Raises:
@@ -169,7 +169,7 @@ def encode(scene: Scene, options: EncodeOptions = DEFAULTS, *, progress: Progres
     Raises:
         FormatError: a coordinate does not fit the fractional bits; the text names the most that would.
     """
-    header = _header_of(scene, options)
+    header = header_of(scene, options)
     layout = Layout(
         header["version"], len(scene.splats), scene.splats.sh_degree, header["fractional_bits"], header["flags"]
     )
@@ -182,9 +182,7 @@ def encode(scene: Scene, options: EncodeOptions = DEFAULTS, *, progress: Progres
 
 def _pieces(scene: Scene, layout: Layout, options: EncodeOptions, progress: Progress) -> Iterator[bytes]:
     data = np.empty(HEADER.size + layout.total, np.uint8)
-    head = HEADER.pack(
-        MAGIC, layout.version, layout.count, layout.sh_degree, layout.fractional_bits, layout.flags, 0
-    )
+    head = HEADER.pack(MAGIC, layout.version, layout.count, layout.sh_degree, layout.fractional_bits, layout.flags, 0)
     data[: HEADER.size] = np.frombuffer(head, np.uint8)
     codes, at = {}, HEADER.size
     for stream in layout.streams():

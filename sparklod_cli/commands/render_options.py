@@ -17,7 +17,7 @@ from .usage import exclude, is_given
 
 if TYPE_CHECKING:
     from ..images.pixels import Color
-    from ..render.renderer import RenderSettings
+    from ..render.settings import RenderSettings
 
 COLORS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "transparent": None}
 
@@ -166,7 +166,7 @@ def look_options(command: Command) -> Command:
 
 def manner_from(ctx: click.Context, settings: Mapping[str, Any]) -> RenderSettings:
     """The manner that the options of `look_options` ask for."""
-    from ..render.renderer import RenderSettings
+    from ..render.settings import RenderSettings
 
     style, by = settings["style"], settings["color_by"]
     if not settings["near"] < settings["far"]:
@@ -189,7 +189,7 @@ def manner_from(ctx: click.Context, settings: Mapping[str, Any]) -> RenderSettin
     if options and settings["backend"] != "osmesa":
         raise click.UsageError("--sorting and --sort-throttle only mean something with --backend osmesa")
     return RenderSettings(
-        look=RasterSettings(settings["near"], settings["far"], settings["profile"], settings["sort"]),
+        raster=RasterSettings(settings["near"], settings["far"], settings["profile"], settings["sort"]),
         style=style,
         backend=settings["backend"],
         color_by=by,

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 from fixtures import by_hand
 from sparklod_cli.codecs import clamps, quantize, spz
+from sparklod_cli.codecs.encoded import EncodeOptions
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.support.errors import FormatError
@@ -119,7 +120,7 @@ def test_a_tree_is_read() -> None:
 @pytest.mark.parametrize("threads", [2, 5])
 def test_threads_do_not_change_a_file(version: int, threads: int) -> None:
     scene = Scene(random_splats(40_000, sh_degree=1))  # more than two chunks of rows and five gzip blocks
-    one, many = (b"".join(spz.encode(scene, spz.Options(version=version, threads=count))) for count in (1, threads))
+    one, many = (b"".join(spz.encode(scene, EncodeOptions(version=version, threads=count))) for count in (1, threads))
     assert one == many
     decoded = [spz.decode(io.BytesIO(one), threads=count).splats for count in (1, threads)]
     for column in COLUMNS:
@@ -137,7 +138,7 @@ def splats_with(*, reach: float = 1.0, scale: float = 0.01, count: int = 200) ->
 
 
 def bits_of(splats: Splats, fractional_bits: int | None = None) -> int | None:
-    return spz.fractional_bits(splats, spz.Options(fractional_bits=fractional_bits))
+    return spz.header_of(Scene(splats), EncodeOptions(fractional_bits=fractional_bits))["fractional_bits"]
 
 
 @given(reach=st.floats(2.0**-10, spz.LAST_CODE, width=32))
@@ -146,7 +147,7 @@ def test_the_most_bits_are_the_most_that_fit(reach: float) -> None:
     bits = spz.largest_fractional_bits(splats.center)
     assert round(reach * 2.0**bits) <= spz.LAST_CODE == 2**23 - 2
     assert bits == 24 or round(reach * 2.0 ** (bits + 1)) > spz.LAST_CODE
-    back = spz.decode(io.BytesIO(b"".join(spz.encode(Scene(splats), spz.Options(fractional_bits=bits)))))
+    back = spz.decode(io.BytesIO(b"".join(spz.encode(Scene(splats), EncodeOptions(fractional_bits=bits)))))
     assert np.abs(back.splats.center.astype(np.float64) - splats.center).max() <= 0.5 * 2.0**-bits
 
 
@@ -190,7 +191,7 @@ def test_what_no_bits_hold_is_refused() -> None:
 def test_only_versions_2_and_3_are_written() -> None:
     for version in (1, 4):
         with pytest.raises(ValueError, match="is not one of"):
-            spz.fractional_bits(random_splats(1), spz.Options(version=version))
+            spz.header_of(Scene(random_splats(1)), EncodeOptions(version=version))
 
 
 def test_what_is_clamped_is_counted_by_splat() -> None:
@@ -199,21 +200,20 @@ def test_what_is_clamped_is_counted_by_splat() -> None:
     low, high = math.exp(-10 - 1 / 32), math.exp(255.5 / 16 - 10)
     splats.scale[0] = low * 1.001  # rounds to the last code that is in
     splats.scale[1] = high * 0.999
-    assert spz.clamped(splats) == {}
+    assert clamps.find(splats) == clamps.Clamps()
     splats.scale[2, 1] = low * 0.999
     splats.scale[3, 2] = high * 1.001
     splats.scale[4] = 0  # a splat counts once, however many of its axes are out
     splats.rgb[5] = -0.5
     splats.sh[6:, 2] = 1.1
-    assert spz.clamped(splats, threads=2) == {"scale": 3, "rgb": 1, "sh": 2}
-    found = {(at.column, at.above): (at.splats, at.farthest) for at in clamps.clamps(splats, ["scale", "rgb", "sh"])}
+    assert clamps.find(splats, threads=2).splats == {"scale": 3, "rgb": 1, "sh": 2}
+    found = {(at.column, at.above): (at.splats, at.farthest) for at in clamps.find(splats).ends}
     assert found == {
         ("scale", False): (2, 0.0),
         ("scale", True): (1, pytest.approx(high * 1.001)),
         ("rgb", False): (1, -0.5),
         ("sh", True): (2, pytest.approx(1.1)),
     }
-    assert clamps.clamps(splats, []) == []
 
 
 @pytest.mark.parametrize(("name", "decode"), [("scale", quantize.decode_log_scale), ("rgb", quantize.decode_color)])

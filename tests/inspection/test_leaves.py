@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from sparklod_cli.cli import run
 from sparklod_cli.codecs import spz
+from sparklod_cli.codecs.encoded import EncodeOptions
 from sparklod_cli.inspection import leaves
 from sparklod_cli.inspection.findings import Finding
 from sparklod_cli.inspection.leaves import check
@@ -82,7 +83,7 @@ def tree_of(splats: Splats, **options: int) -> Scene:
 
 
 def coded(scene: Scene, **options: int) -> Scene:
-    return spz.decode(BytesIO(b"".join(spz.encode(scene, spz.Options(**options)))))
+    return spz.decode(BytesIO(b"".join(spz.encode(scene, EncodeOptions(**options)))))
 
 
 @given(st.integers(1, 60), st.integers(0, 24), st.integers(0, 3), st.integers(0, 2**32 - 1))

@@ -12,6 +12,7 @@ import pytest
 
 from sparklod_cli.cli import run
 from sparklod_cli.codecs import ply, splat, spz
+from sparklod_cli.codecs.encoded import EncodeOptions
 from sparklod_cli.inspection import values
 from sparklod_cli.inspection.report import Wanted, inspect
 from sparklod_cli.inspection.values import MAIN, PERCENTILES, QUANTITIES, check, examine, names_of, quantity
@@ -250,7 +251,7 @@ def test_the_bounds_are_said_of_scenes_as_they_are_written(tmp_path: Path) -> No
     splats = random_splats(50)
     splats.scale[:10] = 1e-6
     path = tmp_path / "scene.spz"
-    path.write_bytes(b"".join(spz.encode(Scene(splats), spz.Options())))
+    path.write_bytes(b"".join(spz.encode(Scene(splats), EncodeOptions())))
     report, _ = inspect(path, Wanted(check=True))
     assert [(found.code, found.count) for found in report.findings or []] == [("values.scale-clamped", 10)]
     path.write_bytes(b"".join(ply.encode(Scene(splats))))

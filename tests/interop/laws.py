@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sparklod_cli.codecs import spz
+from sparklod_cli.codecs.encoded import EncodeOptions
 from sparklod_cli.model.gaussian import lod_opacity
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
@@ -127,7 +128,7 @@ def check_sh(spark: Spark, data: bytes, splats: Splats) -> None:
     within(got, sh, spz_step / 2 + 1 / 256 + packed_step / 2 + TINY)
 
 
-def check(spark: Spark, scene: Scene, options: spz.Options) -> ExtSplats:
+def check(spark: Spark, scene: Scene, options: EncodeOptions) -> ExtSplats:
     """All of the above, for the file that `spz.encode` makes of a scene."""
     data = b"".join(spz.encode(scene, options))
     raw = gzip.decompress(data)

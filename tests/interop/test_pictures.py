@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from sparklod_cli.codecs import spz
+from sparklod_cli.codecs.encoded import EncodeOptions
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod import quick
 from sparklod_cli.model.scene import Scene
@@ -42,7 +43,7 @@ def demo() -> Splats:
 
 def written(folder: Path, scene: Scene) -> Path:
     path = folder / "scene.spz"
-    path.write_bytes(b"".join(spz.encode(scene, spz.Options())))
+    path.write_bytes(b"".join(spz.encode(scene, EncodeOptions())))
     return path
 
 

@@ -7,9 +7,9 @@ from functools import cache
 import numpy as np
 import pytest
 
-from sparklod_cli.bake import BUILDERS
-from sparklod_cli.codecs import spz
+from sparklod_cli.codecs.encoded import EncodeOptions
 from sparklod_cli.io import read_scene
+from sparklod_cli.lod.builders import BUILDERS
 from sparklod_cli.model.scene import Scene
 from tests.conftest import real_scene
 from tests.interop import laws
@@ -18,7 +18,7 @@ from tests.interop.spark import Spark
 
 @cache
 def baked(name: str, method: str = "quick") -> Scene:
-    return Scene(*BUILDERS[method][0].build(read_scene(real_scene(name)).splats))
+    return Scene(*BUILDERS[method].load().build(read_scene(real_scene(name)).splats))
 
 
 @pytest.mark.parametrize("version", [2, 3])
@@ -29,7 +29,7 @@ def baked(name: str, method: str = "quick") -> Scene:
 def test_spark_reads_the_tree_of_a_real_scene_as_it_was_baked(
     spark: Spark, name: str, method: str, version: int
 ) -> None:
-    laws.check(spark, baked(name, method), spz.Options(version=version, threads=2))
+    laws.check(spark, baked(name, method), EncodeOptions(version=version, threads=2))
 
 
 @pytest.mark.parametrize("name", ["biker.ply", "playbot-125k.ply"])

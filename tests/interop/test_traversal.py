@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sparklod_cli.bake import BUILDERS
 from sparklod_cli.codecs.gpu import ext_splats, lod_tree
 from sparklod_cli.codecs.gpu.lod_tree import Nodes
 from sparklod_cli.io import read_scene
+from sparklod_cli.lod.builders import BUILDERS
 from sparklod_cli.lod.traversal import CHUNK_NODES, Cones, Cut, Forest, Instance, Traversal, View, pixel_limit, views_of
 from tests.conftest import FIXTURES, real_scene
 from tests.interop.spark import NODE, Spark
@@ -59,7 +59,7 @@ class Tree:
 @cache
 def baked(path: Path, method: str = "quick") -> Tree:
     """Our tree of a scene, measured as Spark does: what it holds of the splats, after their coding."""
-    splats, tree = BUILDERS[method][0].build(read_scene(path).splats)
+    splats, tree = BUILDERS[method].load().build(read_scene(path).splats)
     return Tree.of(lod_tree.pack(ext_splats.unpack(ext_splats.pack(splats)), tree)["lod_tree"])
 
 

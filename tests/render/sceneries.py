@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from sparklod_cli.scenery import Scenery, Source
+from sparklod_cli.world import Placement
 
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.model.splats import Splats
-from sparklod_cli.scenery import Scenery, Source
-from sparklod_cli.world import Placement
 
 
 def balls(*centers: tuple[float, float, float], size: float = 0.3, opacity: float = 1.0, rgb: object = 1.0) -> Splats:

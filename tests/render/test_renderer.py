@@ -7,13 +7,13 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
+from sparklod_cli.scenery import Scenery
 
 from sparklod_cli.render.backends import BACKENDS
 from sparklod_cli.render.renderer import Drawn, Renderer, RenderSettings
 from sparklod_cli.render.settings import RasterSettings
 from sparklod_cli.render.shading import show
 from sparklod_cli.render.styles import BILLBOARD_ALPHA
-from sparklod_cli.scenery import Scenery
 from sparklod_cli.support.defaults import COLOR_BY, STYLES
 from sparklod_cli.support.errors import SparklodError
 from tests.render.sceneries import balls, camera, plain

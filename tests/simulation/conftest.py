@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from sparklod_cli.world import Placement, World, read_world
 
 from sparklod_cli.lod.traversal import Frustum
-from sparklod_cli.world import Placement, World, read_world
 from tests.lod.forests import transform
 from tests.simulation.worlds import HAND, TOWN
 

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from sparklod_cli.world import TOTAL, World
 
 from sparklod_cli.cameras.path import CameraPath
 from sparklod_cli.simulation.columns import COLUMNS
 from sparklod_cli.simulation.frames import LodSettings, Simulation
 from sparklod_cli.tables.columns import Row
-from sparklod_cli.world import TOTAL, World
 from tests.simulation.worlds import OF_THE_PAST, SPARK, around, camera, path_of, resting, rows_of, viewers, without
 
 #: Cells that only the row of all instances has.

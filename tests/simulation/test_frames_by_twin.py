@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from sparklod_cli.world import Placement, Tree, World
 
 from sparklod_cli.lod.traversal import Forest, Frustum, Instance
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.simulation.frames import LodSettings, Simulation
-from sparklod_cli.world import Placement, Tree, World
 from tests.lod.forests import random_tree, transform
 from tests.references import frames as twin
 from tests.scenes import random_splats

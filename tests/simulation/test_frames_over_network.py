@@ -6,10 +6,10 @@ import math
 from typing import Any
 
 import pytest
+from sparklod_cli.world import Placement, World, read_world
 
 from sparklod_cli.simulation.frames import LodSettings
 from sparklod_cli.simulation.streaming import Network
-from sparklod_cli.world import Placement, World, read_world
 from tests.simulation.worlds import HAND, OF_THE_PAST, SPARK, TOWN, around, path_of, resting, rows_of, without
 
 

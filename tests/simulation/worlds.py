@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+from sparklod_cli.world import World
 
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.cameras.path import CameraPath
@@ -14,7 +15,6 @@ from sparklod_cli.lod.traversal import Cones, Frustum
 from sparklod_cli.simulation.frames import LodSettings, Simulation
 from sparklod_cli.simulation.streaming import Network
 from sparklod_cli.tables.columns import Row
-from sparklod_cli.world import World
 from tests.conftest import FIXTURES
 
 TOWN, HAND = FIXTURES / "traverse" / "town.spz", FIXTURES / "golden" / "hand-tree-v3.spz"

@@ -5,8 +5,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import Any
 
-#: By the name that --encoding takes, the module in this package, with `arrays(scene, *, threads)`, which gives the words
-#: of a tree as uint32 arrays by name; docs/formats.md lays them out.
+#: By the name that --encoding takes, a module of this package. Its `arrays(scene, *, threads)` gives the words of a
+#: tree as uint32 arrays by name; docs/formats.md lays them out.
 ENCODINGS = {"packed": "packed_splats", "ext": "ext_splats", "lodtree": "lod_tree", "texture": "data_texture"}
 
 #: What a file of these arrays is called, and one of their words alone; the latter may have no suffix, too.

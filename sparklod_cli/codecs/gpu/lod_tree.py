@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,6 +10,7 @@ from numpy.typing import NDArray
 
 from ...model.gaussian import spark_size
 from ...model.lod_tree import MAX_CHILDREN, LodTree
+from ...model.nodes import Nodes
 from ...model.scene import Scene
 from ...model.splats import FloatArray, Splats
 from ...support.errors import FormatError
@@ -65,21 +65,6 @@ def pack(
 
     for_chunks(encode, len(splats), threads, lambda _: None)
     return {"lod_tree": words}
-
-
-@dataclass(frozen=True)
-class Nodes:
-    """What a packed tree holds.
-
-    Attributes:
-        center: (N, 3) float32 world units.
-        size: (N,) float32 world units.
-        tree: (N,) links; not validated.
-    """
-
-    center: FloatArray
-    size: FloatArray
-    tree: LodTree
 
 
 def unpack(arrays: Mapping[str, NDArray[Any]]) -> Nodes:

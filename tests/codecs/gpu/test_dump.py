@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 
 from sparklod_cli.cli import run
-from sparklod_cli.codecs.gpu import dump
+from sparklod_cli.codecs.gpu.encodings import ENCODINGS, layout
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod import quick
 from sparklod_cli.model.scene import Scene
-from sparklod_cli.support.defaults import ENCODINGS
 from tests.conftest import FIXTURES
 
 SCENE = FIXTURES / "sh3.ply"
@@ -24,12 +23,17 @@ ARRAYS = {
 }
 
 
+def packed(encoding: str) -> dict[str, np.ndarray]:
+    """The arrays that the command should write of `SCENE`."""
+    return layout(encoding).arrays(baked())
+
+
 def baked() -> Scene:
     return Scene(*quick.build(read_scene(SCENE).splats))
 
 
 def test_every_encoding_can_be_had() -> None:
-    assert set(ENCODINGS) == set(dump.PACKERS) == {*ARRAYS, "texture"}
+    assert set(ENCODINGS) == {*ARRAYS, "texture"}
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
@@ -40,7 +44,7 @@ def test_an_npz_has_the_arrays_that_the_codec_packs(
     assert run(command) == 0
     record = json.loads(capsys.readouterr().out)
     path = tmp_path / "sh3-lod.npz"
-    nodes, expected = record["nodes"], dump.pack(baked(), encoding)
+    nodes, expected = record["nodes"], packed(encoding)
     with np.load(path) as file:
         assert set(file) == set(expected) == set(record["arrays"])
         for name, words in expected.items():
@@ -63,7 +67,7 @@ def test_an_npz_has_the_arrays_that_the_codec_packs(
 def test_a_bin_has_the_words_of_all_arrays_one_after_the_other(encoding: str, tmp_path: Path) -> None:
     path = tmp_path / "scene.bin"
     assert run(["build-lod", str(SCENE), "--encoding", encoding, "-o", str(path)]) == 0
-    expected = np.concatenate([words.ravel() for words in dump.pack(baked(), encoding).values()])
+    expected = np.concatenate([words.ravel() for words in packed(encoding).values()])
     np.testing.assert_array_equal(np.fromfile(path, "<u4"), expected)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sparklod_cli.io import read_scene
-from sparklod_cli.support.defaults import METHODS
+from sparklod_cli.lod.builders import METHODS
 from tests.commands.build_lod.runs import build
 from tests.conftest import FIXTURES
 
