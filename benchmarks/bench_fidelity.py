@@ -27,7 +27,6 @@ from sparklod_cli.cameras.framing import framing
 from sparklod_cli.cameras.generators import orbit
 from sparklod_cli.cameras.path import GENERATED, cameras_of
 from sparklod_cli.codecs import spz
-from sparklod_cli.codecs.encoded import EncodeOptions
 from sparklod_cli.codecs.gpu import ext_splats, lod_tree
 from sparklod_cli.codecs.gpu.lod_tree import Nodes
 from sparklod_cli.compare import on_background
@@ -206,7 +205,7 @@ def ours(splats: Splats, method: str, arguments: argparse.Namespace) -> Built:
 
 def as_written(scene: Scene) -> tuple[Splats, LodTree]:
     """A tree after its coding as SPZ, with the options of `build-lod`."""
-    data = b"".join(spz.encode(scene, EncodeOptions(threads=processors())))
+    data = b"".join(spz.encode(scene, threads=processors()))
     held = spz.decode(io.BytesIO(data), threads=processors())
     assert held.tree is not None
     return held.splats, held.tree

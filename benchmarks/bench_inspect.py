@@ -15,7 +15,6 @@ from bench_build import MEASURED, machine
 from scenes import load, tiled
 
 from sparklod_cli.codecs import spz
-from sparklod_cli.codecs.encoded import EncodeOptions
 from sparklod_cli.io import write_whole
 from sparklod_cli.lod import quick
 from sparklod_cli.model.scene import Scene
@@ -80,7 +79,7 @@ def bake(source: Splats, nodes: int, path: Path) -> tuple[int, int]:
     growth = len(quick.build(tiled(source.with_max_sh(0), sample))[1]) / sample
     leaves = round(nodes / growth)
     splats, tree = quick.build(tiled(source, leaves))
-    write_whole(path, spz.encode(Scene(splats, tree), EncodeOptions(threads=processors())), overwrite=True)
+    write_whole(path, spz.encode(Scene(splats, tree), threads=processors()), overwrite=True)
     return leaves, len(tree)
 
 

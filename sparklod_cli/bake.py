@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from .codecs import formats
-from .codecs.clamps import Clamp
-from .codecs.encoded import EncodeOptions
+from .codecs import clamps, spz
+from .codecs.clamps import Clamp, Clamps
 from .codecs.gpu import dump
-from .io import read_rgba, read_scene, sink
+from .codecs.options import WriteOptions
+from .io import Sink, read_rgba, read_scene, sink
 from .lod.builders import BUILDERS, METHODS
 from .model.lod_tree import LodTree
 from .model.scene import Scene
@@ -41,7 +41,9 @@ class BakeSettings:
         selection: which splats are kept; its coordinates are those of the input.
         transform: turns, scales and moves the splats that are kept.
         rgba: a file of colours and opacities that replace the splats' own, see `io.read_rgba`.
-        output: how to write; with an `encoding`, arrays instead of SPZ. `threads` is for all stages.
+        spz: how to write SPZ.
+        encoding: of `codecs.gpu.table.ENCODINGS`, to write arrays in that layout instead of SPZ.
+        raw: write their words alone, rather than as .npz.
     """
 
     method: str = METHODS[0]
@@ -51,7 +53,9 @@ class BakeSettings:
     selection: Selection = field(default_factory=Selection)
     transform: Transform = field(default_factory=Transform)
     rgba: Path | None = None
-    output: EncodeOptions = field(default_factory=EncodeOptions)
+    spz: WriteOptions = field(default_factory=WriteOptions)
+    encoding: str | None = None
+    raw: bool = False
 
     def builder(self) -> Callable[..., tuple[Splats, LodTree]]:
         """What makes `(nodes, tree)` of splats; takes `progress`, too."""
@@ -104,6 +108,7 @@ def bake(
     *,
     overwrite: bool = False,
     make_parent: bool = False,
+    threads: int = 1,
     progress: Progress = silent,
 ) -> Baked:
     """Reads a splat file, builds its tree and writes a Level-of-Detail file.
@@ -114,6 +119,7 @@ def bake(
         settings: how.
         overwrite: replace a file that exists.
         make_parent: make the folder of the output if there is none.
+        threads: to work on.
         progress: told of the stages.
 
     Raises:
@@ -123,7 +129,7 @@ def bake(
     with memory_told():
         write = sink(target, overwrite=overwrite, make_parent=make_parent)
         start = time.perf_counter()
-        scene = read_scene(source, threads=settings.output.threads, progress=progress)
+        scene = read_scene(source, threads=threads, progress=progress)
         if scene.tree is not None:
             raise FormatError("it is a Level-of-Detail file already; --unlod writes its splats back out")
         facts: dict[str, Any] = {"format": scene.format, "notes": scene.notes, "read": len(scene.splats)}
@@ -133,20 +139,18 @@ def bake(
         kept = _transformed(kept, settings.transform)
         read_done = time.perf_counter()
         facts |= {"splats": len(kept), "sh_degree": kept.sh_degree}
-        codec: Any = dump if settings.output.encoding else formats.writers(tree=True)[0].codec()
         antialiased = scene.antialiased
         # Before building, so that what does not fit is said at once.
-        codec.check(Scene(kept, antialiased=antialiased), settings.output)
-        jit.use_threads(settings.output.threads)
+        if settings.encoding is None:
+            spz.settled(Scene(kept), settings.spz)
+        jit.use_threads(threads)
         # The builder frees its input as it goes, if nobody else holds it: a third of the peak.
         handed_over = [kept]
         del scene, kept
         nodes, tree = settings.builder()(handed_over.pop(), progress=progress)
         levels = int(tree.depths().max()) + 1
         build_done = time.perf_counter()
-        encoded = codec.encode(Scene(nodes, tree, antialiased), settings.output, progress=progress)
-        size = write(encoded)
-        clamps = encoded.clamps()
+        facts |= _written(Scene(nodes, tree, antialiased), write, settings, threads, progress)
         seconds = {
             "read": read_done - start,
             "build": build_done - read_done,
@@ -157,14 +161,28 @@ def bake(
         method=settings.method,
         nodes=len(nodes),
         levels=levels,
-        bytes=size,
-        version=encoded.header.get("version"),
-        fractional_bits=encoded.header.get("fractional_bits"),
-        arrays=dict(encoded.arrays),
-        clamped=clamps.splats,
-        clamps=clamps.ends,
         seconds={stage: round(value, 4) for stage, value in seconds.items()},
     )
+
+
+def _written(scene: Scene, write: Sink, settings: BakeSettings, threads: int, progress: Progress) -> dict[str, Any]:
+    """Writes a tree; the facts of `Baked` about that."""
+    if settings.encoding is not None:
+        arrays = dump.pack(scene, settings.encoding, threads)
+        size = write(dump.encode_raw(arrays) if settings.raw else dump.encode_npz(arrays))
+        options, beyond = WriteOptions(), Clamps()
+    else:
+        arrays, options = {}, spz.settled(scene, settings.spz)
+        size = write(spz.encode(scene, options, threads=threads, progress=progress))
+        beyond = clamps.find(scene.splats, threads)
+    return {
+        "bytes": size,
+        "version": options.spz_version,
+        "fractional_bits": options.fractional_bits,
+        "arrays": {name: words.shape for name, words in arrays.items()},
+        "clamped": beyond.splats,
+        "clamps": beyond.ends,
+    }
 
 
 def _transformed(splats: Splats, transform: Transform) -> Splats:

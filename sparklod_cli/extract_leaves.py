@@ -9,12 +9,16 @@ from pathlib import Path
 
 import numpy as np
 
-from .codecs import formats
-from .codecs.encoded import EncodeOptions
+from .codecs.formats import WRITABLE
+from .codecs.options import WriteOptions
+from .codecs.spz_options import like
 from .io import read_scene, sink
 from .model.scene import Scene
 from .support.errors import FormatError, memory_told
 from .support.progress import Progress, silent
+
+#: Of outputs whose name has none.
+SUFFIX = ".spz"
 
 
 @dataclass(frozen=True)
@@ -54,10 +58,11 @@ def leaves_of(scene: Scene) -> Scene:
 def extract_leaves(
     source: Path,
     target: Path,
-    options: EncodeOptions,
+    options: WriteOptions,
     *,
     overwrite: bool = False,
     make_parent: bool = False,
+    threads: int = 1,
     progress: Progress = silent,
 ) -> Extracted:
     """Reads the tree of a Level-of-Detail file and writes its leaves, in their order, as a file of plain splats.
@@ -68,6 +73,7 @@ def extract_leaves(
         options: how to write; what is None is taken from the input, which keeps its values as they are.
         overwrite: replace a file that exists.
         make_parent: make the folder of the output if there is none.
+        threads: to work on.
         progress: told of the stages.
 
     Raises:
@@ -77,14 +83,14 @@ def extract_leaves(
     """
     with memory_told():
         write = sink(target, overwrite=overwrite, make_parent=make_parent)
-        form = formats.writer(target.suffix.lower(), tree=False)
-        if form is None:
-            raise ValueError(f"no format that is written ends in {target.suffix}")
+        suffix = target.suffix.lower() or SUFFIX
+        if suffix not in WRITABLE:
+            raise ValueError(f"{suffix} is not one of {', '.join(WRITABLE)}")
         start = time.perf_counter()
-        scene = read_scene(source, threads=options.threads, progress=progress)
+        scene = read_scene(source, threads=threads, progress=progress)
         leaves = leaves_of(scene)
         read_done = time.perf_counter()
-        size = write(form.codec().encode(leaves, options.like(scene.header), progress=progress))
+        size = write(WRITABLE[suffix].codec().encode(leaves, like(scene, options), threads=threads, progress=progress))
         seconds = {"read": read_done - start, "write": time.perf_counter() - read_done}
     return Extracted(
         format=scene.format,

@@ -18,9 +18,9 @@ from hypothesis import strategies as st
 
 from fixtures import by_hand, by_hand_ksplat, by_hand_splat
 from sparklod_cli.bake import BakeSettings, bake
-from sparklod_cli.codecs import ply, spz
-from sparklod_cli.codecs.encoded import EncodeOptions
-from sparklod_cli.codecs.gpu.encodings import ENCODINGS
+from sparklod_cli.codecs import ply, spz_options
+from sparklod_cli.codecs.gpu.table import ENCODINGS
+from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.inspection import leaves, values
 from sparklod_cli.inspection.findings import ERROR, NOTE, Finding
 from sparklod_cli.inspection.report import Wanted, inspect
@@ -108,7 +108,7 @@ def reported(source: Path) -> None:
     json.dumps(report.as_dict(), allow_nan=False)
     assert scene is not None
     for name in values.names_of(scene.splats):
-        histograms.as_text(histograms.of_quantity(scene.splats, name))
+        histograms.as_text(values.histogram_of(scene.splats, name))
 
 
 def checked(output: Path, source: Path) -> list[Finding]:
@@ -141,7 +141,7 @@ def refused(error: SparklodError) -> bool:
 @settings(max_examples=300, deadline=None)
 def test_what_is_written_passes_our_own_check(splats: Splats, method: str, version: int, bits: int | None) -> None:
     with tempfile.TemporaryDirectory() as folder:
-        how = BakeSettings(method=method, output=EncodeOptions(version=version, fractional_bits=bits))
+        how = BakeSettings(method=method, spz=WriteOptions(spz_version=version, fractional_bits=bits))
         try:
             found = findings_of(file_of(folder, splats), how)
         except SparklodError as error:
@@ -158,9 +158,9 @@ def test_a_coordinate_is_written_up_to_the_last_but_one_code(bits: int | None, m
     for code, sign in itertools.product((-1, 0, 1), (1, -1)):
         splats = random_splats(5)
         splats.center[:] = 0
-        splats.center[3, 1] = sign * (spz.LAST_CODE + code) * step
+        splats.center[3, 1] = sign * (spz_options.LAST_CODE + code) * step
         source = file_of(tmp_path, splats)
-        how = BakeSettings(method=method, output=EncodeOptions(fractional_bits=bits))
+        how = BakeSettings(method=method, spz=WriteOptions(fractional_bits=bits))
         if code < 1:
             assert [each.code for each in findings_of(source, how) if each.severity == ERROR] == []
         else:
@@ -176,7 +176,7 @@ def test_every_encoding_and_every_report_of_an_extreme_scene_is_made_without_a_w
     with tempfile.TemporaryDirectory() as folder:
         source, output = file_of(folder, splats), Path(folder, "out")
         try:
-            bake(source, output, BakeSettings(method=method, output=EncodeOptions(encoding=encoding)))
+            bake(source, output, BakeSettings(method=method, encoding=encoding))
         except InvalidSplatsError as error:  # of which none can be seen
             assert refused(error)
         reported(source)
@@ -224,9 +224,7 @@ def test_any_numbers_are_baked_refused_and_reported_without_a_warning(
     with tempfile.TemporaryDirectory() as folder:
         source, output = Path(folder, f"scene{kind}"), Path(folder, "out.spz")
         source.write_bytes(data)
-        how = BakeSettings(
-            method=method, output=EncodeOptions(encoding=encoding), selection=Selection(drop_invalid=drop)
-        )
+        how = BakeSettings(method=method, encoding=encoding, selection=Selection(drop_invalid=drop))
         try:
             bake(source, output, how)
         except SparklodError as error:
@@ -245,7 +243,7 @@ REAL = ("biker.ply", "biker.spz", "playbot-125k.ply", "meadow.sog", "playbot.sog
 
 def passes(source: Path, method: str) -> None:
     """The law of docs/ci.md: `--check --fail-on warning`."""
-    found = findings_of(source, BakeSettings(method=method, output=EncodeOptions(threads=2)))
+    found = findings_of(source, BakeSettings(method=method))
     assert {each.code for each in found if each.severity != NOTE} == ODD.get(source.name, set()), found
 
 

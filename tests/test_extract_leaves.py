@@ -10,7 +10,7 @@ import pytest
 
 from sparklod_cli.cli import run
 from sparklod_cli.codecs import spz
-from sparklod_cli.codecs.encoded import EncodeOptions
+from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.codecs.splat import importance_order
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod import quick
@@ -24,7 +24,7 @@ from tests.scenes import random_splats
 def tree_file(tmp_path: Path) -> Path:
     path = tmp_path / "scene-lod.spz"
     scene = Scene(*quick.build(random_splats(3000, sh_degree=2)), antialiased=True)
-    path.write_bytes(b"".join(spz.encode(scene, EncodeOptions(version=2, fractional_bits=9))))
+    path.write_bytes(b"".join(spz.encode(scene, WriteOptions(spz_version=2, fractional_bits=9))))
     return path
 
 
@@ -78,27 +78,27 @@ def test_leaves_that_cannot_be_drawn_are_written_too(tmp_path: Path) -> None:
     splats = random_splats(50)
     splats.opacity[:10] = 1e-4  # becomes 0 in the file
     scene = Scene(*quick.build(splats))
-    (tmp_path / "scene-lod.spz").write_bytes(b"".join(spz.encode(scene, EncodeOptions())))
+    (tmp_path / "scene-lod.spz").write_bytes(b"".join(spz.encode(scene)))
     assert unlod(tmp_path / "scene-lod.spz") == 0
     assert len(read_scene(tmp_path / "scene-unlod.spz").splats) == 50
 
 
 def test_what_is_no_tree_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert unlod(FIXTURES / "one.ply", "--output-dir", tmp_path) == 1
-    assert "it has no Level-of-Detail tree that could be undone" in capsys.readouterr().err
+    assert "it has no Level-of-Detail tree whose leaves could be written" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--base", "1.2"], "--base is of no use with --unlod"),
-        (["--method", "quick"], "--method is of no use with --unlod"),
-        (["--growth", "1.2"], "--growth is of no use with --unlod"),
-        (["--rgba", "c.npy"], "--rgba is of no use with --unlod"),
-        (["--encoding", "ext"], "--encoding is of no use with --unlod"),
-        (["-o", "x.sog"], "--unlod writes .spz, .ply, .splat, not .sog"),
-        (["-o", "x.ply", "--spz-version", "2"], "--spz-version is of SPZ, not of .ply"),
+        (["--base", "1.2"], "--base cannot be used with --unlod"),
+        (["--method", "quick"], "--method cannot be used with --unlod"),
+        (["--growth", "1.2"], "--growth cannot be used with --unlod"),
+        (["--rgba", "c.npy"], "--rgba cannot be used with --unlod"),
+        (["--encoding", "ext"], "--encoding cannot be used with --unlod"),
+        (["-o", "x.sog"], "--unlod writes .ply, .spz, .splat, not .sog"),
+        (["-o", "x.ply", "--spz-version", "2"], "--spz-version is an option of SPZ, not of .ply"),
     ],
 )
 def test_options_that_do_not_suit_unlod_are_refused(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from sparklod_cli.codecs.gpu.encodings import ENCODINGS
+from sparklod_cli.codecs.gpu.table import ENCODINGS
 from sparklod_cli.lod.builders import METHODS
 from sparklod_cli.support.defaults import MAX_BASE, MAX_GROWTH, MIN_BASE, MIN_GROWTH
 
@@ -29,7 +29,7 @@ def make(rng: Rng) -> Case:
     output = "baked.spz"
     if rng.integers(4) == 0:
         output = pick(rng, ("baked.npz", "baked.bin"))
-        options += ["--encoding", pick(rng, list(ENCODINGS))]
+        options += ["--encoding", pick(rng, tuple(ENCODINGS))]
     else:
         options += ["--spz-version", pick(rng, ("2", "3"))]
         if rng.integers(3) == 0:

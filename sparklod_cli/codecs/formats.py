@@ -17,14 +17,14 @@ class Format:
 
     Attributes:
         name: for people.
-        module: in this package; has `decode(file, *, threads, progress) -> Scene`. That of a format which writes trees
-            also has `check(scene, options)`, which raises what `encode` would raise.
+        module: in this package; has `decode(file, *, threads, progress) -> Scene`.
+        writable: its module also has `encode(scene, options, *, threads, progress) -> Iterator[bytes]`, and
+            `settled(scene, options) -> WriteOptions`, the options with nothing left open, which raises `FormatError`
+            where the scene cannot be written.
+        trees: what is written can be a Level-of-Detail tree.
         suffixes: lower case, with the dot.
         beginning: a regular expression that the first bytes of its files match; None where they can be anything, and
             only the suffix tells.
-        writes: what its `encode(scene, options, *, progress) -> Encoded` takes: "" for nothing, "splats", or "trees"
-            and plain splats.
-        options: the fields of `EncodeOptions` that mean something to it.
         companions: its files name others beside them; `decode` takes another argument, `beside`, which opens these.
         selective: its module also has `examine(file, *, columns, threads, progress) -> Scene`, which decodes columns
             only and passes a broken tree on.
@@ -34,8 +34,8 @@ class Format:
     module: str
     suffixes: tuple[str, ...]
     beginning: bytes | None
-    writes: str = ""
-    options: tuple[str, ...] = ()
+    writable: bool = False
+    trees: bool = False
     companions: bool = False
     selective: bool = False
 
@@ -57,22 +57,17 @@ FORMATS = (
         (".ply",),
         rb"ply\s(?:(?!end_header).)*[\r\n]\s*property\s+\w+\s+packed_position\s",
     ),
-    Format("PLY", "ply", (".ply",), rb"ply[\r\n]", writes="splats"),
-    Format(
-        "SPZ",
-        "spz",
-        (".spz",),
-        rb"\x1f\x8b\x08[\0-\x1f]|NGSP",  # gzipped up to version 3
-        writes="trees",
-        options=("version", "fractional_bits", "compression_level"),
-        selective=True,
-    ),
-    Format(
-        "SOG", "sog", (".sog", ".json"), rb"PK\x03\x04|\s*\{\s*\"\w+\"\s*:", companions=True
-    ),  # a zip, or its meta.json unpacked
+    Format("PLY", "ply", (".ply",), rb"ply[\r\n]", writable=True),
+    # Gzipped up to version 3.
+    Format("SPZ", "spz", (".spz",), rb"\x1f\x8b\x08[\0-\x1f]|NGSP", writable=True, trees=True, selective=True),
+    # A zip, or its meta.json unpacked.
+    Format("SOG", "sog", (".sog", ".json"), rb"PK\x03\x04|\s*\{\s*\"\w+\"\s*:", companions=True),
     Format("KSPLAT", "ksplat", (".ksplat",), rb"\0[\x01-\xff]\0\0"),  # version 0.1 and up; a float would be denormal
-    Format("SPLAT", "splat", (".splat",), None, writes="splats"),
+    Format("SPLAT", "splat", (".splat",), None, writable=True),
 )
+
+#: The formats that can be written, by the suffix of the file.
+WRITABLE = {suffix: form for form in FORMATS if form.writable for suffix in form.suffixes}
 
 
 def sniff(head: bytes, suffix: str) -> Format | None:
@@ -83,19 +78,3 @@ def sniff(head: bytes, suffix: str) -> Format | None:
     by_content = (form for form in FORMATS if form.begins(head))
     by_suffix = (form for form in FORMATS if form.beginning is None and suffix.lower() in form.suffixes)
     return next(by_content, None) or next(by_suffix, None)
-
-
-def writer(suffix: str, *, tree: bool) -> Format | None:
-    """The format that is written by a suffix; the first one that takes what there is where there is no suffix.
-
-    Args:
-        suffix: lower case, with the dot; or empty.
-        tree: what is written is a Level-of-Detail tree.
-    """
-    return next((form for form in writers(tree=tree) if suffix in ("", form.suffixes[0])), None)
-
-
-def writers(*, tree: bool) -> list[Format]:
-    """The formats that trees, or plain splats, are written in; the first one is what is written if nobody says."""
-    found = [form for form in FORMATS if form.writes == "trees" or (form.writes and not tree)]
-    return sorted(found, key=lambda form: form.writes != "trees")

@@ -14,7 +14,7 @@ from ..support.errors import FormatError, TruncatedError
 from ..support.parallel import chunks_of, ordered_map
 from ..support.progress import Progress, silent
 from . import quantize
-from .encoded import DEFAULTS, Encoded, EncodeOptions
+from .options import DEFAULTS, WriteOptions
 from .stream import decode_rows, rows_of, size_of
 
 ROW = np.dtype(
@@ -58,28 +58,36 @@ def importance_order(splats: Splats) -> NDArray[np.intp]:
     return np.argsort(-importance, kind="stable")
 
 
-def encode(scene: Scene, options: EncodeOptions = DEFAULTS, *, progress: Progress = silent) -> Encoded:
-    """A .splat file, in order of importance. It holds no SH above degree 0.
+def settled(scene: Scene, options: WriteOptions) -> WriteOptions:
+    """These options, of which .splat leaves none open.
 
     Raises:
         FormatError: the scene is a tree, which .splat cannot hold.
     """
     if scene.tree is not None:
         raise FormatError("SPLAT holds no Level-of-Detail tree")
-    return Encoded(_pieces(scene.splats.with_max_sh(0), options.threads, progress))
+    return options
 
 
-def _pieces(splats: Splats, threads: int, progress: Progress) -> Iterator[bytes]:
-    order = importance_order(splats)
+def encode(
+    scene: Scene, options: WriteOptions = DEFAULTS, *, threads: int = 1, progress: Progress = silent
+) -> Iterator[bytes]:
+    """The bytes of a .splat file, piece by piece, in order of importance. It holds no SH above degree 0.
+
+    Raises:
+        FormatError: the scene is a tree, which .splat cannot hold.
+    """
+    settled(scene, options)
+    order = importance_order(scene.splats)
 
     def rows(part: slice) -> bytes:
-        some = splats.take(order[part])
-        out = np.empty(len(some), ROW)
-        out["center"] = some.center
-        out["scale"] = some.scale
-        out["rgb"] = quantize.encode_unorm8(some.rgb)
-        out["opacity"] = quantize.encode_unorm8(some.opacity)
-        out["quat_wxyz"] = quantize.encode_quat_bytes(some.quat_xyzw[:, [3, 0, 1, 2]])
+        splats = scene.splats.with_max_sh(0).take(order[part])
+        out = np.empty(len(splats), ROW)
+        out["center"] = splats.center
+        out["scale"] = splats.scale
+        out["rgb"] = quantize.encode_unorm8(splats.rgb)
+        out["opacity"] = quantize.encode_unorm8(splats.opacity)
+        out["quat_wxyz"] = quantize.encode_quat_bytes(splats.quat_xyzw[:, [3, 0, 1, 2]])
         return out.tobytes()
 
     parts = chunks_of(len(order))

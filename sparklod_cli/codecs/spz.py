@@ -6,8 +6,6 @@ versions 2 and 3. `docs/formats.md` lays the extension out byte by byte.
 
 from __future__ import annotations
 
-import functools
-import math
 import struct
 from collections.abc import Collection, Iterator
 from typing import Any, BinaryIO
@@ -19,18 +17,14 @@ from ..model.lod_tree import LodTree
 from ..model.scene import Scene
 from ..model.sh import notes_on_degree
 from ..model.splats import COLUMNS, Splats
-from ..support.defaults import (
-    DEFAULT_SPZ_VERSION,
-    MAX_FRACTIONAL_BITS,
-    MAX_SH_DEGREE,
-    SPZ_VERSIONS,
-)
+from ..support.defaults import MAX_SH_DEGREE
 from ..support.errors import FormatError, MembersError, NotSplatsError, TreeError, TruncatedError, VersionError
 from ..support.parallel import for_chunks, ordered_map
 from ..support.progress import Progress, silent
-from . import clamps, compression, quantize
-from .encoded import DEFAULTS, Encoded, EncodeOptions
+from . import compression
+from .options import DEFAULTS, WriteOptions
 from .spz_layout import ANTIALIASED, EXTENSIONS, LOD, Layout, Stream, StreamRows
+from .spz_options import settled as settled
 from .stream import Read, rows_of, size_of
 
 MAGIC = 0x5053474E  # "NGSP"
@@ -39,63 +33,6 @@ HEADER_V4 = struct.Struct("<IIIBBBBI12s")  # ..., streams, offset of the table o
 STREAM_SIZES = struct.Struct("<QQ")  # of a version 4 stream: compressed, uncompressed
 
 READABLE = (1, 2, 3, 4)
-
-#: What "far below the smallest splats" means for the step of a position: see `fractional_bits`.
-STEPS_A_SPLAT, SMALL_QUANTILE = 16, 0.01
-
-
-#: The largest code that a coordinate is given. The one after it, with either sign, is what writers clamp to: `inspect`
-#: takes a coordinate that has it for one that did not fit.
-LAST_CODE = quantize.FIXED24_MAX - 1
-
-
-def largest_fractional_bits(center: NDArray[np.float32]) -> int:
-    """The most fractional bits, 0 to 24, with which every coordinate fits 24-bit fixed point.
-
-    Raises:
-        FormatError: not even whole units fit.
-    """
-    largest = float(np.abs(center).max(initial=0))
-    if np.rint(largest) > LAST_CODE:
-        reach = f"{largest:.0f}" if largest < 1e7 else f"{largest:.3g}"
-        raise FormatError(f"coordinates reach {reach}, SPZ holds at most {LAST_CODE}: scale the scene")
-    bits = MAX_FRACTIONAL_BITS
-    while bits and np.rint(largest * 2.0**bits) > LAST_CODE:
-        bits -= 1
-    return bits
-
-
-def check(scene: Scene, options: EncodeOptions) -> None:
-    """Raises the `FormatError` that `encode` would raise of this scene, before a tree is built of it, say."""
-    header_of(scene, options)
-
-
-def header_of(scene: Scene, options: EncodeOptions) -> dict[str, int]:
-    """Version, fractional bits and flags that a scene gets.
-
-    Raises:
-        FormatError: a coordinate does not fit the fractional bits; the text names the most that would.
-    """
-    version = DEFAULT_SPZ_VERSION if options.version is None else options.version
-    if version not in SPZ_VERSIONS:
-        raise ValueError(f"SPZ version {version} is not one of {SPZ_VERSIONS}")
-    most = largest_fractional_bits(scene.splats.center)
-    bits = _enough_bits(scene, most) if options.fractional_bits is None else options.fractional_bits
-    if bits > most:
-        raise FormatError(f"a coordinate does not fit {bits} fractional bits, at most {most} would do")
-    flags = (ANTIALIASED if scene.antialiased else 0) | (LOD if scene.tree is not None else 0)
-    return {"version": version, "fractional_bits": bits, "flags": flags}
-
-
-def _enough_bits(scene: Scene, most: int) -> int:
-    """As many bits as the extent allows, up to where a step is far below the smallest splats; of a tree, its leaves.
-
-    Small splats are measured by the 1 % quantile of their largest scales; a step is at most 1/16 of that.
-    """
-    scale = scene.splats.scale
-    largest = scale.max(axis=1) if scene.tree is None else scale[scene.tree.is_leaf].max(axis=1)
-    small = float(np.quantile(largest, SMALL_QUANTILE))
-    return max(0, min(most, math.ceil(math.log2(STEPS_A_SPLAT / small))))
 
 
 def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> Scene:
@@ -161,29 +98,26 @@ def _column(splats: Splats, tree: LodTree | None, stream: Stream) -> NDArray[Any
     return column
 
 
-def encode(scene: Scene, options: EncodeOptions = DEFAULTS, *, progress: Progress = silent) -> Encoded:
-    """A file: an LoD file where the scene has a tree, else a plain one.
+def encode(
+    scene: Scene, options: WriteOptions = DEFAULTS, *, threads: int = 1, progress: Progress = silent
+) -> Iterator[bytes]:
+    """The bytes of a file, piece by piece: an LoD file where the scene has a tree, else a plain one.
 
     The same scene and options give the same bytes for any number of threads.
 
     Raises:
         FormatError: a coordinate does not fit the fractional bits; the text names the most that would.
     """
-    header = header_of(scene, options)
-    layout = Layout(
-        header["version"], len(scene.splats), scene.splats.sh_degree, header["fractional_bits"], header["flags"]
-    )
-    return Encoded(
-        _pieces(scene, layout, options, progress),
-        header,
-        clamps=functools.partial(clamps.find, scene.splats, options.threads),
-    )
-
-
-def _pieces(scene: Scene, layout: Layout, options: EncodeOptions, progress: Progress) -> Iterator[bytes]:
+    splats, tree = scene.splats, scene.tree
+    options = settled(scene, options)
+    assert options.spz_version is not None and options.fractional_bits is not None
+    bits = options.fractional_bits
+    flags = (ANTIALIASED if scene.antialiased else 0) | (LOD if tree is not None else 0)
+    layout = Layout(options.spz_version, len(splats), splats.sh_degree, bits, flags)
     data = np.empty(HEADER.size + layout.total, np.uint8)
-    head = HEADER.pack(MAGIC, layout.version, layout.count, layout.sh_degree, layout.fractional_bits, layout.flags, 0)
-    data[: HEADER.size] = np.frombuffer(head, np.uint8)
+    data[: HEADER.size] = np.frombuffer(
+        HEADER.pack(MAGIC, layout.version, layout.count, layout.sh_degree, bits, flags, 0), np.uint8
+    )
     codes, at = {}, HEADER.size
     for stream in layout.streams():
         codes[stream] = data[at : at + stream.size * layout.count].reshape(layout.count, stream.size)
@@ -191,11 +125,11 @@ def _pieces(scene: Scene, layout: Layout, options: EncodeOptions, progress: Prog
 
     def fill(part: slice) -> None:
         for stream, out in codes.items():
-            values = np.ascontiguousarray(stream.encode(_column(scene.splats, scene.tree, stream)[part]))
+            values = np.ascontiguousarray(stream.encode(_column(splats, tree, stream)[part]))
             out[part] = values.view(np.uint8).reshape(-1, stream.size)
 
-    for_chunks(fill, layout.count, options.threads, lambda done: progress("encoding", done, layout.count, "splat"))
-    yield from compression.gzip_member(data, options.compression_level, options.threads, progress)
+    for_chunks(fill, layout.count, threads, lambda done: progress("encoding", done, layout.count, "splat"))
+    yield from compression.gzip_member(data, options.compression_level, threads, progress)
 
 
 def _checked(layout: Layout, file_size: int) -> Layout:

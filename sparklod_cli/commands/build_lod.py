@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..codecs.formats import FORMATS, writers
-from ..codecs.gpu.encodings import NPZ, RAW_SUFFIXES
+from ..codecs.formats import FORMATS, WRITABLE
+from ..codecs.gpu.table import NPZ, RAW_SUFFIXES
 from ..support.errors import SparklodError
 from ..support.printable import MOST, shortened
 from ..support.stdin import DASH, name_of
@@ -25,7 +25,7 @@ from .options.baking import (
     bake_settings,
     baking_options,
     check_method,
-    encode_options,
+    write_options,
 )
 from .options.common import General, common_options, overwrite_option
 from .paths import InputPath, OutputPath, claim_stdout, keep_apart
@@ -37,11 +37,12 @@ if TYPE_CHECKING:
     from ..extract_leaves import Extracted
     from .console import Console
 
-#: Suffixes of the formats that a tree, or its leaves, can be written in; the first is the default.
-TREES, LEAVES = (tuple(form.suffixes[0] for form in writers(tree=tree)) for tree in (True, False))
+#: Suffixes of the formats in which a tree can be written, and the one of files that are given a name.
+TREES = tuple(suffix for suffix, form in WRITABLE.items() if form.trees)
+SPZ = TREES[0]
 
-#: Suffixes that are promises of another format.
-PROMISES = {suffix for form in FORMATS for suffix in form.suffixes} - set(TREES)
+#: Suffixes of formats that hold no tree.
+PLAIN = {suffix for form in FORMATS for suffix in form.suffixes if not form.trees}
 
 EXAMPLES = """
 \b
@@ -94,8 +95,8 @@ class Outputs:
         # The meta.json of an unpacked SOG has the name of its folder.
         stem = source.absolute().parent.name if source.name == "meta.json" else source.stem
         if self.unlod:
-            return f"{stem.removesuffix('-lod')}-unlod{LEAVES[0]}"
-        return f"{stem}-lod{NPZ if self.encoding else TREES[0]}"
+            return f"{stem.removesuffix('-lod')}-unlod{SPZ}"
+        return f"{stem}-lod{NPZ if self.encoding else SPZ}"
 
 
 @click.command("build-lod", cls=Command, epilog=EXAMPLES, context_settings={"show_default": True})
@@ -142,7 +143,7 @@ def build_lod(ctx: click.Context, /, inputs: tuple[Path, ...], **_: Any) -> None
     _check(ctx, inputs, outputs, general)
     failed = False
     with general.console() as console:
-        work = _extracting(ctx, outputs, console) if outputs.unlod else _baking(ctx, outputs, console)
+        work = (_extracting if outputs.unlod else _baking)(ctx, outputs, general.threads, console)
         for source in inputs:
             target = outputs.target(source)
             try:
@@ -176,9 +177,9 @@ def _check(ctx: click.Context, inputs: tuple[Path, ...], outputs: Outputs, gener
     suffix = outputs.suffix
     if outputs.unlod:
         refuse(ctx, (*OF_TREES, *OF_SELECTION, *OF_PLACE, "encoding"), "cannot be used with --unlod")
-        if suffix not in ("", *LEAVES):
-            raise click.UsageError(f"--unlod writes {', '.join(LEAVES)}, not {suffix}")
-        if suffix not in ("", LEAVES[0]):
+        if suffix not in ("", *WRITABLE):
+            raise click.UsageError(f"--unlod writes {', '.join(WRITABLE)}, not {suffix}")
+        if suffix not in ("", SPZ):
             refuse(ctx, OF_SPZ, f"is an option of SPZ, not of {suffix}")
         return
     check_method(ctx)
@@ -188,13 +189,13 @@ def _check(ctx: click.Context, inputs: tuple[Path, ...], outputs: Outputs, gener
             raise click.UsageError(f"--encoding writes {', '.join((NPZ, *RAW_SUFFIXES))}, not {suffix}")
     elif suffix in (NPZ, *RAW_SUFFIXES):
         raise click.UsageError(f"{suffix} is a file of arrays; choose their layout with --encoding")
-    elif suffix in PROMISES:
-        raise click.UsageError(f"{suffix} cannot hold a tree; name the output {TREES[0]}")
+    elif suffix in PLAIN:
+        raise click.UsageError(f"{suffix} cannot hold a tree; name the output {SPZ}")
     elif suffix not in ("", *TREES):
-        raise click.UsageError(f"trees are written as SPZ, not as {suffix}; name the output {TREES[0]}")
+        raise click.UsageError(f"trees are written as SPZ, not as {suffix}; name the output {SPZ}")
 
 
-def _baking(ctx: click.Context, outputs: Outputs, console: Console) -> Callable[[Path, Path], Baked]:
+def _baking(ctx: click.Context, outputs: Outputs, threads: int, console: Console) -> Callable[[Path, Path], Baked]:
     """What bakes a file and reports it; the point where numpy and numba are loaded."""
     from ..bake import bake
 
@@ -208,6 +209,7 @@ def _baking(ctx: click.Context, outputs: Outputs, console: Console) -> Callable[
             settings,
             overwrite=outputs.overwrite,
             make_parent=outputs.output_dir is not None,
+            threads=threads,
             progress=console.progress,
         )
         report_baked(console, source, target, baked)
@@ -216,11 +218,13 @@ def _baking(ctx: click.Context, outputs: Outputs, console: Console) -> Callable[
     return work
 
 
-def _extracting(ctx: click.Context, outputs: Outputs, console: Console) -> Callable[[Path, Path], Extracted]:
+def _extracting(
+    ctx: click.Context, outputs: Outputs, threads: int, console: Console
+) -> Callable[[Path, Path], Extracted]:
     """What writes the leaves of a file and reports it."""
     from ..extract_leaves import extract_leaves
 
-    options = encode_options(ctx)
+    options = write_options(ctx)
 
     def work(source: Path, target: Path) -> Extracted:
         extracted = extract_leaves(
@@ -229,6 +233,7 @@ def _extracting(ctx: click.Context, outputs: Outputs, console: Console) -> Calla
             options,
             overwrite=outputs.overwrite,
             make_parent=outputs.output_dir is not None,
+            threads=threads,
             progress=console.progress,
         )
         report_extracted(console, source, target, extracted)

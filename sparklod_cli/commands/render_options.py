@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from ..codecs.rounding import ROUND_TRIPS
 from ..render.settings import PROFILES, SORTS, RasterSettings
 from ..support import defaults
 from ..support.defaults import OF_PIXELS
@@ -124,7 +125,7 @@ def look_options(command: Command) -> Command:
             click.option("--no-bar", is_flag=True, help="Leave that bar out."),
             click.option(
                 "--through",
-                type=click.Choice(defaults.THROUGH),
+                type=click.Choice(list(ROUND_TRIPS)),
                 help="Draw splats as they are after Spark's PackedSplats or ExtSplats, or SPZ, in the file's own cuts.",
             ),
             click.option(

@@ -57,11 +57,11 @@ def _clamped(clamp: Clamp, nodes: int) -> str:
     """How many nodes have values that were clamped, how far these were off, and what that means."""
     name, advice = CLAMPED[clamp.column, clamp.above]
     share = f"{count_of(clamp.splats, 'node')} ({100 * clamp.splats / nodes:.3g} %)"
-    where, end, way = ("above", "largest", "up") if clamp.above else ("below", "smallest", "down")
+    where, way = ("above", "up") if clamp.above else ("below", "down")
     farthest = clamp.farthest or 0.0  # no -0
     return (
-        f"{name} of {share} are {where} {clamp.end:.3g}, {way} to {farthest:.3g}, and are clamped to that,"
-        f" the {end} that SPZ holds: {advice}"
+        f"{name} of {share} are {where} {clamp.end:.3g}, {way} to {farthest:.3g}, and are clamped to what SPZ holds:"
+        f" {advice}"
     )
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from ..support import defaults
+from ..tables.files import FORMS
 from .camera_options import camera_options, cameras_from
 from .command import Command
 from .console import Console
@@ -43,7 +43,7 @@ Examples:
 @click.option(
     "--format",
     "form",
-    type=click.Choice(defaults.TABLES),
+    type=click.Choice(list(FORMS)),
     help="Of the table.  [default: by the name of --output, or csv]",
 )
 @click.option("--per-instance", is_flag=True, help="A row for each instance, too.")

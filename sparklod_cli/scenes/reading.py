@@ -39,7 +39,7 @@ def read_scenes(
         instances: at least one.
         columns: of `Splats` that are read; with `trees_only` only, for all are looked at where there is no tree.
         trees_only: refuse scenes without trees.
-        through: one of `defaults.THROUGH`, a coding after which splats are drawn; cuts are those of the scene.
+        through: one of `rounding.ROUND_TRIPS`, a coding after which splats are drawn; cuts are those of the scene.
         precision: one of `PRECISIONS`, of the nodes that cuts are found with.
         threads: to decode on.
         progress: is told how much is done.

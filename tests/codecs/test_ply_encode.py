@@ -10,7 +10,6 @@ from plyfile import PlyData
 
 from fixtures import by_hand
 from sparklod_cli.codecs import ply
-from sparklod_cli.codecs.encoded import EncodeOptions
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
@@ -86,7 +85,7 @@ def test_what_was_read_is_written_as_it_was() -> None:
 def test_threads_do_not_change_a_byte_of_ply(count: int) -> None:
     scene = Scene(random_splats(max(count, 1), sh_degree=1).take(slice(count)))
     one = b"".join(ply.encode(scene))
-    assert b"".join(ply.encode(scene, EncodeOptions(threads=3))) == one
+    assert b"".join(ply.encode(scene, threads=3)) == one
     back = ply.decode(io.BytesIO(one)).splats
     assert len(back) == count
     for column in COLUMNS:

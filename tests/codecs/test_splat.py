@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from sparklod_cli.codecs import splat
-from sparklod_cli.codecs.encoded import EncodeOptions
 from sparklod_cli.io import read_scene
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
@@ -88,7 +87,7 @@ def test_threads_do_not_change_a_byte_of_splat() -> None:
     scene = Scene(random_splats(40_000))
     one = b"".join(splat.encode(scene))
     assert len(one) == 32 * 40_000
-    assert b"".join(splat.encode(scene, EncodeOptions(threads=3))) == one
+    assert b"".join(splat.encode(scene, threads=3)) == one
 
 
 def test_splat_refuses_to_write_a_tree() -> None:

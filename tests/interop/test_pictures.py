@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from sparklod_cli.codecs import spz
-from sparklod_cli.codecs.encoded import EncodeOptions
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod import quick
 from sparklod_cli.model.scene import Scene
@@ -43,7 +42,7 @@ def demo() -> Splats:
 
 def written(folder: Path, scene: Scene) -> Path:
     path = folder / "scene.spz"
-    path.write_bytes(b"".join(spz.encode(scene, EncodeOptions())))
+    path.write_bytes(b"".join(spz.encode(scene)))
     return path
 
 

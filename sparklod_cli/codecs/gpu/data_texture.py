@@ -34,11 +34,6 @@ assert SPLAT.itemsize == 32
 GAIN, LARGEST = 4, 65504
 
 
-def arrays(scene: Scene, *, threads: int = 1) -> dict[str, Words]:
-    """The arrays of a scene."""
-    return pack(scene.splats, threads=threads)
-
-
 def pack(splats: Splats, *, threads: int = 1) -> dict[str, Words]:
     """Splats as the viewer uploads them: "texture" (H, 2048, 4) uint32, H = ceil(N / 1024), at least 1; the rest is 0.
 
@@ -64,6 +59,11 @@ def pack(splats: Splats, *, threads: int = 1) -> dict[str, Words]:
 
     for_chunks(encode, len(splats), threads, lambda _: None)
     return {"texture": texture}
+
+
+def dump(scene: Scene, *, threads: int = 1) -> dict[str, Words]:
+    """The texture of a scene; it holds no links of a tree."""
+    return pack(scene.splats, threads=threads)
 
 
 @dataclass(frozen=True)

@@ -44,11 +44,6 @@ _BITS = tuple((np.uint32(byte), np.uint32(sign)) for byte, sign in ((0, 24), (8,
 _EXPONENT = np.uint32(27)
 
 
-def arrays(scene: Scene, *, threads: int = 1) -> dict[str, Words]:
-    """The arrays of a scene."""
-    return pack(scene.splats, threads=threads)
-
-
 def pack(splats: Splats, *, threads: int = 1) -> dict[str, Words]:
     """Splats as Spark holds them: "ext0" and "ext1" (N, 4) uint32, and by SH degree "sh1", "sh2", "sh3a" and "sh3b".
 
@@ -75,6 +70,11 @@ def pack(splats: Splats, *, threads: int = 1) -> dict[str, Words]:
 
     for_chunks(encode, len(splats), threads, lambda _: None)
     return arrays
+
+
+def dump(scene: Scene, *, threads: int = 1) -> dict[str, Words]:
+    """The arrays of a scene; those of a tree are no different."""
+    return pack(scene.splats, threads=threads)
 
 
 def unpack(arrays: Mapping[str, NDArray[Any]], *, threads: int = 1) -> Splats:

@@ -28,13 +28,6 @@ NODE = np.dtype(
 assert NODE.itemsize == 16
 
 
-def arrays(scene: Scene, *, threads: int = 1) -> dict[str, Words]:
-    """The array of a scene that is a tree."""
-    if scene.tree is None:
-        raise ValueError("the scene has no tree")
-    return pack(scene.splats, scene.tree, threads=threads)
-
-
 def pack(
     splats: Splats, tree: LodTree, *, size: Callable[[Splats], FloatArray] = spark_size, threads: int = 1
 ) -> dict[str, Words]:
@@ -65,6 +58,17 @@ def pack(
 
     for_chunks(encode, len(splats), threads, lambda _: None)
     return {"lod_tree": words}
+
+
+def dump(scene: Scene, *, threads: int = 1) -> dict[str, Words]:
+    """The words of a scene that is a tree.
+
+    Raises:
+        ValueError: it is none.
+    """
+    if scene.tree is None:
+        raise ValueError("the scene has no tree")
+    return pack(scene.splats, scene.tree, threads=threads)
 
 
 def unpack(arrays: Mapping[str, NDArray[Any]]) -> Nodes:

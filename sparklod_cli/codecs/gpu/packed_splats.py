@@ -18,7 +18,7 @@ from ...model.sh import COEFFICIENTS
 from ...model.splats import FloatArray, Splats
 from ...support.errors import FormatError
 from ...support.parallel import for_chunks
-from .. import octahedral
+from .. import octahedral, quantize
 from ..octahedral import STEPS_8_8_8, Words, to_code
 
 SPLAT = np.dtype(
@@ -81,9 +81,9 @@ class Encoding:
 DEFAULT = Encoding()
 
 
-def arrays(scene: Scene, *, threads: int = 1) -> dict[str, Words]:
-    """The arrays of a scene, with LoD opacity if it is a tree."""
-    return pack(scene.splats, Encoding(lod_opacity=scene.tree is not None), threads=threads)
+def of_scene(scene: Scene) -> Encoding:
+    """The encoding that Spark sets up for a scene: an LoD tree has LoD opacities."""
+    return Encoding(lod_opacity=scene.tree is not None)
 
 
 def pack(splats: Splats, encoding: Encoding = DEFAULT, *, threads: int = 1) -> dict[str, Words]:
@@ -113,6 +113,11 @@ def pack(splats: Splats, encoding: Encoding = DEFAULT, *, threads: int = 1) -> d
 
     for_chunks(encode, len(splats), threads, lambda _: None)
     return arrays
+
+
+def dump(scene: Scene, *, threads: int = 1) -> dict[str, Words]:
+    """The arrays of a scene, in the encoding of `of_scene`."""
+    return pack(scene.splats, of_scene(scene), threads=threads)
 
 
 def unpack(arrays: Mapping[str, NDArray[Any]], encoding: Encoding = DEFAULT, *, threads: int = 1) -> Splats:
@@ -160,8 +165,7 @@ def _encode_linear(values: FloatArray, low: float, high: float) -> Words:
 
 
 def _decode_linear(codes: NDArray[np.uint8], low: float, high: float) -> FloatArray:
-    first, width = np.float32(low), np.float32(high) - np.float32(low)
-    return first + codes.astype(np.float32) / np.float32(255) * width
+    return quantize.of_range(codes.astype(np.float32) / np.float32(255), np.float32(low), np.float32(high))
 
 
 def encode_log_scale(scale: FloatArray, encoding: Encoding = DEFAULT) -> Words:

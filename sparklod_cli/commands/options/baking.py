@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ...codecs.gpu.encodings import ENCODINGS, NPZ, RAW_SUFFIXES
+from ...codecs.gpu.table import ENCODINGS, NPZ, RAW_SUFFIXES
 from ...lod.builders import BUILDERS, METHODS
 from ...support import defaults
 from ..command import COMMON, option
@@ -18,7 +18,7 @@ from .types import AutoOr, Ball, Numbers, Real
 
 if TYPE_CHECKING:
     from ...bake import BakeSettings
-    from ...codecs.encoded import EncodeOptions
+    from ...codecs.options import WriteOptions
 
 TREE, SELECTION, PLACE, FORMAT = "Tree", "Selection", "Rotation, scale and position", "File format"
 
@@ -167,7 +167,7 @@ OPTIONS: tuple[Callable[[Command], Command], ...] = (
 
 
 def baking_options(command: Command) -> Command:
-    """Adds the options of this module; `bake_settings` and `encode_options` take what they are given."""
+    """Adds the options of this module; `bake_settings` and `write_options` take what they are given."""
     for add in reversed(OPTIONS):
         command = add(command)
     return command
@@ -213,20 +213,19 @@ def bake_settings(ctx: click.Context, *, raw: bool) -> BakeSettings:
         ),
         transform=transform,
         rgba=given["rgba"],
-        output=encode_options(ctx, raw=raw),
+        spz=write_options(ctx),
+        encoding=given["encoding"],
+        raw=raw,
     )
 
 
-def encode_options(ctx: click.Context, *, raw: bool = False) -> EncodeOptions:
-    """How to write; what nobody chose is left to the library, which may take it from the input."""
-    from ...codecs.encoded import EncodeOptions
+def write_options(ctx: click.Context) -> WriteOptions:
+    """How to write SPZ; what nobody chose is left to the library, which may take it from the input."""
+    from ...codecs.options import WriteOptions
 
     given = ctx.params
-    return EncodeOptions(
-        version=int(given["spz_version"]) if is_given(ctx, "spz_version") else None,
+    return WriteOptions(
+        spz_version=int(given["spz_version"]) if is_given(ctx, "spz_version") else None,
         fractional_bits=given["fractional_bits"],
         compression_level=given["compression_level"],
-        encoding=given["encoding"],
-        raw=raw,
-        threads=given["threads"],
     )

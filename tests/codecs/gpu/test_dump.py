@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from sparklod_cli.cli import run
-from sparklod_cli.codecs.gpu.encodings import ENCODINGS, layout
+from sparklod_cli.codecs.gpu import dump
+from sparklod_cli.codecs.gpu.table import ENCODINGS
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod import quick
 from sparklod_cli.model.scene import Scene
@@ -21,11 +22,6 @@ ARRAYS = {
     "ext": {"ext0": 4, "ext1": 4, "sh1": 4, "sh2": 4, "sh3a": 4, "sh3b": 4},
     "lodtree": {"lod_tree": 4},
 }
-
-
-def packed(encoding: str) -> dict[str, np.ndarray]:
-    """The arrays that the command should write of `SCENE`."""
-    return layout(encoding).arrays(baked())
 
 
 def baked() -> Scene:
@@ -44,7 +40,7 @@ def test_an_npz_has_the_arrays_that_the_codec_packs(
     assert run(command) == 0
     record = json.loads(capsys.readouterr().out)
     path = tmp_path / "sh3-lod.npz"
-    nodes, expected = record["nodes"], packed(encoding)
+    nodes, expected = record["nodes"], dump.pack(baked(), encoding)
     with np.load(path) as file:
         assert set(file) == set(expected) == set(record["arrays"])
         for name, words in expected.items():
@@ -67,16 +63,16 @@ def test_an_npz_has_the_arrays_that_the_codec_packs(
 def test_a_bin_has_the_words_of_all_arrays_one_after_the_other(encoding: str, tmp_path: Path) -> None:
     path = tmp_path / "scene.bin"
     assert run(["build-lod", str(SCENE), "--encoding", encoding, "-o", str(path)]) == 0
-    expected = np.concatenate([words.ravel() for words in packed(encoding).values()])
+    expected = np.concatenate([words.ravel() for words in dump.pack(baked(), encoding).values()])
     np.testing.assert_array_equal(np.fromfile(path, "<u4"), expected)
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--encoding", "ext", "--fractional-bits", "9"], "--fractional-bits is of SPZ, not of --encoding"),
-        (["-o", "x.npz"], "a .npz output needs --encoding"),
-        (["-o", "x.splat"], ".splat holds no tree"),
+        (["--encoding", "ext", "--fractional-bits", "9"], "--fractional-bits is an option of SPZ, not of --encoding"),
+        (["-o", "x.npz"], ".npz is a file of arrays; choose their layout with --encoding"),
+        (["-o", "x.splat"], ".splat cannot hold a tree"),
     ],
 )
 def test_outputs_that_do_not_suit_an_encoding_are_refused(

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from sparklod_cli.cli import run
-from sparklod_cli.codecs import spz
-from sparklod_cli.codecs.encoded import EncodeOptions
+from sparklod_cli.codecs import spz, spz_options
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod import quality, quick
 from sparklod_cli.model.lod_tree import LodTree
@@ -84,8 +83,8 @@ def test_merged_splats_outside_of_the_box_of_the_leaves(
     splats = read_scene(scene).splats
     splats.center[:] *= 1e5  # so that it is the extent that bounds the bits
     far = tmp_path / "far.spz"
-    far.write_bytes(b"".join(spz.encode(Scene(splats), EncodeOptions())))
-    most = spz.largest_fractional_bits(read_scene(far).splats.center)
+    far.write_bytes(b"".join(spz.encode(Scene(splats))))
+    most = spz_options.largest_fractional_bits(read_scene(far).splats.center)
     assert build(far, "-o", tmp_path / "out.spz", "--method", "quality", "--json") == 0
     assert json.loads(capsys.readouterr().out)["fractional_bits"] < most
 
@@ -99,7 +98,7 @@ def test_what_is_dropped_is_said(scene: Path, capsys: pytest.CaptureFixture[str]
     cropped = int((splats.center[:, 0] > x).sum())
     assert record["dropped"] == {"cropped": cropped}
     assert record["splats"] + cropped == record["read"] == len(splats)
-    assert f"dropped {cropped} cropped" in err
+    assert f"left out: {cropped} cropped" in err
 
 
 def test_quiet_says_nothing_and_verbose_more(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
