@@ -58,7 +58,7 @@ from tests.conftest import FIXTURES, ROOT
         ([TREE, "-o", "t.png"], "--output t.png: tables are written as .csv"),
         ([TREE, "-o", "t.spz", "--format", "json"], "t.spz does not end in .json, which --format asks for"),
         ([TREE, "--plot", "t.jpg"], "'t.jpg' does not end in .png, which is what is written"),
-        ([TREE, "--json", "-o", "-"], "--json and the table cannot both go to standard output"),
+        ([TREE, "--json", "-o", "-"], "--output - and --json cannot both go to standard output"),
         ([TREE, "--json", "--per-instance"], "--per-instance cannot be used with --json without --output"),
         ([TREE, "--padded"], "--padded only means something with --indices-out"),
         ([TREE, "--assert", "churn"], "--assert 'churn' is not an assertion"),
