@@ -20,8 +20,8 @@ from sparklod_cli.cameras.path import CameraPath
 from sparklod_cli.cameras.pose import look_at
 from sparklod_cli.commands import render_compare
 from sparklod_cli.commands.console import Console
-from sparklod_cli.compare import Comparison, on_background
-from sparklod_cli.images.metrics import MOST_PSNR
+from sparklod_cli.compare import Comparison
+from sparklod_cli.images.metrics import MOST_PSNR, on_background
 from sparklod_cli.lod.budget import parse_budgets
 from sparklod_cli.lod.settings import LodSettings
 from sparklod_cli.model.foveation import Cones
