@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..io import examine_scene, read_scene, write_whole
+from ..lod.builders import BUILDERS, METHODS
 from ..model.scene import Scene, Tree
 from ..model.splats import COLUMNS
-from ..support.defaults import DEFAULT_BASE, DEFAULT_COMPRESSION, DEFAULT_GROWTH, MAX_SH_DEGREE, METHODS
+from ..support.defaults import DEFAULT_BASE, DEFAULT_COMPRESSION, DEFAULT_GROWTH, MAX_SH_DEGREE
 from ..support.errors import FormatError, memory_told
 from ..support.threads import on_threads, thread_count
 from .progress import Told, telling
@@ -154,18 +155,18 @@ def build_lod(
         InvalidSplatsError: some splats are invalid and `selection` does not drop them, or none is left.
         ValueError: there is no such method.
     """
-    from ..bake import BUILDERS
+    from ..bake import BakeSettings
     from ..model.selection import Selection
 
     if scene.tree is not None:
         raise FormatError("the scene has a Level-of-Detail tree already; extract_leaves gives its splats")
     if method not in BUILDERS:
         raise ValueError(f"there is no method {method!r}; give one of {', '.join(BUILDERS)}")
-    builder, setting = BUILDERS[method]
+    build = BakeSettings(method=method, base=base, growth=growth).builder()
     with on_threads(threads), telling(progress) as told, memory_told():
         kept, _ = (selection or Selection()).apply(scene.splats.with_max_sh(max_sh))
         # A builder frees its input as it goes where nobody else holds it.
-        nodes, tree = builder.build(kept, {"base": base, "growth": growth}[setting], progress=told)
+        nodes, tree = build(kept, progress=told)
     return Tree(nodes, tree, scene.antialiased)
 
 
@@ -175,15 +176,9 @@ def extract_leaves(tree: Scene) -> Scene:
     Raises:
         FormatError: the scene has no tree.
     """
-    import dataclasses
+    from ..extract_leaves import leaves_of
 
-    import numpy as np
-
-    if tree.tree is None:
-        raise FormatError("the scene has no Level-of-Detail tree whose leaves could be taken")
-    leaves = tree.splats.take(tree.tree.is_leaf)
-    leaves = dataclasses.replace(leaves, opacity=np.minimum(leaves.opacity, np.float32(1)))
-    return Scene(leaves, antialiased=tree.antialiased, format=tree.format, header=tree.header)
+    return leaves_of(tree)
 
 
 def inspect(
