@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..io import examine_scene, read_scene, write_whole
+from ..lod.builders import BUILDERS, METHODS
 from ..model.scene import Scene, Tree
 from ..model.splats import COLUMNS
 from ..support.defaults import DEFAULT_BASE, DEFAULT_COMPRESSION, DEFAULT_GROWTH, MAX_SH_DEGREE
@@ -130,7 +131,7 @@ def write(
 def build_lod(
     scene: Scene,
     *,
-    method: str = "quick",
+    method: str = METHODS[0],
     base: float = DEFAULT_BASE,
     growth: float = DEFAULT_GROWTH,
     max_sh: int = MAX_SH_DEGREE,
@@ -155,18 +156,18 @@ def build_lod(
         InvalidSplatsError: some splats are invalid and `selection` does not drop them, or none is left.
         ValueError: there is no such method.
     """
-    from ..lod.builders import BUILDERS
+    from ..bake import BakeSettings
     from ..model.selection import Selection
 
     if scene.tree is not None:
         raise FormatError("the scene has a Level-of-Detail tree already; extract_leaves gives its splats")
     if method not in BUILDERS:
         raise ValueError(f"there is no method {method!r}; give one of {', '.join(BUILDERS)}")
-    row = BUILDERS[method]
-    setting = {row.setting: {"base": base, "growth": growth}[row.setting]}
+    build = BakeSettings(method=method, base=base, growth=growth).builder()
     with on_threads(threads), telling(progress) as told, memory_told():
         kept, _ = (selection or Selection()).apply(scene.splats.with_max_sh(max_sh))
-        nodes, tree = row.load().build(kept, **setting, progress=told)
+        # A builder frees its input as it goes where nobody else holds it.
+        nodes, tree = build(kept, progress=told)
     return Tree(nodes, tree, scene.antialiased)
 
 
