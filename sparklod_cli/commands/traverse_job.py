@@ -176,14 +176,14 @@ class Job:
 
     def _plot(self, target: Path) -> None:
         """Draws the charts, and the path over what the frame that is most worth looking at had: its cut, as drawn."""
-        from ..figures.traversal_chart import Scenery, plot
+        from ..figures.traversal_chart import PathScene, plot
 
         scenes = self.simulation.scenes
         worth = [self._kept[what] for what in (*(moment.what for moment in self._lookout.moments()), "first")]
         frame = next((each for each in worth if len(each.cut)), worth[0])  # before anything arrived, nothing is drawn
         at = self.path.numbers.index(frame.number)
         cut = scenes.cut_of(frame.cut)
-        scenery = Scenery(
+        scenery = PathScene(
             self.path.cameras,
             cut.splats,
             np.concatenate([part.depth for part in cut.parts]),

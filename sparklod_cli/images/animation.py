@@ -1,4 +1,4 @@
-"""Animations: GIF and WebP, which Pillow writes, and MP4, which needs the extra `video`."""
+"""Animations: GIF and WebP by Pillow, MP4 by imageio of the extra `video`."""
 
 from __future__ import annotations
 
@@ -16,33 +16,33 @@ from ..support.errors import SparklodError
 from ..support.progress import Progress, silent
 from .pixels import Pixels
 
-#: What animations are written as.
+#: Suffixes of animations.
 ANIMATIONS = ("gif", "webp", "mp4")
 
-#: GIF counts time in hundredths of a second, and what plays it slows down where a frame is shorter than this.
+#: GIF counts time in steps of 10 ms; players slow down frames that are shorter than this many steps.
 GIF_STEP, GIF_LEAST = 10, 2
 
-#: Milliseconds that a frame lasts at most: 16 bits of hundredths in GIF, 24 bits in WebP; of MP4, what ffmpeg takes.
+#: Longest duration of a frame, ms: 16 bits of hundredths in GIF, 24 bits of ms in WebP, the limit of ffmpeg for MP4.
 LONGEST = {"gif": 10 * 0xFFFF, "webp": 0xFFFFFF, "mp4": 1_000_000}
 
-#: Quality of WebP, 0 to 100, and of H.264, 51 to 0: what is lost is hardly seen.
+#: Quality of WebP (0 to 100) and rate factor of H.264 (51 to 0): losses are hardly visible.
 WEBP_QUALITY, H264_QUALITY = 90, 16
 
 
 def check(form: str, fps: float) -> None:
-    """Raises a `SparklodError` where an animation cannot be written, before work goes into it."""
+    """Raises a `SparklodError` if an animation cannot be written; called before any frame is drawn."""
     if form == "mp4":
         load_imageio()
     longest = LONGEST[form] / 1000
     if 1 / fps > longest:
-        raise SparklodError(f"a frame of .{form} lasts {longest:,.3f} s at most, not {1 / fps:,.7g} s; see --fps")
+        raise SparklodError(f"a frame of .{form} lasts at most {longest:,.3f} s, not {1 / fps:,.7g} s; raise --fps")
 
 
 def load_imageio() -> ModuleType:
-    """Imports imageio, with what writes MP4.
+    """Imports imageio with its ffmpeg.
 
     Raises:
-        SparklodError: it is not installed.
+        SparklodError: one of them is not installed.
     """
     try:
         import imageio.v2
@@ -56,14 +56,14 @@ def load_imageio() -> ModuleType:
 
 
 def animate(frames: Iterable[Pixels], form: str, fps: float, progress: Progress = silent) -> bytes:
-    """The bytes of an animation that is repeated for ever, or of a video.
+    """The bytes of an animation in an endless loop ("gif", "webp") or of a video ("mp4").
 
     Args:
         frames: at least one, all of one size; with alpha for "webp" only.
         form: one of `ANIMATIONS`.
         fps: frames a second.
-        progress: is told how many frames are written, where that begins when all of them are there: MP4's are
-            written as they come.
+        progress: called for each frame that GIF and WebP write, which they do at the end; MP4 writes frames as they
+            come, without calling it.
 
     Raises:
         SparklodError: MP4 cannot be written here.
@@ -81,7 +81,7 @@ def animate(frames: Iterable[Pixels], form: str, fps: float, progress: Progress 
 
 
 def _times(fps: float, step: int, least: int) -> Iterator[int]:
-    """Milliseconds of each frame in whole steps, which do not drift from the time that has passed."""
+    """Durations of the frames in ms, in whole steps whose sum does not drift from the true time."""
     shown = 0
     for number in itertools.count(1):
         end = max(round(1000 * number / (fps * step)), shown + least)
@@ -90,17 +90,22 @@ def _times(fps: float, step: int, least: int) -> Iterator[int]:
 
 
 def _write_images(
-    out: io.BytesIO, name: str, pictures: Iterable[Image.Image], times: Iterator[int], progress: Progress, **how: Any
+    out: io.BytesIO,
+    name: str,
+    pictures: Iterable[Image.Image],
+    times: Iterator[int],
+    progress: Progress,
+    **options: Any,
 ) -> None:
     first, *others = every = list(pictures)
     durations = list(itertools.islice(times, len(every)))
     for number, picture in enumerate(every):
-        # What Pillow does with a picture before it writes it, and all that it tells of how far it is.
-        picture.seek = functools.partial(_sought, picture.seek, progress, number, len(every))  # type: ignore[method-assign]
-    first.save(out, name, save_all=True, append_images=others, duration=durations, loop=0, **how)
+        # Pillow seeks each picture before it writes it, which is the only sign of its progress.
+        picture.seek = functools.partial(_seek, picture.seek, progress, number, len(every))  # type: ignore[method-assign]
+    first.save(out, name, save_all=True, append_images=others, duration=durations, loop=0, **options)
 
 
-def _sought(seek: Callable[[int], None], progress: Progress, number: int, total: int, frame: int) -> None:
+def _seek(seek: Callable[[int], None], progress: Progress, number: int, total: int, frame: int) -> None:
     seek(frame)
     progress("encoding", number + 1, total, "frame")
 
@@ -111,10 +116,10 @@ def _write_mp4(out: io.BytesIO, frames: Iterable[Pixels], fps: float) -> None:
     tuned = ["-crf", str(H264_QUALITY), "-preset", "medium", "-movflags", "+faststart"]
     with imageio.get_writer(out, format=".mp4", mode="I", fps=fps, output_params=tuned, **settings) as writer:
         for frame in frames:
-            # Its colours are kept for every second pixel, so sides are even: the last row and column are repeated.
+            # yuv420p has colours for every second pixel, so odd sides get their last row or column twice.
             odd = [(0, side % 2) for side in frame.shape[:2]]
             even = np.pad(frame, (*odd, (0, 0)), mode="edge")
             try:
                 writer.append_data(even)
-            except OSError as error:  # its text is what ffmpeg says, at length
+            except OSError as error:  # its text is the whole log of ffmpeg
                 raise SparklodError(f"ffmpeg cannot write it: {str(error).strip().splitlines()[-1]}") from None
