@@ -1,4 +1,4 @@
-"""Animations: GIF and WebP by Pillow, MP4 by imageio of the extra `video`."""
+"""Animations: GIF and WebP by Pillow, MP4 and WebM by imageio of the extra `video`."""
 
 from __future__ import annotations
 
@@ -17,32 +17,42 @@ from ..support.progress import Progress, silent
 from .pixels import Pixels
 
 #: Suffixes of animations.
-ANIMATIONS = ("gif", "webp", "mp4")
+ANIMATIONS = ("gif", "webp", "mp4", "webm")
 
 #: GIF counts time in steps of 10 ms; players slow down frames that are shorter than this many steps.
 GIF_STEP, GIF_LEAST = 10, 2
 
-#: Longest duration of a frame, ms: 16 bits of hundredths in GIF, 24 bits of ms in WebP, the limit of ffmpeg for MP4.
-LONGEST = {"gif": 10 * 0xFFFF, "webp": 0xFFFFFF, "mp4": 1_000_000}
+#: Longest duration of a frame, ms: 16 bits of hundredths in GIF, 24 bits of ms in WebP, ffmpeg's limit for videos.
+LONGEST = {"gif": 10 * 0xFFFF, "webp": 0xFFFFFF, "mp4": 1_000_000, "webm": 1_000_000}
 
-#: Quality of WebP (0 to 100) and rate factor of H.264 (51 to 0): losses are hardly visible.
-WEBP_QUALITY, H264_QUALITY = 90, 16
+#: Quality of WebP (0 to 100), rate factors of H.264 (51 to 0) and VP9 (63 to 0): losses are hardly visible.
+WEBP_QUALITY, H264_QUALITY, VP9_QUALITY = 90, 16, 24
+
+#: Codec and options of ffmpeg for each kind of video. VP9 obeys its rate factor only with a bit rate of 0, and uses
+#: several processors only with -row-mt.
+VIDEOS = {
+    "mp4": ("libx264", ["-crf", str(H264_QUALITY), "-preset", "medium", "-movflags", "+faststart"]),
+    "webm": (
+        "libvpx-vp9",
+        ["-crf", str(VP9_QUALITY), "-b:v", "0", "-deadline", "good", "-cpu-used", "3", "-row-mt", "1"],
+    ),
+}
 
 
 def check(form: str, fps: float) -> None:
     """Raises a `SparklodError` if an animation cannot be written; called before any frame is drawn."""
-    if form == "mp4":
-        load_imageio()
+    if form in VIDEOS:
+        load_imageio(form)
     longest = LONGEST[form] / 1000
     if 1 / fps > longest:
         raise SparklodError(f"a frame of .{form} lasts at most {longest:,.3f} s, not {1 / fps:,.7g} s; raise --fps")
 
 
-def load_imageio() -> ModuleType:
-    """Imports imageio with its ffmpeg.
+def load_imageio(form: str) -> ModuleType:
+    """Imports imageio with its ffmpeg, which writes videos of a form.
 
     Raises:
-        SparklodError: one of them is not installed.
+        SparklodError: it is not installed.
     """
     try:
         import imageio.v2
@@ -50,27 +60,27 @@ def load_imageio() -> ModuleType:
 
         imageio_ffmpeg.get_ffmpeg_exe()
     except (ImportError, RuntimeError) as error:
-        raise SparklodError(f".mp4 is written by imageio: pip install 'sparklod[video]' ({error})") from None
+        raise SparklodError(f".{form} is written by imageio: pip install 'sparklod[video]' ({error})") from None
     module: ModuleType = imageio.v2
     return module
 
 
 def animate(frames: Iterable[Pixels], form: str, fps: float, progress: Progress = silent) -> bytes:
-    """The bytes of an animation in an endless loop ("gif", "webp") or of a video ("mp4").
+    """The bytes of an animation in an endless loop ("gif", "webp") or of a video ("mp4", "webm").
 
     Args:
         frames: at least one, all of one size; with alpha for "webp" only.
         form: one of `ANIMATIONS`.
         fps: frames a second.
-        progress: called for each frame that GIF and WebP write, which they do at the end; MP4 writes frames as they
+        progress: called for each frame that GIF and WebP write, which they do at the end; videos write frames as they
             come, without calling it.
 
     Raises:
-        SparklodError: MP4 cannot be written here.
+        SparklodError: videos cannot be written here.
     """
     out = io.BytesIO()
-    if form == "mp4":
-        _write_mp4(out, frames, fps)
+    if form in VIDEOS:
+        _write_video(out, frames, form, fps)
     elif form == "gif":
         pictures = (Image.fromarray(frame).convert("P", palette=Image.Palette.ADAPTIVE, colors=256) for frame in frames)
         _write_images(out, "GIF", pictures, _times(fps, GIF_STEP, GIF_LEAST), progress)
@@ -110,11 +120,11 @@ def _seek(seek: Callable[[int], None], progress: Progress, number: int, total: i
     progress("encoding", number + 1, total, "frame")
 
 
-def _write_mp4(out: io.BytesIO, frames: Iterable[Pixels], fps: float) -> None:
-    imageio = load_imageio()
-    settings = {"codec": "libx264", "quality": None, "pixelformat": "yuv420p", "macro_block_size": 1}
-    tuned = ["-crf", str(H264_QUALITY), "-preset", "medium", "-movflags", "+faststart"]
-    with imageio.get_writer(out, format=".mp4", mode="I", fps=fps, output_params=tuned, **settings) as writer:
+def _write_video(out: io.BytesIO, frames: Iterable[Pixels], form: str, fps: float) -> None:
+    imageio = load_imageio(form)
+    codec, tuned = VIDEOS[form]
+    settings = {"codec": codec, "quality": None, "pixelformat": "yuv420p", "macro_block_size": 1}
+    with imageio.get_writer(out, format=f".{form}", mode="I", fps=fps, output_params=tuned, **settings) as writer:
         for frame in frames:
             # yuv420p has colours for every second pixel, so odd sides get their last row or column twice.
             odd = [(0, side % 2) for side in frame.shape[:2]]
