@@ -169,4 +169,4 @@ def _boxes(stage: Stage, scene: Scene, index: NDArray[np.int64], drawable: NDArr
         stage.lines(box_lines(center.min(axis=0)[None], center.max(axis=0)[None]), color, opacity)
     drawn = f", the first {MOST_CHUNKS} drawn" if len(chunks) > MOST_CHUNKS else ""
     what = "splats" if scene.tree is None else "nodes"
-    return f"boxes: chunks of {CHUNK_NODES:,} {what}, {len(chunks)} of {count} hold these{drawn}"
+    return f"boxes: the {len(chunks)} of {count} chunks of {CHUNK_NODES:,} {what} that hold these{drawn}"

@@ -9,7 +9,7 @@ import numpy as np
 from PIL import Image
 
 from sparklod_cli.cameras.camera import Camera
-from sparklod_cli.figures.traversal_chart import Plot, PathScene, plot
+from sparklod_cli.figures.traversal_chart import PathScene, Plot, plot
 from sparklod_cli.simulation.summary import look_at
 from sparklod_cli.tables.columns import Row
 from sparklod_cli.tables.statistics import totals
