@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..lod.kernels.tree_links import walk
+from ..lod.kernels.tree_links import find_depths
 from ..lod.traversal import CHUNK_NODES
 from ..model.gaussian import spark_size
 from ..model.scene import Scene
@@ -115,7 +115,7 @@ def _subject(scene: Scene, level: int | None, drawable: NDArray[np.bool_]) -> _S
         index, others, depth = np.flatnonzero(drawable), none, None
         title = _counted(len(index), "splat")
     else:
-        depth = walk(scene.tree.child_count, scene.tree.child_start, spark_size(scene.splats))[0]
+        depth = find_depths(scene.tree.child_count, scene.tree.child_start, spark_size(scene.splats))[0]
         leaf = scene.tree.is_leaf & drawable & (depth >= 0)
         if level is None:
             index, others = np.flatnonzero(leaf), none

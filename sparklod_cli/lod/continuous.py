@@ -25,7 +25,6 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,14 +35,11 @@ from ..model.lod_tree import LodTree
 from ..model.splats import FloatArray, Splats
 from ..support.defaults import BLEND
 from ..world import World
-from .kernels.pixel_scale import FRUSTUM, NEAREST, NO_FOVEATION
+from .kernels.pixel_scale import pixel_scales
 from .traversal import Matrix, Traversal, View, views_of
 
 #: Halvings of the interval in which the threshold is, which is no longer than the width.
 HALVINGS = 40
-
-#: Numbers of a `VIEW` that say how pixel scales count by direction.
-FOVEATION = ("side", "behind", "inner", "outer")
 
 Shares = NDArray[np.float64]
 
@@ -92,7 +88,7 @@ class ContinuousCuts:
         """
         views = views_of(self._forest, self._instances, view)
         inner = [self._inner[instance.tree] for instance in self._instances]
-        limits = [each.limits(record) for each, record in zip(inner, views, strict=True)]
+        limits = [each.limits(views, number) for number, each in enumerate(inner)]
         more = np.concatenate([each.more for each in inner])
         threshold = max(find_threshold(np.concatenate(limits), more, budget - len(views), width), smallest)
         parts = [each.blended(shares(limit, threshold, width)) for each, limit in zip(inner, limits, strict=True)]
@@ -174,11 +170,12 @@ class _Inner:
         self._above = above[self._node]
         ends = np.cumsum(np.bincount(depth[self._node]))
         self._levels = [slice(a, b) for a, b in itertools.pairwise(ends)]
-        self._values = [np.ascontiguousarray(nodes[name][self._node]) for name in ("x", "y", "z", "size")]
+        self._nodes = nodes
 
-    def limits(self, view: np.void) -> Shares:
-        """(M,) the least pixel scale on the way from the root to each."""
-        limit = pixel_scales(self._values, view)
+    def limits(self, views: NDArray[np.void], number: int) -> Shares:
+        """(M,) the least pixel scale on the way from the root to each, as one of the views has it."""
+        limit = np.empty(len(self._node), np.float32)
+        pixel_scales(self._nodes, self._node, views, number, limit)
         for level in self._levels:
             limit[level] = np.minimum(limit[level], limit[self._above[level]])
         return np.minimum(limit, np.finfo(np.float32).max).astype(np.float64)
@@ -202,39 +199,6 @@ def _ranges(start: NDArray[np.int64], count: NDArray[np.int64]) -> NDArray[np.in
     """start[0], start[0] + 1, ..., so many as `count` says, then those of the next."""
     first = np.cumsum(count) - count
     return np.repeat(start - first, count) + np.arange(count.sum())
-
-
-def pixel_scales(values: Sequence[NDArray[np.float32]], view: np.void) -> NDArray[np.float32]:
-    """(N,) pixel scales, the very numbers of the traversal's; infinite where those are not numbers.
-
-    Args:
-        values: x, y, z and sizes, (N,) each.
-        view: a `kernels.sight.VIEW`.
-    """
-    one = np.float32(1)
-    with np.errstate(all="ignore"):
-        delta = [value - view[f"origin_{axis}"] for axis, value in zip("xyz", values, strict=False)]
-
-        def along(way: str) -> NDArray[np.float32]:
-            x, y, z = (part * view[f"{way}_{axis}"] for axis, part in zip("xyz", delta, strict=True))
-            return (x + y) + z
-
-        x, y, z = delta
-        distance = np.sqrt((x * x + y * y) + z * z)
-        inverse = one / np.where(distance > NEAREST, distance, NEAREST)
-        scale: NDArray[np.float32] = values[3] * inverse * view["lod_scale"]
-        if view["kind"] != NO_FOVEATION:
-            ahead, side, behind, inner, outer = along("forward"), *(view[name] for name in FOVEATION)
-            if view["kind"] == FRUSTUM:
-                seen = (abs(along("right")) <= inner * ahead) & (abs(along("up")) <= outer * ahead)
-                weight = np.where(seen, one, side)
-            else:
-                cosine = ahead * inverse
-                within = side + (one - side) * ((cosine - outer) / (inner - outer))
-                beyond = behind + (side - behind) * (cosine / outer)
-                weight = np.where(cosine >= inner, one, np.where(cosine >= outer, within, beyond))
-            scale = np.where(ahead <= 0, behind, weight) * scale
-        return np.where(np.isnan(scale), np.float32(np.inf), abs(scale))
 
 
 def faded(opacity: FloatArray, weight: Shares) -> FloatArray:

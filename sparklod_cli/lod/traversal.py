@@ -11,13 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..codecs.gpu.lod_tree import Nodes
-from .kernels import cut as kernels
-from .kernels import pixel_scale
+from .kernels import cut_arrays, pixel_scale
+from .kernels.cut import find_cut
 
 Matrix = NDArray[np.float64]
 
-#: Nodes of a chunk, as Spark streams them.
-CHUNK_NODES = 1 << kernels.CHUNK_BITS
+#: Nodes of a chunk, as Spark streams them; as a power of 2.
+CHUNK_BITS = 16
+CHUNK_NODES = 1 << CHUNK_BITS
 
 #: How many nodes are looked at for a cut of so many, at most where every node that is divided has two children or more;
 #: in others the buffers grow.
@@ -29,10 +30,10 @@ GUESS = 0.97
 
 #: Why a cut has no more nodes, by the number that the kernel tells.
 REASONS = {
-    kernels.BUDGET: "budget",
-    kernels.PIXEL: "pixel",
-    kernels.MISSING: "missing",
-    kernels.EXHAUSTED: "exhausted",
+    cut_arrays.BUDGET: "budget",
+    cut_arrays.PIXEL: "pixel",
+    cut_arrays.MISSING: "missing",
+    cut_arrays.EXHAUSTED: "exhausted",
 }
 
 
@@ -101,7 +102,7 @@ class Forest:
     """Trees ready to be traversed.
 
     Attributes:
-        nodes: `sight.NODE` of all trees, one after the other.
+        nodes: `pixel_scale.NODE` of all trees, one after the other.
         node_base: (trees + 1,) int64, where the nodes of each begin.
         chunk_base: (trees + 1,) int64, where the chunks of each begin.
     """
@@ -133,7 +134,7 @@ class Cut:
     """The nodes that are drawn; S of them, of all instances.
 
     Attributes:
-        views: (instances,) `sight.VIEW`.
+        views: (instances,) `pixel_scale.VIEW`.
         node: (S,) uint32 index in its tree.
         instance: (S,) uint16.
         limit: (S,) float32, the least pixel scale from the root to it; negative for one that the queue took out, since
@@ -199,34 +200,27 @@ class Traversal:
         work = self._work(LOOKS * budget + CHUNK_NODES)
         wanted = np.empty(self.forest.chunks, np.float32)
         length = min(budget, self._most) + 1
-        cut = np.empty(length, np.uint32), np.empty(length, np.int32), np.empty(length, np.uint16)
+        cut = cut_arrays.CutNodes(np.empty(length, np.uint32), np.empty(length, np.int32), np.empty(length, np.uint16))
+        trees = cut_arrays.Trees(self.forest.nodes, views, present, CHUNK_BITS)
+        stop = cut_arrays.Stop(np.float32(smallest).view(np.int32), budget)
         while True:
-            selected, reason, missing, least, stop = kernels.find_cut(
-                self.forest.nodes,
-                views,
-                present,
-                np.float32(smallest).view(np.int32),
-                budget,
-                np.float32(work.guess),
-                *work.slots,
-                work.sums,
-                wanted,
-                cut,
+            selected, reason, missing, least, last = find_cut(
+                trees, stop, np.float32(work.guess), work.slots, wanted, cut
             )
-            if reason != kernels.FULL:
+            if reason != cut_arrays.FULL:
                 break
-            work = self._work(2 * len(work.slots[0]))
+            work = self._work(2 * len(work.slots.node))
         # The next cut will be much like this one.
-        work.guess = GUESS * least if reason == kernels.BUDGET else smallest
+        work.guess = GUESS * least if reason == cut_arrays.BUDGET else smallest
         return Cut(
             views=views,
-            node=cut[0][:selected],
-            instance=cut[2][:selected],
-            limit=cut[1][:selected].view(np.float32),
+            node=cut.node[:selected],
+            instance=cut.instance[:selected],
+            limit=cut.limit[:selected].view(np.float32),
             reason=REASONS[reason],
             missing=missing,
             least=float(least),
-            stop=None if stop < 0 else work.slot(stop),
+            stop=None if last < 0 else work.slot(last),
             wanted=wanted,
         )
 
@@ -240,7 +234,7 @@ class Traversal:
         """Buffers of this thread, at least so long as is asked for or as could be needed."""
         slots = min(slots, 2 * self._most)  # a node is looked at by its threshold, and once more by the queue
         work: _Work | None = getattr(self._local, "work", None)
-        if work is None or len(work.slots[0]) < slots:
+        if work is None or len(work.slots.node) < slots:
             work = self._local.work = _Work(slots)
         return work
 
@@ -250,14 +244,14 @@ class _Work:
 
     def __init__(self, slots: int) -> None:
         kinds = (np.uint32, np.int32, np.uint16, np.int32, np.int32, np.int32, np.int32)
-        self.slots = [np.empty(slots + 1, kind) for kind in kinds]
-        self.sums = np.empty(kernels.BUCKETS, np.int32)
+        arrays = [np.empty(slots + 1, kind) for kind in kinds]
+        self.slots = cut_arrays.Slots(*arrays, np.empty(cut_arrays.BUCKETS, np.int32))
         self.guess = 0.0
 
     def slot(self, at: int) -> tuple[float, int, int]:
         """The pixel scale, instance and index of the node in a slot."""
-        node, limit, instance, *_ = self.slots
-        return float(limit.view(np.float32)[at]), int(instance[at]), int(node[at])
+        slots = self.slots
+        return float(slots.limit.view(np.float32)[at]), int(slots.instance[at]), int(slots.node[at])
 
 
 def pixel_limit(fov_y: float, height: int, scale: float = 1.0) -> float:
@@ -272,7 +266,7 @@ def pixel_limit(fov_y: float, height: int, scale: float = 1.0) -> float:
 
 
 def views_of(forest: Forest, instances: Sequence[Instance], view: View) -> NDArray[np.void]:
-    """(instances,) `sight.VIEW`: the camera in the space of each instance, in the precision that Spark has."""
+    """(instances,) `pixel_scale.VIEW`: the camera in the space of each instance, in the precision that Spark has."""
     views = np.zeros(len(instances), pixel_scale.VIEW)
     for row, instance in zip(views, instances, strict=True):
         view_to_object = (np.linalg.inv(instance.object_to_world) @ view.camera_to_world).astype(np.float32)

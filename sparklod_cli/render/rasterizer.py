@@ -38,22 +38,14 @@ def draw(shown: ShadedSplats, camera: Camera, look: RasterSettings) -> Image:
 def seen(shown: ShadedSplats, camera: Camera, look: RasterSettings) -> NDArray[np.float32]:
     """The splats on the screen, (M, `project.COLUMNS`) from near to far; a buffer, which the next call overwrites."""
     screen, arranged, keys = _buffers(len(shown))
-    project.project(
-        shown.center,
-        shown.scale,
-        shown.quat_xyzw,
-        shown.lod_opacity,
-        shown.rgb,
-        world_to_camera(camera),
-        np.array([*camera.focal, *camera.principal, camera.width, camera.height], np.float32),
-        np.array([look.near, look.far, CLIP, BLUR, MIN_ALPHA, MAX_STD_DEV, STD_DEV_PER_D, look.max_radius], np.float32),
-        look.sort == "radial",
-        screen,
-        keys,
-    )
-    keys = np.sort(keys[keys != project.NOWHERE])
+    splats = project.ShadedColumns(shown.center, shown.scale, shown.quat_xyzw, shown.lod_opacity, shown.rgb)
+    lens = project.Lens(*map(np.float32, (*camera.focal, *camera.principal, camera.width, camera.height)))
+    near, far, radius = look.near, look.far, look.max_radius
+    limits = project.Limits(*map(np.float32, (near, far, CLIP, BLUR, MIN_ALPHA, MAX_STD_DEV, STD_DEV_PER_D, radius)))
+    project.project(splats, world_to_camera(camera), lens, limits, look.sort == "radial", screen, keys)
+    keys = np.sort(keys[keys != project.NOT_DRAWN])
     arranged = arranged[: len(keys)]
-    project.arrange(screen, keys, arranged)
+    project.gather_drawn(screen, keys, arranged)
     return arranged
 
 

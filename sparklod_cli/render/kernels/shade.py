@@ -1,4 +1,4 @@
-"""Spherical harmonics: the colour that a splat has from one direction."""
+"""Spherical harmonics: the colour of a splat from one direction."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ C3 = tuple(
 
 @kernel(parallel=True)
 def add_sh(center, sh, eye, degree, rgb):
-    """Adds spherical harmonics to colours.
+    """Adds the terms of degree 1 and above to colours.
 
     Args:
         center: (N, 3) float32.
-        sh: (N, K, 3) float32 coefficients of degree 1 and above.
-        eye: (3,) float32, where they are seen from.
+        sh: (N, K, 3) float32 coefficients of degree 1 and above, K = 3, 8 or 15.
+        eye: (3,) float32 position of the camera.
         degree: 1 to 3.
         rgb: (N, 3) float32, added to.
     """

@@ -1,0 +1,43 @@
+"""The falloff: alpha of a splat at a distance from its centre.
+
+z is the distance in standard deviations, and z2 its square, which may be rounded to less than 0.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...support.fast_math import exp2, log2
+from ...support.jit import kernel
+
+f32 = np.float32
+
+#: -log2(e) / 2: exp(-z^2 / 2) = 2 ** (MINUS_HALF_LOG2E * z^2).
+MINUS_HALF_LOG2E = f32(-0.7213475204444817)
+
+#: Least argument of `log2`, which must be a normal number. The least difference of two float32 near 1 is 6e-8, so only 0
+#: is raised to it.
+LEAST_REST = f32(1e-30)
+
+#: Least argument of `exp2`, which is exact down to -126. 2 ** -120 is lost beside 1.
+LEAST_EXPONENT = f32(-120)
+
+
+@kernel(inline=True)
+def plain(z2, opacity):
+    """Alpha of a splat with D up to 1: D * exp(-z^2 / 2)."""
+    return opacity * exp2(MINUS_HALF_LOG2E * z2)
+
+
+@kernel(inline=True)
+def merged(z2, power):
+    """Alpha of a splat with D above 1: 1 - (1 - exp(-z^2 / 2)) ** power."""
+    rest = max(f32(1) - exp2(MINUS_HALF_LOG2E * z2), LEAST_REST)
+    return f32(1) - exp2(max(power * log2(rest), LEAST_EXPONENT))
+
+
+@kernel(inline=True)
+def shifted(z2, opacity):
+    """Alpha of a splat with D above 1 in Spark's LoD design: exp(-D / 2 * max(0, z - (D - 1)) ** 2)."""
+    beyond = max(np.sqrt(max(z2, f32(0))) - (opacity - f32(1)), f32(0))
+    return exp2(MINUS_HALF_LOG2E * opacity * beyond * beyond)
