@@ -29,10 +29,11 @@ from sparklod_cli.cameras.path import GENERATED, cameras_of
 from sparklod_cli.codecs import spz
 from sparklod_cli.codecs.gpu import ext_splats, lod_tree
 from sparklod_cli.codecs.gpu.lod_tree import Nodes
-from sparklod_cli.compare import Budget, on_background, parse_budgets
+from sparklod_cli.compare import on_background
 from sparklod_cli.images.metrics import psnr
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod import quality, quick
+from sparklod_cli.lod.budget import Budget, parse_budgets
 from sparklod_cli.lod.traversal import Forest, Instance, Traversal
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
@@ -204,7 +205,7 @@ def ours(splats: Splats, method: str, arguments: argparse.Namespace) -> Built:
 
 def as_written(scene: Scene) -> tuple[Splats, LodTree]:
     """A tree after its coding as SPZ, with the options of `build-lod`."""
-    data = b"".join(spz.encode(scene, spz.Options(threads=processors())))
+    data = b"".join(spz.encode(scene, threads=processors()))
     held = spz.decode(io.BytesIO(data), threads=processors())
     assert held.tree is not None
     return held.splats, held.tree

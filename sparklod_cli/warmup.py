@@ -77,9 +77,8 @@ JOBS = {
     ),
     "render": Job(
         (
-            *("bands.count_fragments", "bands.draw_discs", "cut.find_cut", "cut_statistics.measure_cut"),
-            *("pixel_scale.pixel_scales", "project.gather_drawn", "project.project", "raster.draw_tiles"),
-            "raster.sort_into_tiles",
+            *("bands.count_fragments", "bands.draw_discs", "cut.find_cut", "pixel_scale.pixel_scales"),
+            *("project.gather_drawn", "project.project", "raster.draw_tiles", "raster.sort_into_tiles"),
         ),
         (
             "render tree.spz --size 64x64 -o cut.png",
@@ -196,4 +195,4 @@ def _write_inputs(folder: Path) -> None:
     children[0], starts[0] = count, 1
     tree = Scene(root, LodTree(children, starts))
     write_whole(folder / "scene.ply", ply.encode(Scene(leaves)), overwrite=True)
-    write_whole(folder / "tree.spz", spz.encode(tree, spz.Options()), overwrite=True)
+    write_whole(folder / "tree.spz", spz.encode(tree), overwrite=True)

@@ -118,4 +118,4 @@ def rotation_of(quat_wxyz: ArrayLike) -> Matrix:
     w, x, y, z = unit = normalized(quat_wxyz)
     if not np.isfinite(unit).all():
         raise ValueError("has a quaternion of length 0")
-    return np.array(rotation_matrix(x, y, z, w))
+    return np.array(rotation_matrix(x, y, z, w)).reshape(3, 3)

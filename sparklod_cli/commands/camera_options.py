@@ -13,15 +13,16 @@ from ..cameras.axes import Axes
 from ..cameras.formats.table import FORMATS, NAMES
 from ..support.errors import CameraPathError, SparklodError, TooManyCamerasError
 from .camera_values import Size, View, Views
-from .options import Command, Numbers, Real
+from .options.common import Command
+from .options.types import Numbers, Real
 from .paths import InputPath
 
 if TYPE_CHECKING:
     from ..cameras.camera import Matrix
     from ..cameras.formats.source import Parsed
     from ..cameras.frame import Frame, Settings
-    from ..cameras.framing import Balls
     from ..cameras.path import CameraPath
+    from ..model.balls import Balls
 
     #: Gives what the splats cover.
     Scene = Callable[[], Balls]

@@ -7,12 +7,14 @@ from typing import Any
 
 import click
 
-from ..support import defaults
+from ..tables.files import FORMS
 from .camera_options import camera_options, cameras_from
+from .command import Command
 from .console import Console
-from .options import common_options, refuse, table_form
-from .paths import OutputPath, keep_apart
-from .world_options import files_meant, placements_from, viewer_from, viewer_options, world_options
+from .options.common import common_options, overwrite_option, table_form
+from .paths import OutputPath, claim_stdout, keep_apart
+from .usage import exclude
+from .world_options import files_meant, placements_from, streaming_from, viewer_from, viewer_options, world_options
 
 #: Below this share of splats in front of the cameras, path and scene probably do not share their axes.
 LEAST_IN_FRONT = 0.05
@@ -32,16 +34,16 @@ Examples:
 """
 
 
-@click.command("traverse", epilog=EXAMPLES, context_settings={"show_default": True})
+@click.command("traverse", cls=Command, epilog=EXAMPLES, context_settings={"show_default": True})
 @world_options
 @camera_options
 @viewer_options
 @click.option("-o", "--output", metavar="FILE", type=OutputPath(), help="Of the table.  [default: standard output]")
-@click.option("--overwrite", is_flag=True, help="Replace outputs that exist.")
+@overwrite_option
 @click.option(
     "--format",
     "form",
-    type=click.Choice(defaults.TABLES),
+    type=click.Choice(list(FORMS)),
     help="Of the table.  [default: by the name of --output, or csv]",
 )
 @click.option("--per-instance", is_flag=True, help="A row for each instance, too.")
@@ -81,9 +83,10 @@ def traverse(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, *
 
     Coordinates are those of the files; --up, --world-transform and --camera-axes bring cameras into them.
     """
+    from ..scenes.reading import TRAVERSED, read_scenes
+    from ..simulation import columns
     from ..simulation.frames import Simulation
-    from ..tables import assertions, files
-    from ..world import TRAVERSED, read_world
+    from ..tables import assertions
     from .traverse_job import Job, Wanted
 
     viewer = viewer_from(ctx, settings)
@@ -91,13 +94,13 @@ def traverse(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, *
     keep_apart(ctx, files_meant(settings, placements))
     form = table_form("--output", settings["output"], settings["form"])
     try:
-        asserts = [assertions.parse(text) for text in settings["asserts"]]
+        asserts = [assertions.parse(text, columns.COLUMNS) for text in settings["asserts"]]
     except assertions.BadAssertionError as error:
         raise click.UsageError(f"--assert {error}") from None
     wanted = Wanted(
         output=settings["output"],
         form=form,
-        columns=files.select(timing=not settings["no_timing"]),
+        columns=columns.select(timing=not settings["no_timing"]),
         summary=settings["summary"],
         as_json=as_json,
         asserts=asserts,
@@ -106,10 +109,9 @@ def traverse(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, *
         padded=settings["padded"],
         overwrite=settings["overwrite"],
     )
-    if as_json and str(wanted.output) == "-":
-        raise click.UsageError("--json and the table cannot both go to standard output")
+    claim_stdout(ctx, "output", as_json=as_json)
     if as_json and wanted.output is None:
-        refuse(ctx, "--json without --output, which writes no table", OF_TABLES)
+        exclude(ctx, OF_TABLES, "--json without --output, which writes no table")
     if wanted.padded and wanted.indices is None:
         raise click.UsageError("--padded only means something with --indices-out")
     with Console(quiet=quiet, verbose=verbose) as console:
@@ -117,8 +119,9 @@ def traverse(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, *
 
         console.announce_compiling("traverse")
         wanted.check()
-        world = read_world(
+        world = read_scenes(
             placements,
+            trees_only=True,
             columns=TRAVERSED if wanted.plot is None else COLUMNS,
             precision=settings["precision"],
             threads=settings["threads"],
@@ -126,7 +129,7 @@ def traverse(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, *
         )
         path = cameras_from(settings, world.balls)
         try:
-            simulation = Simulation(world, viewer, by_instance=settings["per_instance"])
+            simulation = Simulation(world, viewer, streaming_from(settings), by_instance=settings["per_instance"])
         except ValueError as error:
             raise click.UsageError(str(error)) from None
         for note in path.notes:

@@ -57,8 +57,7 @@ def sphere(rounds: int) -> Mesh:
 
 def rotation(quat_xyzw: FloatArray) -> FloatArray:
     """(N, 4) unit quaternions to (N, 3, 3) matrices: splat, world axis, local axis."""
-    axes: FloatArray = np.ascontiguousarray(np.moveaxis(np.array(rotation_matrix(*quat_xyzw.T)), 2, 0))
-    return axes
+    return np.stack(rotation_matrix(*quat_xyzw.T), axis=1).reshape(-1, 3, 3)
 
 
 def ellipsoids(splats: Splats, deviations: float, of: Mesh, thinnest: float) -> Mesh:

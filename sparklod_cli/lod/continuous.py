@@ -22,7 +22,6 @@ continuous and falls with T; so there is such a T, and it moves by no more than 
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import math
 from dataclasses import dataclass
@@ -32,11 +31,10 @@ from numpy.typing import NDArray
 
 from ..model.gaussian import linear_opacity, lod_opacity
 from ..model.lod_tree import LodTree
-from ..model.splats import FloatArray, Splats
+from ..model.splats import FloatArray
 from ..support.defaults import BLEND
-from ..world import World
 from .kernels.pixel_scale import pixel_scales
-from .traversal import Matrix, Traversal, View, views_of
+from .traversal import Traversal, View, views_of
 
 #: Halvings of the interval in which the threshold is, which is no longer than the width.
 HALVINGS = 40
@@ -83,7 +81,7 @@ class ContinuousCuts:
             view: where the camera is.
             budget: what the weights sum to, all instances together, unless `smallest` or the leaves come first; at
                 least as many as there are instances. More nodes are drawn, for those that fade are, too.
-            smallest: nodes of this pixel scale are not divided; see `pixel_limit`.
+            smallest: nodes of this pixel scale are not divided; see `settings.pixel_limit`.
             width: nodes of so many times the threshold are divided wholly; above 1.
         """
         views = views_of(self._forest, self._instances, view)
@@ -210,14 +208,3 @@ def faded(opacity: FloatArray, weight: Shares) -> FloatArray:
     """
     fading: FloatArray = np.where(weight < 1, linear_opacity(lod_opacity(opacity) * weight), opacity)
     return fading.astype(np.float32)
-
-
-def parts_of(world: World, cut: BlendedCut) -> list[tuple[Splats, Matrix]]:
-    """For `render.shown.show`: the splats of each instance, as opaque as they are drawn, and where it stands."""
-    parts = []
-    for number, instance in enumerate(world.instances):
-        mine = cut.instance == number
-        splats = world.trees[instance.tree].scene.splats.take(cut.node[mine])
-        splats = dataclasses.replace(splats, opacity=faded(splats.opacity, cut.weight[mine]))
-        parts.append((splats, instance.object_to_world))
-    return parts

@@ -30,13 +30,13 @@ SIZE_PER_D = 0.7
 THOMSEN_P = 1.6075
 
 
-def rotation_matrix(x: Any, y: Any, z: Any, w: Any, one: Any = 1.0) -> tuple[tuple[Any, Any, Any], ...]:
-    """Rows of the rotation matrix of a unit quaternion, local to world; scalars or arrays, `one` of their type."""
+def rotation_matrix(x: Any, y: Any, z: Any, w: Any, one: Any = 1.0) -> tuple[Any, ...]:
+    """The 9 elements, row by row, of the rotation by a unit quaternion, local to world; `one` is of the type of x."""
     two = one + one
     return (
-        (one - two * (y * y + z * z), two * (x * y - w * z), two * (x * z + w * y)),
-        (two * (x * y + w * z), one - two * (x * x + z * z), two * (y * z - w * x)),
-        (two * (x * z - w * y), two * (y * z + w * x), one - two * (x * x + y * y)),
+        *(one - two * (y * y + z * z), two * (x * y - w * z), two * (x * z + w * y)),
+        *(two * (x * y + w * z), one - two * (x * x + z * z), two * (y * z - w * x)),
+        *(two * (x * z - w * y), two * (y * z + w * x), one - two * (x * x + y * y)),
     )
 
 
@@ -70,9 +70,14 @@ def covariance(scale: FloatArray, quat_xyzw: FloatArray) -> NDArray[np.float64]:
 
     In float64, because elements of a thin splat's covariance are small differences of large numbers.
     """
-    axes = np.array(rotation_matrix(*quat_xyzw.T.astype(np.float64)))  # world axis, local axis, splat
+    axes = rotation_matrices(quat_xyzw)
     axes *= scale.T
     return np.einsum("kin,kin->nk", axes[_ROW], axes[_COLUMN])
+
+
+def rotation_matrices(quat_xyzw: FloatArray) -> NDArray[np.float64]:
+    """(3, 3, N) rotations, world axis by local axis, of (N, 4) unit quaternions, local to world."""
+    return np.array(rotation_matrix(*quat_xyzw.T.astype(np.float64))).reshape(3, 3, -1)
 
 
 def moved(points: FloatArray, matrix: NDArray[np.float64]) -> FloatArray:
@@ -84,7 +89,7 @@ def moved(points: FloatArray, matrix: NDArray[np.float64]) -> FloatArray:
 def placed(splats: Splats, matrix: NDArray[np.float64]) -> Splats:
     """Splats under a (4, 4) rotation, uniform scale and translation; their SH are not turned."""
     size = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
-    turn = _quat_of(matrix[:3, :3] / size)
+    turn = quat_of_rotation(matrix[:3, :3] / size)
     x, y, z, w = splats.quat_xyzw.T
     a, b, c, d = turn
     quat = [d * x + a * w + b * z - c * y, d * y - a * z + b * w + c * x, d * z + a * y - b * x + c * w]
@@ -96,8 +101,11 @@ def placed(splats: Splats, matrix: NDArray[np.float64]) -> Splats:
     )
 
 
-def _quat_of(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(4,) x y z w of a (3, 3) rotation: the eigenvector of Bar-Itzhack's matrix, which needs no special cases."""
+def quat_of_rotation(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(4,) unit x y z w, of either sign, of a (3, 3) rotation.
+
+    The eigenvector of Bar-Itzhack's matrix, which needs no special cases.
+    """
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation
     symmetric = np.array(
         [

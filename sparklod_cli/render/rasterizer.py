@@ -22,27 +22,27 @@ _kept = threading.local()
 CHUNKS = 2
 
 
-def draw(shown: ShadedSplats, camera: Camera, look: RasterSettings) -> Image:
+def draw(splats: ShadedSplats, camera: Camera, settings: RasterSettings) -> Image:
     """What a camera sees: (height, width, 4) float32, red, green, blue, multiplied by alpha, and alpha; 0..1.
 
     The image is the same for any number of threads.
     """
-    screen = seen(shown, camera, look)
+    screen = seen(splats, camera, settings)
     across, down = -(-camera.width // raster.TILE), -(-camera.height // raster.TILE)
-    start, splats = raster.sort_into_tiles(screen, across, down, CHUNKS * threads_in_use())
+    start, order = raster.sort_into_tiles(screen, across, down, CHUNKS * threads_in_use())
     image = np.empty((camera.height, camera.width, 4), np.float32)
-    raster.draw_tiles(screen, start, splats, across, down, look.profile == "shifted", np.float32(MIN_ALPHA), image)
+    raster.draw_tiles(screen, start, order, across, down, settings.profile == "shifted", np.float32(MIN_ALPHA), image)
     return image
 
 
-def seen(shown: ShadedSplats, camera: Camera, look: RasterSettings) -> NDArray[np.float32]:
+def seen(splats: ShadedSplats, camera: Camera, settings: RasterSettings) -> NDArray[np.float32]:
     """The splats on the screen, (M, `project.COLUMNS`) from near to far; a buffer, which the next call overwrites."""
-    screen, arranged, keys = _buffers(len(shown))
-    splats = project.ShadedColumns(shown.center, shown.scale, shown.quat_xyzw, shown.lod_opacity, shown.rgb)
+    screen, arranged, keys = _buffers(len(splats))
+    columns = project.ShadedColumns(splats.center, splats.scale, splats.quat_xyzw, splats.lod_opacity, splats.rgb)
     lens = project.Lens(*map(np.float32, (*camera.focal, *camera.principal, camera.width, camera.height)))
-    near, far, radius = look.near, look.far, look.max_radius
+    near, far, radius = settings.near, settings.far, settings.max_radius
     limits = project.Limits(*map(np.float32, (near, far, CLIP, BLUR, MIN_ALPHA, MAX_STD_DEV, STD_DEV_PER_D, radius)))
-    project.project(splats, world_to_camera(camera), lens, limits, look.sort == "radial", screen, keys)
+    project.project(columns, world_to_camera(camera), lens, limits, settings.sort == "radial", screen, keys)
     keys = np.sort(keys[keys != project.NOT_DRAWN])
     arranged = arranged[: len(keys)]
     project.gather_drawn(screen, keys, arranged)

@@ -13,20 +13,20 @@ import pytest
 from fixtures import by_hand
 from sparklod_cli.codecs import ply, splat, spz
 from sparklod_cli.codecs.formats import HEAD, sniff
+from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.codecs.stream import rows_of
-from sparklod_cli.errors import FormatError
-from sparklod_cli.parallel import CHUNK, ordered_map
-from sparklod_cli.scene import Scene
-from sparklod_cli.splats import COLUMNS, Splats
-
-from ..scenes import random_splats
+from sparklod_cli.model.scene import Scene
+from sparklod_cli.model.splats import COLUMNS, Splats
+from sparklod_cli.support.errors import FormatError
+from sparklod_cli.support.parallel import CHUNK, ordered_map
+from tests.scenes import random_splats
 
 COUNT = 12 * CHUNK
 
 
 def spz4(splats: Splats) -> bytes:
     """Version 4 of what version 3 has: the same streams, a zstd frame each."""
-    gzipped = b"".join(spz.encode(Scene(splats), spz.Options(version=3)))
+    gzipped = b"".join(spz.encode(Scene(splats), WriteOptions(spz_version=3)))
     raw = by_hand.unpacked(gzipped)
     streams, at = [], 16
     for size in (9, 1, 3, 3, 4, 3 * splats.sh.shape[1]):
@@ -40,7 +40,7 @@ def spz4(splats: Splats) -> bytes:
 WRITERS: dict[str, Callable[[Splats], bytes]] = {
     "ply": lambda splats: b"".join(ply.encode(Scene(splats))),
     "splat": lambda splats: b"".join(splat.encode(Scene(splats))),
-    "spz 3": lambda splats: b"".join(spz.encode(Scene(splats), spz.Options(version=3))),
+    "spz 3": lambda splats: b"".join(spz.encode(Scene(splats), WriteOptions(spz_version=3))),
     "spz 4": spz4,
 }
 
@@ -50,7 +50,7 @@ EXTRA = {"ply": 12e6, "splat": 3e6, "spz 3": 9e6, "spz 4": 9e6}
 
 
 @pytest.mark.parametrize("kind", WRITERS)
-def test_peak_memory(kind: str) -> None:
+def test_decoding_takes_little_memory_beside_the_splats(kind: str) -> None:
     file = io.BytesIO(WRITERS[kind](random_splats(COUNT, sh_degree=3)))
     head = file.read(HEAD)
     file.seek(0)

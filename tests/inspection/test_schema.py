@@ -18,13 +18,14 @@ from jsonschema import Draft202012Validator
 from sparklod_cli.cli import run
 from sparklod_cli.codecs import spz
 from sparklod_cli.codecs.formats import FORMATS
+from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.inspection import values
 from sparklod_cli.inspection.expectations import value_at
 from sparklod_cli.inspection.findings import CODES
 from sparklod_cli.inspection.report import SCHEMA_VERSION, Wanted, inspect
 from sparklod_cli.lod import quick
-from sparklod_cli.scene import Scene
-from sparklod_cli.tree import MAX_CHILDREN, LodTree
+from sparklod_cli.model.lod_tree import MAX_CHILDREN, LodTree
+from sparklod_cli.model.scene import Scene
 from tests.conftest import FIXTURES, ROOT
 from tests.scenes import random_splats
 
@@ -64,7 +65,7 @@ def faults(report: Report) -> list[str]:
 @cache
 def tree_bytes(sh_degree: int) -> bytes:
     scene = Scene(*quick.build(random_splats(300, sh_degree=sh_degree)))
-    return b"".join(spz.encode(scene, spz.Options()))
+    return b"".join(spz.encode(scene))
 
 
 @pytest.fixture
@@ -96,7 +97,7 @@ def test_reports_of_the_fixtures(path: Path, wanted: Wanted) -> None:
 
 @pytest.mark.parametrize("wanted", WAYS.values(), ids=WAYS.keys())
 @pytest.mark.parametrize("sh_degree", range(4))
-def test_reports_of_trees(tmp_path: Path, sh_degree: int, wanted: Wanted) -> None:
+def test_reports_of_trees_follow_the_schema(tmp_path: Path, sh_degree: int, wanted: Wanted) -> None:
     path = tmp_path / "tree.spz"
     path.write_bytes(tree_bytes(sh_degree))
     report = report_of(path, wanted)
@@ -126,14 +127,14 @@ def test_reports_of_broken_trees(tmp_path: Path, count: int, most: int) -> None:
             rng.integers(0, most + 1, count).astype(np.uint16), rng.integers(0, count + 2, count).astype(np.uint32)
         )
         path = tmp_path / "tree.spz"
-        path.write_bytes(b"".join(spz.encode(Scene(splats, tree), spz.Options(fractional_bits=12))))
+        path.write_bytes(b"".join(spz.encode(Scene(splats, tree), WriteOptions(fractional_bits=12))))
         for name, wanted in WAYS.items():
             assert faults(report_of(path, wanted)) == [], (seed, name)
 
 
 @pytest.mark.parametrize("wanted", WAYS.values(), ids=WAYS.keys())
 @pytest.mark.parametrize("path", ["missing.spz", "."])
-def test_reports_of_nothing(tmp_path: Path, path: str, wanted: Wanted) -> None:
+def test_reports_of_unreadable_files_follow_the_schema(tmp_path: Path, path: str, wanted: Wanted) -> None:
     report = report_of(tmp_path / path, wanted)
     assert faults(report) == []
     assert report["findings"][0]["code"] == "file.unreadable"

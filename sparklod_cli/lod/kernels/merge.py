@@ -30,7 +30,7 @@ rotation_matrix = kernel(inline=True)(gaussian.rotation_matrix)
 def covariance(a, b, c, x, y, z, w):
     """xx, yy, zz, xy, xz, yz of R diag(a^2, b^2, c^2) R^T, of scales a, b, c and a unit quaternion in float64."""
     a, b, c = a * a, b * b, c * c
-    (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = rotation_matrix(x, y, z, w, 1.0)
+    r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation_matrix(x, y, z, w, 1.0)
     return (
         r00 * r00 * a + r01 * r01 * b + r02 * r02 * c,
         r10 * r10 * a + r11 * r11 * b + r12 * r12 * c,

@@ -129,7 +129,7 @@ def project(splats, world_to_camera, lens, limits, radial, screen, keys):
         t10, t11, t12 = jy * m[1, 0] + ky * m[2, 0], jy * m[1, 1] + ky * m[2, 1], jy * m[1, 2] + ky * m[2, 2]
         qx, qy, qz, qw = quat[i, 0], quat[i, 1], quat[i, 2], quat[i, 3]
         one = f32(1)
-        (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = rotation_matrix(qx, qy, qz, qw, one)
+        r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation_matrix(qx, qy, qz, qw, one)
         sx, sy, sz = scale[i, 0], scale[i, 1], scale[i, 2]
         p0, p1, p2 = (
             (t00 * r00 + t01 * r10 + t02 * r20) * sx,
