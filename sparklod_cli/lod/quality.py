@@ -179,12 +179,9 @@ def _leaves(splats: Splats, curve: _Curve, threads: int) -> tuple[_BinaryTree, N
         n,
     )
     index = curve.sort(curve.centers(splats), np.arange(n, dtype=np.uint32), 0, threads)
-    node_rows.fill_leaf_rows(index, _geometry(splats), splats.rgb, curve.space, binary.rows, binary.size)
+    columns = SplatColumns(splats.center, splats.scale, splats.quat_xyzw, splats.opacity)
+    node_rows.fill_leaf_rows(index, columns, splats.rgb, curve.space, binary.rows, binary.size)
     return binary, index
-
-
-def _geometry(splats: Splats) -> SplatColumns:
-    return SplatColumns(splats.center, splats.scale, splats.quat_xyzw, splats.opacity)
 
 
 def _merge_all(binary: _BinaryTree, leaves: int, curve: _Curve, progress: Progress) -> None:
@@ -265,7 +262,8 @@ def _in_final_order(
     out = Splats.empty(total, degree_of(splats.sh.shape[1]))
     for name in COLUMNS:
         fill_leaves(order, index, getattr(splats, name).reshape(n, -1), getattr(out, name).reshape(total, -1))
-    node_rows.fill_merged_splats(order, n, binary.rows, curve.space, _geometry(out))
+    geometry = out.center, out.scale, out.quat_xyzw, out.opacity
+    node_rows.fill_merged_splats(order, n, binary.rows, curve.space, *geometry)
     weights = binary.rows[:, pair_cost.WEIGHT].astype(np.float64)
     for begin, end in zip(ends[-2::-1], ends[:0:-1], strict=True):
         with threads_for(int(end - begin)) as threads:

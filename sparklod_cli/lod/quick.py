@@ -203,8 +203,8 @@ def _in_final_order(voxel_tree: _VoxelTree, index: Nodes, rgb: FloatArray, sh: F
     final = final_indices(order, voxel_tree.leaves)
     tree = LodTree(np.zeros(total, np.uint16), np.zeros(total, np.uint32))
     out = Splats.empty(total, degree_of(sh.shape[1]))
-    columns = SplatColumns(out.center, out.scale, out.quat_xyzw, out.opacity)
-    fill_geometry(order, voxel_tree.geometry, voxel_tree.leaves, SHRINK, columns)
+    geometry = out.center, out.scale, out.quat_xyzw, out.opacity
+    fill_geometry(order, voxel_tree.geometry, voxel_tree.leaves, SHRINK, *geometry)
     voxel_tree.geometry = np.empty((0, WIDTH), np.float32)  # frees memory for the colours
     flat_sh = out.sh.reshape(total, -1)
     fill_leaves(order, index, rgb, out.rgb)

@@ -28,7 +28,7 @@ def final_indices(order, leaves):
 
 
 @kernel(parallel=True)
-def fill_geometry(order, geometry, leaves, shrink, splats):
+def fill_geometry(order, geometry, leaves, shrink, center, scale, quat, opacity):
     """Fills the geometry of splats in final order: splat i from geometry[order[i]].
 
     Args:
@@ -36,9 +36,8 @@ def fill_geometry(order, geometry, leaves, shrink, splats):
         geometry: rows of `geometry.py`.
         leaves: number of leaves; rows from there on are merged nodes.
         shrink: float32, factor for the scales of merged nodes.
-        splats: `SplatColumns` of M splats, filled.
+        center, scale, quat, opacity: columns of M splats, filled.
     """
-    center, scale, quat, opacity = splats
     for i in prange(len(order)):
         j = order[i]
         factor = shrink if j >= leaves else np.float32(1)

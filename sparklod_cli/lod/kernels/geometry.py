@@ -30,7 +30,10 @@ THOMSEN_P32, THOMSEN_ROOT, THIRD = np.float32(THOMSEN_P), np.float32(1 / THOMSEN
 
 
 class SplatColumns(NamedTuple):
-    """Geometry of N splats for a kernel, float32 columns as in `Splats`.
+    """Geometry of N splats, float32 columns as in `Splats`, for a kernel to read.
+
+    Arrays that a parallel kernel fills must be arguments of their own: numba 0.68 takes writes to arrays out of a tuple
+    for dead code and removes them.
 
     Attributes:
         center: (N, 3). scale: (N, 3). quat_xyzw: (N, 4). opacity: (N,).

@@ -100,7 +100,7 @@ def morton_keys(rows, nodes, low, step):
 
 
 @kernel(parallel=True)
-def fill_merged_splats(order, leaves, rows, space, splats):
+def fill_merged_splats(order, leaves, rows, space, center, scale, quat, opacity):
     """Fills the geometry of merged splats in final order; leaves are left as they are.
 
     Args:
@@ -108,9 +108,8 @@ def fill_merged_splats(order, leaves, rows, space, splats):
         leaves: number of leaves; nodes from there on are merged.
         rows: node rows.
         space: `Space`.
-        splats: `SplatColumns` of M splats.
+        center, scale, quat, opacity: columns of M splats.
     """
-    center, scale, quat, opacity = splats
     middle, unit = space
     n = len(order)
     for block in prange((n + BLOCK - 1) // BLOCK):
