@@ -14,9 +14,10 @@ import pytest
 from click.testing import CliRunner, Result
 
 from sparklod_cli.cameras import generators
-from sparklod_cli.cameras.framing import FILLED, Balls
+from sparklod_cli.cameras.framing import FILLED
 from sparklod_cli.cameras.path import CameraPath
 from sparklod_cli.commands.camera_options import camera_options, cameras_from
+from sparklod_cli.model.balls import Balls
 from sparklod_cli.support.errors import CameraPathError
 from tests.cameras.known import FOLDER, KNOWN, SIZE, check_pose
 
