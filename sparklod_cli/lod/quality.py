@@ -33,8 +33,8 @@ from .kernels.sort import Nodes, sort_by_key
 #: Growth, from level to level, of the size up to which leaves join and nodes merge. Chosen.
 BASE = 2.0
 
-#: Largest distance on the curve of two nodes that merge. Measured: 8 loses 0.1 to 0.2 dB to 16, which gains nothing over
-#: 12, nor does 24 (docs/decisions/2026-11-21-fidelity.md).
+#: Largest distance on the curve of two nodes that merge. Measured: 8 loses 0.1 to 0.2 dB to 16; 16 and 24 gain nothing
+#: over 12 (docs/decisions/2026-11-21-fidelity.md).
 WINDOW = 12
 
 #: Quantile of the costs of pairs up to which pairs merge in a round, which comes close to merging the cheapest first.
@@ -58,8 +58,8 @@ SMALLEST = 0.01
 #: Share of the leaves outside the curve's box on either side of an axis, as scenes have a few far away. Chosen.
 OUTSIDE = 0.005
 
-#: How much wider the curve's box is than the scene, as a share of its edge, which leaves room to shift it. From round to
-#: round it is shifted by the golden section, so that no two rounds have the same seams. Chosen.
+#: How much wider the curve's box is than the scene, as a share of its edge, which leaves room to shift it. From round
+#: to round it is shifted by the golden section, so that no two rounds have the same seams. Chosen.
 SLACK, GOLDEN = 0.3, 0.6180339887
 
 #: Largest coordinate and size, units: float32 holds its square. Chosen.
@@ -105,7 +105,7 @@ class _Curve:
 
     @classmethod
     def of(cls, splats: Splats, bounds: Bounds) -> _Curve:
-        """Around most of the splats; the unit is a power of two near their median size, unless FARTHEST wants a larger."""
+        """Around most of the splats; the unit is a power of two near their median scale, or as FARTHEST requires."""
         some = slice(None, None, max(1, len(splats) // SAMPLE))
         center = splats.center[some].astype(np.float64)
         middle = np.median(center, axis=0)
@@ -139,8 +139,8 @@ def build(splats: Splats, growth: float = DEFAULT_GROWTH, *, progress: Progress 
     """Builds a Level-of-Detail tree whose cuts are close to full detail.
 
     The result does not depend on the number of threads (`jit.use_threads`). Each input splat is one leaf, bit for bit.
-    The root is node 0, siblings are consecutive and come after their parent. Any prefix of the nodes is a coarser scene:
-    the children of larger nodes come first, and along a Morton curve within a step of size.
+    The root is node 0, siblings are consecutive and come after their parent. Any prefix of the nodes is a coarser
+    scene: the children of larger nodes come first, and along a Morton curve within a step of size.
 
     Args:
         splats: N splats, finite, with positive opacity and at least one positive scale each.

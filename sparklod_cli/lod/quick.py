@@ -5,8 +5,8 @@ whose cells have edges of base ** level. From the finest level up, the splats of
 below, and all that share a cell become the children of one merged node.
 
 For speed, leaves are sorted once, by level and Morton code, into rows that hold all that a merge reads, so that each
-level reads neighbouring memory. A level is a radix sort of its cells and one parallel merge. As the nodes of a level are
-made in Morton order, writing the levels out backwards gives the final order, coarse before fine.
+level reads neighbouring memory. A level is a radix sort of its cells and one parallel merge. As the nodes of a level
+are made in Morton order, writing the levels out backwards gives the final order, coarse before fine.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ from .kernels.sort import Nodes, sort_by_cell, sort_by_key
 #: Largest cell coordinate: they are int64, and their differences must be, too. No level is finer than this allows.
 MAX_CELL = 2.0**61
 
-#: Bits per axis of the Morton codes that leaves are sorted by: 51 bits, and at most 11 for the level (sizes are float32,
-#: the base at least 1.1), fit a uint64.
+#: Bits per axis of the Morton codes that leaves are sorted by: 51 bits, and at most 11 for the level (sizes are
+#: float32, the base is at least 1.1), fit a uint64.
 CURVE_BITS = 17
 
 #: Factor for the scales of merged splats: the profile of a splat with D above 1 is wider than its scale, and tails of
@@ -81,7 +81,7 @@ class _VoxelTree:
         return survivors
 
     def _fold_oversized(self, members: Nodes, first: Offsets) -> tuple[Nodes, Offsets]:
-        """Gives groups with more than MAX_CHILDREN members intermediate nodes, with equal shares of them, as members."""
+        """Groups members of oversized groups into intermediate nodes of equal shares, at most MAX_CHILDREN each."""
         count = np.diff(first)
         big = np.flatnonzero(count > MAX_CHILDREN)
         shares = [np.linspace(0, count[g], -(-count[g] // MAX_CHILDREN) + 1).astype(np.int64) for g in big]
@@ -100,8 +100,8 @@ def build(splats: Splats, base: float = DEFAULT_BASE, *, progress: Progress = si
     """Builds a Level-of-Detail tree.
 
     The result does not depend on the number of threads (`jit.use_threads`). Each input splat is one leaf, bit for bit.
-    The root is node 0, siblings are consecutive and come after their parent. Any prefix of the nodes is a coarser scene:
-    nodes whose parents were made at a coarser level come first, and along a Morton curve within a level.
+    The root is node 0, siblings are consecutive and come after their parent. Any prefix of the nodes is a coarser
+    scene: nodes whose parents were made at a coarser level come first, and along a Morton curve within a level.
 
     Args:
         splats: N splats, finite, with positive opacity and at least one positive scale each.

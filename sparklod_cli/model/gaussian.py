@@ -161,5 +161,5 @@ def spark_size(splats: Splats) -> FloatArray:
 
 
 def design_size(splats: Splats) -> FloatArray:
-    """(N,) 2 * max(scale) * max(1, D): the feature size of Spark's LoD design pages, which its quick builder sorts by."""
+    """(N,) 2 * max(scale) * max(1, D): feature size in Spark's LoD design, by which its quick builder sorts."""
     return 2 * splats.scale.max(axis=1) * np.maximum(lod_opacity(splats.opacity), 1)

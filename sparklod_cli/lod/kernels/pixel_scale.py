@@ -94,7 +94,7 @@ def pixel_scale(node, view):
 
 @kernel(nogil=True)
 def pixel_scales(nodes, index, views, number, scales):
-    """Pixel scales of some nodes, without a sign; those that are not numbers are infinite, which is how cuts order them.
+    """Pixel scales of some nodes, without sign; NaN becomes infinite. Cuts order them so, too.
 
     Args:
         nodes: `NODE` of one tree.

@@ -15,8 +15,8 @@ f32 = np.float32
 #: -log2(e) / 2: exp(-z^2 / 2) = 2 ** (MINUS_HALF_LOG2E * z^2).
 MINUS_HALF_LOG2E = f32(-0.7213475204444817)
 
-#: Least argument of `log2`, which must be a normal number. The least difference of two float32 near 1 is 6e-8, so only 0
-#: is raised to it.
+#: Least argument of `log2`, which must be a normal number. Differences of float32 near 1 are 0 or at least 6e-8, so
+#: only 0 is raised to it.
 LEAST_REST = f32(1e-30)
 
 #: Least argument of `exp2`, which is exact down to -126. 2 ** -120 is lost beside 1.

@@ -27,7 +27,7 @@ NOT_DRAWN = np.uint64(0xFFFFFFFFFFFFFFFF)
 #: The largest index in a key, whose lower half it is.
 MAX_INDEX = 0xFFFFFFFF
 
-#: Largest variance on the screen, pixels squared, so that float32 holds determinants. Chosen; no `max_radius` is so large.
+#: Largest variance on the screen, pixels squared, so that float32 holds determinants. Chosen, far beyond any picture.
 MAX_VARIANCE = f32(1e18)
 
 #: Least covariance on the screen, pixels squared, from which the direction of the longer axis is computed; below it the
