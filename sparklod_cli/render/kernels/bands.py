@@ -8,7 +8,7 @@ import numpy as np
 from numba import prange
 
 from ...support.jit import kernel
-from .falloff import merged, plain, shifted
+from .falloff import alpha_at
 from .project import END, HALF_HEIGHT, HALF_WIDTH, OPACITY, POWER, A, B, C, X, Y
 
 f32 = np.float32
@@ -80,11 +80,5 @@ def count_fragments(screen, design, least, counts):
                     z2 = row[A] * dx * dx + f32(2) * row[B] * dx * dy + row[C] * dy * dy
                     if z2 > row[END]:
                         continue
-                    if d <= 1:
-                        alpha = plain(z2, d)
-                    elif design:
-                        alpha = shifted(z2, d)
-                    else:
-                        alpha = merged(z2, row[POWER])
-                    if alpha >= least:
+                    if alpha_at(z2, d, row[POWER], design) >= least:
                         counts[line, column] += 1

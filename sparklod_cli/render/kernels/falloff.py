@@ -1,9 +1,13 @@
 """The falloff: alpha of a splat at a distance from its centre.
 
-z is the distance in standard deviations, and z2 its square, which may be rounded to less than 0.
+z is the distance in standard deviations, and z2 its square, which may be rounded to less than 0. Pictures are drawn with
+`plain`, `merged` and `shifted`, which are approximations to 1e-6 that LLVM vectorizes; `alpha_at` has the same formulas
+in libm's functions.
 """
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 
@@ -41,3 +45,16 @@ def shifted(z2, opacity):
     """Alpha of a splat with D above 1 in Spark's LoD design: exp(-D / 2 * max(0, z - (D - 1)) ** 2)."""
     beyond = max(np.sqrt(max(z2, f32(0))) - (opacity - f32(1)), f32(0))
     return exp2(MINUS_HALF_LOG2E * opacity * beyond * beyond)
+
+
+@kernel(inline=True)
+def alpha_at(z2, opacity, power, design):
+    """Alpha of a splat; `shifted` if `design` and D is above 1."""
+    if opacity <= 1:
+        alpha = opacity * math.exp(f32(-0.5) * z2)
+    elif design:
+        beyond = max(math.sqrt(max(z2, f32(0))) - (opacity - f32(1)), f32(0))
+        alpha = math.exp(f32(-0.5) * opacity * beyond * beyond)
+    else:
+        alpha = f32(1) - (f32(1) - math.exp(f32(-0.5) * z2)) ** power
+    return alpha
