@@ -15,7 +15,7 @@ from sparklod_cli.cameras.formats.source import Files
 from sparklod_cli.cameras.formats.table import FORMATS, NAMES
 from sparklod_cli.cameras.frame import Settings
 from sparklod_cli.cameras.path import read
-from sparklod_cli.commands.camera_options import LARGEST
+from sparklod_cli.cameras.sources import LARGEST
 from sparklod_cli.io import read_together
 
 from ..case import Case, LawError, Rng
