@@ -1,8 +1,8 @@
 """The falloff: alpha of a splat at a distance from its centre.
 
-z is the distance in standard deviations, and z2 its square, which may be rounded to less than 0. Pictures are drawn with
-`plain`, `merged` and `shifted`, which are approximations to 1e-6 that LLVM vectorizes; `alpha_at` has the same formulas
-in libm's functions.
+z is the distance in standard deviations, and z2 its square, which may be rounded to less than 0. Pictures are drawn
+with `plain`, `merged` and `shifted`, approximations that LLVM vectorizes; `alpha_at` has the same formulas in libm's
+functions.
 """
 
 from __future__ import annotations
