@@ -6,7 +6,6 @@ import dataclasses
 import io
 import json
 import math
-from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -72,20 +71,6 @@ def rows(
 
 def column(table: list[Row], name: str) -> list[Any]:
     return [row[name] for row in table]
-
-
-def test_budgets_are_shares_or_counts() -> None:
-    some = parse_budgets("2%, 12.5 %,500k,1000,.5%")
-    assert [budget.text for budget in some] == ["2%", "12.5 %", "500k", "1000", ".5%"]
-    assert [budget.of(8000) for budget in some] == [160, 1000, 500_000, 1000, 40]
-    assert parse_budgets("0.001%")[0].of(10) == 1  # there is always something to draw
-    assert parse_budgets("29%")[0].share == Fraction(29, 100)  # and not 28.999 %
-
-
-@pytest.mark.parametrize("text", ["", ",", "0%", "0", "-5%", "5 percent", "1%5%", "nan%", "2.5", "5%,lots"])
-def test_what_is_no_budget(text: str) -> None:
-    with pytest.raises(ValueError, match=r"budget|neither|nothing"):
-        parse_budgets(text)
 
 
 def test_all_splats_are_full_detail(twice: Scenes) -> None:

@@ -135,7 +135,7 @@ def _draw(ctx: click.Context, asked: Asked) -> None:
         path, settings = seen(ctx, asked, scenes)
         output = _place(ctx, asked, instances, len(path.cameras))
         background = _check_output(ctx, asked, instances, path, output)
-        notes = [*path.notes, *scenes().notes]
+        notes = [*path.notes, *scenes().notes, *_upside_down(asked, scenes())]
         unused = given(ctx, cut.CUTS)
         if unused and not scenes().trees:
             notes.append(f"no file is a Level-of-Detail tree, so all splats are drawn, whatever {' and '.join(unused)}")
@@ -169,6 +169,21 @@ def _draw(ctx: click.Context, asked: Asked) -> None:
         )
         console.clear()
         report(console, written, output, path, settings, time.perf_counter() - start, as_json=asked.general.as_json)
+
+
+def _upside_down(asked: Asked, scenes: Scenes) -> list[str]:
+    """Notes on files whose y is up by their format, for cameras that take it to be down.
+
+    No other up is taken for them: SPZ files converted from trained PLY often keep its axes, and so do our own.
+    """
+    if asked.cameras.up is not None or asked.cameras.camera_path is not None:
+        return []
+    plain = (loaded for loaded in scenes.loaded if loaded.scene.format.startswith("SPZ") and not loaded.is_tree)
+    return [
+        f"{loaded.name}: y is up in SPZ by its specification, and down in scenes as training leaves them; give"
+        " --up 0,1,0 if this one stands on its head"
+        for loaded in plain
+    ]
 
 
 def _reference(asked: Asked, console: Console) -> Scenes:

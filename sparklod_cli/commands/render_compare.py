@@ -68,13 +68,18 @@ def _table(asked: Asked) -> TableOutput:
     from ..tables.output import TableOutput
 
     output = asked.pictures.output
-    nowhere = output is None and (asked.general.as_json or is_terminal(sys.stdout))
+    nowhere = _on_screen(asked) or (output is None and asked.general.as_json)
     return TableOutput(
         path=None if output == DASH else output,
         form=None if nowhere else table_form("--output", output),
         columns=COLUMNS,
         overwrite=asked.pictures.overwrite,
     )
+
+
+def _on_screen(asked: Asked) -> bool:
+    """Whether the summary takes the place of a table that would scroll by on a terminal, and nobody asked for."""
+    return asked.pictures.output is None and not asked.general.as_json and is_terminal(sys.stdout)
 
 
 def _limited(asked: Asked) -> LodSettings:
@@ -107,8 +112,12 @@ def _report(
         figures = [each.as_dict() for each in summary]
         whole = {"frames": len(path.cameras), "leaves": comparison.leaves, "budgets": figures, "asserts": held}
         click.echo(json.dumps(whole, allow_nan=False))
-    for line in lines(summary, path, comparison.leaves):
-        console.say(line)
+    told = lines(summary, path, comparison.leaves)
+    if _on_screen(asked):
+        click.echo("\n".join(told))
+    else:
+        for line in told:
+            console.say(line)
     for (at, _), outcome in zip(asserts, outcomes, strict=True):
         of = f", at a budget of {outcome.worst['budget']:,}" if at is None and outcome.worst is not None else ""
         if outcome.held:
