@@ -11,7 +11,7 @@ from sparklod_cli.cameras.path import CameraPath
 from sparklod_cli.cameras.sources import Views
 from sparklod_cli.images import sequence
 from sparklod_cli.images.output import output_for
-from sparklod_cli.images.sequence import PictureSettings, Pictures, write_pictures
+from sparklod_cli.images.sequence import Pictures, PictureSettings, write_pictures
 from sparklod_cli.lod.settings import LodSettings
 from sparklod_cli.model.instances import instances_of
 from sparklod_cli.render.renderer import Drawn, Renderer
