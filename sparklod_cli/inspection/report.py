@@ -25,13 +25,13 @@ TREE_COLUMNS = ("scale", "opacity")
 
 
 @dataclass(frozen=True)
-class Wanted:
-    """What to look at, beside the header and the tree.
+class ReportSettings:
+    """What a report has, beside the header and the tree.
 
     Attributes:
-        values: the numbers of the splats.
-        all_quantities: every quantity of them.
-        check: what is wrong.
+        values: statistics of the main quantities of the splats.
+        all_quantities: those of all quantities.
+        check: findings.
     """
 
     values: bool = False
@@ -54,7 +54,7 @@ class Report:
         compression_ratio: of the decoded splats, in 4-byte floats, to the file.
         notes: what the reader left out.
         tree: where the file is a Level-of-Detail tree.
-        values: where they were wanted.
+        values: where they were settings.
         findings: where they were wanted, or the file could not be read.
     """
 
@@ -81,10 +81,10 @@ class Report:
 
 
 def inspect(
-    path: Path, wanted: Wanted, *, threads: int = 1, progress: Progress = silent
+    path: Path, settings: ReportSettings, *, threads: int = 1, progress: Progress = silent
 ) -> tuple[Report, Scene | None]:
     """Looks at a file; what cannot be read is a finding, not an error. Also gives what was read of the scene."""
-    columns = COLUMNS if wanted.values or wanted.check else TREE_COLUMNS
+    columns = COLUMNS if settings.values or settings.check else TREE_COLUMNS
     size = size_of_input(path)
     try:
         scene = examine_scene(path, columns=columns, threads=threads, progress=progress)
@@ -95,9 +95,9 @@ def inspect(
     findings = _container_findings(scene)
     facts = None
     if scene.tree is not None and count:
-        facts, found = tree.examine(splats, scene.tree, check=wanted.check, scale_ends=values.scale_ends(scene))
+        facts, found = tree.examine(splats, scene.tree, check=settings.check, scale_ends=values.scale_ends(scene))
         findings += found
-    if wanted.check:
+    if settings.check:
         findings += values.check(scene)
     report = Report(
         file=str(path),
@@ -111,8 +111,8 @@ def inspect(
         compression_ratio=round(4 * count * (14 + 3 * COEFFICIENTS[splats.sh_degree]) / size, 3) if size else None,
         notes=list(scene.notes),
         tree=facts,
-        values=values.examine(splats, all_quantities=wanted.all_quantities) if wanted.values else None,
-        findings=findings if wanted.check else None,
+        values=values.examine(splats, all_quantities=settings.all_quantities) if settings.values else None,
+        findings=findings if settings.check else None,
     )
     return report, scene
 

@@ -41,9 +41,8 @@ format = "SPZ 3 LoD"
 
 
 def test_every_key_is_read_from_json_and_toml(tmp_path: Path, tree: Report) -> None:
-    as_json = written(
-        tmp_path, json.dumps({"assert" if key == "asserts" else key: value for key, value in vars(EVERY).items()})
-    )
+    keys = {"assert" if name == "asserts" else name: value for name, value in vars(EVERY).items()}
+    as_json = written(tmp_path, json.dumps(keys))
     as_toml = written(tmp_path, AS_TOML, "expect.TOML")
     assert read(as_json) == read(as_toml) == EVERY
     assert check(tree, EVERY) == []
