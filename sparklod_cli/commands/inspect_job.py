@@ -104,7 +104,7 @@ class Job:
         picture = None
         if scene is not None:
             try:
-                picture = tree_plot.plot(scene, by=self.output.plot_by, level=self.output.plot_level)
+                picture = tree_plot.plot(scene, by=self.output.plot_by, depth=self.output.plot_level)
             except SparklodError as error:
                 if plot is not None:
                     raise
