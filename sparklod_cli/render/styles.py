@@ -51,7 +51,7 @@ def draw(
     """What a camera sees; the image is that of `rasterizer.draw`.
 
     Args:
-        style: one of `defaults.STYLES`. "points" are opaque, a pixel each, "billboards" discs of one opacity, as wide
+        style: one of `settings.STYLES`. "points" are opaque, a pixel each, "billboards" discs of one opacity, as wide
             as the splats; both are drawn in the order of the file. "sorted-billboards" are drawn from far to near, as
             "splats" are.
         backend: one of `BACKENDS`, which draws splats.
