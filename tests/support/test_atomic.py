@@ -197,7 +197,7 @@ def test_a_part_that_is_swept_before_it_is_locked(tmp_path: Path, monkeypatch: p
 
 
 #: Modules that write files, and what: outputs (whole or to a device), the cache of kernels, what Open3D's process says.
-WRITERS = {"io.py", "whole.py", "render/open3d_process.py"}
+WRITERS = {"io.py", "support/atomic.py", "render/open3d/process.py"}
 
 
 def writes(call: ast.Call) -> bool:
