@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,6 +17,9 @@ from ..support.threads import on_threads, thread_count
 from .progress import Told, telling
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from ..inspection.report import Report
     from ..model.selection import Selection
 
@@ -106,16 +109,14 @@ def write(
     """
     from ..codecs.formats import WRITABLE
     from ..codecs.gpu import dump
-    from ..codecs.gpu.table import ENCODINGS, RAW_SUFFIXES
+    from ..codecs.gpu.table import RAW_SUFFIXES
     from ..codecs.options import WriteOptions
 
     path, count = Path(path), thread_count(threads)
     suffix = path.suffix.lower()
     with telling(progress) as told, memory_told():
         if encoding is not None:
-            if encoding not in ENCODINGS:
-                raise ValueError(f"there is no encoding {encoding!r}; give one of {', '.join(ENCODINGS)}")
-            arrays = dump.pack(scene, encoding, count)
+            arrays = pack(scene, encoding, threads=count)
             pieces = dump.encode_raw(arrays) if suffix in RAW_SUFFIXES else dump.encode_npz(arrays)
             return Written(path, encoding, write_whole(path, pieces, overwrite=overwrite))
         form = WRITABLE.get(suffix)
@@ -179,6 +180,56 @@ def extract_leaves(tree: Scene) -> Scene:
     from ..extract_leaves import leaves_of
 
     return leaves_of(tree)
+
+
+def pack(scene: Scene, encoding: str, *, threads: int | None = None) -> dict[str, NDArray[np.uint32]]:
+    """A scene in the layout of a viewer's memory, as `build-lod --encoding` writes it; docs/formats.md has the words.
+
+    Args:
+        scene: a scene or a tree.
+        encoding: "packed", "ext", "lodtree" (of a tree) or "texture".
+        threads: to encode on; None for all processors.
+
+    Returns:
+        arrays of uint32 words by their names, N rows each but for a texture.
+
+    Raises:
+        ValueError: there is no such encoding, or no tree for it.
+    """
+    from ..codecs.gpu import dump
+    from ..codecs.gpu.table import ENCODINGS
+
+    if encoding not in ENCODINGS:
+        raise ValueError(f"there is no encoding {encoding!r}; give one of {', '.join(ENCODINGS)}")
+    return dump.pack(scene, encoding, thread_count(threads))
+
+
+def unpack(arrays: Mapping[str, NDArray[np.uint32]], *, threads: int | None = None) -> Scene:
+    """The scene that arrays of `pack`, or of a viewer, hold; a `Tree` where the words of a LodTree are among them.
+
+    Args:
+        arrays: those of "packed" or of "ext", and of "lodtree" where there is a tree.
+        threads: to decode on; None for all processors.
+
+    Raises:
+        FormatError: an array is missing, or has another shape or type.
+        TreeError: the tree is broken.
+    """
+    from ..codecs.gpu import ext_splats, lod_tree, packed_splats
+
+    count = thread_count(threads)
+    tree = lod_tree.unpack(arrays).tree if "lod_tree" in arrays else None
+    if "packed" in arrays:
+        encoding = packed_splats.Encoding(lod_opacity=tree is not None)
+        splats = packed_splats.unpack(arrays, encoding, threads=count)
+    else:
+        splats = ext_splats.unpack(arrays, threads=count)
+    if tree is None:
+        return Scene(splats)
+    if len(tree) != len(splats):
+        raise FormatError(f"{len(tree):,} nodes but {len(splats):,} splats")
+    tree.validate()
+    return Tree(splats, tree)
 
 
 def inspect(
