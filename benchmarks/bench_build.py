@@ -16,11 +16,8 @@ from pathlib import Path
 import numpy as np
 from scenes import load, tiled, write_ply
 
-from sparklod_cli.codecs import spz
-from sparklod_cli.codecs.options import WriteOptions
-from sparklod_cli.lod.builders import BUILDERS, METHODS
-from sparklod_cli.model.scene import Scene
-from sparklod_cli.support import jit
+import sparklod_cli as sparklod
+from sparklod_cli.lod.builders import METHODS
 from sparklod_cli.support.parallel import processors
 
 HERE = Path(__file__).resolve().parent
@@ -53,16 +50,14 @@ def machine() -> str:
 
 def warm_build(path: Path, method: str, runs: int) -> list[float]:
     """Times the builder alone, from decoded splats to final order; returns the seconds of each run after the first."""
-    splats = load(path)
-    builder = BUILDERS[method].load()
-    jit.use_threads(processors())
+    scene = sparklod.Scene(load(path))
     # Touch memory first: on a virtual machine the first touch of a page is slow, since the host may take free pages
     # back. That would be measured as a cost of the builder, which in a long-running process it is not.
     np.zeros(1 << 30, np.float64)[::512] = 1
     seconds = []
     for run in range(runs + 1):
         start = time.perf_counter()
-        builder.build(splats)
+        sparklod.build_lod(scene, method=method)
         if run:
             seconds.append(time.perf_counter() - start)
     return seconds
@@ -88,8 +83,8 @@ def whole_command(path: Path, output: Path, method: str) -> dict[str, float]:
 
 def plain_bytes(path: Path, bits: int) -> int:
     """Size in bytes of a plain SPZ file of the same splats in their own order, with the same fractional bits."""
-    pieces = spz.encode(Scene(load(path)), WriteOptions(fractional_bits=bits), threads=processors())
-    return sum(map(len, pieces))
+    with tempfile.TemporaryDirectory() as folder:
+        return sparklod.write(Path(folder, "plain.spz"), sparklod.Scene(load(path)), fractional_bits=bits).bytes
 
 
 def spark(path: Path, runs: int) -> list[float]:
