@@ -15,17 +15,17 @@ import numpy as np
 from bench_build import machine
 from scenes import load
 
-from sparklod_cli import jit
-from sparklod_cli.errors import SparklodError
-from sparklod_cli.parallel import processors
+from sparklod_cli.cameras.camera import Camera
+from sparklod_cli.cameras.framing import framing
+from sparklod_cli.cameras.pose import look_at
+from sparklod_cli.model.splats import Splats
 from sparklod_cli.render.backends import BACKENDS
-from sparklod_cli.render.camera import Camera
-from sparklod_cli.render.framing import framing
-from sparklod_cli.render.look import Look
-from sparklod_cli.render.pose import look_at
 from sparklod_cli.render.rasterizer import Image
-from sparklod_cli.render.shown import Shown, show
-from sparklod_cli.splats import Splats
+from sparklod_cli.render.settings import RasterSettings
+from sparklod_cli.render.shading import ShadedSplats, show
+from sparklod_cli.support import jit
+from sparklod_cli.support.errors import SparklodError
+from sparklod_cli.support.parallel import processors
 
 HEADINGS = (
     "scene",
@@ -47,7 +47,7 @@ CAMERAS = {"far": 2.4, "near": 0.8, "inside": 0.1}
 
 FOV_Y, FPS, TURN_A_SECOND = math.radians(60), 30, math.radians(12)
 
-Draw = Callable[[Shown, Camera, Look], Image]
+Draw = Callable[[ShadedSplats, Camera, RasterSettings], Image]
 
 
 def drawer(spec: str) -> Draw:
@@ -94,7 +94,7 @@ def measure(
     for camera in [cameras[0], *cameras]:
         shown = show([(splats, np.eye(4))], camera)
         start = time.perf_counter()
-        images.append(draw(shown, camera, Look()))
+        images.append(draw(shown, camera, RasterSettings()))
         seconds.append(time.perf_counter() - start)
     images = images[1:]
     pairs = list(zip(images, references or images, strict=True))

@@ -16,12 +16,12 @@ from pathlib import Path
 import numpy as np
 from scenes import load, tiled, write_ply
 
-from sparklod_cli import jit
 from sparklod_cli.bake import BUILDERS
 from sparklod_cli.codecs import spz
-from sparklod_cli.limits import METHODS
-from sparklod_cli.parallel import processors
-from sparklod_cli.scene import Scene
+from sparklod_cli.model.scene import Scene
+from sparklod_cli.support import jit
+from sparklod_cli.support.defaults import METHODS
+from sparklod_cli.support.parallel import processors
 
 HERE = Path(__file__).resolve().parent
 

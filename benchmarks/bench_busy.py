@@ -17,8 +17,8 @@ import tempfile
 import time
 from pathlib import Path
 
-from sparklod_cli.jit import WAITING
-from sparklod_cli.limits import METHODS
+from sparklod_cli.support.defaults import METHODS
+from sparklod_cli.support.jit import WAITING
 
 #: What OpenMP does by itself, what sparklod asks of it, and what else could be asked; one thread for comparison.
 WAYS: dict[str, tuple[dict[str, str], list[str]]] = {

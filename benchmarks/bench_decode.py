@@ -21,8 +21,8 @@ from scenes import load, tiled
 
 from sparklod_cli.codecs import ply, splat
 from sparklod_cli.io import read_scene, write_whole
-from sparklod_cli.parallel import processors
-from sparklod_cli.scene import Scene
+from sparklod_cli.model.scene import Scene
+from sparklod_cli.support.parallel import processors
 
 HERE = Path(__file__).resolve().parent
 
@@ -37,7 +37,7 @@ import re, sys
 from pathlib import Path
 from sparklod_cli.codecs.formats import FORMATS
 from sparklod_cli.io import read_scene
-from sparklod_cli.parallel import processors
+from sparklod_cli.support.parallel import processors
 def memory(what):
     return int(re.search(what + r":\\s+(\\d+)", Path("/proc/self/status").read_text())[1])
 for form in FORMATS:

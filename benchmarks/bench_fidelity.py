@@ -20,30 +20,32 @@ import numpy as np
 from bench_build import machine
 from numpy.typing import NDArray
 
-from sparklod_cli import jit
-from sparklod_cli.codecs import ext_splats, lod_tree, spz
-from sparklod_cli.codecs.lod_tree import Nodes
+from sparklod_cli.cameras.camera import Camera
+from sparklod_cli.cameras.formats.source import Parsed
+from sparklod_cli.cameras.frame import DEFAULT_UP, Settings
+from sparklod_cli.cameras.framing import framing
+from sparklod_cli.cameras.generators import orbit
+from sparklod_cli.cameras.path import GENERATED, cameras_of
+from sparklod_cli.codecs import spz
+from sparklod_cli.codecs.gpu import ext_splats, lod_tree
+from sparklod_cli.codecs.gpu.lod_tree import Nodes
+from sparklod_cli.compare import on_background
+from sparklod_cli.images.metrics import psnr
 from sparklod_cli.io import read_scene
-from sparklod_cli.limits import DEFAULT_GROWTH
 from sparklod_cli.lod import quality, quick
+from sparklod_cli.lod.budget import Budget, parse_budgets
 from sparklod_cli.lod.traversal import Forest, Instance, Traversal
-from sparklod_cli.parallel import processors
-from sparklod_cli.preview.compare import Budget, on_background, parse_budgets
-from sparklod_cli.preview.metrics import psnr
-from sparklod_cli.render.camera import Camera
-from sparklod_cli.render.camera_path import GENERATED, cameras_of
-from sparklod_cli.render.frame import DEFAULT_UP, Settings
-from sparklod_cli.render.framing import framing
-from sparklod_cli.render.generate import orbit
-from sparklod_cli.render.look import Look
-from sparklod_cli.render.paths.source import Parsed
+from sparklod_cli.model.lod_tree import LodTree
+from sparklod_cli.model.scene import Scene
+from sparklod_cli.model.selection import Selection
+from sparklod_cli.model.splats import Splats
 from sparklod_cli.render.rasterizer import Image, draw
-from sparklod_cli.render.shown import show
-from sparklod_cli.scene import Scene
-from sparklod_cli.selection import Selection
-from sparklod_cli.simulation.simulate import view_of
-from sparklod_cli.splats import Splats
-from sparklod_cli.tree import LodTree
+from sparklod_cli.render.settings import RasterSettings
+from sparklod_cli.render.shading import show
+from sparklod_cli.simulation.frames import view_of
+from sparklod_cli.support import jit
+from sparklod_cli.support.defaults import DEFAULT_GROWTH
+from sparklod_cli.support.parallel import processors
 
 #: What a folder stands for.
 REAL_SCENES = ("biker.ply", "playbot.sog", "playbot-125k.ply", "meadow.sog")
@@ -166,7 +168,7 @@ def cameras_around(center: NDArray[np.floating]) -> tuple[Camera, ...]:
 
 def picture(splats: Splats, camera: Camera) -> Image:
     """What a camera sees."""
-    return draw(show([(splats, np.eye(4))], camera), camera, Look())
+    return draw(show([(splats, np.eye(4))], camera), camera, RasterSettings())
 
 
 def difference(image: Image, full: Image) -> float:

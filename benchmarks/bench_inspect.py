@@ -14,13 +14,13 @@ from typing import NamedTuple
 from bench_build import MEASURED, machine
 from scenes import load, tiled
 
-from sparklod_cli import jit
 from sparklod_cli.codecs import spz
 from sparklod_cli.io import write_whole
 from sparklod_cli.lod import quick
-from sparklod_cli.parallel import processors
-from sparklod_cli.scene import Scene
-from sparklod_cli.splats import Splats
+from sparklod_cli.model.scene import Scene
+from sparklod_cli.model.splats import Splats
+from sparklod_cli.support import jit
+from sparklod_cli.support.parallel import processors
 
 #: What no way to look at a file can do without: inflating all of it, as the codec does, and keeping nothing.
 INFLATE = """

@@ -10,15 +10,15 @@ import time
 import numpy as np
 from bench_build import machine
 
-from sparklod_cli import jit
-from sparklod_cli.parallel import processors
-from sparklod_cli.render.camera import Camera
-from sparklod_cli.render.look import Look
+from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.render.rasterizer import draw
-from sparklod_cli.render.shown import Shown
+from sparklod_cli.render.settings import RasterSettings
+from sparklod_cli.render.shading import ShadedSplats
+from sparklod_cli.support import jit
+from sparklod_cli.support.parallel import processors
 
 
-def scattered(count: int, camera: Camera) -> Shown:
+def scattered(count: int, camera: Camera) -> ShadedSplats:
     """Round splats of 1.5 to 2.5 pixels of standard deviation all over a picture, opaque by a tenth to wholly."""
     rng = np.random.default_rng(0)
     depth = rng.uniform(2, 10, count)
@@ -26,7 +26,7 @@ def scattered(count: int, camera: Camera) -> Shown:
     x = rng.uniform(-0.5, 0.5, count) * camera.width / focal * depth
     y = rng.uniform(-0.5, 0.5, count) * camera.height / focal * depth
     size = rng.uniform(1.5, 2.5, count) * depth / focal
-    return Shown(
+    return ShadedSplats(
         center=np.stack([x, y, -depth], axis=1).astype(np.float32),
         scale=np.repeat(size[:, None], 3, axis=1).astype(np.float32),
         quat_xyzw=np.tile(np.float32([0, 0, 0, 1]), (count, 1)),
@@ -53,7 +53,7 @@ def main() -> None:
         seconds = []
         for _ in range(arguments.runs + 1):
             start = time.perf_counter()
-            draw(shown, camera, Look())
+            draw(shown, camera, RasterSettings())
             seconds.append(time.perf_counter() - start)
         median = statistics.median(seconds[1:])
         spread = f"{1e3 * min(seconds[1:]):.0f} to {1e3 * max(seconds[1:]):.0f}"

@@ -13,10 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
-from sparklod_cli import jit
 from sparklod_cli.io import read_scene
-from sparklod_cli.parallel import processors
-from sparklod_cli.render.look import SORTS, Look
+from sparklod_cli.render.settings import SORTS, RasterSettings
+from sparklod_cli.support import jit
+from sparklod_cli.support.parallel import processors
 from tests.interop.page import Page
 from tests.interop.pictures import AROUND, Difference, cameras_around, compare
 
@@ -79,7 +79,7 @@ def main() -> None:
             cameras = cameras_around(leaves, width, height)
             for budget in [0] if scene.tree is None else arguments.budgets:
                 name = file.name + (f", {budget:,} nodes" if budget else "")
-                pictures = compare(page, file, cameras[: arguments.views], Look(sort=arguments.sort), budget)
+                pictures = compare(page, file, cameras[: arguments.views], RasterSettings(sort=arguments.sort), budget)
                 for view, found in enumerate(pictures):
                     print(row(name, view, found), flush=True)
                     least = min(least, found.psnr)

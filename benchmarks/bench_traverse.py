@@ -15,15 +15,15 @@ import numpy as np
 from bench_build import machine
 from scenes import load, tiled
 
-from sparklod_cli import jit
-from sparklod_cli.codecs import lod_tree
-from sparklod_cli.codecs.lod_tree import Nodes
+from sparklod_cli.cameras.framing import framing
+from sparklod_cli.cameras.pose import look_at
+from sparklod_cli.codecs.gpu import lod_tree
+from sparklod_cli.codecs.gpu.lod_tree import Nodes
 from sparklod_cli.lod import quick
 from sparklod_cli.lod.traversal import Forest, Instance, Traversal, View
-from sparklod_cli.parallel import ordered_map, processors
-from sparklod_cli.render.framing import framing
-from sparklod_cli.render.pose import look_at
-from sparklod_cli.splats import Splats
+from sparklod_cli.model.splats import Splats
+from sparklod_cli.support import jit
+from sparklod_cli.support.parallel import ordered_map, processors
 
 HEADINGS = (
     "million nodes",

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from sparklod_cli.io import read_scene
-from sparklod_cli.sh import SH_C0
-from sparklod_cli.splats import Splats
+from sparklod_cli.model.sh import SH_C0
+from sparklod_cli.model.splats import Splats
 
 
 def tiled(splats: Splats, count: int, seed: int = 0) -> Splats:

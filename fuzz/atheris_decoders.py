@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from sparklod_cli.codecs.formats import FORMATS, HEAD, sniff
-from sparklod_cli.errors import FormatError, SparklodError
+from sparklod_cli.support.errors import FormatError, SparklodError
 
 from .containers import good, opened, seeds
 

@@ -10,12 +10,12 @@ import numpy as np
 from PIL import Image
 
 from sparklod_cli.commands.inspect_text import finding_line
-from sparklod_cli.errors import FormatError, InvalidSplatsError
 from sparklod_cli.inspection import report
 from sparklod_cli.io import read_scene
-from sparklod_cli.scene import Scene
-from sparklod_cli.selection import Selection
-from sparklod_cli.splats import COLUMNS
+from sparklod_cli.model.scene import Scene
+from sparklod_cli.model.selection import Selection
+from sparklod_cli.model.splats import COLUMNS
+from sparklod_cli.support.errors import FormatError, InvalidSplatsError
 
 from .case import LawError
 from .oracle import lines_fault

@@ -16,7 +16,7 @@ from types import TracebackType
 from typing import Any
 
 from sparklod_cli.commands.console import say_error
-from sparklod_cli.errors import OutOfMemoryError, SparklodError
+from sparklod_cli.support.errors import OutOfMemoryError, SparklodError
 
 from .case import Case, LawError, Target
 from .streams import STREAMS

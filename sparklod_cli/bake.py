@@ -9,15 +9,16 @@ from pathlib import Path
 
 import numpy as np
 
-from .codecs import clamps, dump, spz
-from .errors import FormatError, memory_told
+from .codecs import clamps, spz
+from .codecs.gpu import dump
 from .io import Sink, read_rgba, read_scene
-from .limits import DEFAULT_BASE, DEFAULT_GROWTH, MAX_SH_DEGREE, METHODS
 from .lod import quality, quick
-from .progress import Progress, silent
-from .scene import Scene
-from .selection import Selection
-from .splats import Splats
+from .model.scene import Scene
+from .model.selection import Selection
+from .model.splats import Splats
+from .support.defaults import DEFAULT_BASE, DEFAULT_GROWTH, MAX_SH_DEGREE, METHODS
+from .support.errors import FormatError, memory_told
+from .support.progress import Progress, silent
 
 #: What has `build`, by method, and what of a recipe it takes.
 BUILDERS = {"quick": (quick, "base"), "quality": (quality, "growth")}
@@ -28,13 +29,13 @@ class Recipe:
     """How to bake.
 
     Attributes:
-        method: one of `limits.METHODS`.
+        method: one of `defaults.METHODS`.
         base: of quick, growth of the cells from level to level, 1.1 to 2.0.
         growth: of quality, the most nodes a leaf, 1.05 to 2.0.
         max_sh: SH degrees above this are left out.
         selection: which splats to keep.
         rgba: a file of colours and opacities that take the place of the splats' own, see `io.read_rgba`.
-        encoding: one of `limits.ENCODINGS`, to write the arrays of that instead of SPZ.
+        encoding: one of `defaults.ENCODINGS`, to write the arrays of that instead of SPZ.
         raw: write their words alone, rather than as .npz.
         spz: how to write SPZ, and on how many threads to work.
     """

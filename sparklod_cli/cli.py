@@ -10,11 +10,12 @@ from typing import Any, NoReturn
 
 import click
 
-from . import __version__, interrupts, stdout
+from . import __version__
 from .commands.console import say, say_error, say_usage_error
 from .commands.options import Verbosity
-from .errors import SparklodError, out_of_memory
-from .printable import printable
+from .support import interrupts, stdout
+from .support.errors import SparklodError, out_of_memory
+from .support.printable import printable
 
 #: Characters that are quoted of an error that nobody foresaw.
 QUOTED = 200

@@ -13,17 +13,17 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from . import whole
 from .codecs import npy
 from .codecs.formats import FORMATS, HEAD, Format, sniff
 from .codecs.sog_files import MAX_META, META, names_beside
-from .errors import FormatError, OutputError, StdoutError, UnknownFormatError, UnreadableError
-from .progress import Progress, silent
-from .quantities import count_of
-from .scene import Scene
-from .splats import COLUMNS, FloatArray
-from .stdout import ReaderGoneError, told
-from .untrusted import shown
+from .model.scene import Scene
+from .model.splats import COLUMNS, FloatArray
+from .support import atomic
+from .support.errors import FormatError, OutputError, StdoutError, UnknownFormatError, UnreadableError
+from .support.progress import Progress, silent
+from .support.stdout import ReaderGoneError, told
+from .support.units import count_of
+from .support.untrusted import shown
 
 #: Bytes of a text that is read whole: instances, expectations, matrices. Parsed it may take thirty times as much.
 MAX_TEXT = 1 << 24
@@ -282,7 +282,7 @@ def write_whole(path: Path, pieces: Iterable[bytes], *, overwrite: bool) -> int:
         if path.exists() and not path.is_file():  # a pipe or a device is written to, never replaced
             with path.open("wb") as file:
                 return sum(map(file.write, pieces))
-        return whole.write(Path(os.path.realpath(path)), pieces, overwrite=overwrite)
+        return atomic.write(Path(os.path.realpath(path)), pieces, overwrite=overwrite)
     except FileExistsError:
         raise OutputError(f"{path} exists, add --overwrite to replace it") from None
     except OSError as error:

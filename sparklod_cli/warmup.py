@@ -19,14 +19,14 @@ from typing import Any
 
 import numpy as np
 
-from . import jit
 from .codecs import ply, spz
-from .errors import SparklodError
 from .io import write_whole
-from .progress import Progress, silent
-from .scene import Scene
-from .splats import Splats
-from .tree import LodTree
+from .model.lod_tree import LodTree
+from .model.scene import Scene
+from .model.splats import Splats
+from .support import jit
+from .support.errors import SparklodError
+from .support.progress import Progress, silent
 
 #: Seconds from look to look at what has been compiled.
 PATIENCE = 0.1
@@ -50,30 +50,39 @@ JOBS = {
     "quick": Job(
         (
             *("geometry.extremes", "geometry.fill_rows", "group.level_keys", "group.split_cells"),
-            *("merge.merge_groups", "order.fill_columns", "order.fill_leaves", "order.merge_colors"),
-            *("order.places_of_merged", "sort.cell_words", "sort.sort_pass"),
+            *("merge.merge_groups", "final_order.fill_columns", "final_order.fill_leaves", "final_order.merge_colors"),
+            *("final_order.places_of_merged", "sort.cell_words", "sort.sort_pass"),
         ),
         ("build-lod scene.ply -o quick.spz",),
     ),
     "traverse": Job(
-        ("cut.find_cut", "measure.exchange", "measure.measure"),
+        ("cut.find_cut", "cut_statistics.exchange", "cut_statistics.measure"),
         ("traverse tree.spz --orbit 2 -o frames.csv",),
     ),
     "inspect": Job(
-        ("walk.find_cycles", "walk.find_parents", "walk.sizes_below", "walk.sum_levels", "walk.walk"),
+        (
+            *("tree_links.find_cycles", "tree_links.find_parents", "tree_links.sizes_below", "tree_links.sum_levels"),
+            "tree_links.walk",
+        ),
         ("inspect tree.spz --check",),
     ),
     "quality": Job(
         (
-            *("geometry.extremes", "keep.drop_nodes", "keep.levels_of", "keep.place_nodes", "keep.value_nodes"),
-            *("order.fill_leaves", "order.merge_colors", "pairs.cheapest", "pairs.pair_up", "sort.sort_pass"),
-            *("state.curve_keys", "state.fill_merged", "state.fill_state", "union.unite_pairs"),
+            *("geometry.extremes", "prune.drop_nodes", "prune.levels_of", "prune.place_nodes", "prune.value_nodes"),
+            *("final_order.fill_leaves", "final_order.merge_colors", "pair_cost.cheapest", "pair_cost.pair_up"),
+            *(
+                "sort.sort_pass",
+                "node_rows.curve_keys",
+                "node_rows.fill_merged",
+                "node_rows.fill_state",
+                "pair_merge.unite_pairs",
+            ),
         ),
         ("build-lod scene.ply --method quality -o quality.spz",),
     ),
     "render": Job(
         (
-            *("bands.count_fragments", "bands.draw_discs", "cut.find_cut", "measure.measure", "project.arrange"),
+            *("bands.count_fragments", "bands.draw_discs", "cut.find_cut", "cut_statistics.measure", "project.arrange"),
             *("project.project", "raster.draw_tiles", "raster.sort_into_tiles"),
         ),
         (

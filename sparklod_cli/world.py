@@ -10,17 +10,17 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from .codecs import lod_tree
-from .codecs.lod_tree import Nodes
-from .errors import FormatError, SparklodError, TreeError, memory_told
-from .gaussian import placed, spark_size
+from .cameras.framing import Balls, balls_of, together
+from .codecs.gpu import lod_tree
+from .codecs.gpu.lod_tree import Nodes
 from .io import examine_scene, size_on_disk
-from .limits import PRECISIONS
 from .lod.traversal import CHUNK_NODES, Cones, Forest, Frustum, Instance, Matrix
-from .progress import Progress, silent
-from .render.framing import Balls, balls_of, together
-from .scene import Scene
-from .splats import COLUMNS, Splats
+from .model.gaussian import placed, spark_size
+from .model.scene import Scene
+from .model.splats import COLUMNS, Splats
+from .support.defaults import PRECISIONS
+from .support.errors import FormatError, SparklodError, TreeError, memory_told
+from .support.progress import Progress, silent
 
 #: What all instances together are called.
 TOTAL = "total"

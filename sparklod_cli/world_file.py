@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from .errors import SparklodError
+from .cameras.pose import rotation_of
 from .io import is_file_name, read_text
 from .lod.traversal import Cones, Frustum, Matrix
-from .render.pose import rotation_of
-from .untrusted import parse_json, shown, well_formed
+from .support.errors import SparklodError
+from .support.untrusted import parse_json, shown, well_formed
 from .world import TOTAL, Placement, names_of
 
 #: What an instance may say, and how many numbers that is; 0 for something else.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from sparklod_cli.simulation.assertions import parse
+from sparklod_cli.tables.assertions import parse
 
 from ..case import Case, Rng
 from ..command import command

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from sparklod_cli.limits import ENCODINGS, MAX_BASE, MAX_GROWTH, METHODS, MIN_BASE, MIN_GROWTH
+from sparklod_cli.support.defaults import ENCODINGS, MAX_BASE, MAX_GROWTH, METHODS, MIN_BASE, MIN_GROWTH
 
 from .. import laws, scenes
 from ..case import Case, LawError, Rng

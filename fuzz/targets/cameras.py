@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 
 from fixtures import camera_files
+from sparklod_cli.cameras.formats.source import Files
+from sparklod_cli.cameras.formats.table import FORMATS, NAMES
+from sparklod_cli.cameras.frame import Settings
+from sparklod_cli.cameras.path import read
 from sparklod_cli.commands.camera_options import LARGEST
 from sparklod_cli.io import read_together
-from sparklod_cli.render.camera_path import read
-from sparklod_cli.render.frame import Settings
-from sparklod_cli.render.paths.formats import FORMATS, NAMES
-from sparklod_cli.render.paths.source import Files
 
 from ..case import Case, LawError, Rng
 from ..command import command

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..splats import Splats
+from ..model.splats import Splats
 from . import quantize
 
 

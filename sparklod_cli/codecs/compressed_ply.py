@@ -8,13 +8,13 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FormatError
-from ..limits import MAX_SH_DEGREE
-from ..progress import Progress, silent
-from ..quantities import count_of
-from ..scene import Scene
-from ..sh import degree_of, notes_on_degree
-from ..splats import FloatArray, Splats
+from ..model.scene import Scene
+from ..model.sh import degree_of, notes_on_degree
+from ..model.splats import FloatArray, Splats
+from ..support.defaults import MAX_SH_DEGREE
+from ..support.errors import FormatError
+from ..support.progress import Progress, silent
+from ..support.units import count_of
 from . import quantize
 from .ply_header import Header, read_header
 from .stream import decode_rows, rows_of, size_of

@@ -14,9 +14,9 @@ import zstandard
 from numpy.typing import NDArray
 from zlib_ng import zlib_ng
 
-from ..errors import ChecksumError, FormatError, PromiseError, TooLongError, TruncatedError
-from ..parallel import ordered_map
-from ..progress import Progress
+from ..support.errors import ChecksumError, FormatError, PromiseError, TooLongError, TruncatedError
+from ..support.parallel import ordered_map
+from ..support.progress import Progress
 
 BLOCK = 1 << 18  # bytes that are deflated apart
 WINDOW = 1 << 15  # bytes before a block that it may refer to

@@ -13,13 +13,13 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FormatError, TruncatedError, VersionError
-from ..gaussian import normalized_quat
-from ..progress import Progress, silent
-from ..quantities import count_of
-from ..scene import Scene
-from ..sh import COEFFICIENTS
-from ..splats import FloatArray, Splats
+from ..model.gaussian import normalized_quat
+from ..model.scene import Scene
+from ..model.sh import COEFFICIENTS
+from ..model.splats import FloatArray, Splats
+from ..support.errors import FormatError, TruncatedError, VersionError
+from ..support.progress import Progress, silent
+from ..support.units import count_of
 from . import quantize
 from .stream import Rows, decode_rows, rows_of, size_of
 

@@ -10,7 +10,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FormatError, TruncatedError
+from ..support.errors import FormatError, TruncatedError
 
 MAGIC = b"\x93NUMPY"
 

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FormatError
-from ..gaussian import linear_opacity, lod_opacity
-from ..splats import FloatArray
+from ..model.gaussian import linear_opacity, lod_opacity
+from ..model.splats import FloatArray
+from ..support.errors import FormatError
 
 Words = NDArray[np.uint32]
 

@@ -15,15 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 from plyfile import PlyData, PlyParseError
 
-from ..errors import FormatError, NotSplatsError, TruncatedError
-from ..gaussian import normalized_quat
-from ..limits import MAX_SH_DEGREE
-from ..parallel import chunks_of, ordered_map
-from ..progress import Progress, silent
-from ..scene import Scene
-from ..sh import degree_of, notes_on_degree
-from ..splats import FloatArray, Splats
-from ..untrusted import quoted
+from ..model.gaussian import normalized_quat
+from ..model.scene import Scene
+from ..model.sh import degree_of, notes_on_degree
+from ..model.splats import FloatArray, Splats
+from ..support.defaults import MAX_SH_DEGREE
+from ..support.errors import FormatError, NotSplatsError, TruncatedError
+from ..support.parallel import chunks_of, ordered_map
+from ..support.progress import Progress, silent
+from ..support.untrusted import quoted
 from . import quantize
 from .ply_header import Header, read_header
 from .stream import Rows, decode_rows, rows_of, size_of

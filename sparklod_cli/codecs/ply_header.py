@@ -9,8 +9,8 @@ from typing import Any, BinaryIO
 import numpy as np
 from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
 
-from ..errors import FormatError, PromiseError, TruncatedError
-from ..untrusted import quoted
+from ..support.errors import FormatError, PromiseError, TruncatedError
+from ..support.untrusted import quoted
 
 MAX_HEADER = 1 << 20
 

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..gaussian import normalized_quat
-from ..sh import SH_C0
-from ..splats import FloatArray
+from ..model.gaussian import normalized_quat
+from ..model.sh import SH_C0
+from ..model.splats import FloatArray
 
 Bytes = NDArray[np.uint8]
 

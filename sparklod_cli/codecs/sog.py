@@ -11,12 +11,12 @@ from typing import BinaryIO
 
 import numpy as np
 
-from ..errors import FormatError, VersionError
-from ..parallel import for_chunks
-from ..progress import Progress, silent
-from ..scene import Scene
-from ..sh import COEFFICIENTS
-from ..splats import FloatArray, Splats
+from ..model.scene import Scene
+from ..model.sh import COEFFICIENTS
+from ..model.splats import FloatArray, Splats
+from ..support.errors import FormatError, VersionError
+from ..support.parallel import for_chunks
+from ..support.progress import Progress, silent
 from . import quantize
 from .compression import check_promise
 from .sog_files import Files, Meta, Texels

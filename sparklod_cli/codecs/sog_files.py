@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL.WebPImagePlugin import WebPImageFile
 
-from ..errors import ChecksumError, FormatError, NotSplatsError
-from ..quantities import count_of
-from ..untrusted import parse_json, quoted, shown
+from ..support.errors import ChecksumError, FormatError, NotSplatsError
+from ..support.units import count_of
+from ..support.untrusted import parse_json, quoted, shown
 from .compression import check_promise
 from .stream import size_of
 

@@ -8,11 +8,11 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FormatError, TruncatedError
-from ..parallel import chunks_of, ordered_map
-from ..progress import Progress, silent
-from ..scene import Scene
-from ..splats import Splats
+from ..model.scene import Scene
+from ..model.splats import Splats
+from ..support.errors import FormatError, TruncatedError
+from ..support.parallel import chunks_of, ordered_map
+from ..support.progress import Progress, silent
 from . import quantize
 from .stream import decode_rows, rows_of, size_of
 

@@ -15,14 +15,20 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FormatError, MembersError, NotSplatsError, TreeError, TruncatedError, VersionError
-from ..limits import DEFAULT_COMPRESSION, DEFAULT_SPZ_VERSION, MAX_FRACTIONAL_BITS, MAX_SH_DEGREE, SPZ_VERSIONS
-from ..parallel import chunks_of, for_chunks, ordered_map
-from ..progress import Progress, silent
-from ..scene import Scene
-from ..sh import notes_on_degree
-from ..splats import COLUMNS, FloatArray, Splats
-from ..tree import LodTree
+from ..model.lod_tree import LodTree
+from ..model.scene import Scene
+from ..model.sh import notes_on_degree
+from ..model.splats import COLUMNS, FloatArray, Splats
+from ..support.defaults import (
+    DEFAULT_COMPRESSION,
+    DEFAULT_SPZ_VERSION,
+    MAX_FRACTIONAL_BITS,
+    MAX_SH_DEGREE,
+    SPZ_VERSIONS,
+)
+from ..support.errors import FormatError, MembersError, NotSplatsError, TreeError, TruncatedError, VersionError
+from ..support.parallel import chunks_of, for_chunks, ordered_map
+from ..support.progress import Progress, silent
 from . import compression, quantize
 from .spz_layout import ANTIALIASED, EXTENSIONS, LOD, Layout, Stream, StreamRows
 from .stream import Read, rows_of, size_of

@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..gaussian import linear_opacity, lod_opacity
-from ..limits import MAX_SH_DEGREE
-from ..sh import COEFFICIENTS
+from ..model.gaussian import linear_opacity, lod_opacity
+from ..model.sh import COEFFICIENTS
+from ..support.defaults import MAX_SH_DEGREE
 from . import quantize
 
 #: Flags of the header.

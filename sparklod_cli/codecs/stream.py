@@ -9,9 +9,9 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import TruncatedError
-from ..parallel import CHUNK, chunks_of, ordered_map
-from ..progress import Progress
+from ..support.errors import TruncatedError
+from ..support.parallel import CHUNK, chunks_of, ordered_map
+from ..support.progress import Progress
 
 #: Narrow rows, such as the columns of SPZ, would otherwise be over before a thread has been handed them.
 CHUNK_BYTES = 1 << 18

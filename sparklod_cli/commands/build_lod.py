@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from .. import limits
-from ..printable import MOST, shortened
+from ..support import defaults
+from ..support.printable import MOST, shortened
 from .console import Console, is_terminal
 from .options import AutoOr, Ball, Numbers, Real, common_options, is_given
 from .paths import InputPath, OutputPath, keep_apart
@@ -22,8 +22,8 @@ from .reports import report_baked, report_unbaked
 
 if TYPE_CHECKING:
     from ..bake import Baked
+    from ..extract_leaves import Unbaked
     from ..io import Sink
-    from ..unlod import Unbaked
 
     #: Makes the output of an input through a sink, and reports what came of it.
     Work = Callable[[Path, Path, Sink], Baked | Unbaked]
@@ -78,30 +78,30 @@ Examples:
 @click.option("--overwrite", is_flag=True, help="Replace outputs that exist.")
 @click.option(
     "--method",
-    type=click.Choice(limits.METHODS),
-    default=limits.METHODS[0],
+    type=click.Choice(defaults.METHODS),
+    default=defaults.METHODS[0],
     help="How to merge: quick takes next to no time, cuts of quality are nearer to full detail.",
 )
 @click.option(
     "--base",
     metavar="N",
-    type=Real(limits.MIN_BASE, limits.MAX_BASE),
-    default=limits.DEFAULT_BASE,
+    type=Real(defaults.MIN_BASE, defaults.MAX_BASE),
+    default=defaults.DEFAULT_BASE,
     help="With --method quick: growth of the voxel grid from level to level; nearer 1, smoother transitions and more"
     " nodes.",
 )
 @click.option(
     "--growth",
     metavar="N",
-    type=Real(limits.MIN_GROWTH, limits.MAX_GROWTH),
-    default=limits.DEFAULT_GROWTH,
+    type=Real(defaults.MIN_GROWTH, defaults.MAX_GROWTH),
+    default=defaults.DEFAULT_GROWTH,
     help="With --method quality: at most so many nodes a leaf.",
 )
 @click.option(
     "--max-sh",
     metavar="N",
-    type=click.IntRange(0, limits.MAX_SH_DEGREE),
-    default=limits.MAX_SH_DEGREE,
+    type=click.IntRange(0, defaults.MAX_SH_DEGREE),
+    default=defaults.MAX_SH_DEGREE,
     help="Leave out spherical harmonics above this degree.",
 )
 @click.option("--min-opacity", metavar="N", type=Real(0, 1), default=0.0, help="Leave out splats of lower opacity.")
@@ -122,7 +122,7 @@ Examples:
 )
 @click.option(
     "--encoding",
-    type=click.Choice(limits.ENCODINGS),
+    type=click.Choice(defaults.ENCODINGS),
     help="Write the tree as arrays in a viewer's memory layout: .npz, or the words alone if FILE is .bin or .raw.",
 )
 @click.option(
@@ -132,21 +132,21 @@ Examples:
 )
 @click.option(
     "--spz-version",
-    type=click.Choice([str(version) for version in limits.SPZ_VERSIONS]),
-    default=str(limits.DEFAULT_SPZ_VERSION),
+    type=click.Choice([str(version) for version in defaults.SPZ_VERSIONS]),
+    default=str(defaults.DEFAULT_SPZ_VERSION),
     help="2 is 4 to 8 % smaller, 3 keeps rotations ten times as exact.",
 )
 @click.option(
     "--fractional-bits",
-    type=AutoOr(0, limits.MAX_FRACTIONAL_BITS),
+    type=AutoOr(0, defaults.MAX_FRACTIONAL_BITS),
     default="auto",
     help="Bits after the binary point of a position; auto suits the extent and the smallest splats.",
 )
 @click.option(
     "--compression-level",
     metavar="N",
-    type=click.IntRange(limits.MIN_COMPRESSION, limits.MAX_COMPRESSION),
-    default=limits.DEFAULT_COMPRESSION,
+    type=click.IntRange(defaults.MIN_COMPRESSION, defaults.MAX_COMPRESSION),
+    default=defaults.DEFAULT_COMPRESSION,
     help="1 is fast, 9 small.",
 )
 @common_options
@@ -182,7 +182,7 @@ def build_lod(
     with Console(quiet=quiet, verbose=verbose) as console:
         work = _unlod(ctx, settings, console) if settings["unlod"] else _bake(settings, output, console)
         from .. import io
-        from ..errors import SparklodError
+        from ..support.errors import SparklodError
 
         for source, target in zip(inputs, outputs, strict=True):
             try:
@@ -215,18 +215,18 @@ def _check_usage(ctx: click.Context, inputs: tuple[Path, ...], output: Path | No
     suffix = output.suffix.lower() if output is not None and output != STDOUT else ""
     if settings["unlod"]:
         refuse(OF_BAKING, "is of no use with --unlod, which writes what there is")
-        if suffix and suffix not in limits.PLAIN_SUFFIXES:
-            raise click.UsageError(f"--unlod writes {', '.join(limits.PLAIN_SUFFIXES)}, not {suffix}")
+        if suffix and suffix not in defaults.PLAIN_SUFFIXES:
+            raise click.UsageError(f"--unlod writes {', '.join(defaults.PLAIN_SUFFIXES)}, not {suffix}")
         if suffix not in ("", ".spz"):
             refuse(OF_SPZ, f"is of SPZ, not of {suffix}")
     elif settings["encoding"]:
         refuse(OF_SPZ, "is of SPZ, not of --encoding")
-        if suffix not in ("", ".npz", *limits.RAW_SUFFIXES):
-            known = ", ".join((".npz", *limits.RAW_SUFFIXES))
+        if suffix not in ("", ".npz", *defaults.RAW_SUFFIXES):
+            known = ", ".join((".npz", *defaults.RAW_SUFFIXES))
             raise click.UsageError(f"--encoding writes {known}, not {suffix}")
     elif suffix in OTHER_SUFFIXES:
         raise click.UsageError(f"{suffix} holds no tree, which is written as SPZ; name the output .spz")
-    elif suffix in (".npz", *limits.RAW_SUFFIXES):
+    elif suffix in (".npz", *defaults.RAW_SUFFIXES):
         raise click.UsageError(f"a {suffix} output needs --encoding")
     elif suffix not in ("", ".spz"):
         raise click.UsageError(f"a tree is written as SPZ, not as {suffix}; name the output .spz")
@@ -268,10 +268,10 @@ def _output_name(source: Path, settings: dict[str, Any]) -> str:
 
 def _bake(settings: dict[str, Any], output: Path | None, console: Console) -> Work:
     """What bakes a file and reports it; the point where numpy and numba are loaded."""
-    from .. import jit
     from ..bake import Recipe, bake
     from ..codecs import spz
-    from ..selection import Selection
+    from ..model.selection import Selection
+    from ..support import jit
 
     jit.use_threads(settings["threads"])
     console.announce_compiling(settings["method"])
@@ -308,7 +308,7 @@ def _bake(settings: dict[str, Any], output: Path | None, console: Console) -> Wo
 
 def _unlod(ctx: click.Context, settings: dict[str, Any], console: Console) -> Work:
     """What writes the leaves of a file and reports it."""
-    from ..unlod import Target, unlod
+    from ..extract_leaves import Target, unlod
 
     chosen = ctx.get_parameter_source("spz_version") != click.core.ParameterSource.DEFAULT
 

@@ -9,19 +9,19 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..errors import CameraPathError, SparklodError, TooManyCamerasError
-from ..render.axes import Axes
-from ..render.paths.formats import FORMATS, NAMES
+from ..cameras.axes import Axes
+from ..cameras.formats.table import FORMATS, NAMES
+from ..support.errors import CameraPathError, SparklodError, TooManyCamerasError
 from .camera_values import Size, View, Views
 from .options import Command, Numbers, Real
 from .paths import InputPath
 
 if TYPE_CHECKING:
-    from ..render.camera import Matrix
-    from ..render.camera_path import CameraPath
-    from ..render.frame import Frame, Settings
-    from ..render.framing import Balls
-    from ..render.paths.source import Parsed
+    from ..cameras.camera import Matrix
+    from ..cameras.formats.source import Parsed
+    from ..cameras.frame import Frame, Settings
+    from ..cameras.framing import Balls
+    from ..cameras.path import CameraPath
 
     #: Gives what the splats cover.
     Scene = Callable[[], Balls]
@@ -181,7 +181,7 @@ def cameras_from(settings: Mapping[str, Any], scene: Scene, *, orbit: int = DEFA
             names = " or ".join(SOURCES[name] for name in sources)
             raise click.UsageError(f"--{option.replace('_', '-')} only means something with {names}")
 
-    from ..render.camera_path import GENERATED, cameras_of
+    from ..cameras.path import GENERATED, cameras_of
 
     how = _settings(settings)
     if source == "camera_path":
@@ -200,7 +200,7 @@ def _source(settings: Mapping[str, Any]) -> str:
 
 
 def _settings(settings: Mapping[str, Any]) -> Settings:
-    from ..render.frame import Settings
+    from ..cameras.frame import Settings
 
     axes, fov, world, up = (settings[name] for name in ("camera_axes", "fov", "world_transform", "up"))
     if up is not None and not any(up):
@@ -219,7 +219,7 @@ def _settings(settings: Mapping[str, Any]) -> Settings:
 def _world(value: str) -> Matrix:
     """(4, 4) of the text of --world-transform, or of the file that it names."""
     from .. import io
-    from ..render.world import similarity
+    from ..cameras.world_transform import similarity
 
     if "," in value and not set(value) - NUMERIC:
         try:
@@ -236,8 +236,8 @@ def _world(value: str) -> Matrix:
 
 def _read(path: Path, form: str | None, how: Settings) -> CameraPath:
     from .. import io
-    from ..render.camera_path import read
-    from ..render.paths.source import Files
+    from ..cameras.formats.source import Files
+    from ..cameras.path import read
 
     try:
         contents = io.read_together(path, NAMES, LARGEST)
@@ -250,18 +250,18 @@ def _read(path: Path, form: str | None, how: Settings) -> CameraPath:
 
 
 def _generated(source: str, settings: Mapping[str, Any], how: Settings, scene: Scene) -> Parsed:
-    from ..render import generate
-    from ..render.frame import DEFAULT_FPS, DEFAULT_UP
-    from ..render.paths.source import Parsed
+    from ..cameras import generators
+    from ..cameras.formats.source import Parsed
+    from ..cameras.frame import DEFAULT_FPS, DEFAULT_UP
 
     fps, up = how.fps or DEFAULT_FPS, how.up or DEFAULT_UP
-    seconds = settings["seconds"] or generate.SECONDS
+    seconds = settings["seconds"] or generators.SECONDS
     if source == "look_at":
         eye, target = settings["look_at"]
-        return Parsed([generate.frame_looking(eye, target, up)])
+        return Parsed([generators.frame_looking(eye, target, up)])
     if source == "keyframes":
-        keys = [generate.Key(eye, target) for eye, target in settings["keyframes"]]
-        return Parsed(generate.between(keys, fps, up, seconds=seconds))
+        keys = [generators.Key(eye, target) for eye, target in settings["keyframes"]]
+        return Parsed(generators.between(keys, fps, up, seconds=seconds))
     center, distance = settings["center"], settings["distance"]
     elevation = DEFAULT_ELEVATION if settings["elevation"] is None else settings["elevation"]
     tilt = math.radians(elevation)
@@ -269,14 +269,14 @@ def _generated(source: str, settings: Mapping[str, Any], how: Settings, scene: S
     if center is None or distance is None:
         origin = (0.0, 0.0, 0.0)
         if source == "orbit":
-            around = generate.orbit(count, origin, 1, tilt, up)
+            around = generators.orbit(count, origin, 1, tilt, up)
         else:
-            around = generate.dolly(2, origin, 1, 1, tilt, up)
+            around = generators.dolly(2, origin, 1, 1, tilt, up)
         center, fits = _place(around, center, scene(), how)
-        distance = distance or (fits if source == "orbit" else generate.DOLLY_START * fits)
+        distance = distance or (fits if source == "orbit" else generators.DOLLY_START * fits)
     if source == "orbit":
-        return Parsed(generate.orbit(count, center, distance, tilt, up))
-    return Parsed(generate.dolly(count, center, distance, distance / generate.DOLLY_ZOOM, tilt, up))
+        return Parsed(generators.orbit(count, center, distance, tilt, up))
+    return Parsed(generators.dolly(count, center, distance, distance / generators.DOLLY_ZOOM, tilt, up))
 
 
 def _place(frames: Sequence[Frame], center: Any, scene: Balls, how: Settings) -> tuple[Any, float]:
@@ -290,8 +290,8 @@ def _place(frames: Sequence[Frame], center: Any, scene: Balls, how: Settings) ->
     """
     import numpy as np
 
-    from ..render.frame import camera_of
-    from ..render.framing import covered, distance, middle_of, some
+    from ..cameras.frame import camera_of
+    from ..cameras.framing import covered, distance, middle_of, some
 
     kept = covered(scene)
     middle = middle_of(kept) if center is None else np.asarray(center, np.float64)

@@ -30,7 +30,7 @@ class Reporter:
 
     def listen(self) -> Callable[[], None]:
         """Begins; returns what ends it."""
-        from .. import jit
+        from ..support import jit
 
         stop = jit.listen(self._begin, self._end, self._say_once)
 
@@ -54,7 +54,7 @@ class Reporter:
         self._console.progress("compiling", self._done, self._total, "kernel")
 
     def _announce(self, name: str) -> None:
-        from .. import jit
+        from ..support import jit
         from ..warmup import missing
 
         self._total = len({name, *missing(self._jobs)})

@@ -11,9 +11,9 @@ from typing import Any, TextIO
 
 import click
 
-from ..printable import MOST, printable
-from ..quantities import count_of as count_of
-from ..stdout import silence
+from ..support.printable import MOST, printable
+from ..support.stdout import silence
+from ..support.units import count_of as count_of
 
 
 def size_of(size: int) -> str:
@@ -83,7 +83,7 @@ def _unheard() -> Iterator[None]:
 class Console:
     """Says lines on standard error, and shows a bar for each stage of work where that is a terminal.
 
-    Used as a context manager, which clears the bar. Its `progress` is a `sparklod_cli.progress.Progress`.
+    Used as a context manager, which clears the bar. Its `progress` is a `sparklod_cli.support.progress.Progress`.
     """
 
     def __init__(self, *, quiet: bool, verbose: bool) -> None:

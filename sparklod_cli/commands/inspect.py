@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..limits import MAX_SH_DEGREE, PLOT_BY
-from ..quantities import parse_size
+from ..support.defaults import MAX_SH_DEGREE, PLOT_BY
+from ..support.units import parse_size
 from .console import Console
 from .inspect_job import Job
 from .options import Quantity, Real, common_options, is_given
@@ -19,7 +19,7 @@ from .paths import InputPath, OutputPath, keep_apart
 if TYPE_CHECKING:
     from ..inspection.expectations import Expectations
     from ..inspection.report import Wanted
-    from ..scene import Scene
+    from ..model.scene import Scene
 
 #: Options that are expectations, by the names that `Expectations` has for them.
 EXPECTED = ("max_bytes", "min_splats", "max_splats", "sh", "max_growth")
@@ -115,8 +115,8 @@ def inspect(
     """
     _check_usage(ctx, files, settings, as_json)
     with Console(quiet=quiet, verbose=verbose) as console:
-        from .. import jit
         from ..io import check_writable
+        from ..support import jit
 
         jit.use_threads(settings["threads"])
         console.announce_compiling("inspect")
@@ -205,8 +205,8 @@ def _wanted(settings: dict[str, Any], as_json: bool) -> Wanted:
 
 def _original(settings: dict[str, Any], console: Console) -> Scene | None:
     """The scene of --leaves-of."""
-    from ..errors import FormatError
     from ..io import read_scene
+    from ..support.errors import FormatError
 
     path = settings["leaves_of"]
     try:

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..errors import OutOfMemoryError, SparklodError, StdoutError, memory_told
-from ..printable import printable
+from ..support.errors import OutOfMemoryError, SparklodError, StdoutError, memory_told
+from ..support.printable import printable
 from .console import Console, count_of, size_of
 from .inspect_text import finding_line, lines
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from ..inspection.findings import Finding
     from ..inspection.html import Section
     from ..inspection.report import Report, Wanted
-    from ..scene import Scene
+    from ..model.scene import Scene
 
 
 @dataclass
@@ -117,10 +117,11 @@ class Job:
         plot, html = self.settings["plot"], self.settings["html"]
         if plot is None and html is None:
             return
-        from ..inspection import histograms, values
+        from ..figures import tree_plot as plots
         from ..inspection import html as pages
-        from ..inspection import plot as plots
+        from ..inspection import values
         from ..io import write_whole
+        from ..tables import histograms
 
         picture = None
         if scene is not None:
@@ -158,7 +159,7 @@ def _fails(findings: list[Finding], fail_on: str) -> bool:
 
 def _print_histograms(scene: Scene, names: tuple[str, ...]) -> None:
     from ..inspection import values
-    from ..inspection.histograms import as_text, of_quantity
+    from ..tables.histograms import as_text, of_quantity
 
     for name in names:
         if name not in values.names_of(scene.splats):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
-from ..printable import MOST, printable, shortened
+from ..support.printable import MOST, printable, shortened
 from .console import count_of, size_of
 
 if TYPE_CHECKING:

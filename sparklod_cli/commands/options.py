@@ -11,8 +11,8 @@ from typing import Any, TypeVar
 import click
 
 from .. import __version__
-from ..limits import MAX_THREADS, TABLES
-from ..parallel import processors
+from ..support.defaults import MAX_THREADS, TABLES
+from ..support.parallel import processors
 
 #: Suffixes, without a point, of what is no table, whatever format is asked for.
 NO_TABLES = ("gif", "html", "ksplat", "mp4", "npy", "npz", "ply", "png", "sog", "splat", "spz", "webp")

@@ -108,8 +108,8 @@ def _keep_apart(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:
 
 def _all_read(paths: Iterable[Path]) -> Iterator[Path]:
     """Each path, and the files that are read with it."""
+    from ..cameras.formats.table import NAMES
     from ..io import companions
-    from ..render.paths.formats import NAMES
 
     for path in dict.fromkeys(paths):
         yield path

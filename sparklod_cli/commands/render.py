@@ -21,8 +21,8 @@ from .render_options import background_from, blend_from, check_size, look_option
 from .world_options import cut_options, files_meant, placements_from, viewer_from, world_options
 
 if TYPE_CHECKING:
-    from ..preview.scenery import Scenery
-    from ..simulation.simulate import Viewer
+    from ..scenery import Scenery
+    from ..simulation.frames import LodSettings
     from ..world import Placement
     from .render_output import Output
 
@@ -138,9 +138,9 @@ def render(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, **s
     # Before much is read, what is wrong with the output already.
     _output(settings, placements, least_cameras(settings))
     with Console(quiet=quiet, verbose=verbose) as console:
-        from ..preview import animation
-        from ..preview.pictures import Painter
-        from ..preview.pixels import scale_width
+        from ..images import animation
+        from ..images.pixels import scale_width
+        from ..render.renderer import Renderer
         from .render_job import Job, Wanted, frame_rate
 
         console.announce_compiling("render")
@@ -177,13 +177,15 @@ def render(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, **s
         for note in notes:
             console.say(note)
         console.detail(f"  read in {time.perf_counter() - start:.2f} s")
-        painter, other = Painter(scenery(), manner, path.cameras), None
+        painter, other = Renderer(scenery(), manner, path.cameras), None
         if settings["diff"] is not None:
             from ..world import Placement
 
             compared = [Placement(settings["diff"], settings["diff"].stem)]
             plain = settings | {"through": None}
-            other = Painter(_read(compared, None if settings["full"] else viewer, plain, console), manner, path.cameras)
+            other = Renderer(
+                _read(compared, None if settings["full"] else viewer, plain, console), manner, path.cameras
+            )
         wanted = Wanted(
             output=output,
             overwrite=settings["overwrite"],
@@ -221,9 +223,9 @@ def _compare(ctx: click.Context, settings: dict[str, Any], console: Console, *, 
     viewer = viewer_from(ctx, settings | {"budget": None})
     manner = manner_from(ctx, settings)
     with console:
-        from ..preview.compare import How
+        from ..compare import ComparisonSettings
+        from ..model.splats import COLUMNS
         from ..render.backends import BACKENDS
-        from ..splats import COLUMNS
         from ..world import read_world
         from .render_compare import run, wanted_from
 
@@ -243,7 +245,7 @@ def _compare(ctx: click.Context, settings: dict[str, Any], console: Console, *, 
         for note in path.notes:
             console.say(note)
         draw = functools.partial(BACKENDS[settings["backend"]].draw, **manner.options)
-        how = How(draw, look, settings["max_sh"], blend_from(settings))
+        how = ComparisonSettings(draw, look, settings["max_sh"], blend_from(settings))
         return run(console, world, viewer, path, how, wanted, threads=settings["threads"])
 
 
@@ -275,8 +277,10 @@ def _output(settings: Mapping[str, Any], placements: list[Placement], cameras: i
     return output_for(settings["output"], name.stem or name.name, cameras, sheet=_is_sheet(settings))
 
 
-def _read(placements: list[Placement], viewer: Viewer | None, settings: Mapping[str, Any], console: Console) -> Scenery:
-    from ..preview.scenery import read_scenery
+def _read(
+    placements: list[Placement], viewer: LodSettings | None, settings: Mapping[str, Any], console: Console
+) -> Scenery:
+    from ..scenery import read_scenery
 
     try:
         return read_scenery(
@@ -293,6 +297,6 @@ def _read(placements: list[Placement], viewer: Viewer | None, settings: Mapping[
 
 
 def _use_threads(count: int) -> None:
-    from .. import jit
+    from ..support import jit
 
     jit.use_threads(count)

@@ -13,9 +13,9 @@ from .camera_options import SOURCES, cameras_from
 from .options import is_given, refuse
 
 if TYPE_CHECKING:
-    from ..render.camera_path import CameraPath
-    from ..render.framing import Balls
-    from ..render.look import Look
+    from ..cameras.framing import Balls
+    from ..cameras.path import CameraPath
+    from ..render.settings import RasterSettings
 
 #: Sources of cameras that are chosen for the scene, where nobody says how far away they are.
 CHOSEN = ("orbit", "dolly")
@@ -48,8 +48,8 @@ def is_free(settings: Mapping[str, Any]) -> bool:
 
 
 def framed(
-    ctx: click.Context, settings: Mapping[str, Any], look: Look, scene: Callable[[], Balls]
-) -> tuple[CameraPath, Look]:
+    ctx: click.Context, settings: Mapping[str, Any], look: RasterSettings, scene: Callable[[], Balls]
+) -> tuple[CameraPath, RasterSettings]:
     """The cameras, and a look in whose reach they have the scene where they were chosen for it.
 
     Args:
@@ -58,7 +58,7 @@ def framed(
         look: that they ask for.
         scene: gives what the splats cover; called only where cameras are chosen by it.
     """
-    from ..render.framing import with_reach
+    from ..cameras.framing import with_reach
 
     scene = functools.cache(scene)
     path = _cameras(settings, scene)
@@ -73,7 +73,7 @@ def _cameras(settings: Mapping[str, Any], scene: Callable[[], Balls]) -> CameraP
     if not settings["views"]:
         if not is_free(settings):
             return cameras_from(settings, scene, orbit=1)
-        from ..render.framing import covered, fitted
+        from ..cameras.framing import covered, fitted
 
         path = cameras_from({**settings, "center": (0.0, 0.0, 0.0), "distance": 1.0}, scene, orbit=1)
         return dataclasses.replace(path, cameras=(fitted(path.cameras[0], covered(scene())),))

@@ -13,17 +13,18 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from .. import limits
+from ..support import defaults
 from .console import Console, count_of, for_screen, is_terminal
 from .options import Command, Quantity, table_form
 from .paths import OutputPath
 
 if TYPE_CHECKING:
-    from ..preview.compare import Budget, Comparison, How, OfBudget
-    from ..render.camera_path import CameraPath
-    from ..simulation.assertions import Assertion
-    from ..simulation.columns import Row
-    from ..simulation.simulate import Viewer
+    from ..cameras.path import CameraPath
+    from ..compare import Comparison, ComparisonSettings, OfBudget
+    from ..lod.budget import Budget
+    from ..simulation.frames import LodSettings
+    from ..tables.assertions import Assertion
+    from ..tables.columns import Row
     from ..world import World
 
 #: What is compared unless told otherwise.
@@ -34,7 +35,7 @@ ABOUT = ":"
 
 
 def _budgets(text: str) -> Any:
-    from ..preview.compare import parse_budgets
+    from ..lod.budget import parse_budgets
 
     return parse_budgets(text)
 
@@ -69,8 +70,8 @@ def compare_options(command: Command) -> Command:
             click.option(
                 "--max-sh",
                 metavar="N",
-                type=click.IntRange(0, limits.MAX_SH_DEGREE),
-                default=limits.MAX_SH_DEGREE,
+                type=click.IntRange(0, defaults.MAX_SH_DEGREE),
+                default=defaults.MAX_SH_DEGREE,
                 help="Leave out spherical harmonics of higher degrees.",
             ),
         )
@@ -109,11 +110,11 @@ class Wanted:
             if target is not None and str(target) != "-":
                 check_writable(target, overwrite=self.overwrite)
         if self.form == "parquet":
-            from ..simulation.tables import load_pyarrow
+            from ..tables.files import load_pyarrow
 
             load_pyarrow()
         if self.plot is not None:
-            from ..simulation.charts import load_matplotlib
+            from ..figures.charts import load_matplotlib
 
             load_matplotlib()
 
@@ -133,8 +134,8 @@ def wanted_from(
 
 
 def _assertion(text: str, budgets: Sequence[Budget]) -> tuple[int | None, Assertion]:
-    from ..preview.compare import COLUMNS
-    from ..simulation import assertions
+    from ..compare import COLUMNS
+    from ..tables import assertions
 
     name, found, rest = text.rpartition(ABOUT)
     at, texts = None, [budget.text for budget in budgets]
@@ -149,15 +150,22 @@ def _assertion(text: str, budgets: Sequence[Budget]) -> tuple[int | None, Assert
 
 
 def run(
-    console: Console, world: World, viewer: Viewer, path: CameraPath, how: How, wanted: Wanted, *, threads: int
+    console: Console,
+    world: World,
+    viewer: LodSettings,
+    path: CameraPath,
+    how: ComparisonSettings,
+    wanted: Wanted,
+    *,
+    threads: int,
 ) -> int:
     """Compares, writes the table and the charts, and says what they come to; the exit status.
 
     Cuts go down to the budget, not to the size of a pixel, unless the viewer has a limit of its own.
     """
+    from ..compare import COLUMNS, Comparison
     from ..io import write_stdout, write_whole
-    from ..preview.compare import COLUMNS, Comparison
-    from ..simulation.tables import encode
+    from ..tables.files import encode
 
     wanted.check()
     if viewer.pixel_scale_limit is None and viewer.render_scale == 1:
@@ -183,7 +191,7 @@ def run(
     console.clear()
     console.detail(f"  {len(rows):,} pictures, {time.perf_counter() - start:.2f} s")
     if wanted.plot is not None:
-        from ..preview.compare_plot import plot
+        from ..figures.comparison_chart import plot
 
         title = ", ".join(dict.fromkeys(tree.file.name for tree in world.trees))
         write_whole(wanted.plot, [plot(rows, wanted.budgets, title)], overwrite=wanted.overwrite)
@@ -191,8 +199,8 @@ def run(
 
 
 def _report(console: Console, wanted: Wanted, comparison: Comparison, path: CameraPath, rows: Sequence[Row]) -> int:
-    from ..preview.compare import rows_of, summarize
-    from ..simulation.assertions import check
+    from ..compare import rows_of, summarize
+    from ..tables.assertions import check
 
     groups = rows_of(rows, wanted.budgets)
     outcomes = [

@@ -12,22 +12,22 @@ from typing import TYPE_CHECKING, Any
 import click
 import numpy as np
 
-from .. import jit
+from ..images import pixels as codes
+from ..images.metrics import check_covered, psnr
 from ..io import write_stdout, write_whole
-from ..limits import OF_PIXELS
-from ..parallel import ordered_map
-from ..preview import pixels as codes
-from ..preview.metrics import check_covered, psnr
+from ..support import jit
+from ..support.defaults import OF_PIXELS
+from ..support.parallel import ordered_map
 from .console import Console, count_of, size_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from ..preview.pictures import Drawn, Painter
-    from ..preview.pixels import Color, Pixels
-    from ..render.camera import Camera
-    from ..render.camera_path import CameraPath
-    from ..render.colors import Coloring
+    from ..cameras.camera import Camera
+    from ..cameras.path import CameraPath
+    from ..images.pixels import Color, Pixels
+    from ..render.color_scales import Coloring
+    from ..render.renderer import Drawn, Renderer
     from .render_output import Output
 
 
@@ -87,8 +87,8 @@ class Job:
 
     console: Console
     wanted: Wanted
-    painter: Painter
-    other: Painter | None
+    painter: Renderer
+    other: Renderer | None
     path: CameraPath
     captions: list[str]
     start: float
@@ -100,8 +100,8 @@ class Job:
 
     def run(self) -> None:
         """Draws and writes all of them."""
-        from ..preview.animation import animate
-        from ..preview.sheet import sheet
+        from ..images.animation import animate
+        from ..images.contact_sheet import sheet
 
         output = self.wanted.output
         if self.other is not None:
@@ -170,7 +170,7 @@ class Job:
             return codes.difference_bar(self._gain)
         return self.painter.scale.bar if self.painter.scale is not None else None
 
-    def _fitting_gain(self, other: Painter) -> float:
+    def _fitting_gain(self, other: Renderer) -> float:
         """What suits the first picture, the last and the one in the middle; the same for all."""
         cameras, background = self.path.cameras, self.wanted.background
         some = sorted({0, len(cameras) // 2, len(cameras) - 1}, reverse=True)
@@ -236,7 +236,7 @@ class Job:
 
 def frame_rate(path: CameraPath) -> float:
     """Frames a second, on average."""
-    from ..render.frame import DEFAULT_FPS
+    from ..cameras.frame import DEFAULT_FPS
 
     span = path.cameras[-1].time - path.cameras[0].time
     return (len(path.cameras) - 1) / span if span > 0 else DEFAULT_FPS

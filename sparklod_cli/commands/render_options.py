@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from .. import limits
-from ..limits import OF_PIXELS
-from ..render.look import PROFILES, SORTS, Look
+from ..render.settings import PROFILES, SORTS, RasterSettings
+from ..support import defaults
+from ..support.defaults import OF_PIXELS
 from .options import Command, Real, is_given, refuse
 
 if TYPE_CHECKING:
-    from ..preview.pictures import Manner
-    from ..preview.pixels import Color
+    from ..images.pixels import Color
+    from ..render.renderer import RenderSettings
 
 COLORS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "transparent": None}
 
@@ -60,7 +60,7 @@ class Background(click.ParamType):
 
 def look_options(command: Command) -> Command:
     """How pictures look."""
-    look = Look()
+    look = RasterSettings()
     for option in reversed(
         (
             click.option(
@@ -73,14 +73,14 @@ def look_options(command: Command) -> Command:
             click.option(
                 "--supersample",
                 metavar="N",
-                type=click.IntRange(1, limits.MAX_SUPERSAMPLE),
+                type=click.IntRange(1, defaults.MAX_SUPERSAMPLE),
                 default=1,
                 help="Make each pixel the mean of N x N, up to 4 x 4.",
             ),
             click.option(
                 "--near",
                 metavar="D",
-                type=Real(0, limits.FARTHEST, min_open=True),
+                type=Real(0, defaults.FARTHEST, min_open=True),
                 default=look.near,
                 show_default=False,
                 help="Draw nothing nearer along the axis."
@@ -89,7 +89,7 @@ def look_options(command: Command) -> Command:
             click.option(
                 "--far",
                 metavar="D",
-                type=Real(0, limits.FARTHEST, min_open=True),
+                type=Real(0, defaults.FARTHEST, min_open=True),
                 default=look.far,
                 show_default=False,
                 help="Draw nothing farther along the axis."
@@ -105,24 +105,24 @@ def look_options(command: Command) -> Command:
                 "--blend",
                 metavar="X",
                 type=Real(1, min_open=True),
-                help=f"With --continuous: ratio of pixel scales between which they do.  [default: {limits.BLEND:g}]",
+                help=f"With --continuous: ratio of pixel scales between which they do.  [default: {defaults.BLEND:g}]",
             ),
             click.option(
                 "--style",
-                type=click.Choice(limits.STYLES),
-                default=limits.STYLES[0],
+                type=click.Choice(defaults.STYLES),
+                default=defaults.STYLES[0],
                 help="Splats, or what is simpler: opaque points of a pixel, discs in the order of the file, or discs"
                 " from far to near.",
             ),
             click.option(
                 "--color-by",
-                type=click.Choice(limits.COLOR_BY),
+                type=click.Choice(defaults.COLOR_BY),
                 help="Colours that mean something, without light, and beside the picture a bar that says what.",
             ),
             click.option("--no-bar", is_flag=True, help="Leave that bar out."),
             click.option(
                 "--through",
-                type=click.Choice(limits.THROUGH),
+                type=click.Choice(defaults.THROUGH),
                 help="Draw splats as they are after Spark's PackedSplats or ExtSplats, or SPZ, in the file's own cuts.",
             ),
             click.option(
@@ -139,7 +139,7 @@ def look_options(command: Command) -> Command:
             ),
             click.option(
                 "--sorting",
-                type=click.Choice(limits.SORTINGS),
+                type=click.Choice(defaults.SORTINGS),
                 help="With --backend osmesa: exactly, or by 16 bits of the depth, as antimatter15's viewer."
                 "  [default: exact]",
             ),
@@ -152,8 +152,8 @@ def look_options(command: Command) -> Command:
             ),
             click.option(
                 "--backend",
-                type=click.Choice(limits.BACKENDS),
-                default=limits.BACKENDS[0],
+                type=click.Choice(defaults.BACKENDS),
+                default=defaults.BACKENDS[0],
                 help="What draws splats.",
             ),
         )
@@ -162,9 +162,9 @@ def look_options(command: Command) -> Command:
     return command
 
 
-def manner_from(ctx: click.Context, settings: Mapping[str, Any]) -> Manner:
+def manner_from(ctx: click.Context, settings: Mapping[str, Any]) -> RenderSettings:
     """The manner that the options of `look_options` ask for."""
-    from ..preview.pictures import Manner
+    from ..render.renderer import RenderSettings
 
     style, by = settings["style"], settings["color_by"]
     if not settings["near"] < settings["far"]:
@@ -186,8 +186,8 @@ def manner_from(ctx: click.Context, settings: Mapping[str, Any]) -> Manner:
     }
     if options and settings["backend"] != "osmesa":
         raise click.UsageError("--sorting and --sort-throttle only mean something with --backend osmesa")
-    return Manner(
-        look=Look(settings["near"], settings["far"], settings["profile"], settings["sort"]),
+    return RenderSettings(
+        look=RasterSettings(settings["near"], settings["far"], settings["profile"], settings["sort"]),
         style=style,
         backend=settings["backend"],
         color_by=by,
@@ -202,7 +202,7 @@ def blend_from(settings: Mapping[str, Any]) -> float | None:
         if settings["blend"] is not None:
             raise click.UsageError("--blend only means something with --continuous")
         return None
-    return settings["blend"] or limits.BLEND
+    return settings["blend"] or defaults.BLEND
 
 
 def background_from(ctx: click.Context, settings: Mapping[str, Any], form: str) -> Color | None:

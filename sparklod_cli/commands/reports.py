@@ -10,7 +10,7 @@ from .console import Console, count_of, size_of
 if TYPE_CHECKING:
     from ..bake import Baked
     from ..codecs.clamps import Clamp
-    from ..unlod import Unbaked
+    from ..extract_leaves import Unbaked
 
 #: What SPZ clamps, by column and whether it is above the upper end: what it is called, what comes of it, what to do.
 CLAMPED = {
@@ -31,7 +31,7 @@ CLAMPED = {
 
 def report_baked(console: Console, source: Path, target: Path, baked: Baked) -> None:
     """A line, and one for each thing that a person should know."""
-    from ..selection import describe
+    from ..model.selection import describe
 
     console.say(
         f"{source}  {count_of(baked.splats, 'splat')}, SH {baked.sh_degree}  ->  {target} "

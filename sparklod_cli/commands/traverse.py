@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from .. import limits
+from ..support import defaults
 from .camera_options import camera_options, cameras_from
 from .console import Console
 from .options import common_options, refuse, table_form
@@ -41,7 +41,7 @@ Examples:
 @click.option(
     "--format",
     "form",
-    type=click.Choice(limits.TABLES),
+    type=click.Choice(defaults.TABLES),
     help="Of the table.  [default: by the name of --output, or csv]",
 )
 @click.option("--per-instance", is_flag=True, help="A row for each instance, too.")
@@ -81,8 +81,8 @@ def traverse(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, *
 
     Coordinates are those of the files; --up, --world-transform and --camera-axes bring cameras into them.
     """
-    from ..simulation import assertions, tables
-    from ..simulation.simulate import Simulation
+    from ..simulation.frames import Simulation
+    from ..tables import assertions, files
     from ..world import TRAVERSED, read_world
     from .traverse_job import Job, Wanted
 
@@ -97,7 +97,7 @@ def traverse(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, *
     wanted = Wanted(
         output=settings["output"],
         form=form,
-        columns=tables.select(timing=not settings["no_timing"]),
+        columns=files.select(timing=not settings["no_timing"]),
         summary=settings["summary"],
         as_json=as_json,
         asserts=asserts,
@@ -113,7 +113,7 @@ def traverse(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, *
     if wanted.padded and wanted.indices is None:
         raise click.UsageError("--padded only means something with --indices-out")
     with Console(quiet=quiet, verbose=verbose) as console:
-        from ..splats import COLUMNS
+        from ..model.splats import COLUMNS
 
         console.announce_compiling("traverse")
         wanted.check()

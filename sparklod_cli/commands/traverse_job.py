@@ -15,17 +15,17 @@ import click
 import numpy as np
 
 from ..io import check_writable, write_stdout, write_whole
-from ..progress import Progress, silent
 from ..simulation.summary import Lookout
+from ..support.progress import Progress, silent
 from .console import Console, for_screen, is_terminal
 from .traverse_text import lines
 
 if TYPE_CHECKING:
-    from ..render.camera_path import CameraPath
-    from ..simulation.assertions import Assertion
-    from ..simulation.columns import Column, Row
-    from ..simulation.simulate import Frame, Simulation
+    from ..cameras.path import CameraPath
+    from ..simulation.frames import Frame, Simulation
     from ..simulation.summary import Summary
+    from ..tables.assertions import Assertion
+    from ..tables.columns import Column, Row
 
 #: Nodes of a row of Spark's index texture.
 ROW = 16_384
@@ -66,11 +66,11 @@ class Wanted:
         if self.indices is not None and self.indices.exists():  # it is made when all else is known to be right
             check_writable(self.indices / "0.npy", overwrite=True)
         if self.form == "parquet":
-            from ..simulation.tables import load_pyarrow
+            from ..tables.files import load_pyarrow
 
             load_pyarrow()
         if self.plot is not None:
-            from ..simulation.charts import load_matplotlib
+            from ..figures.charts import load_matplotlib
 
             load_matplotlib()
 
@@ -90,7 +90,7 @@ class Job:
 
     def run(self, threads: int) -> None:
         """Simulates the path and writes what is made frame by frame, then the plot."""
-        from ..simulation.tables import encode
+        from ..tables.files import encode
 
         wanted, start = self.wanted, time.perf_counter()
         to_stdout = wanted.output is None or str(wanted.output) == "-"
@@ -115,8 +115,8 @@ class Job:
 
     def report(self) -> int:
         """Says what is asked for; the exit status."""
-        from ..simulation.assertions import check
         from ..simulation.summary import summarize
+        from ..tables.assertions import check
 
         wanted = self.wanted
         outcomes = check(wanted.asserts, self.rows)
@@ -175,8 +175,8 @@ class Job:
 
     def _plot(self, target: Path) -> None:
         """Draws the charts, and the path over what the frame that is most worth looking at had: its cut, as drawn."""
-        from ..simulation.plot import Scenery, plot
-        from ..splats import Splats
+        from ..figures.traversal_chart import Scenery, plot
+        from ..model.splats import Splats
 
         world = self.simulation.world
         worth = [self._kept[what] for what in (*(moment.what for moment in self._lookout.moments()), "first")]

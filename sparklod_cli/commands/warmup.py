@@ -8,7 +8,7 @@ import time
 import click
 
 from .. import __version__
-from ..parallel import processors
+from ..support.parallel import processors
 from .console import Console, count_of
 from .options import verbose_option
 
@@ -42,7 +42,7 @@ def warmup(jobs: int, as_json: bool, quiet: bool, verbose: bool) -> None:
     that is read-only, in your cache directory; NUMBA_CACHE_DIR names another. What is there already is left alone.
     """
     with Console(quiet=quiet, verbose=verbose) as console:
-        from .. import jit
+        from ..support import jit
         from ..warmup import JOBS, missing, warm_up
 
         for name in sorted(missing(JOBS)):

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from .. import limits
-from ..quantities import parse_bandwidth, parse_count, parse_latency
+from ..support import defaults
+from ..support.units import parse_bandwidth, parse_count, parse_latency
 from .options import Command, Quantity, Real, is_given, refuse
 from .paths import InputPath, file_of
 
 if TYPE_CHECKING:
-    from ..simulation.simulate import Viewer
+    from ..simulation.frames import LodSettings
     from ..world import Placement
 
 #: Options of the cones, which --outside-foveate leaves no room for.
@@ -36,8 +36,8 @@ def world_options(command: Command) -> Command:
     for option in (
         click.option(
             "--precision",
-            type=click.Choice(limits.PRECISIONS),
-            default=limits.PRECISIONS[0],
+            type=click.Choice(defaults.PRECISIONS),
+            default=defaults.PRECISIONS[0],
             help="Of centres and sizes: as in the file, or rounded to halves, which is nearly, but not exactly, what"
             " Spark holds after loading it.",
         ),
@@ -96,7 +96,7 @@ def cut_options(command: Command, *, budgets: Quantity | None = None) -> Command
             ),
             click.option(
                 "--preset",
-                type=click.Choice(list(limits.PRESETS)),
+                type=click.Choice(list(defaults.PRESETS)),
                 default="desktop",
                 help="Budget of a device: Spark 2's, or with preview-desktop and mobile those of its LoD design.",
             ),
@@ -124,18 +124,18 @@ def cut_options(command: Command, *, budgets: Quantity | None = None) -> Command
                 "--cone-fov0",
                 metavar="DEGREES",
                 type=Real(0, 180),
-                default=limits.CONE_FOV0,
+                default=defaults.CONE_FOV0,
                 help="Full weight inside.",
             ),
             click.option(
                 "--cone-fov",
                 metavar="DEGREES",
                 type=Real(0, 180),
-                default=limits.CONE_FOV,
+                default=defaults.CONE_FOV,
                 help="There the weight has fallen to --cone-foveate.",
             ),
             click.option(
-                "--cone-foveate", metavar="X", type=Real(0), default=limits.CONE_FOVEATE, help="Weight at --cone-fov."
+                "--cone-foveate", metavar="X", type=Real(0), default=defaults.CONE_FOVEATE, help="Weight at --cone-fov."
             ),
             click.option(
                 "--outside-foveate",
@@ -147,7 +147,7 @@ def cut_options(command: Command, *, budgets: Quantity | None = None) -> Command
                 "--behind-foveate",
                 metavar="X",
                 type=Real(0),
-                help=f"Weight behind the camera.  [default: {limits.BEHIND_FOVEATE:g}; 1 with --outside-foveate]",
+                help=f"Weight behind the camera.  [default: {defaults.BEHIND_FOVEATE:g}; 1 with --outside-foveate]",
             ),
         )
     ):
@@ -179,7 +179,7 @@ def _streaming_options(command: Command) -> Command:
                 "--fetchers",
                 metavar="N",
                 type=click.IntRange(1, 1000),
-                help=f"Chunks that are fetched at a time.  [default: {limits.FETCHERS}]",
+                help=f"Chunks that are fetched at a time.  [default: {defaults.FETCHERS}]",
             ),
         )
     ):
@@ -187,10 +187,10 @@ def _streaming_options(command: Command) -> Command:
     return command
 
 
-def viewer_from(ctx: click.Context, settings: Mapping[str, Any]) -> Viewer:
+def viewer_from(ctx: click.Context, settings: Mapping[str, Any]) -> LodSettings:
     """The viewer that the options of `viewer_options`, or of `cut_options`, ask for."""
     from ..lod.traversal import Cones, Frustum
-    from ..simulation.simulate import Viewer
+    from ..simulation.frames import LodSettings
     from ..simulation.streaming import Network
 
     behind, outside = settings["behind_foveate"], settings["outside_foveate"]
@@ -210,15 +210,15 @@ def viewer_from(ctx: click.Context, settings: Mapping[str, Any]) -> Viewer:
     if outside is not None:
         foveation = Frustum(outside, 1.0 if behind is None else behind)
     else:
-        behind = limits.BEHIND_FOVEATE if behind is None else behind
+        behind = defaults.BEHIND_FOVEATE if behind is None else behind
         foveation = Cones(settings["cone_fov0"], settings["cone_fov"], settings["cone_foveate"], behind)
     network = Network()
     if settings.get("bandwidth") is not None:
-        network = Network(settings["bandwidth"], settings["latency"] or 0.0, settings["fetchers"] or limits.FETCHERS)
-    budget = limits.PRESETS[settings["preset"]] if settings["budget"] is None else settings["budget"]
+        network = Network(settings["bandwidth"], settings["latency"] or 0.0, settings["fetchers"] or defaults.FETCHERS)
+    budget = defaults.PRESETS[settings["preset"]] if settings["budget"] is None else settings["budget"]
     if not 0 < budget * settings["lod_splat_scale"] < BUDGETS:
         raise click.UsageError("the budget is to be more than 0, and no more than people can count")
-    return Viewer(
+    return LodSettings(
         budget=max(1, int(budget * settings["lod_splat_scale"])),
         foveation=foveation,
         pixel_scale_limit=settings["pixel_scale_limit"],

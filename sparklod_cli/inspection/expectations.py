@@ -9,11 +9,11 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from ..errors import SparklodError
 from ..io import read_text
-from ..printable import printable
-from ..quantities import count_of
-from ..untrusted import QUOTED, parse_json, parse_toml, quoted, shown
+from ..support.errors import SparklodError
+from ..support.printable import printable
+from ..support.units import count_of
+from ..support.untrusted import QUOTED, parse_json, parse_toml, quoted, shown
 from .findings import Finding
 from .report import Report
 

@@ -10,10 +10,10 @@ from importlib.resources import files
 from typing import Any
 
 from .. import __version__
-from .charts import bar, children_groups, histogram_chart, text_of
+from ..figures.svg import bar, children_groups, histogram_chart, text_of
+from ..figures.tree_plot import Picture
+from ..tables.histograms import Histogram
 from .findings import CODES, ERROR, NOTE, WARNING
-from .histograms import Histogram
-from .plot import Picture
 
 #: Nothing but the style and the pictures inside the page is let in, whatever a file is called.
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..codecs.spz_layout import LOD, Layout
-from ..errors import InvalidSplatsError
-from ..quantities import count_of
-from ..scene import Scene
-from ..selection import Selection
-from ..splats import Splats
+from ..model.scene import Scene
+from ..model.selection import Selection
+from ..model.splats import Splats
+from ..support.errors import InvalidSplatsError
+from ..support.units import count_of
 from .findings import Finding
 
 #: Codes of one splat may differ by so much, as writers round, cut off, or go through float16; those of SH have upper

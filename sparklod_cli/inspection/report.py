@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from ..codecs.spz_layout import KNOWN_FLAGS
-from ..errors import FormatError
 from ..io import examine_scene, size_on_disk
-from ..progress import Progress, silent
-from ..scene import Scene
-from ..sh import COEFFICIENTS
-from ..splats import COLUMNS
+from ..model.scene import Scene
+from ..model.sh import COEFFICIENTS
+from ..model.splats import COLUMNS
+from ..support.errors import FormatError
+from ..support.progress import Progress, silent
 from . import tree, values
 from .findings import Finding
 

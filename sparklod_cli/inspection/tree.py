@@ -9,11 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..gaussian import spark_size
-from ..lod.kernels.walk import find_cycles, find_parents, sizes_below, sum_levels, walk
+from ..lod.kernels.tree_links import find_cycles, find_parents, sizes_below, sum_levels, walk
 from ..lod.traversal import CHUNK_NODES
-from ..splats import FloatArray, Splats
-from ..tree import LodTree
+from ..model.gaussian import spark_size
+from ..model.lod_tree import LodTree
+from ..model.splats import FloatArray, Splats
 from .findings import Finding
 
 #: A node may be this much smaller than what it stands for: its children in the mean, by what they cover. A merged splat

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..codecs import quantize
-from ..gaussian import spark_size
-from ..scene import Scene
-from ..sh import COEFFICIENTS
-from ..splats import FloatArray, Splats
+from ..model.gaussian import spark_size
+from ..model.scene import Scene
+from ..model.sh import COEFFICIENTS
+from ..model.splats import FloatArray, Splats
 from .findings import Finding
 
 #: The quantities that are looked at, by name; each makes (N,) numbers of N splats. `SH_QUANTITIES` join them.

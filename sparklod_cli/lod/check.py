@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InvalidSplatsError
-from ..jit import threads_for
-from ..splats import Splats, describe_invalid
+from ..model.splats import Splats, describe_invalid
+from ..support.errors import InvalidSplatsError
+from ..support.jit import threads_for
 from .kernels.geometry import extremes
 
 

@@ -18,15 +18,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..jit import threads_for
-from ..limits import DEFAULT_GROWTH, MAX_GROWTH, MIN_GROWTH
-from ..progress import Progress, silent
-from ..sh import degree_of
-from ..splats import COLUMNS, FloatArray, Splats
-from ..tree import LodTree
+from ..model.lod_tree import LodTree
+from ..model.sh import degree_of
+from ..model.splats import COLUMNS, FloatArray, Splats
+from ..support.defaults import DEFAULT_GROWTH, MAX_GROWTH, MIN_GROWTH
+from ..support.jit import threads_for
+from ..support.progress import Progress, silent
 from .check import Extremes, check
-from .kernels import keep, pairs, state, union
-from .kernels.order import fill_leaves, merge_colors
+from .kernels import node_rows, pair_cost, pair_merge, prune
+from .kernels.final_order import fill_leaves, merge_colors
 from .kernels.sort import Nodes, sort_by_key
 
 #: Growth from level to level of the size up to which leaves have joined, and nodes merge.
@@ -106,14 +106,14 @@ class _Space:
 
     def sort(self, rows: FloatArray, nodes: Nodes, turn: int, threads: int) -> Nodes:
         """Nodes along the curve, which moves from turn to turn."""
-        _, nodes = sort_by_key(self.places(rows, nodes, turn), nodes.copy(), 3 * state.CURVE_BITS, threads)
+        _, nodes = sort_by_key(self.places(rows, nodes, turn), nodes.copy(), 3 * node_rows.CURVE_BITS, threads)
         return nodes
 
     def places(self, rows: FloatArray, nodes: Nodes, turn: int) -> NDArray[np.uint64]:
         """Where nodes are on the curve."""
         moved = np.modf(np.array([1, 2, 3]) * GOLDEN * turn)[0] * SLACK * self.extent
-        step = (1 + SLACK) * self.extent / (1 << state.CURVE_BITS)
-        return state.curve_keys(rows, nodes, self.low - moved, step)
+        step = (1 + SLACK) * self.extent / (1 << node_rows.CURVE_BITS)
+        return node_rows.curve_keys(rows, nodes, self.low - moved, step)
 
 
 def build(splats: Splats, growth: float = DEFAULT_GROWTH, *, progress: Progress = silent) -> tuple[Splats, LodTree]:
@@ -153,7 +153,7 @@ def _leaves(splats: Splats, space: _Space, threads: int) -> tuple[_Growing, Node
     n = len(splats)
     rows = 2 * n - 1
     growing = _Growing(
-        np.empty((rows, pairs.WIDTH), np.float32),
+        np.empty((rows, pair_cost.WIDTH), np.float32),
         np.empty((rows, 2), np.uint32),
         np.empty(rows, np.float32),
         np.zeros(rows, np.float32),
@@ -161,7 +161,7 @@ def _leaves(splats: Splats, space: _Space, threads: int) -> tuple[_Growing, Node
     )
     index = space.sort(space.centers(splats), np.arange(n, dtype=np.uint32), 0, threads)
     columns = splats.center, splats.scale, splats.quat_xyzw, splats.opacity, splats.rgb
-    state.fill_state(index, *columns, space.middle, space.unit, growing.state, growing.size)
+    node_rows.fill_state(index, *columns, space.middle, space.unit, growing.state, growing.size)
     return growing, index
 
 
@@ -190,15 +190,15 @@ def _merge(
     while len(active) > 1 and (rounds is None or done < rounds):
         with threads_for(len(active)) as threads:
             active = space.sort(growing.state, active, growing.rounds, threads)
-            partner, cost = pairs.cheapest(growing.state, active, WINDOW, np.float32(largest))
+            partner, cost = pair_cost.cheapest(growing.state, active, WINDOW, np.float32(largest))
             before = len(active)
-            found, rest = pairs.pair_up(active, partner, cost, _limit(cost), growing.used)
+            found, rest = pair_cost.pair_up(active, partner, cost, _limit(cost), growing.used)
             if rounds is None and not len(found):  # no cost is a number: what is left is too far apart for float32
                 partner = np.arange(before, dtype=np.int32) ^ 1
                 partner[partner >= before] = -1
-                found, rest = pairs.pair_up(active, partner, np.zeros_like(cost), np.float32(0), growing.used)
+                found, rest = pair_cost.pair_up(active, partner, np.zeros_like(cost), np.float32(0), growing.used)
             active = rest
-            union.unite_pairs(found, growing.used, growing.state, growing.children, growing.size, growing.error)
+            pair_merge.unite_pairs(found, growing.used, growing.state, growing.children, growing.size, growing.error)
         growing.used += len(found)
         growing.rounds += 1
         progress("building", growing.used - leaves, leaves - 1, "node")
@@ -222,21 +222,21 @@ def _in_final_order(
     n, rows = len(index), growing.used
     progress("pruning", 0, rows, "node")
     log_size, weight, lost = (np.empty(rows, np.float32) for _ in range(3))
-    parent = keep.value_nodes(growing.children, n, growing.size, growing.error, log_size, weight, lost)
+    parent = prune.value_nodes(growing.children, n, growing.size, growing.error, log_size, weight, lost)
     saved = np.empty(rows, np.int32)
-    keep.drop_nodes(n, max(int(growth * n) - n, 1), parent, log_size, weight, lost, saved)
-    inner, ends = _by_level(growing, keep.levels_of(n, parent, log_size, saved), space)
+    prune.drop_nodes(n, max(int(growth * n) - n, 1), parent, log_size, weight, lost, saved)
+    inner, ends = _by_level(growing, prune.levels_of(n, parent, log_size, saved), space)
     total = n + len(inner)
     progress("ordering", 0, total, "node")
     order = np.empty(total, np.uint32)
     tree = LodTree(np.zeros(total, np.uint16), np.zeros(total, np.uint32))
-    place = keep.place_nodes(inner, parent, saved, order, tree.child_start, tree.child_count)
+    place = prune.place_nodes(inner, parent, saved, order, tree.child_start, tree.child_count)
     out = Splats.empty(total, degree_of(splats.sh.shape[1]))
     for name in COLUMNS:
         fill_leaves(order, index, getattr(splats, name).reshape(n, -1), getattr(out, name).reshape(total, -1))
     geometry = out.center, out.scale, out.quat_xyzw, out.opacity
-    state.fill_merged(order, n, growing.state, space.middle, space.unit, *geometry)
-    weights = growing.state[:, pairs.WEIGHT].astype(np.float64)
+    node_rows.fill_merged(order, n, growing.state, space.middle, space.unit, *geometry)
+    weights = growing.state[:, pair_cost.WEIGHT].astype(np.float64)
     for begin, end in zip(ends[-2::-1], ends[:0:-1], strict=True):
         with threads_for(int(end - begin)) as threads:
             for color in (out.rgb, out.sh.reshape(total, -1)):
@@ -249,7 +249,7 @@ def _by_level(growing: _Growing, level: NDArray[np.int32], space: _Space) -> tup
     """The merged nodes that are kept, level by level along the curve, and where each level ends, from 0."""
     inner = np.flatnonzero(level >= 0).astype(np.uint32)
     own = level[inner]
-    keys = space.places(growing.state, inner, 0) | (own.astype(np.uint64) << np.uint64(3 * state.CURVE_BITS))
+    keys = space.places(growing.state, inner, 0) | (own.astype(np.uint64) << np.uint64(3 * node_rows.CURVE_BITS))
     with threads_for(len(inner)) as threads:
-        _, inner = sort_by_key(keys, inner, 3 * state.CURVE_BITS + int(own.max()).bit_length(), threads)
+        _, inner = sort_by_key(keys, inner, 3 * node_rows.CURVE_BITS + int(own.max()).bit_length(), threads)
     return inner, np.concatenate([[0], np.cumsum(np.bincount(own))]).astype(np.int64)

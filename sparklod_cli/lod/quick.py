@@ -17,17 +17,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..jit import threads_for
-from ..limits import DEFAULT_BASE, MAX_BASE, MIN_BASE
-from ..progress import Progress, silent
-from ..sh import degree_of
-from ..splats import FloatArray, Splats
-from ..tree import MAX_CHILDREN, LodTree
+from ..model.lod_tree import MAX_CHILDREN, LodTree
+from ..model.sh import degree_of
+from ..model.splats import FloatArray, Splats
+from ..support.defaults import DEFAULT_BASE, MAX_BASE, MIN_BASE
+from ..support.jit import threads_for
+from ..support.progress import Progress, silent
 from .check import check
+from .kernels.final_order import fill_columns, fill_leaves, merge_colors, places_of_merged
 from .kernels.geometry import CENTER, WIDTH, fill_rows
 from .kernels.group import level_keys, split_cells
 from .kernels.merge import merge_groups
-from .kernels.order import fill_columns, fill_leaves, merge_colors, places_of_merged
 from .kernels.sort import Nodes, sort_by_cell, sort_by_key
 
 #: Cells count in int64; the finest level is the first at which the scene's coordinates stay below this.

@@ -10,9 +10,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from ..codecs.lod_tree import Nodes
+from ..codecs.gpu.lod_tree import Nodes
 from .kernels import cut as kernels
-from .kernels import sight
+from .kernels import pixel_scale
 
 Matrix = NDArray[np.float64]
 
@@ -111,7 +111,7 @@ class Forest:
         self.node_base = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
         chunks = [-(-count // CHUNK_NODES) for count in counts]
         self.chunk_base = np.concatenate([[0], np.cumsum(chunks)]).astype(np.int64)
-        self.nodes = np.empty(int(self.node_base[-1]), sight.NODE)
+        self.nodes = np.empty(int(self.node_base[-1]), pixel_scale.NODE)
         for tree, start in zip(trees, self.node_base, strict=False):
             part = self.nodes[start : start + len(tree.size)]
             part["x"], part["y"], part["z"] = tree.center.T
@@ -273,7 +273,7 @@ def pixel_limit(fov_y: float, height: int, scale: float = 1.0) -> float:
 
 def views_of(forest: Forest, instances: Sequence[Instance], view: View) -> NDArray[np.void]:
     """(instances,) `sight.VIEW`: the camera in the space of each instance, in the precision that Spark has."""
-    views = np.zeros(len(instances), sight.VIEW)
+    views = np.zeros(len(instances), pixel_scale.VIEW)
     for row, instance in zip(views, instances, strict=True):
         view_to_object = (np.linalg.inv(instance.object_to_world) @ view.camera_to_world).astype(np.float32)
         right, up, backward, origin = view_to_object[:3].T
@@ -290,16 +290,16 @@ def views_of(forest: Forest, instances: Sequence[Instance], view: View) -> NDArr
         foveation = instance.foveation
         row["behind"] = foveation.behind
         if isinstance(foveation, Frustum):
-            row["kind"] = sight.FRUSTUM
+            row["kind"] = pixel_scale.FRUSTUM
             row["side"] = foveation.outside
             row["inner"], row["outer"] = math.tan(view.fov_x / 2), math.tan(view.fov_y / 2)
         else:
-            row["kind"] = sight.CONE
+            row["kind"] = pixel_scale.CONE
             row["side"] = foveation.foveate
             row["inner"] = _half_angle_cosine(foveation.fov0)
             row["outer"] = min(row["inner"], _half_angle_cosine(foveation.fov))
         if row["behind"] == row["side"] == 1:
-            row["kind"] = sight.NO_FOVEATION
+            row["kind"] = pixel_scale.NO_FOVEATION
     return views
 
 

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import Any, Protocol, cast
 
-from ..errors import SparklodError
-from .camera import Camera
-from .look import Look
+from ..cameras.camera import Camera
+from ..support.errors import SparklodError
 from .rasterizer import Image
-from .shown import Shown
+from .settings import RasterSettings
+from .shading import ShadedSplats
 
 
 class BackendError(SparklodError):
@@ -27,7 +27,7 @@ class Draw(Protocol):
         BackendError: it cannot draw here.
     """
 
-    def __call__(self, shown: Shown, camera: Camera, look: Look, **options: Any) -> Image: ...
+    def __call__(self, shown: ShadedSplats, camera: Camera, look: RasterSettings, **options: Any) -> Image: ...
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Backend:
     name: str
     module: str
 
-    def draw(self, shown: Shown, camera: Camera, look: Look, **options: Any) -> Image:
+    def draw(self, shown: ShadedSplats, camera: Camera, look: RasterSettings, **options: Any) -> Image:
         """What a camera sees; see `Draw`. Options are those of the module's function."""
         return cast(Draw, import_module(self.module, __package__).draw)(shown, camera, look, **options)
 
@@ -46,7 +46,7 @@ BACKENDS = {
     backend.name: backend
     for backend in (
         Backend("numba", ".rasterizer"),
-        Backend("osmesa", ".osmesa"),
-        Backend("open3d", ".open3d_backend"),
+        Backend("osmesa", ".gl.osmesa"),
+        Backend("open3d", ".open3d.backend"),
     )
 }

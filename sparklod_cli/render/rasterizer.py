@@ -7,12 +7,12 @@ import threading
 import numpy as np
 from numpy.typing import NDArray
 
-from ..jit import threads_in_use
-from .camera import Camera
+from ..cameras.camera import Camera
+from ..cameras.pose import FLIP
+from ..support.jit import threads_in_use
 from .kernels import project, raster
-from .look import BLUR, CLIP, MAX_STD_DEV, MIN_ALPHA, STD_DEV_PER_D, Look
-from .pose import FLIP
-from .shown import Shown
+from .settings import BLUR, CLIP, MAX_STD_DEV, MIN_ALPHA, STD_DEV_PER_D, RasterSettings
+from .shading import ShadedSplats
 
 Image = NDArray[np.float32]
 
@@ -22,7 +22,7 @@ _kept = threading.local()
 CHUNKS = 2
 
 
-def draw(shown: Shown, camera: Camera, look: Look) -> Image:
+def draw(shown: ShadedSplats, camera: Camera, look: RasterSettings) -> Image:
     """What a camera sees: (height, width, 4) float32, red, green, blue, multiplied by alpha, and alpha; 0..1.
 
     The image is the same for any number of threads.
@@ -35,7 +35,7 @@ def draw(shown: Shown, camera: Camera, look: Look) -> Image:
     return image
 
 
-def seen(shown: Shown, camera: Camera, look: Look) -> NDArray[np.float32]:
+def seen(shown: ShadedSplats, camera: Camera, look: RasterSettings) -> NDArray[np.float32]:
     """The splats on the screen, (M, `project.COLUMNS`) from near to far; a buffer, which the next call overwrites."""
     screen, arranged, keys = _buffers(len(shown))
     project.project(

@@ -9,8 +9,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from heapq import heappop, heappush
 
-from ..limits import FETCHERS
-from .chunks import ChunkCache, Chunks
+from ..support.defaults import FETCHERS
+from .chunk_cache import ChunkCache, Chunks
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from .columns import COLUMNS, Row
-from .statistics import Number, numbers, statistic, totals
+from ..tables.columns import COLUMNS, Row
+from ..tables.statistics import Number, numbers, statistic, totals
 
 UNITS = {column.name: column.unit for column in COLUMNS}
 

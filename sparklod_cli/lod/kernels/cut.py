@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...jit import kernel
+from ...support.jit import kernel
+from .pixel_scale import ZERO, pixel_scale
 from .queue import comes_before, rise, sink
-from .sight import ZERO, pixel_scale
 
 #: Nodes of a chunk, as a power of 2.
 CHUNK_BITS = 16

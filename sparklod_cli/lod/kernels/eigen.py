@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from ...jit import kernel
+from ...support.jit import kernel
 
 MAX_SWEEPS = 16  # 4 suffice as a rule
 CONVERGED = 1e-18  # sum of squares of the off-diagonal, relative to the largest diagonal

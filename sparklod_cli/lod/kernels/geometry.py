@@ -11,8 +11,8 @@ import math
 import numpy as np
 from numba import prange
 
-from ...gaussian import THOMSEN_P
-from ...jit import kernel
+from ...model.gaussian import THOMSEN_P
+from ...support.jit import kernel
 
 CENTER, SCALE, QUAT, OPACITY, WIDTH = 0, 3, 6, 10, 11  # first column of each, and the number of columns
 

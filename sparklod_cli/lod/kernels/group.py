@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numba import prange
 
-from ...jit import kernel
+from ...support.jit import kernel
 from .sort import morton_code
 
 

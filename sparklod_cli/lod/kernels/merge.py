@@ -11,8 +11,8 @@ import math
 import numpy as np
 from numba import prange
 
-from ...gaussian import MAX_OPACITY, MIN_OPACITY
-from ...jit import kernel
+from ...model.gaussian import MAX_OPACITY, MIN_OPACITY
+from ...support.jit import kernel
 from .eigen import ROWS, decompose
 from .geometry import CENTER, LARGEST, OPACITY, QUAT, SCALE, WIDTH, ellipsoid_area
 

@@ -16,8 +16,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ...gaussian import MIN_OPACITY, SIZE_PER_D, linear_opacity
-from ...jit import kernel
+from ...model.gaussian import MIN_OPACITY, SIZE_PER_D, linear_opacity
+from ...support.jit import kernel
 
 #: The sharpest profile that a merged splat gets, D; more gains nothing (docs/decisions/2026-11-21-fidelity.md). What
 #: covers more than it can is drawn larger.

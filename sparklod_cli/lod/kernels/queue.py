@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ...jit import kernel
+from ...support.jit import kernel
 
 
 @kernel(inline=True)

@@ -8,8 +8,8 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
-from ...jit import kernel
-from ...splats import FloatArray
+from ...model.splats import FloatArray
+from ...support.jit import kernel
 from .geometry import CENTER
 
 Keys = NDArray[np.uint64]

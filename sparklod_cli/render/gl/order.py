@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ...splats import FloatArray
-from ..camera import Camera
-from ..look import CLIP, MIN_ALPHA, Look
+from ...cameras.camera import Camera
+from ...model.splats import FloatArray
 from ..rasterizer import world_to_camera
-from ..shown import Shown
+from ..settings import CLIP, MIN_ALPHA, RasterSettings
+from ..shading import ShadedSplats
 
 #: By the distance itself, or by 65,536 steps of it.
 SORTINGS = ("exact", "counting16")
@@ -24,19 +24,19 @@ class Order:
         sorting: one of `SORTINGS`.
         throttle: splats are not sorted again while the cosine between where the camera looked when they were and where
             it looks now is above 1 - throttle; antimatter15's viewer has 0.01, an angle of 8.1 degrees. 0 sorts for
-            each camera. With `Look.sort` "radial", where what counts is the camera's place, they are also sorted when
+            each camera. With `RasterSettings.sort` "radial", where what counts is the camera's place, they are also sorted when
             it has moved so far that the middle one of the splats appears turned by that angle.
     """
 
     def __init__(self, sorting: str, throttle: float = 0.0) -> None:
         self.sorting, self.throttle = sorting, throttle
-        self._sorted: tuple[Camera, Look, float] | None = None
+        self._sorted: tuple[Camera, RasterSettings, float] | None = None
 
     def forget(self) -> None:
         """The splats are others now."""
         self._sorted = None
 
-    def update(self, shown: Shown, camera: Camera, look: Look) -> Indices | None:
+    def update(self, shown: ShadedSplats, camera: Camera, look: RasterSettings) -> Indices | None:
         """Rows of `shown`, as many as may be seen; or None while those of the last time will do."""
         if self._sorted is not None and self._close(camera, look, *self._sorted):
             return None
@@ -52,7 +52,9 @@ class Order:
         self._sorted = camera, look, float(np.median(np.abs(key))) if len(key) else 0.0
         return seen[SORT[self.sorting](key)]
 
-    def _close(self, camera: Camera, look: Look, old: Camera, old_look: Look, middle: float) -> bool:
+    def _close(
+        self, camera: Camera, look: RasterSettings, old: Camera, old_look: RasterSettings, middle: float
+    ) -> bool:
         if not self.throttle or look.sort != old_look.sort or 1 - float(camera.forward @ old.forward) >= self.throttle:
             return False
         if look.sort != "radial":
@@ -68,7 +70,9 @@ def _into_camera(center: FloatArray, camera: Camera) -> tuple[FloatArray, FloatA
     return u, v, w
 
 
-def _in_sight(shown: Shown, u: FloatArray, v: FloatArray, depth: FloatArray, camera: Camera, look: Look) -> Indices:
+def _in_sight(
+    shown: ShadedSplats, u: FloatArray, v: FloatArray, depth: FloatArray, camera: Camera, look: RasterSettings
+) -> Indices:
     """Those that the vertex shader would not throw out by their centres, or a hair more."""
     seen = (depth > look.near) & (depth < look.far) & (shown.lod_opacity >= np.float32(MIN_ALPHA))
     for across, focal, principal, pixels in zip(

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..kernels.project import MOST_OPAQUE
-from ..look import BLUR, CLIP, MAX_STD_DEV, MIN_ALPHA, STD_DEV_PER_D
+from ..settings import BLUR, CLIP, MAX_STD_DEV, MIN_ALPHA, STD_DEV_PER_D
 
 
 def _literal(value: float) -> str:

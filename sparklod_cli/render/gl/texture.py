@@ -8,16 +8,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...codecs import data_texture
-from ...sh import COEFFICIENTS
-from ...splats import FloatArray, Splats
+from ...codecs.gpu import data_texture
+from ...model.sh import COEFFICIENTS
+from ...model.splats import FloatArray, Splats
 from ..kernels.project import BRIGHTEST
-from ..shown import Shown
+from ..shading import ShadedSplats
 
 #: How exactly splats are held: as they are, or as antimatter15's viewer holds them.
 PRECISIONS = ("float", "half")
 
-#: Columns of `Shown` that stay as they are while a camera moves; colours do not, where there are spherical harmonics.
+#: Columns of `ShadedSplats` that stay as they are while a camera moves; colours do not, where there are spherical harmonics.
 GEOMETRY = ("center", "scale", "quat_xyzw", "lod_opacity")
 
 Words = NDArray[np.uint32]
@@ -37,9 +37,9 @@ class DataTexture(ABC):
 
     def __init__(self) -> None:
         self.texture: Words = np.zeros((0, self.splats_a_row * self.texels_a_splat, 4), np.uint32)
-        self._shown: Shown | None = None
+        self._shown: ShadedSplats | None = None
 
-    def update(self, shown: Shown) -> tuple[bool, bool]:
+    def update(self, shown: ShadedSplats) -> tuple[bool, bool]:
         """Takes splats in.
 
         Compares what they are, not where they lie: every frame has new arrays, mostly of the same numbers.
@@ -64,11 +64,11 @@ class DataTexture(ABC):
         return self.texture.reshape(-1, 4 * self.texels_a_splat).view(kind)[:count, 0]
 
     @abstractmethod
-    def _geometry(self, shown: Shown) -> None:
+    def _geometry(self, shown: ShadedSplats) -> None:
         """Writes all but the colours."""
 
     @abstractmethod
-    def _colors(self, shown: Shown) -> None:
+    def _colors(self, shown: ShadedSplats) -> None:
         """Writes the colours."""
 
 
@@ -94,12 +94,12 @@ class Floats(DataTexture):
 
     texels_a_splat, splats_a_row = 4, 2048
 
-    def _geometry(self, shown: Shown) -> None:
+    def _geometry(self, shown: ShadedSplats) -> None:
         rows = self._rows(self.RECORD, len(shown))
         for name in GEOMETRY:
             rows[name] = getattr(shown, name)
 
-    def _colors(self, shown: Shown) -> None:
+    def _colors(self, shown: ShadedSplats) -> None:
         self._rows(self.RECORD, len(shown))["rgb"] = _shown_colors(shown)
 
 
@@ -112,7 +112,7 @@ class Halves(DataTexture):
 
     texels_a_splat, splats_a_row = 2, data_texture.SPLATS_A_ROW
 
-    def _geometry(self, shown: Shown) -> None:
+    def _geometry(self, shown: ShadedSplats) -> None:
         colorless = np.zeros_like(shown.rgb)
         sh = np.zeros((len(shown), COEFFICIENTS[0], 3), np.float32)
         opacity = np.minimum(shown.lod_opacity, 1)
@@ -120,7 +120,7 @@ class Halves(DataTexture):
         self.texture = data_texture.pack(splats)["texture"]
         self._extra(shown)[:, 0] = shown.lod_opacity
 
-    def _colors(self, shown: Shown) -> None:
+    def _colors(self, shown: ShadedSplats) -> None:
         rgb = _shown_colors(shown)
         gain = np.maximum(rgb.max(axis=1, initial=0), 1).astype(np.float16)
         # float16 rounds down, too, and a byte must not wrap around.
@@ -128,7 +128,7 @@ class Halves(DataTexture):
         self._rows(data_texture.SPLAT, len(shown))["rgba"][:, :3] = np.rint(bright * 255)
         self._extra(shown)[:, 1] = gain
 
-    def _extra(self, shown: Shown) -> NDArray[np.float16]:
+    def _extra(self, shown: ShadedSplats) -> NDArray[np.float16]:
         """(N, 2) of the unused word."""
         words: NDArray[np.float16] = self.texture.reshape(-1, 8).view(np.float16)[: len(shown), 6:8]
         return words
@@ -139,13 +139,13 @@ def data_texture_of(precision: str) -> DataTexture:
     return {"float": Floats, "half": Halves}[precision]()
 
 
-def _shown_colors(shown: Shown) -> FloatArray:
+def _shown_colors(shown: ShadedSplats) -> FloatArray:
     """(N, 3) colours in the range that the rasterizer draws; 0 for what is no number."""
     rgb: FloatArray = np.where(shown.rgb > 0, np.minimum(shown.rgb, BRIGHTEST), np.float32(0))
     return rgb
 
 
-def _same(one: Shown, other: Shown, columns: tuple[str, ...]) -> bool:
+def _same(one: ShadedSplats, other: ShadedSplats, columns: tuple[str, ...]) -> bool:
     return all(
         (mine := getattr(one, name)) is (theirs := getattr(other, name)) or np.array_equal(mine, theirs)
         for name in columns

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numba import prange
 
-from ...jit import kernel
+from ...support.jit import kernel
 from .project import END, HALF_HEIGHT, HALF_WIDTH, OPACITY, POWER, A, B, C, X, Y
 
 f32 = np.float32

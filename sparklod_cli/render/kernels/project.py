@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import prange
 
-from ...jit import kernel
+from ...support.jit import kernel
 
 f32 = np.float32
 
@@ -29,7 +29,7 @@ def project(center, scale, quat, lod_opacity, rgb, world_to_camera, lens, limits
     """Splats on the screen, as Spark's vertex shader puts them there.
 
     Args:
-        center, scale, quat, lod_opacity, rgb: columns of `Shown`.
+        center, scale, quat, lod_opacity, rgb: columns of `ShadedSplats`.
         world_to_camera: (3, 4) float32; the camera looks along z, with y down.
         lens: (6,) float32: focal x and y, principal x and y, width, height; pixels.
         limits: (8,) float32: near, far, clip, blur, least alpha, standard deviations, more of them for each D, largest

@@ -7,8 +7,8 @@ import math
 import numpy as np
 from numba import prange
 
-from ...approximations import exp2, log2
-from ...jit import kernel
+from ...support.fast_math import exp2, log2
+from ...support.jit import kernel
 from .project import BLUE, END, GREEN, HALF_HEIGHT, HALF_WIDTH, OPACITY, POWER, RED, A, B, C, X, Y
 
 f32 = np.float32

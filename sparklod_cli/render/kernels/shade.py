@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import prange
 
-from ...jit import kernel
+from ...support.jit import kernel
 
 f32 = np.float32
 

@@ -1,0 +1,1 @@
+"""Cameras: poses, paths, generators, and framing."""

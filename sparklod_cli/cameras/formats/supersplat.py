@@ -1,0 +1,161 @@
+"""SuperSplat: the settings.json of its viewer, of both versions, and the document.json of its projects.
+
+All have keys of position, target and field of view, on a time line that is counted in frames, and a smoothness; what
+lies between them is worked out as SuperSplat does.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...support.errors import CameraPathError
+from ..camera import Matrix
+from ..frame import Frame, Lens, Settings, sampled
+from ..generators import along, frame_looking
+from ..spline import cardinal_tangents, hermite
+from .source import Files, Json, Parsed, brief
+
+UP = (0.0, 1.0, 0.0)
+FRAME_RATE = 30.0
+
+#: Degrees, where a file of version 1 has none: for its animation, and for its first view.
+FOV_TRACK, FOV_VIEW = 60.0, 75.0
+
+VERSION = 2
+
+
+def recognises(files: Files) -> bool:
+    """Whether it is the one or the other."""
+    root = files.json
+    if root is None:
+        return False
+    return (
+        root.has("poseSets")
+        or root.has("animTracks")
+        or root.has("version", "cameras")
+        or root.has("camera", "background")
+    )
+
+
+@np.errstate(all="ignore")  # numbers may be of any size; what comes of them is looked at in the end
+def parse(files: Files, settings: Settings) -> Parsed:
+    """The frames of its first animation, or else its views."""
+    root = files.object()
+    if root.has("poseSets"):
+        return _of_document(root, settings)
+    if root.has("version") and root.get("version").value != VERSION:
+        raise CameraPathError(f"version {brief(root.value['version'])} of SuperSplat's settings is not known")
+    tracks = list(root.get("animTracks").items()) if root.has("animTracks") else []
+    if tracks:
+        fov = root.find("camera", "fov")
+        return _of_track(tracks[0], fov.number() if fov else FOV_TRACK, not root.has("version"), settings)
+    if root.has("cameras"):
+        views = [camera.get("initial") for camera in root.get("cameras").items()]
+    else:
+        views = [root.get("camera")]
+    return Parsed([_looking(_values(view, FOV_VIEW), None, settings) for view in views])
+
+
+def _of_track(track: Json, fov: float, first_version: bool, settings: Settings) -> Parsed:
+    """An item of animTracks. Version 1 has one field of view for all keys, and counted in seconds in the beginning."""
+    rate = _positive(track, "frameRate", FRAME_RATE)
+    times = np.array(track.get("keyframes").get("times").numbers())
+    if not track.has("frameRate"):
+        times = times * FRAME_RATE
+    values = track.get("keyframes").get("values")
+    points = np.empty((len(times), 7))
+    for column, key in ((0, "position"), (3, "target")):
+        points[:, column : column + 3] = np.reshape(values.get(key).numbers(3 * len(times)), (-1, 3))
+    points[:, 6] = values.get("fov").numbers(len(times)) if values.has("fov") else fov
+    duration = _positive(track, "duration", 0)
+    smoothness = track.get("smoothness").number() if track.has("smoothness") else float(not first_version)
+    length = None
+    if len(times) and track.has("loopMode") and track.get("loopMode").value == "repeat":
+        length = (duration + (duration == times[-1] / rate)) * rate
+    step = track.has("interpolation") and track.get("interpolation").value == "step"
+    at = _curve(times, points, smoothness, length, step)
+    return _sampled(at, _whole(duration * rate), rate, settings)
+
+
+def _of_document(root: Json, settings: Settings) -> Parsed:
+    """The poses of a project; those past the end of its time line are left out."""
+    line = root.get("timeline")
+    count, rate = line.get("frames").number(), _positive(line, "frameRate", FRAME_RATE)
+    fov = root.find("camera", "fov")
+    keys = {}
+    sets = list(root.get("poseSets").items())[:1]  # SuperSplat has one set only, or none
+    for index, pose in enumerate(pose for one in sets for pose in one.get("poses").items()):
+        frame = pose.get("frame").number() if pose.has("frame") else index * rate
+        if frame < count:
+            keys[frame] = _values(pose, fov.number() if fov else FOV_TRACK)
+    smoothness = line.get("smoothness").number() if line.has("smoothness") else 1.0
+    looping = not line.has("loop") or line.get("loop").value is True
+    times = np.array(sorted(keys))
+    points = np.array([keys[time] for time in times]).reshape(-1, 7)
+    curve = _curve(times, points, smoothness, count if looping else None, False)
+    return _sampled(curve, float(math.floor(count)), rate, settings)
+
+
+def _whole(frames: float) -> float:
+    """Rounded; what is infinite stays so."""
+    return float(round(frames)) if math.isfinite(frames) else frames
+
+
+def _values(view: Json, fov: float) -> list[float]:
+    """Position, target and field of view in degrees."""
+    own = view.get("fov").number() if view.has("fov") else fov
+    return [*view.get("position").numbers(3), *view.get("target").numbers(3), own]
+
+
+def _positive(place: Json, key: str, default: float) -> float:
+    value = place.get(key).number() if place.has(key) else default
+    if not value > 0:
+        raise CameraPathError(f"{place.way}.{key} is not positive")
+    return value
+
+
+def _curve(
+    times: Matrix, points: Matrix, smoothness: float, length: float | None, step: bool
+) -> Callable[[Matrix], Matrix]:
+    """What is between keys.
+
+    Args:
+        times: (n,) of the keys, frames.
+        points: (n, 7).
+        smoothness: 0, straight from key to key, to 1.
+        length: of the loop that the path is, frames; None where it is none.
+        step: each key is held until the next.
+    """
+    if not len(times):
+        raise CameraPathError("it has no keyframes")
+    if length is not None and len(times) > 1 and not step:  # two keys more at either end, and round it goes
+        times = np.concatenate([times[-2:] - length, times, times[:2] + length])
+        points = np.concatenate([points[-2:], points, points[:2]])
+    if not (np.diff(times) > 0).all():
+        raise CameraPathError("the times of its keyframes do not increase, or go beyond its end")
+    if step or len(times) == 1:
+        return lambda at: points[np.clip(np.searchsorted(times, at, side="right") - 1, 0, len(times) - 1)]
+    tangents = smoothness * cardinal_tangents(times, points)
+    return lambda at: hermite(times, points, tangents, np.clip(at, times[0], times[-1]))
+
+
+def _sampled(curve: Callable[[Matrix], Matrix], count: float, rate: float, settings: Settings) -> Parsed:
+    """All frames of a path of `count` frames; --fps takes more of them, or fewer, over the same time."""
+    fps = settings.fps or rate
+
+    def at(numbers: NDArray[np.int64]) -> list[Frame]:
+        times = numbers / fps
+        samples = along(curve, times * rate)
+        return [_looking(sample, float(time), settings) for sample, time in zip(samples, times, strict=True)]
+
+    return Parsed(sampled(max(count, 1) / rate * fps - 1e-6, at), fps=rate)
+
+
+def _looking(sample: Matrix | list[float], time: float | None, settings: Settings) -> Frame:
+    """The field of view is that along the longer side of the image."""
+    lens = Lens(fov=math.radians(sample[6]), fov_along="longer")
+    return frame_looking(sample[:3], sample[3:6], settings.up or UP, lens, time)

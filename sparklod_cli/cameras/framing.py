@@ -1,0 +1,204 @@
+"""Where a scene is, and how large, for cameras that are to look at it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..model.splats import Splats
+from ..render.settings import RasterSettings
+from ..support.defaults import FARTHEST
+from ..support.errors import InvalidSplatsError
+from .camera import Camera, Matrix
+
+#: The share of the splats that a ball around the middle holds, which says how large a scene is.
+SHARE = 0.9
+
+#: The share of the splats that are in view, each with all that it covers: trained scenes have a few that are very far
+#: away, or very large.
+COVERED = 0.999
+
+#: What is farther from the middle than so many times the ball that most splats are in does not belong to what is shown:
+#: a sky, and what training leaves far out.
+OUTSIDE = 3.0
+
+#: So many splats are looked at; more make no difference that could be seen.
+SAMPLE = 1 << 18
+
+#: How far out a splat is seen, in standard deviations: there it has an eighth of its opacity left.
+SEEN = 2.0
+
+#: The share of the picture's width, or height, that is filled.
+FILLED = 0.92
+
+#: No splat counts as smaller than this share of the scene.
+SPECK = 0.005
+
+#: Steps of float32, as a share of the number, with room for what is computed with them.
+STEPS = 1e-6
+
+#: So many cameras of a path are looked through; those between them see as good as the same.
+CAMERAS = 64
+
+Item = TypeVar("Item")
+
+
+@dataclass(frozen=True)
+class Balls:
+    """What splats cover, a ball each; N of them.
+
+    Attributes:
+        center: (N, 3) float64 world units.
+        radius: (N,) float64 world units.
+    """
+
+    center: Matrix
+    radius: Matrix
+
+    def take(self, index: NDArray[np.bool_]) -> Balls:
+        """Some of them, of a mask (N,)."""
+        return Balls(self.center[index], self.radius[index])
+
+
+def balls_of(splats: Splats, index: NDArray[Any] | slice, object_to_world: Matrix) -> Balls:
+    """What some splats cover where they stand; those without finite numbers are left out.
+
+    Args:
+        splats: that they are of.
+        index: which of them.
+        object_to_world: (4, 4) a rotation, a uniform scale and a translation.
+    """
+    with np.errstate(all="ignore"):
+        center = splats.center[index].astype(np.float64) @ object_to_world[:3, :3].T + object_to_world[:3, 3]
+        times = SEEN * float(np.cbrt(np.linalg.det(object_to_world[:3, :3])))
+        radius = times * splats.scale[index].max(axis=1, initial=0).astype(np.float64)
+        finite = np.isfinite(center).all(axis=1) & np.isfinite(radius)
+    return Balls(center[finite], radius[finite])
+
+
+def together(parts: Iterable[Balls]) -> Balls:
+    """All balls of several."""
+    every = list(parts)
+    return Balls(np.concatenate([part.center for part in every]), np.concatenate([part.radius for part in every]))
+
+
+def framing(center: NDArray[np.floating]) -> tuple[NDArray[np.float64], float]:
+    """The middle of a scene and the radius of a ball around it that most splats are in.
+
+    Args:
+        center: (N, 3) of the splats, world units. What is not finite is left out.
+
+    Returns:
+        (3,) the median of each coordinate, and a radius above 0.
+
+    Raises:
+        InvalidSplatsError: there are no finite centres.
+    """
+    sample = np.asarray(center[:: max(len(center) // SAMPLE, 1)], np.float64)
+    sample = sample[np.isfinite(sample).all(axis=1)]
+    if not len(sample):
+        raise InvalidSplatsError("the scene has no finite centres for cameras to look at")
+    middle = np.median(sample, axis=0)
+    radius = float(np.quantile(np.linalg.norm(sample - middle, axis=1), SHARE))
+    return middle, radius or 1.0
+
+
+def covered(scene: Balls) -> Balls:
+    """What cameras are to have in view: of what is no backdrop, all that 99.9 % of the splats cover.
+
+    Raises:
+        InvalidSplatsError: there are no splats with finite numbers.
+    """
+    middle, radius = framing(scene.center)
+    every = max(len(scene.center) // SAMPLE, 1)
+    scene = Balls(scene.center[::every], scene.radius[::every])
+    reach = np.linalg.norm(scene.center - middle, axis=1) + scene.radius
+    # The nearest is always kept, however large it is.
+    near = reach <= max(OUTSIDE * radius, float(reach.min()))
+    most = float(np.quantile(reach[near], COVERED, method="higher"))
+    kept = scene.take(near & (reach <= most))
+    # Nothing is a point: a camera in line with all of them would be in their midst. Nor is anything, far out, smaller
+    # than the steps of the numbers there.
+    least = max(SPECK * most, STEPS * float(np.abs(kept.center).max())) or radius
+    return Balls(kept.center, np.maximum(kept.radius, least))
+
+
+def middle_of(scene: Balls) -> Matrix:
+    """(3,) the middle of the box of what is in view."""
+    radius = scene.radius[:, None]
+    middle: Matrix = ((scene.center - radius).min(axis=0) + (scene.center + radius).max(axis=0)) / 2
+    return middle
+
+
+def _support(scene: Balls, camera: Camera) -> tuple[Matrix, Matrix, Matrix]:
+    """How far a scene reaches outwards from the sides of a camera's view, if that were at the origin.
+
+    A ball is inside where it is behind all four sides, right, left, top and bottom, so the camera sees all of them
+    where its position, times the normal of each side, is no less than what is told here.
+
+    Returns:
+        (4,) the reach, world units, and of both pairs of sides, (2,), the share of their normals that is to the side,
+        and that is backwards.
+    """
+    half = FILLED * np.array([camera.width, camera.height]) / (2 * np.asarray(camera.focal))
+    back = half / np.hypot(1, half)
+    aside = 1 / np.hypot(1, half)
+    (across, up), (deep, high) = aside, back
+    normals = np.array([[across, 0, deep], [-across, 0, deep], [0, up, high], [0, -up, high]])
+    directions = normals @ camera.camera_to_world[:3, :3].T
+    return (scene.center @ directions.T + scene.radius[:, None]).max(axis=0), aside, back
+
+
+def fitted(camera: Camera, scene: Balls) -> Camera:
+    """A camera of the same direction that has a scene just inside its picture.
+
+    Args:
+        camera: whose principal point is the middle of its picture.
+        scene: of `covered`.
+    """
+    middle = middle_of(scene)
+    reach, aside, back = _support(Balls(scene.center - middle, scene.radius), camera)
+    away = float(((reach[::2] + reach[1::2]) / (2 * back)).max())
+    sideways = (reach[::2] - reach[1::2]) / (2 * aside)
+    pose = camera.camera_to_world.copy()
+    pose[:3, 3] = middle + pose[:3, :3] @ [*sideways, away]
+    return dataclasses.replace(camera, camera_to_world=pose)
+
+
+def distance(cameras: Sequence[Camera], center: Matrix, scene: Balls) -> float:
+    """How far from a point cameras that look at it have a scene in their pictures, world units.
+
+    Args:
+        cameras: at least one, wherever they are; their directions count.
+        center: (3,) in the middle of all pictures.
+        scene: of `covered`.
+    """
+    local = Balls(scene.center - center, scene.radius)
+    needed = []
+    for camera in some(cameras):
+        reach, _, back = _support(local, camera)
+        needed.append(float((reach / np.repeat(back, 2)).max()))
+    return max(needed)
+
+
+def some(cameras: Sequence[Item]) -> Sequence[Item]:
+    """At most `CAMERAS` of a path, evenly spaced."""
+    return cameras[:: -(-len(cameras) // CAMERAS)]
+
+
+def with_reach(look: RasterSettings, cameras: Sequence[Camera], scene: Balls) -> RasterSettings:
+    """A look that leaves nothing out of a scene, however small or large it is, because of near and far."""
+    near, far = look.near, look.far
+    sample = scene.center[:: max(len(scene.center) // SAMPLE, 1)]
+    corners = np.stack([scene.center.min(axis=0), scene.center.max(axis=0)])
+    largest = float(scene.radius.max())
+    for camera in some(cameras):
+        away = np.linalg.norm(sample - camera.position, axis=1)
+        farthest = float(np.linalg.norm(np.abs(corners - camera.position).max(axis=0)))
+        near, far = min(near, float(np.median(away)) / 100), max(far, 2 * (farthest + largest))
+    return dataclasses.replace(look, near=near, far=min(far, FARTHEST))

@@ -1,0 +1,120 @@
+"""Camera paths, from any file: what parsers found becomes cameras in OpenGL's axes, in one place and one way."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..support.errors import CameraPathError, TooManyCamerasError
+from .axes import Axes
+from .camera import Camera
+from .formats import own_csv
+from .formats.source import Files, Parsed
+from .formats.table import FORMATS, PathFormat
+from .frame import DEFAULT_FPS, MAX_FRAMES, MAX_MADE, Sampled, Settings, camera_of
+from .pose import rigid, to_opengl
+
+#: What is said of cameras that come from no file.
+GENERATED = {
+    name: PathFormat(name, title, "", Axes.OPENGL_C2W)
+    for name, title in {
+        "orbit": "an orbit",
+        "dolly": "a dolly",
+        "look_at": "one view",
+        "keyframes": "keyframes",
+    }.items()
+}
+
+
+@dataclass(frozen=True)
+class CameraPath:
+    """Cameras in the order in which they are passed.
+
+    Attributes:
+        cameras: at least one; in OpenGL's axes, camera-to-world, in the world of the splats.
+        format: where they come from, for people.
+        notes: what was left out or assumed, a sentence each, for people.
+        numbers: of each camera, its number in the file or on the whole path, from 0 on.
+    """
+
+    cameras: tuple[Camera, ...]
+    format: str
+    notes: tuple[str, ...]
+    numbers: tuple[int, ...]
+
+
+def read(files: Files, *, format: str | None = None, settings: Settings | None = None) -> CameraPath:
+    """The cameras of a file.
+
+    Args:
+        files: the file, and those that belong to it.
+        format: its name in `FORMATS`; None tells it by the content.
+        settings: what the user says.
+
+    Raises:
+        CameraPathError: the file is of no known format, or broken, or a camera makes no sense.
+    """
+    settings = settings or Settings()
+    if not any(files.contents.values()):
+        raise CameraPathError("it is empty")
+    form = _known(files) if format is None else next(form for form in FORMATS if form.name == format)
+    if settings.axes and form.axes is None:
+        raise CameraPathError(f"{form.title} says itself where cameras look, so --camera-axes cannot be used with it")
+    parsed = form.parser().parse(files, settings)
+    if settings.up is not None and (parsed.turned or not form.looking):
+        raise CameraPathError("its cameras say themselves which way is up, so --up cannot be used with them")
+    return cameras_of(parsed, form, settings)
+
+
+def _known(files: Files) -> PathFormat:
+    form = next((form for form in FORMATS if form.parser().recognises(files)), None)
+    if form is None and own_csv.resembles(files):
+        form = next(form for form in FORMATS if form.parser() is own_csv)  # which says what it lacks
+    if form is None:
+        names = ", ".join(form.name for form in FORMATS)
+        raise CameraPathError(f"it is of no format that is known by its content; see --camera-format ({names})")
+    return form
+
+
+def cameras_of(parsed: Parsed, form: PathFormat, settings: Settings) -> CameraPath:
+    """The cameras of frames, whoever made them.
+
+    Raises:
+        CameraPathError: there is none, or one makes no sense; the text names it.
+        TooManyCamerasError: there are too many of them.
+    """
+    numbers = range(0, len(parsed.frames), settings.every)
+    if not numbers:
+        raise CameraPathError("it has no cameras")
+    most = MAX_MADE if isinstance(parsed.frames, Sampled) else MAX_FRAMES
+    if len(numbers) > most:
+        raise TooManyCamerasError(f"it has {len(numbers):,} cameras, more than {most:,}; see --every")
+    frames = parsed.frames[:: settings.every]
+    first = frames[0].time
+    world = np.eye(4) if settings.world is None else settings.world
+    cameras = []
+    for number, frame in zip(numbers, frames, strict=True):
+        if frame.time is None or first is None or settings.fps:
+            time = number / (settings.fps or parsed.fps or DEFAULT_FPS)
+        else:
+            time = frame.time - first
+        try:
+            axes = frame.axes or settings.axes or form.axes
+            assert axes is not None
+            with np.errstate(all="ignore"):
+                pose = rigid(world @ to_opengl(frame.matrix, axes))
+            cameras.append(camera_of(pose, frame.lens, time, frame.name, settings))
+        except ValueError as error:
+            name = f" ({' '.join(frame.name.split())[:60]})" if frame.name else ""
+            raise CameraPathError(f"the camera of frame {number}{name} {error}") from None
+    notes = parsed.notes
+    if form.world and settings.world is None:
+        notes += (form.world,)
+    if not all(a.time <= b.time for a, b in itertools.pairwise(cameras)):
+        notes += ("Its times go back and forth; --fps counts them anew.",)
+    if not all(math.isfinite(camera.time) for camera in cameras):
+        raise CameraPathError("it has times that are too far apart")
+    return CameraPath(tuple(cameras), form.title, notes, tuple(numbers))

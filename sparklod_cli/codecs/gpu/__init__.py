@@ -1,0 +1,1 @@
+"""Encodings of splats and trees in the memory of Spark's shaders."""

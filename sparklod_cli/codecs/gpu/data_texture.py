@@ -1,0 +1,106 @@
+"""The data texture of antimatter15's viewer and of those that follow it: RGBA32UI, 2048 texels wide, 2 a splat."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...model.gaussian import covariance
+from ...model.splats import FloatArray, Splats
+from ...support.errors import FormatError
+from ...support.parallel import for_chunks
+from .. import quantize
+from ..octahedral import Words
+
+WIDTH = 2048
+SPLATS_A_ROW = WIDTH // 2
+
+SPLAT = np.dtype(
+    [
+        ("center", "<f4", 3),  # 0: world units, in x y z of texel 2i
+        ("unused", "<u4"),  # 12: 0
+        ("covariance", "<f2", 6),  # 16: 4 * (xx xy | xz yy | yz zz), in x y z of texel 2i + 1; world units squared
+        ("rgba", "u1", 4),  # 28: 0..1 in 255 steps, in its w
+    ]
+)
+assert SPLAT.itemsize == 32
+
+#: What the covariance is multiplied by, and the largest number that a float16 holds of the product.
+GAIN, LARGEST = 4, 65504
+
+
+def pack(splats: Splats, *, threads: int = 1) -> dict[str, Words]:
+    """Splats as the viewer uploads them: "texture" (H, 2048, 4) uint32, H = ceil(N / 1024), at least 1; the rest is 0.
+
+    The viewer multiplies M^T M with M = diag(scale) R. Its R, by rows, is the transpose of the matrix that turns local
+    into world axes, so that M^T M is the covariance A diag(scale ** 2) A^T with A local to world, as here.
+
+    Colour and opacity are clamped to 0..1; SH is not held. A splat wider than a float16 takes, a standard deviation of
+    127.97 along a world axis, is shrunk to that, in its shape, where the viewer's own would be infinite. float16s are
+    rounded to the nearest, and the rotation is the splat's own; the viewer cuts both off to fewer bits.
+    """
+    height = max(1, -(-len(splats) // SPLATS_A_ROW))
+    texture = np.zeros((height, WIDTH, 4), np.uint32)
+    texels = texture.reshape(-1, 8).view(SPLAT)[:, 0]
+
+    @np.errstate(over="ignore")
+    def encode(part: slice) -> None:
+        rows = texels[part]
+        rows["center"] = splats.center[part]
+        rows["covariance"] = _encode_covariance(covariance(splats.scale[part], splats.quat_xyzw[part]))
+        # 0..1 to a byte: ties to even, as the viewer's clamped array rounds.
+        rows["rgba"][:, :3] = quantize.encode_unorm8(splats.rgb[part])
+        rows["rgba"][:, 3] = quantize.encode_unorm8(splats.opacity[part])
+
+    for_chunks(encode, len(splats), threads, lambda _: None)
+    return {"texture": texture}
+
+
+@dataclass(frozen=True)
+class Texels:
+    """What a texture holds of N splats, float32.
+
+    Attributes:
+        center: (N, 3) world units.
+        covariance: (N, 6) xx xy xz yy yz zz, world units squared.
+        rgba: (N, 4) display-referred colour and linear opacity, 0..1.
+    """
+
+    center: FloatArray
+    covariance: FloatArray
+    rgba: FloatArray
+
+
+def unpack(arrays: Mapping[str, NDArray[Any]], count: int) -> Texels:
+    """The first `count` splats of a texture that `pack` made.
+
+    Largest errors: the centre is exact; 2 ** -11 of each element of the covariance, or 2 ** -27 if that is more, for
+    splats that were not shrunk; 1 / 510 of each channel of rgba.
+
+    Raises:
+        FormatError: the array is missing, of another shape or type, or has no room for `count` splats.
+    """
+    texture = arrays.get("texture")
+    if texture is None:
+        raise FormatError(f"no array texture, only {', '.join(arrays) or 'none at all'}")
+    if texture.dtype != np.uint32 or texture.ndim != 3 or texture.shape[1:] != (WIDTH, 4):
+        raise FormatError(f"texture is {texture.dtype}{list(texture.shape)}, expected uint32[H, {WIDTH}, 4]")
+    room = len(texture) * SPLATS_A_ROW
+    if not 0 <= count <= room:
+        raise FormatError(f"{count:,} splats of a texture that has room for {room:,}")
+    texels = np.ascontiguousarray(texture).reshape(-1, 8).view(SPLAT)[:count, 0]
+    return Texels(
+        texels["center"].astype(np.float32),
+        texels["covariance"].astype(np.float32) / np.float32(GAIN),
+        quantize.decode_unorm8(texels["rgba"]),
+    )
+
+
+def _encode_covariance(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Times 4, and smaller where that is more than a float16 holds; no element exceeds the largest of the diagonal."""
+    stored = values * GAIN
+    return stored * (LARGEST / np.maximum(stored.max(axis=1, keepdims=True), LARGEST))

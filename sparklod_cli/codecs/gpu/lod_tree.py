@@ -1,0 +1,94 @@
+"""LodTree, Spark's 16 bytes a node in memory: what its traversal reads of each splat of a Level-of-Detail tree."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...model.gaussian import spark_size
+from ...model.lod_tree import MAX_CHILDREN, LodTree
+from ...model.splats import FloatArray, Splats
+from ...support.errors import FormatError
+from ...support.parallel import for_chunks
+from ..octahedral import Words, checked_words
+
+NODE = np.dtype(
+    [
+        ("center", "<f2", 3),  # 0: world units; x | y << 16 in word 0, z in word 1
+        ("size", "<f2"),  # 6: world units, see `spark_size`; the upper half of word 1
+        ("child_count", "<u4"),  # 8: 0 for a leaf; a uint16, the upper half of word 2 is 0
+        ("child_start", "<u4"),  # 12: index of the first child, 0 for a leaf
+    ]
+)
+assert NODE.itemsize == 16
+
+
+def pack(
+    splats: Splats, tree: LodTree, *, size: Callable[[Splats], FloatArray] = spark_size, threads: int = 1
+) -> dict[str, Words]:
+    """Splats and their tree as Spark's traversal has them: "lod_tree" (N, 4) uint32.
+
+    Spark measures the splats that it holds, after their coding: give this what `unpack` of `ext_splats` or of
+    `packed_splats` makes of their `pack`, and the words are Spark's own. A coordinate or a size of 65520 or more
+    becomes infinite, as in Spark.
+
+    Args:
+        size: makes (N,) world units of splats: `spark_size`, or `design_size` to see what the pages' would do.
+
+    Raises:
+        FormatError: there are not as many nodes as splats, or a node has more children than a uint16 holds.
+    """
+    if len(tree) != len(splats):
+        raise FormatError(f"{len(tree):,} nodes but {len(splats):,} splats")
+    _check_child_count(tree.child_count)
+    words = np.empty((len(splats), 4), np.uint32)
+
+    @np.errstate(over="ignore")
+    def encode(part: slice) -> None:
+        rows = words[part].view(NODE)[:, 0]
+        rows["center"] = splats.center[part]
+        rows["size"] = size(splats.take(part))
+        rows["child_count"] = tree.child_count[part]
+        rows["child_start"] = tree.child_start[part]
+
+    for_chunks(encode, len(splats), threads, lambda _: None)
+    return {"lod_tree": words}
+
+
+@dataclass(frozen=True)
+class Nodes:
+    """What a packed tree holds.
+
+    Attributes:
+        center: (N, 3) float32 world units.
+        size: (N,) float32 world units.
+        tree: (N,) links; not validated.
+    """
+
+    center: FloatArray
+    size: FloatArray
+    tree: LodTree
+
+
+def unpack(arrays: Mapping[str, NDArray[Any]]) -> Nodes:
+    """The nodes that `pack` made the array of.
+
+    Largest errors: 2 ** -11 of each coordinate and of the size, or 2 ** -25 if that is more; the links are exact.
+
+    Raises:
+        FormatError: the array is missing, or of another shape or type; a node has more children than a uint16 holds.
+    """
+    rows = checked_words(arrays, {"lod_tree": 4})["lod_tree"].view(NODE)[:, 0]
+    _check_child_count(rows["child_count"])
+    tree = LodTree(rows["child_count"].astype(np.uint16), rows["child_start"].copy())
+    return Nodes(rows["center"].astype(np.float32), rows["size"].astype(np.float32), tree)
+
+
+def _check_child_count(child_count: NDArray[Any]) -> None:
+    if child_count.max(initial=0) > MAX_CHILDREN:
+        node = int(np.argmax(child_count > MAX_CHILDREN))
+        raise FormatError(f"node {node} has {child_count[node]:,} children, at most {MAX_CHILDREN:,} fit a uint16")

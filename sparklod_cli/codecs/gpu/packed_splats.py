@@ -1,0 +1,207 @@
+"""PackedSplats, Spark's 16 bytes a splat in memory, and its arrays of spherical harmonics.
+
+Words, rounding and clamping are those of Spark 2.2.0's own encoder, the one in its worker, but for one thing: a scale
+between 0 and e ** -30 is a true zero here, as Spark's pages and its JavaScript have it, and e ** -12 in its worker.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...model.sh import COEFFICIENTS
+from ...model.splats import FloatArray, Splats
+from ...support.errors import FormatError
+from ...support.parallel import for_chunks
+from .. import octahedral
+from ..octahedral import STEPS_8_8_8, Words, to_code
+
+SPLAT = np.dtype(
+    [
+        ("rgb", "u1", 3),  # 0: rgb_min..rgb_max in 255 steps
+        ("alpha", "u1"),  # 3: opacity 0..1 in 255 steps, or 0..2 where the encoding has lod_opacity
+        ("center", "<f2", 3),  # 4: world units
+        ("axis", "u1", 2),  # 10: of the rotation, u and v on the octahedron, -1..1 in 255 steps
+        ("log_scale", "u1", 3),  # 12: 0 for a scale of 0, else 1 + ln_scale_min..ln_scale_max in 254 steps
+        ("angle", "u1"),  # 15: of the rotation, 0..pi in 255 steps
+    ]
+)
+assert SPLAT.itemsize == 16
+
+#: Words a splat, and bits a number, of the SH arrays of degree 1 to 3. The 3 * (2 * degree + 1) numbers, coefficient by
+#: coefficient with r g b innermost, lie bit after bit in two's complement: -sh_max..sh_max in 2 ** bits - 2 steps.
+SH_WORDS = {1: 2, 2: 4, 3: 4}
+SH_BITS = {1: 7, 2: 8, 3: 6}
+
+#: Smaller scales are a true zero: e ** -30.
+SCALE_ZERO = np.float32(np.exp(-30))
+
+
+@dataclass(frozen=True)
+class Encoding:
+    """The ranges that the codes span: Spark's `splatEncoding`, with its defaults.
+
+    Attributes:
+        rgb_min, rgb_max: colours of code 0 and 255.
+        ln_scale_min, ln_scale_max: logarithms of the scales of code 1 and 255.
+        sh1_max, sh2_max, sh3_max: largest SH coefficient of each degree.
+        lod_opacity: alpha holds 0..2, where 1..2 stands for D = 1..5: what Spark sets for an LoD tree.
+    """
+
+    rgb_min: float = 0
+    rgb_max: float = 1
+    ln_scale_min: float = -12
+    ln_scale_max: float = 9
+    sh1_max: float = 1
+    sh2_max: float = 1
+    sh3_max: float = 1
+    lod_opacity: bool = False
+
+    def __post_init__(self) -> None:
+        if not (self.rgb_min < self.rgb_max and self.ln_scale_min < self.ln_scale_max):
+            raise ValueError(f"an empty range: {self}")
+        if not min(self.sh1_max, self.sh2_max, self.sh3_max) > 0:
+            raise ValueError(f"a largest SH coefficient that is not positive: {self}")
+
+    @property
+    def alpha_max(self) -> int:
+        """The alpha of code 255."""
+        return 2 if self.lod_opacity else 1
+
+    def sh_max(self, degree: int) -> np.float32:
+        """The largest coefficient of a degree."""
+        return np.float32((self.sh1_max, self.sh2_max, self.sh3_max)[degree - 1])
+
+
+DEFAULT = Encoding()
+
+
+def pack(splats: Splats, encoding: Encoding = DEFAULT, *, threads: int = 1) -> dict[str, Words]:
+    """Splats as Spark holds them: "packed" (N, 4) uint32, and by degree "sh1" (N, 2), "sh2" (N, 4) and "sh3" (N, 4).
+
+    What a code cannot hold is clamped; a coordinate of 65520 or more becomes infinite, as in Spark. The formulas are
+    those of Spark's `encode_packed_splat` and `encode_sh1` to `encode_sh3`, which its page on PackedSplats describes.
+    """
+    degrees = range(1, splats.sh_degree + 1)
+    arrays = {"packed": np.empty((len(splats), 4), np.uint32)}
+    arrays |= {f"sh{degree}": np.empty((len(splats), SH_WORDS[degree]), np.uint32) for degree in degrees}
+
+    @np.errstate(over="ignore")
+    def encode(part: slice) -> None:
+        rows = arrays["packed"][part].view(SPLAT)[:, 0]
+        rows["rgb"] = _encode_linear(splats.rgb[part], encoding.rgb_min, encoding.rgb_max)
+        opacity = splats.opacity[part]
+        alpha = octahedral.encode_lod_alpha(opacity) if encoding.lod_opacity else opacity
+        rows["alpha"] = _encode_linear(alpha, 0, encoding.alpha_max)
+        rows["center"] = splats.center[part]
+        rows["log_scale"] = encode_log_scale(splats.scale[part], encoding)
+        u, v, rows["angle"] = octahedral.encode_axis_angle(splats.quat_xyzw[part], STEPS_8_8_8)
+        rows["axis"][:, 0], rows["axis"][:, 1] = u, v
+        for degree in degrees:
+            sh = splats.sh[part, COEFFICIENTS[degree - 1] : COEFFICIENTS[degree]].reshape(len(rows), -1)
+            arrays[f"sh{degree}"][part] = encode_sh(sh, SH_BITS[degree], encoding.sh_max(degree))
+
+    for_chunks(encode, len(splats), threads, lambda _: None)
+    return arrays
+
+
+def unpack(arrays: Mapping[str, NDArray[Any]], encoding: Encoding = DEFAULT, *, threads: int = 1) -> Splats:
+    """The splats that `pack` made the arrays of; those of SH may be left out from the highest degree down.
+
+    Largest errors, inside the ranges and beside float32's own:
+
+    - center: 2 ** -11 of each coordinate, or 2 ** -25 if that is more.
+    - scale: a factor of e ** ((ln_scale_max - ln_scale_min) / 508), 4.3 %; exact for 0.
+    - quat_xyzw: 1.94 degrees of rotation.
+    - opacity: 1 / 510; with lod_opacity 1 / 255, and from 1 on 4 / 255 of D.
+    - rgb: (rgb_max - rgb_min) / 510.
+    - sh: sh1_max / 126, sh2_max / 254 and sh3_max / 62.
+
+    Raises:
+        FormatError: an array is missing, or of another shape or type.
+    """
+    present = tuple(degree for degree in SH_WORDS if f"sh{degree}" in arrays)
+    if present != tuple(range(1, len(present) + 1)):
+        raise FormatError(f"SH arrays of degree {present}, and none of a lower one")
+    found = octahedral.checked_words(arrays, {"packed": 4} | {f"sh{degree}": SH_WORDS[degree] for degree in present})
+    packed = found["packed"].view(SPLAT)[:, 0]
+    splats = Splats.empty(len(packed), len(present))
+
+    def decode(part: slice) -> None:
+        rows = packed[part]
+        splats.center[part] = rows["center"]
+        splats.rgb[part] = _decode_linear(rows["rgb"], encoding.rgb_min, encoding.rgb_max)
+        alpha = _decode_linear(rows["alpha"], 0, encoding.alpha_max)
+        splats.opacity[part] = octahedral.decode_lod_alpha(alpha)
+        splats.scale[part] = decode_log_scale(rows["log_scale"], encoding)
+        u, v = rows["axis"].T
+        splats.quat_xyzw[part] = octahedral.decode_axis_angle(u, v, rows["angle"], STEPS_8_8_8)
+        for degree in present:
+            sh = decode_sh(found[f"sh{degree}"][part], SH_BITS[degree], encoding.sh_max(degree), 3 * (2 * degree + 1))
+            splats.sh[part, COEFFICIENTS[degree - 1] : COEFFICIENTS[degree]] = sh.reshape(len(rows), -1, 3)
+
+    for_chunks(decode, len(splats), threads, lambda _: None)
+    return splats
+
+
+def _encode_linear(values: FloatArray, low: float, high: float) -> Words:
+    first, width = np.float32(low), np.float32(high) - np.float32(low)
+    return to_code((values - first) / width * np.float32(255), 255)
+
+
+def _decode_linear(codes: NDArray[np.uint8], low: float, high: float) -> FloatArray:
+    first, width = np.float32(low), np.float32(high) - np.float32(low)
+    return first + codes.astype(np.float32) / np.float32(255) * width
+
+
+def encode_log_scale(scale: FloatArray, encoding: Encoding = DEFAULT) -> Words:
+    """Linear scales to codes 0..255, where 0 is for scales below e ** -30 and 1..255 are steps of the logarithm."""
+    low = np.float32(encoding.ln_scale_min)
+    width = np.float32(encoding.ln_scale_max) - low
+    zero = scale < SCALE_ZERO
+    log = np.log(np.where(zero, 1, scale).astype(np.float64)).astype(np.float32)
+    codes = 1 + to_code(np.clip((log - low) / width, 0, 1) * np.float32(254), 254)
+    codes[zero] = 0
+    return codes
+
+
+def decode_log_scale(codes: NDArray[np.uint8], encoding: Encoding = DEFAULT) -> FloatArray:
+    """Largest error: a factor of e ** (range / 508), 4.3 % by default; exact for 0."""
+    low = np.float32(encoding.ln_scale_min)
+    step = (np.float32(encoding.ln_scale_max) - low) / np.float32(254)
+    log = low + np.arange(-1, 255, dtype=np.float32) * step
+    table = np.exp(log.astype(np.float64)).astype(np.float32)
+    table[0] = 0
+    return table[codes]
+
+
+def encode_sh(values: FloatArray, bits: int, most: np.float32) -> Words:
+    """(N, numbers) SH coefficients to (N, words), `bits` each in two's complement, bit after bit; -most..most."""
+    top = np.float32(2 ** (bits - 1) - 1)
+    steps = np.clip(values * (top / most), -top, top)
+    codes = octahedral.round_half_away(steps).astype(np.int32).view(np.uint32) & np.uint32(2**bits - 1)
+    words = np.zeros((-(-codes.shape[1] * bits // 32), len(codes)), np.uint32)
+    for index, column in enumerate(np.ascontiguousarray(codes.T)):
+        word, offset = divmod(index * bits, 32)
+        words[word] |= column << np.uint32(offset)
+        if offset + bits > 32:
+            words[word + 1] |= column >> np.uint32(32 - offset)
+    return words.T
+
+
+def decode_sh(words: Words, bits: int, most: np.float32, numbers: int) -> FloatArray:
+    """(N, words) to (N, numbers), the inverse of `encode_sh`. Largest error: most / (2 ** bits - 2)."""
+    columns = np.ascontiguousarray(words.T)
+    codes = np.empty((numbers, len(words)), np.uint32)
+    for index in range(numbers):
+        word, offset = divmod(index * bits, 32)
+        codes[index] = columns[word] >> np.uint32(offset)
+        if offset + bits > 32:
+            codes[index] |= columns[word + 1] << np.uint32(32 - offset)
+    unused = np.int32(32 - bits)
+    signed = codes.view(np.int32) << unused >> unused  # the shift back brings the sign along
+    return signed.T.astype(np.float32) * (most / np.float32(2 ** (bits - 1) - 1))

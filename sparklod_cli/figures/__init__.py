@@ -1,0 +1,1 @@
+"""Pictures of structure: scenes in 3D, charts."""

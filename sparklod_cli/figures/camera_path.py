@@ -1,0 +1,140 @@
+"""A picture of a camera path over the scene that it flies through."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..cameras.camera import Camera
+from ..model.splats import Splats
+from ..render.color_scales import range_of, whole_numbers
+from ..support.errors import SparklodError
+from ..support.units import count_of
+from .ellipsoids import Points, box_lines, evenly
+from .labels import BACKGROUND, write_png
+from .pyvista_scene import Stage
+from .viewpoint import Viewpoint, bounds, is_drawable, viewpoint
+
+#: Of more splats than this, so many are drawn.
+MOST_POINTS = 600_000
+
+#: The frusta of so many cameras are drawn at most, and the path itself through so many.
+MOST_FRUSTA, MOST_STEPS = 24, 5_000
+
+#: How long a frustum is, as a share of what is shown; that of the frame whose cut is drawn is longer.
+LENGTH, CHOSEN_LENGTH = 0.03, 0.075
+
+PATH, CHOSEN = "#ffffff", "#ff5c8a"
+
+#: How much is seen of a line that splats stand before.
+BEHIND = 0.45
+
+#: Left, top, right and bottom of what is shown in the picture; the title, the labels and the colours stand around it.
+FRAME = (0.09, 0.17, 0.85, 0.93)
+
+
+@np.errstate(over="ignore", invalid="ignore")  # of numbers that are out of range in the file
+def picture_of_path(
+    cameras: Sequence[Camera],
+    splats: Splats,
+    level: NDArray[Any],
+    *,
+    frame: int | None = None,
+    size: tuple[int, int] = (1600, 1000),
+) -> bytes:
+    """The PNG of a path and its frusta over a cut.
+
+    Args:
+        cameras: of the path; at least one.
+        splats: N of the cut; those that are not finite are left out.
+        level: (N,) edges from the root to each of them.
+        frame: index of the camera whose cut it is, which is marked.
+        size: width and height in pixels.
+
+    Raises:
+        SparklodError: pyvista is not installed or cannot draw here, or there is nothing to draw.
+    """
+    index = np.flatnonzero(is_drawable(splats))
+    if not len(index):
+        raise SparklodError("there is nothing to draw: no splat of the cut is finite and has a size")
+    drawable = splats.with_max_sh(0).take(index)
+    chosen = index[evenly(len(index), MOST_POINTS)]
+    shown = splats.with_max_sh(0).take(chosen)
+    coloring = whole_numbers("level", level[chosen], *range_of(level[chosen]))
+    low, high = bounds(drawable)
+    way = np.array([camera.position for camera in cameras])
+    low, high = np.minimum(low, way.min(axis=0)), np.maximum(high, way.max(axis=0))
+    eye = _above(cameras, low, high, size)
+    parts = _path_lines(cameras, way, frame, float((high - low).max()))
+    with Stage(low, high, size, BACKGROUND) as stage:
+        drawn = stage.splats(shown, coloring.rgb, eye)
+        for ends, color in parts:
+            stage.lines(ends, color, 1.0, width=1.5)
+        pixels = stage.photograph(eye)
+    with Stage(low, high, size, BACKGROUND) as stage:
+        for ends, color in parts:
+            stage.lines(ends, color, 1.0, width=1.5)
+        pixels = _seen_through(pixels, stage.photograph(eye))
+    if len(chosen) < len(splats):
+        drawn += f", {len(chosen):,} of them, evenly chosen"
+    title = f"The cut of {count_of(len(splats), 'splat')}"
+    said = [f"{drawn}; white: the path and the frusta of {min(len(cameras), MOST_FRUSTA)} of {len(cameras):,} frames"]
+    if frame is not None:
+        title += f" for {_called(cameras[frame], frame)}"
+        said.append("pink: its frustum")
+    return write_png(pixels, title, ["; ".join(said)], coloring, eye, low, high)
+
+
+def _called(camera: Camera, frame: int) -> str:
+    return f"frame {frame} at {camera.time:.3f} s"
+
+
+def _above(cameras: Sequence[Camera], low: Points, high: Points, size: tuple[int, int]) -> Viewpoint:
+    """A place above a corner of the box, where above is what it is for the cameras."""
+    mean = np.sum([camera.camera_to_world[:3, 1] for camera in cameras], axis=0)
+    axis = int(np.abs(mean).argmax())
+    up = np.zeros(3)
+    up[axis] = -1.0 if mean[axis] < 0 else 1.0
+    direction = np.insert([-0.62, -1.0], axis, -0.62 * up[axis])
+    return viewpoint(box_lines(low[None], high[None]), direction, up, aspect=size[0] / size[1], frame=FRAME)
+
+
+def _path_lines(cameras: Sequence[Camera], way: Points, frame: int | None, extent: float) -> list[tuple[Points, str]]:
+    """The ends of the lines of a path and of its frusta, and their colours."""
+    steps = np.unique([*evenly(len(way), MOST_STEPS), len(way) - 1])
+    path = np.repeat(way[steps], 2, axis=0)[1:-1]
+    frusta = [frustum_lines(cameras[at], LENGTH * extent) for at in evenly(len(cameras), MOST_FRUSTA)]
+    parts = [(np.concatenate([path, *frusta]), PATH)]
+    if frame is not None:
+        parts.append((frustum_lines(cameras[frame], CHOSEN_LENGTH * extent), CHOSEN))
+    return parts
+
+
+def frustum_lines(camera: Camera, length: float) -> Points:
+    """(18, 3) ends of the lines of a frustum, world units: four edges, the far rectangle, and a mark of what is up.
+
+    Args:
+        camera: whose it is; its principal point need not be in the middle.
+        length: along the optical axis to the far rectangle.
+    """
+    (fx, fy), (cx, cy) = camera.focal, camera.principal
+    left, right = -cx / fx, (camera.width - cx) / fx
+    top, bottom = cy / fy, (cy - camera.height) / fy
+    corners = [(left, top, -1), (right, top, -1), (right, bottom, -1), (left, bottom, -1)]
+    ridge = ((left + right) / 2, top + 0.35 * (top - bottom), -1)
+    local = length * np.array([(0, 0, 0), *corners, ridge], np.float64)
+    points = local @ camera.camera_to_world[:3, :3].T + camera.position
+    pairs = [(0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1), (1, 5), (5, 2)]
+    return points[np.array(pairs)].reshape(-1, 3)
+
+
+def _seen_through(pixels: NDArray[np.uint8], lines: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """(H, W, 3) a picture with the lines in it that are hidden, faintly: from the same lines on an empty ground."""
+    ground = np.array([int(BACKGROUND[at : at + 2], 16) for at in (1, 3, 5)], np.float32)
+    covered = np.abs(lines - ground).max(axis=2, keepdims=True) / (255 - ground.min())
+    share = BEHIND * np.clip(covered, 0, 1)
+    mixed: NDArray[np.uint8] = np.rint((1 - share) * pixels + share * lines).astype(np.uint8)
+    return mixed

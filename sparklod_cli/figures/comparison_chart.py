@@ -1,0 +1,99 @@
+"""A comparison of cuts with full detail as charts."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw
+
+from ..compare import rows_of
+from ..lod.budget import Budget
+from ..tables.columns import Row
+from ..tables.statistics import numbers
+from .charts import BLUE, DPI, GREEN, INDIGO, ORANGE, PINK, WIDTH, YELLOW, Frames, load_matplotlib, styled
+from .labels import BACKGROUND, FAINT, write_title
+
+#: Pixels of a row of charts, and of the title above them.
+ROW, HEAD = 420, 122
+
+#: Of budgets, from the first on; with more of them they begin again.
+COLORS = (INDIGO, BLUE, GREEN, YELLOW, ORANGE, PINK)
+
+Axes = Any
+
+
+def plot(rows: Sequence[Row], budgets: Sequence[Budget], title: str) -> bytes:
+    """The PNG of charts: PSNR and SSIM by budget and along the path.
+
+    Args:
+        rows: of `Comparison.run`.
+        budgets: that it was made with.
+        title: the name of the scene.
+
+    Raises:
+        SparklodError: matplotlib is not installed.
+    """
+    matplotlib = load_matplotlib()
+    with styled(matplotlib):
+        charts = _charts(matplotlib, rows_of(rows, budgets), budgets)
+    head = Image.new("RGB", (WIDTH, HEAD), BACKGROUND)
+    frames = len(rows) // len(budgets)
+    about = f"against full detail, {frames:,} frame{'s' * (frames > 1)}, on black and on white"
+    write_title(ImageDraw.Draw(head), 1.0, title, [(about, FAINT)])
+    out = io.BytesIO()
+    Image.fromarray(np.concatenate([np.asarray(head), charts])).save(out, "PNG", optimize=True)
+    return out.getvalue()
+
+
+def _charts(matplotlib: ModuleType, groups: Sequence[Sequence[Row]], budgets: Sequence[Budget]) -> NDArray[np.uint8]:
+    figure = matplotlib.figure.Figure((WIDTH / DPI, 2 * ROW / DPI), DPI, layout="constrained")
+    canvas = matplotlib.backends.backend_agg.FigureCanvasAgg(figure)
+    figure.get_layout_engine().set(rect=(0.012, 0.008, 0.976, 0.992), wspace=0.05, hspace=0.05)
+    grid = figure.subplots(2, 2)
+    _by_budget(matplotlib, grid[0, 0], groups, "psnr", "PSNR by budget", "dB")
+    _by_budget(matplotlib, grid[0, 1], groups, "ssim", "SSIM by budget", "")
+    _by_frame(grid[1, 0], groups, budgets, "psnr", "PSNR along the path", "dB")
+    _by_frame(grid[1, 1], groups, budgets, "worst_tile_psnr", "PSNR of the worst tile", "dB")
+    canvas.draw()
+    pixels: NDArray[np.uint8] = np.asarray(canvas.buffer_rgba())[..., :3].copy()
+    return pixels
+
+
+def _by_budget(
+    matplotlib: ModuleType, axes: Axes, groups: Sequence[Sequence[Row]], name: str, title: str, unit: str
+) -> None:
+    """Mean over the frames, on either background, and the band from the least to the most."""
+    groups = sorted(groups, key=lambda rows: numbers(rows, "share")[0])
+    share = np.array([numbers(rows, "share")[0] for rows in groups])
+    cells = np.array([numbers(rows, name) for rows in groups])
+    axes.fill_between(share, cells.min(axis=1), cells.max(axis=1), color=GREEN, alpha=0.25, linewidth=0, label="frames")
+    for background, color in (("black", BLUE), ("white", YELLOW)):
+        mean = [np.mean(numbers(rows, f"{name}_{background}")) for rows in groups]
+        axes.plot(share, mean, color=color, linewidth=1, linestyle=(0, (4, 3)), label=f"on {background}")
+    axes.plot(share, cells.mean(axis=1), "o-", color=GREEN, linewidth=1.8, markersize=5, label="mean")
+    axes.set_xscale("log")
+    axes.set_xticks(share)
+    axes.xaxis.set_major_formatter(lambda value, place: f"{100 * value:.3g} %")
+    axes.xaxis.set_minor_locator(matplotlib.ticker.NullLocator())
+    axes.set_title(title)
+    axes.set_ylabel(unit)
+    axes.legend(loc="lower right", ncols=4, borderpad=0, handlelength=1.4)
+
+
+def _by_frame(
+    axes: Axes, groups: Sequence[Sequence[Row]], budgets: Sequence[Budget], name: str, title: str, unit: str
+) -> None:
+    """A line for each budget."""
+    for at, (rows, budget) in enumerate(zip(groups, budgets, strict=True)):
+        frames = Frames(rows)
+        axes.plot(frames.x, frames.column(name), color=COLORS[at % len(COLORS)], linewidth=1.4, label=budget.text)
+        axes.xaxis.set_major_formatter(frames.tick)
+        axes.set_xlim(frames.x[0], frames.x[-1])
+    axes.set_title(title)
+    axes.set_ylabel(unit)
+    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=len(budgets), borderpad=0, handlelength=1.4)

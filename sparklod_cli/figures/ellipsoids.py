@@ -1,0 +1,119 @@
+"""What a picture of a scene is made of, as plain arrays: ellipsoids, cells, boxes and ticks."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..model.splats import FloatArray, Splats
+from ..support.defaults import DEFAULT_BASE
+
+#: (N, 3) points, or ends of lines by twos; (3,) where it is one.
+Points = NDArray[np.floating[Any]]
+
+#: The corners of the unit cube, and which of them its twelve edges join.
+CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], np.float64)
+EDGES = np.array([(a, b) for a in range(8) for b in range(a + 1, 8) if (a ^ b) in (1, 2, 4)])
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Triangles: (P, 3) points with a unit normal each, and (T, 3) indices of them."""
+
+    points: FloatArray
+    normals: FloatArray
+    triangles: NDArray[np.int64]
+
+
+def sphere(rounds: int) -> Mesh:
+    """The unit sphere: an icosahedron whose triangles are divided by four so many times."""
+    golden = (1 + math.sqrt(5)) / 2
+    one = np.array([[-1, golden, 0], [1, golden, 0], [-1, -golden, 0], [1, -golden, 0]])
+    points = np.concatenate([one, np.roll(one, 1, axis=1), np.roll(one, 2, axis=1)])
+    near = np.linalg.norm(points[:, None] - points[None], axis=2) < 2.1  # the edges are 2 long
+    found = [(a, b, c) for a, b, c in combinations(range(12), 3) if near[a, b] and near[b, c] and near[a, c]]
+    triangles = np.array(found)
+    for _ in range(rounds):
+        sides = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+        pairs, at = np.unique(sides, axis=0, return_inverse=True)
+        middle = at.reshape(-1, 3) + len(points)
+        points = np.concatenate([points, points[pairs].mean(axis=1)])
+        (a, b, c), (ab, bc, ca) = triangles.T, middle.T
+        triangles = np.concatenate(
+            [np.stack(corner, 1) for corner in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))]
+        )
+    unit = points / np.linalg.norm(points, axis=1, keepdims=True)
+    p, q, r = unit[triangles].transpose(1, 0, 2)
+    inward = np.einsum("ij,ij->i", np.cross(q - p, r - p), p) < 0
+    triangles[inward] = triangles[inward][:, ::-1]
+    return Mesh(unit.astype(np.float32), unit.astype(np.float32), triangles)
+
+
+def rotation(quat_xyzw: FloatArray) -> FloatArray:
+    """(N, 4) unit quaternions to (N, 3, 3) matrices: splat, world axis, local axis."""
+    x, y, z, w = quat_xyzw.T
+    axes = np.empty((len(quat_xyzw), 3, 3), np.float32)
+    axes[:, 0] = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], 1)
+    axes[:, 1] = np.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], 1)
+    axes[:, 2] = np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], 1)
+    return axes
+
+
+def ellipsoids(splats: Splats, deviations: float, of: Mesh, thinnest: float) -> Mesh:
+    """The surfaces of N splats at so many standard deviations, one after the other.
+
+    The normal of an ellipsoid is that of the sphere, divided by the radii where points are multiplied by them.
+
+    Args:
+        splats: N of them.
+        deviations: the radii, in standard deviations.
+        of: the unit sphere.
+        thinnest: no radius is drawn smaller than this, so that no splat falls between the pixels; world units.
+    """
+    axes = rotation(splats.quat_xyzw)
+    radii = np.maximum(splats.scale * np.float32(deviations), np.float32(thinnest))
+    points = of.points @ (axes * radii[:, None]).transpose(0, 2, 1) + splats.center[:, None]
+    normals = of.points @ (axes * (radii.min(axis=1, keepdims=True) / radii)[:, None]).transpose(0, 2, 1)
+    normals /= np.linalg.norm(normals, axis=2, keepdims=True)
+    triangles = of.triangles + len(of.points) * np.arange(len(splats))[:, None, None]
+    return Mesh(points.reshape(-1, 3), normals.reshape(-1, 3), triangles.reshape(-1, 3))
+
+
+def evenly(count: int, most: int) -> NDArray[np.int64]:
+    """At most so many of `count` indices, evenly spaced: always the same, and from all parts of the file."""
+    return np.arange(count) if count <= most else np.arange(most) * count // most
+
+
+def level_of_step(size: float, base: float = DEFAULT_BASE) -> int:
+    """The level of Quick-LoD that a size, 2 * max(scale), belongs to; its cells have edges of base ** level."""
+    return math.ceil(math.log(size, base) - 1e-9)
+
+
+def cells(center: FloatArray, step: float) -> Points:
+    """(C, 3) lowest corners of the cells of an edge of `step` that these centres are in."""
+    return np.unique(np.floor(center.astype(np.float64) / step), axis=0) * step
+
+
+def box_lines(low: Points, high: Points) -> Points:
+    """(24 B, 3) ends of the edges of B boxes with the corners (B, 3) `low` and `high`."""
+    corners = low[:, None] + CORNERS * (high - low)[:, None]
+    return corners[:, EDGES].reshape(-1, 3)
+
+
+def wall_lines(low: Points, high: Points, far: Points, spacing: float) -> Points:
+    """Ends of the lines at multiples of `spacing` on three walls of a box, those that go through its corner `far`."""
+    lines: list[Points] = []
+    for axis in range(3):
+        at = spacing * np.arange(math.ceil(low[axis] / spacing - 1e-9), math.floor(high[axis] / spacing + 1e-9) + 1)
+        for wall in {0, 1, 2} - {axis}:
+            along = 3 - axis - wall
+            ends = np.empty((len(at), 2, 3))
+            ends[:, :, axis], ends[:, :, wall] = at[:, None], far[wall]
+            ends[:, :, along] = low[along], high[along]
+            lines.append(ends.reshape(-1, 3))
+    return np.concatenate(lines)

@@ -1,0 +1,65 @@
+"""What the colours of splats mean: their level, chunk, opacity or size."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..lod.traversal import CHUNK_NODES
+from ..model.gaussian import lod_opacity, spark_size
+from ..model.splats import FloatArray, Splats
+from ..render.color_scales import (
+    MAGMA,
+    PLASMA,
+    Coloring,
+    log_marks,
+    log_range,
+    range_of,
+    smooth,
+    top_opacity,
+    whole_numbers,
+    with_ends,
+)
+from ..support.ticks import ticks
+
+#: Marks nearer to an end of a scale than this would touch its own.
+APART = 0.04
+
+
+def color_by(by: str, splats: Splats, index: NDArray[np.int64], depth: NDArray[np.int32] | None) -> Coloring:
+    """The colours of some splats.
+
+    Args:
+        by: "level", which wants a depth, "opacity", "size" or "chunk".
+        splats: N of them.
+        index: (M,) of those that are coloured; at least one.
+        depth: (N,) edges from the root, where there is a tree.
+    """
+    if by == "level" and depth is not None:
+        level = depth[index]
+        if level.min() == level.max():  # the colour tells where in the tree it is
+            return whole_numbers("level", level, 0, int(depth.max()))
+        return whole_numbers("level", level, *range_of(level))
+    if by == "chunk":
+        chunk = index // CHUNK_NODES
+        return whole_numbers("chunk", chunk, 0, (len(splats) - 1) // CHUNK_NODES)
+    if by == "opacity":
+        return _opacity(lod_opacity(np.maximum(splats.opacity[index], 0)))
+    return _size(np.clip(spark_size(splats)[index], 1e-30, 1e30))
+
+
+def _opacity(values: FloatArray) -> Coloring:
+    top = top_opacity(values)
+    marks = [(tick / top, text) for tick, text in ticks(0, top, top / 6)]
+    if values.max() > top:
+        marks = with_ends(marks, None, f"{top:g} or more", APART)
+    return smooth("opacity" if values.max() <= 1 else "opacity (D)", values / top, MAGMA, marks)
+
+
+def _size(values: FloatArray) -> Coloring:
+    logs = np.log10(values.astype(np.float64))
+    low, high = log_range(logs)
+    marks = log_marks(low, high)
+    less = f"{10**low:.2g} or less" if logs.min() < low else None
+    more = f"{10**high:.2g} or more" if logs.max() > high else None
+    return smooth("feature size", (logs - low) / (high - low), PLASMA, with_ends(marks, less, more, APART))

@@ -1,0 +1,103 @@
+"""Charts as SVG and HTML that need no script: their colours come from the page's style, their figures from tooltips."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections.abc import Iterable, Mapping, Sequence
+from html import escape
+
+import numpy as np
+
+from ..tables.histograms import Histogram, edge_names
+
+#: The size of a chart, and what its axis and its figures take of that, in units of its view box.
+WIDTH, HEIGHT, BELOW, ABOVE = 360, 150, 20, 16
+
+#: Labels below a histogram.
+LABELS = 5
+
+#: Up to so many children, each number has a row of its own.
+SINGLE_CHILDREN = 8
+
+
+def text_of(value: object) -> str:
+    """Text of a page: escaped, and without what HTML or UTF-8 cannot hold."""
+    plain = str(value).encode("utf-8", "replace").decode("utf-8")
+    return escape("".join(mark if mark.isprintable() or mark in "\n\t" else "\ufffd" for mark in plain))
+
+
+def chart(counts: Sequence[int], tooltips: Sequence[str], labels: Iterable[tuple[float, str]], summary: str) -> str:
+    """A bar chart.
+
+    Args:
+        counts: of each bar.
+        tooltips: of each bar.
+        labels: places below it, in bars, and what stands there.
+        summary: for who cannot see it.
+    """
+    most, room = max(counts, default=0), HEIGHT - ABOVE - BELOW
+    step = WIDTH / max(1, len(counts))
+    gap = min(2.0, step / 5)
+    parts = [
+        f'<svg class="chart" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{text_of(summary)}">',
+        f'<text class="faint" x="0" y="{ABOVE - 5}">{most:,}</text>',
+    ]
+    base = HEIGHT - BELOW
+    parts.append(f'<line class="line" x1="0" y1="{ABOVE}" x2="{WIDTH}" y2="{ABOVE}"/>')
+    for number, (count, tooltip) in enumerate(zip(counts, tooltips, strict=True)):
+        # What is not nothing is seen.
+        height = max(1.0, room * count / most) if count else 0.0
+        x, y = number * step + gap / 2, base - height
+        parts.append(f'<g class="bar"><title>{text_of(tooltip)}</title>')
+        parts.append(f'<rect class="hit" x="{number * step:.2f}" y="{ABOVE}" width="{step:.2f}" height="{room}"/>')
+        parts.append(f'<rect x="{x:.2f}" y="{y:.2f}" width="{step - gap:.2f}" height="{height:.2f}"/></g>')
+    parts.append(f'<line class="base" x1="0" y1="{base}" x2="{WIDTH}" y2="{base}"/>')
+    for place, text in labels:
+        x = place * step
+        anchor = "start" if x < 0.06 * WIDTH else "end" if x > 0.94 * WIDTH else "middle"
+        parts.append(f'<text class="faint" x="{x:.1f}" y="{HEIGHT - 4}" text-anchor="{anchor}">{text_of(text)}</text>')
+    return "".join([*parts, "</svg>"])
+
+
+def histogram_chart(histogram: Histogram, name: str) -> str:
+    """A histogram as a chart; empty where there are no numbers."""
+    counts = [int(count) for count in histogram.counts]
+    if not counts:
+        return ""
+    names = edge_names(histogram.edges)
+    tooltips = [f"{low} to {high}: {count:,}" for low, high, count in zip(names, names[1:], counts, strict=False)]
+    at = np.unique(np.linspace(0, len(counts), LABELS).round().astype(int))
+    labels = [(float(place), f"{histogram.edges[place]:.3g}") for place in at]
+    if len(counts) == 1:
+        labels = [(0.5, names[0])]
+    peak = int(np.argmax(histogram.counts))
+    summary = f"Histogram of {name}: {sum(counts):,} numbers from {names[0]} to {names[-1]}, most at {tooltips[peak]}"
+    return chart(counts, tooltips, labels, summary)
+
+
+def children_groups(children: Mapping[str, int]) -> list[tuple[str, int]]:
+    """How many nodes have so many children: by single numbers at first, then by ranges that double.
+
+    Args:
+        children: counts of nodes, by their number of children as text.
+    """
+    if not children:
+        return []
+    most = max(int(number) for number in children)
+    ranges = [(number, number) for number in range(1, min(SINGLE_CHILDREN, most) + 1)]
+    while ranges[-1][1] < most:
+        ranges.append((ranges[-1][1] + 1, 2 * ranges[-1][1]))
+    ends = [high for _, high in ranges]
+    counts = [0] * len(ranges)
+    for number, count in children.items():
+        counts[bisect_left(ends, int(number))] += count
+    names = [f"{low}" if low == high else f"{low:,} to {high:,}" for low, high in ranges]
+    return list(zip(names, counts, strict=True))
+
+
+def bar(*shares: float) -> str:
+    """Bars of shares, 0..1, one after the other, for a cell of a table that has the numbers too."""
+    parts = "".join(
+        f'<i class="of{n}" style="width:{100 * share:.2f}%"></i>' for n, share in enumerate(shares) if share
+    )
+    return f'<div class="track" aria-hidden="true">{parts}</div>'

@@ -1,0 +1,122 @@
+"""`--plot`: the charts of a path and, below them, the path over the scene, as one PNG."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw
+
+from ..cameras.camera import Camera
+from ..model.splats import Splats
+from ..simulation.summary import look_at
+from ..support.errors import SparklodError
+from ..tables.columns import Row
+from ..tables.statistics import numbers, totals
+from . import charts
+from .camera_path import picture_of_path
+from .labels import BACKGROUND, FAINT, write_title
+
+#: What the frames to look at are called.
+CALLED = {
+    "churn": "most churn",
+    "bytes": "most fetched",
+    "coarsest": "coarsest",
+    "missing": "most missing",
+    "incomplete": "longest until complete",
+    "overdraw": "most overdraw",
+}
+
+
+@dataclass(frozen=True)
+class Scenery:
+    """What the picture of the path shows.
+
+    Attributes:
+        cameras: of the path.
+        splats: N of the cut of one frame.
+        level: (N,) edges from the root to each of them.
+        frame: index of the camera whose cut it is, which is marked; None for none.
+    """
+
+    cameras: Sequence[Camera]
+    splats: Splats
+    level: NDArray[Any]
+    frame: int | None = None
+
+
+@dataclass(frozen=True)
+class Plot:
+    """The bytes of a PNG, and why there is no picture of the path in it; None where there is, or none was wanted."""
+
+    png: bytes
+    note: str | None
+
+
+def plot(rows: Iterable[Row], title: str, scenery: Scenery | None = None) -> Plot:
+    """Draws a simulation: charts of all its columns that are not empty and, where it can be drawn, the path.
+
+    Args:
+        rows: of all frames; those of single instances are left out.
+        title: the name of the scene.
+        scenery: what the path leads through; None for charts alone.
+
+    Raises:
+        SparklodError: matplotlib is not installed, or there is no frame.
+    """
+    frames = totals(rows)
+    if not frames:
+        raise SparklodError("there is nothing to draw: the path has no frames")
+    images, note = [_head(title, frames), Image.fromarray(charts.draw(frames))], None
+    if scenery is not None:
+        try:
+            picture = picture_of_path(scenery.cameras, scenery.splats, scenery.level, frame=scenery.frame)
+            images.append(Image.open(io.BytesIO(picture)).convert("RGB"))
+        except SparklodError as error:
+            note = f"charts alone, without a picture of the path: {error}"
+    return Plot(_stacked(images), note)
+
+
+def _head(title: str, frames: Sequence[Row]) -> Image.Image:
+    """What stands above the charts."""
+    lines = [(_about(frames), FAINT)]
+    said = ", ".join(f"{CALLED[moment.what]}: frame {moment.frame:,}" for moment in look_at(frames))
+    if said:
+        lines.append((said, charts.PINK))
+    image = Image.new("RGB", (charts.WIDTH, 96 + 26 * len(lines)), BACKGROUND)
+    write_title(ImageDraw.Draw(image), 1.0, _one_line(title), lines)
+    return image
+
+
+def _about(frames: Sequence[Row]) -> str:
+    """What is the same for all charts, in a line."""
+    said = [f"{len(frames):,} frame" + ("" if len(frames) == 1 else "s")]
+    times = numbers(frames, "time_s")
+    if len(set(times)) > 1:
+        said.append(f"{times[-1] - times[0]:.3f} s")
+    sizes = list(dict.fromkeys((row["width"], row["height"]) for row in frames if row["width"] and row["height"]))
+    if sizes:
+        said.append(f"{sizes[0][0]} x {sizes[0][1]} pixels" + (" and others" if len(sizes) > 1 else ""))
+    budgets = sorted(set(numbers(frames, "budget")))
+    if budgets:
+        said.append(
+            f"a budget of {' to '.join(f'{each:,}' for each in dict.fromkeys([budgets[0], budgets[-1]]))} splats"
+        )
+    return ", ".join(said)
+
+
+def _one_line(text: str) -> str:
+    plain = "".join(mark if mark.isprintable() else "\N{REPLACEMENT CHARACTER}" for mark in text)
+    return plain if len(plain) <= 100 else f"{plain[:99]}…"
+
+
+def _stacked(images: Sequence[Image.Image]) -> bytes:
+    """The PNG of pictures of the same width, one below the other."""
+    pixels = np.concatenate([np.asarray(image) for image in images])
+    out = io.BytesIO()
+    Image.fromarray(pixels).save(out, "PNG", optimize=True)
+    return out.getvalue()

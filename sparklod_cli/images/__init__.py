@@ -1,0 +1,1 @@
+"""Pictures: pixels and files of them, contact sheets, animations, and how alike two are."""

@@ -1,0 +1,136 @@
+"""From images of floats to pixels of 8 bits, and to the bytes of picture files."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image as Pillow
+from PIL import ImageDraw
+
+from ..figures.labels import BACKGROUND, write_scale
+from ..render.color_scales import Coloring, smooth
+from ..render.rasterizer import Image
+
+#: (H, W, 3) or, with alpha that red, green and blue are not multiplied by, (H, W, 4).
+Pixels = NDArray[np.uint8]
+
+#: Red, green and blue, 0..1.
+Color = tuple[float, float, float]
+
+#: Deflate level of PNG: the next ones take twice as long for a few percent.
+PNG_LEVEL = 4
+
+#: Height of a picture whose scale is drawn in its own size; the least size, and the least picture that has a scale.
+WHOLE_HEIGHT, LEAST_UNIT, LEAST_PICTURE = 1000, 0.62, (400, 240)
+
+#: Width of what stands beside a picture, in thousandths of `WHOLE_HEIGHT`.
+SCALE_WIDTH = 190
+
+#: How many times as strong differences are shown where nobody says it.
+GAINS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0)
+
+#: Colours of a difference that is the same in all channels.
+GRAYS = ("000000", "ffffff")
+
+
+def over(image: Image, background: Color | None) -> Image:
+    """An image before a background: (H, W, 4) with alpha 1; as it is where that is None."""
+    if background is None:
+        return image
+    through = 1 - image[..., 3:]
+    rgb = image[..., :3] + through * np.asarray(background, np.float32)
+    return np.concatenate([rgb, np.ones_like(through)], axis=2)
+
+
+def eight_bits(image: Image) -> Pixels:
+    """(H, W, 4) of an image, colours divided by alpha; (H, W, 3) where alpha is 1 everywhere."""
+    alpha = image[..., 3:]
+    if (alpha == 1).all():
+        return _codes(image[..., :3])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        straight = np.where(alpha > 0, image[..., :3] / alpha, 0)
+    return np.concatenate([_codes(straight), _codes(alpha)], axis=2)
+
+
+def _codes(values: Image) -> Pixels:
+    codes: Pixels = np.rint(255 * np.clip(values, 0, 1)).astype(np.uint8)
+    return codes
+
+
+def difference(a: Image, b: Image, gain: float) -> Image:
+    """(H, W, 4) how far two images of alpha 1 are apart in each channel, so many times."""
+    shown = np.clip(gain * apart(a, b), 0, 1)
+    return np.concatenate([shown, np.ones_like(a[..., 3:])], axis=2).astype(np.float32)
+
+
+def scale_width(width: int, height: int) -> int:
+    """How much wider a picture becomes where it is told what its colours mean: 0 for one too small for that."""
+    if width < LEAST_PICTURE[0] or height < LEAST_PICTURE[1]:
+        return 0
+    return round(SCALE_WIDTH * _unit(width, height))
+
+
+def _unit(width: int, height: int) -> float:
+    return max(LEAST_UNIT, min(height / WHOLE_HEIGHT, width / (1.6 * WHOLE_HEIGHT)))
+
+
+def with_scale(pixels: Pixels, bar: Coloring) -> Pixels:
+    """A picture, and beside it, on the right, what its colours mean; one too small for that stays as it is."""
+    height, width = pixels.shape[:2]
+    wider = scale_width(width, height)
+    if not wider:
+        return pixels
+    panel = np.empty((height, wider, pixels.shape[2]), np.uint8)
+    panel[...] = [*bytes.fromhex(BACKGROUND[1:]), 255][: pixels.shape[2]]
+    picture = Pillow.fromarray(np.concatenate([pixels, panel], axis=1))
+    write_scale(picture, ImageDraw.Draw(picture), _unit(width, height), bar)
+    return np.asarray(picture)
+
+
+def apart(a: Image, b: Image) -> Image:
+    """(H, W, 3) how far two images of alpha 1 are apart in each channel, 0..1."""
+    return np.abs(np.clip(a[..., :3], 0, 1) - np.clip(b[..., :3], 0, 1))
+
+
+def gain_for(differences: Sequence[Image]) -> float:
+    """How many times as strong differences are to be shown, so that nearly all of them are seen and few are cut.
+
+    Args:
+        differences: (H, W, 3) of `apart`.
+
+    Returns:
+        1, 2, 5, 10, ... 1000, with which 99 % of the pixels that differ are not cut; 1 where none does.
+    """
+    largest = np.concatenate([each.max(axis=2).ravel() for each in differences])
+    differing = largest[largest > 0]
+    if not len(differing):
+        return GAINS[0]
+    most = 1 / float(np.percentile(differing, 99))
+    return next((gain for gain in reversed(GAINS) if gain <= most), GAINS[0])
+
+
+def difference_bar(gain: float) -> Coloring:
+    """What the colours of `difference` mean: how far a channel is off, of 1."""
+    marks = [(0.0, "0"), (0.5, f"{0.5 / gain:.3g}"), (1.0, f"{1 / gain:.3g}" + " or more" * (gain > 1))]
+    return smooth("difference", np.empty(0), GRAYS, marks)
+
+
+def encode(pixels: Pixels, form: str) -> bytes:
+    """The bytes of a "png" or, without loss, of a "webp"."""
+    out = io.BytesIO()
+    picture = Pillow.fromarray(pixels)
+    if form == "webp":
+        picture.save(out, "WEBP", lossless=True, exact=True, method=2)
+    else:
+        picture.save(out, "PNG", compress_level=PNG_LEVEL)
+    return out.getvalue()
+
+
+def encode_floats(values: NDArray[np.float32]) -> bytes:
+    """The bytes of a .npy file."""
+    out = io.BytesIO()
+    np.save(out, values)
+    return out.getvalue()

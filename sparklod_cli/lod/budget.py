@@ -1,0 +1,68 @@
+"""Budgets as people write them: a count of splats, or a share of the leaves."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from fractions import Fraction
+
+from ..support.units import parse_count
+
+#: A share of the leaves, in percent, with at most nine digits after the point.
+SHARE = re.compile(r"([0-9]{1,3}(?:\.[0-9]{1,9})?|\.[0-9]{1,9})\s*%")
+
+
+@dataclass(frozen=True)
+class Budget:
+    """The most splats that a cut may have.
+
+    Attributes:
+        text: as it was written: "5%" or "500k".
+        share: of the leaves of all instances together; None for a count.
+        count: splats; None for a share.
+    """
+
+    text: str
+    share: Fraction | None
+    count: int | None
+
+    @classmethod
+    def of_count(cls, count: int) -> Budget:
+        """A budget of so many splats."""
+        return cls(f"{count}", None, count)
+
+    def of(self, leaves: int) -> int:
+        """Splats, where all instances together have so many leaves; at least 1."""
+        if self.count is not None:
+            return self.count
+        assert self.share is not None
+        return max(1, int(self.share * leaves))
+
+
+def parse_budget(text: str) -> Budget:
+    """The budget of a text such as "5%" or "500k".
+
+    Raises:
+        ValueError: it is neither a share nor a count, or it is 0.
+    """
+    text = text.strip()
+    found = SHARE.fullmatch(text)
+    try:
+        budget = Budget(text, Fraction(found[1]) / 100, None) if found else Budget(text, None, parse_count(text))
+    except ValueError:
+        raise ValueError(f"{text!r} is neither a share such as 5% nor a count such as 500k") from None
+    if not (budget.share or budget.count):
+        raise ValueError(f"a budget of {text!r} leaves nothing to draw; give more than 0")
+    return budget
+
+
+def parse_budgets(text: str) -> tuple[Budget, ...]:
+    """The budgets of a text such as "2%,5%,500k".
+
+    Raises:
+        ValueError: there is none, or one of them is no budget.
+    """
+    budgets = tuple(map(parse_budget, filter(None, map(str.strip, text.split(",")))))
+    if not budgets:
+        raise ValueError(f"{text!r} names no budget, such as 5% or 500k")
+    return budgets

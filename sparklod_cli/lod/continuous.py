@@ -1,0 +1,259 @@
+"""Cuts that do not pop: nodes fade into their children as the camera comes nearer.
+
+An ordinary cut divides a node or does not, by whether its *limit* L, the least pixel scale on the way to it from the
+root, is above a threshold T. Here a node is divided by a share that rises smoothly from 0 to 1,
+
+    t(n) = smoothstep(ln(L(n) / T) / ln(width)),      0 where L <= T, 1 where L >= width * T, always 0 for a leaf,
+
+and drawn with the weight by which its parent is divided and it is not:
+
+    weight(n) = t(parent of n) - t(n),                1 - t(n) for a root.
+
+L does not grow from a node to its children, so t does not either, and no weight is negative; on the way from the root
+to any leaf the weights sum to 1, for they telescope. Sizes over distances, their least and T are continuous in the
+camera's position, hence the weights are: if no pixel scale changes by more than a factor of exp(d), no weight changes
+by more than 6 * d / ln(width). (A smoothstep is at most 1.5 times as steep as its argument, L and T move by d each, and
+a weight has two shares.) Of foveations that holds for cones, unless both are one, but not for a frustum, which jumps at
+its edges; directions count as positions do.
+
+With a budget, T is where the weights sum to it. They sum to W(T) = roots + sum of t(n) * (children of n - 1), which is
+continuous and falls with T; so there is such a T, and it moves by no more than the pixel scales do.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..model.gaussian import linear_opacity, lod_opacity
+from ..model.lod_tree import LodTree
+from ..model.splats import FloatArray, Splats
+from ..support.defaults import BLEND
+from ..world import World
+from .kernels.pixel_scale import FRUSTUM, NEAREST, NO_FOVEATION
+from .traversal import Matrix, Traversal, View, views_of
+
+#: Halvings of the interval in which the threshold is, which is no longer than the width.
+HALVINGS = 40
+
+#: Numbers of a `VIEW` that say how pixel scales count by direction.
+FOVEATION = ("side", "behind", "inner", "outer")
+
+Shares = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class BlendedCut:
+    """The nodes that are drawn; S of them, of all instances.
+
+    Attributes:
+        node: (S,) uint32 index in its tree; ascending within an instance.
+        instance: (S,) uint16, ascending.
+        weight: (S,) float64, above 0 and at most 1.
+        threshold: pixel scale at or under which nothing is divided; 0 where all is.
+    """
+
+    node: NDArray[np.uint32]
+    instance: NDArray[np.uint16]
+    weight: Shares
+    threshold: float
+
+    def __len__(self) -> int:
+        return len(self.node)
+
+
+class ContinuousCuts:
+    """Finds continuous cuts.
+
+    Args:
+        traversal: whose trees and instances they are of.
+    """
+
+    def __init__(self, traversal: Traversal) -> None:
+        self._forest, self._instances = traversal.forest, traversal.instances
+        bases = self._forest.node_base
+        self._inner = [_Inner(self._forest.nodes[bases[i] : bases[i + 1]]) for i in range(len(self._forest))]
+
+    def cut(self, view: View, *, budget: int, smallest: float = 0.0, width: float = BLEND) -> BlendedCut:
+        """The continuous cut.
+
+        Args:
+            view: where the camera is.
+            budget: what the weights sum to, all instances together, unless `smallest` or the leaves come first; at
+                least as many as there are instances. More nodes are drawn, for those that fade are, too.
+            smallest: nodes of this pixel scale are not divided; see `pixel_limit`.
+            width: nodes of so many times the threshold are divided wholly; above 1.
+        """
+        views = views_of(self._forest, self._instances, view)
+        inner = [self._inner[instance.tree] for instance in self._instances]
+        limits = [each.limits(record) for each, record in zip(inner, views, strict=True)]
+        more = np.concatenate([each.more for each in inner])
+        threshold = max(find_threshold(np.concatenate(limits), more, budget - len(views), width), smallest)
+        parts = [each.blended(shares(limit, threshold, width)) for each, limit in zip(inner, limits, strict=True)]
+        return BlendedCut(
+            node=np.concatenate([node for node, _ in parts]),
+            instance=np.repeat(np.arange(len(parts), dtype=np.uint16), [len(node) for node, _ in parts]),
+            weight=np.concatenate([weight for _, weight in parts]),
+            threshold=threshold,
+        )
+
+
+def shares(limit: Shares, threshold: float, width: float) -> Shares:
+    """By how much nodes are divided, 0..1: t(n) above.
+
+    Args:
+        limit: (M,) of nodes with children; at least 0.
+        threshold: at least 0; at 0, all of a limit above that are divided.
+        width: above 1.
+    """
+    with np.errstate(divide="ignore"):
+        if not threshold:
+            return (limit > 0).astype(np.float64)
+        return _smoothstep(np.log(limit / threshold) / math.log(width))
+
+
+def _smoothstep(x: Shares) -> Shares:
+    x = np.clip(x, 0, 1)
+    return x * x * (3 - 2 * x)
+
+
+def find_threshold(limit: Shares, more: NDArray[np.int64], room: int, width: float) -> float:
+    """The threshold at which `shares` of nodes add as many as there is room for; 0 where there is room for all.
+
+    Args:
+        limit: (M,) of nodes with children.
+        more: (M,) by how many their children are more than one.
+        room: what may be added to the roots.
+        width: above 1.
+    """
+    order = np.argsort(-limit, kind="stable")
+    total = np.cumsum(more[order])
+    over = int(np.searchsorted(total, room, side="right"))
+    if over == len(order) or not limit[order[over]]:
+        return 0.0
+    # At the limit of the first node that is too many, nodes above it are not; `width` times lower it is one of them.
+    most = float(limit[order[over]])
+    undecided = (limit * width > most) & (limit < most * width)
+    room -= int(more[limit >= most * width].sum())
+    places, adds = np.log(limit[undecided] / most) / math.log(width), more[undecided]
+    low, high = -1.0, 0.0
+    for _ in range(HALVINGS):
+        middle = (low + high) / 2
+        if adds @ _smoothstep(places - middle) > room:
+            low = middle
+        else:
+            high = middle
+    return most * float(width**high)
+
+
+class _Inner:
+    """The nodes of a tree that have children, from the root on, level by level.
+
+    Attributes:
+        more: (M,) by how many their children are more than one.
+    """
+
+    def __init__(self, nodes: NDArray[np.void]) -> None:
+        tree = LodTree(nodes["child_count"].astype(np.uint16), nodes["child_start"])
+        depth = tree.depths()
+        inner = np.flatnonzero(tree.child_count)
+        self._node = inner[np.argsort(depth[inner], kind="stable")]
+        self._count = tree.child_count[self._node].astype(np.int64)
+        self._start = tree.child_start[self._node].astype(np.int64)
+        self.more = self._count - 1
+        self._place = np.full(len(tree), -1, np.int64)  # of each node among these; -1 for a leaf
+        self._place[self._node] = np.arange(len(self._node))
+        above = np.zeros(len(tree), np.int64)
+        above[_ranges(self._start, self._count)] = np.repeat(np.arange(len(self._node)), self._count)
+        self._above = above[self._node]
+        ends = np.cumsum(np.bincount(depth[self._node]))
+        self._levels = [slice(a, b) for a, b in itertools.pairwise(ends)]
+        self._values = [np.ascontiguousarray(nodes[name][self._node]) for name in ("x", "y", "z", "size")]
+
+    def limits(self, view: np.void) -> Shares:
+        """(M,) the least pixel scale on the way from the root to each."""
+        limit = pixel_scales(self._values, view)
+        for level in self._levels:
+            limit[level] = np.minimum(limit[level], limit[self._above[level]])
+        return np.minimum(limit, np.finfo(np.float32).max).astype(np.float64)
+
+    def blended(self, share: Shares) -> tuple[NDArray[np.uint32], Shares]:
+        """The nodes of a weight above 0, ascending, and their weights; share: (M,) by how much each is divided."""
+        if not len(share):
+            return np.zeros(1, np.uint32), np.ones(1)
+        divided = np.flatnonzero(share > 0)
+        count = self._count[divided]
+        node = np.concatenate([[0], _ranges(self._start[divided], count)])
+        weight = np.concatenate([[1.0], np.repeat(share[divided], count)])
+        own = self._place[node]
+        weight -= np.where(own >= 0, share[own], 0)
+        drawn = np.flatnonzero(weight > 0)
+        drawn = drawn[np.argsort(node[drawn])]
+        return node[drawn].astype(np.uint32), weight[drawn]
+
+
+def _ranges(start: NDArray[np.int64], count: NDArray[np.int64]) -> NDArray[np.int64]:
+    """start[0], start[0] + 1, ..., so many as `count` says, then those of the next."""
+    first = np.cumsum(count) - count
+    return np.repeat(start - first, count) + np.arange(count.sum())
+
+
+def pixel_scales(values: Sequence[NDArray[np.float32]], view: np.void) -> NDArray[np.float32]:
+    """(N,) pixel scales, the very numbers of the traversal's; infinite where those are not numbers.
+
+    Args:
+        values: x, y, z and sizes, (N,) each.
+        view: a `kernels.sight.VIEW`.
+    """
+    one = np.float32(1)
+    with np.errstate(all="ignore"):
+        delta = [value - view[f"origin_{axis}"] for axis, value in zip("xyz", values, strict=False)]
+
+        def along(way: str) -> NDArray[np.float32]:
+            x, y, z = (part * view[f"{way}_{axis}"] for axis, part in zip("xyz", delta, strict=True))
+            return (x + y) + z
+
+        x, y, z = delta
+        distance = np.sqrt((x * x + y * y) + z * z)
+        inverse = one / np.where(distance > NEAREST, distance, NEAREST)
+        scale: NDArray[np.float32] = values[3] * inverse * view["lod_scale"]
+        if view["kind"] != NO_FOVEATION:
+            ahead, side, behind, inner, outer = along("forward"), *(view[name] for name in FOVEATION)
+            if view["kind"] == FRUSTUM:
+                seen = (abs(along("right")) <= inner * ahead) & (abs(along("up")) <= outer * ahead)
+                weight = np.where(seen, one, side)
+            else:
+                cosine = ahead * inverse
+                within = side + (one - side) * ((cosine - outer) / (inner - outer))
+                beyond = behind + (side - behind) * (cosine / outer)
+                weight = np.where(cosine >= inner, one, np.where(cosine >= outer, within, beyond))
+            scale = np.where(ahead <= 0, behind, weight) * scale
+        return np.where(np.isnan(scale), np.float32(np.inf), abs(scale))
+
+
+def faded(opacity: FloatArray, weight: Shares) -> FloatArray:
+    """(N,) linear opacities of splats that are drawn with a weight: that of D times the weight, Spark's parameter.
+
+    A parent and children of half the weight let more through than either alone; two opaque ones a quarter, where each
+    lets through nothing. Ways to make up for that were tried, and pop no less; see docs/decisions. Linear opacity times
+    the weight pops as little, too, but a splat of 1000 would be opaque at a thousandth of it.
+    """
+    fading: FloatArray = np.where(weight < 1, linear_opacity(lod_opacity(opacity) * weight), opacity)
+    return fading.astype(np.float32)
+
+
+def parts_of(world: World, cut: BlendedCut) -> list[tuple[Splats, Matrix]]:
+    """For `render.shown.show`: the splats of each instance, as opaque as they are drawn, and where it stands."""
+    parts = []
+    for number, instance in enumerate(world.instances):
+        mine = cut.instance == number
+        splats = world.trees[instance.tree].scene.splats.take(cut.node[mine])
+        splats = dataclasses.replace(splats, opacity=faded(splats.opacity, cut.weight[mine]))
+        parts.append((splats, instance.object_to_world))
+    return parts

@@ -1,0 +1,153 @@
+"""What a cut is like: how fine, where its nodes are on the screen, and what changed since the one before."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .kernels import cut_statistics as kernels
+from .traversal import Cut, Forest, Instance, View, pixel_limit
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What some nodes of a cut are like.
+
+    Attributes:
+        selected, leaves: how many, and of them those without children.
+        frontier: those that wait in the queue when it stops.
+        in_frustum, outside, behind: by where their centres are: in the picture, beside it, behind the camera.
+        level_min, level_mean, level_max: links from the root; None where nothing is selected.
+        px_p50, px_p95: percentiles of the sizes of those in the picture, pixels; None where there are none.
+        overdraw: how many of them cover a pixel, in the mean.
+    """
+
+    selected: int
+    leaves: int
+    frontier: int
+    in_frustum: int
+    outside: int
+    behind: int
+    level_min: int | None
+    level_mean: float | None
+    level_max: int | None
+    px_p50: float | None
+    px_p95: float | None
+    overdraw: float
+
+
+def measure(
+    forest: Forest,
+    level: NDArray[np.int32],
+    cut: Cut,
+    view: View,
+    *,
+    size: tuple[int, int],
+    by_instance: bool = False,
+) -> tuple[Measured, list[Measured]]:
+    """A cut as a whole and, if they are wanted, each of its instances.
+
+    Args:
+        forest: its trees.
+        level: (nodes,) links from the root, of all trees.
+        cut: what was found for `view`.
+        view: the camera.
+        size: of the picture, pixels.
+        by_instance: each instance is wanted, too.
+    """
+    width, height = size
+    counts = np.empty((len(cut.views), kernels.COUNTS), np.int64)
+    sizes = np.empty(len(cut), np.float32)
+    kernels.measure(
+        forest.nodes,
+        level,
+        cut.views,
+        cut.node,
+        cut.limit.view(np.int32),
+        cut.instance,
+        np.float32(math.tan(view.fov_x / 2)),
+        np.float32(math.tan(view.fov_y / 2)),
+        np.float32(pixel_limit(view.fov_y, height)),
+        float(width * height),
+        counts,
+        sizes,
+    )
+    total = counts.sum(axis=0)
+    total[kernels.LEVEL_MIN] = counts[:, kernels.LEVEL_MIN].min()
+    total[kernels.LEVEL_MAX] = counts[:, kernels.LEVEL_MAX].max()
+    whole = _measured(total, sizes, width * height)
+    if not by_instance:
+        return whole, []
+    order = np.argsort(cut.instance, kind="stable")
+    parts = np.split(sizes[order], np.cumsum(counts[:-1, kernels.SELECTED]))
+    return whole, [_measured(row, part, width * height) for row, part in zip(counts, parts, strict=True)]
+
+
+def _measured(row: NDArray[np.int64], sizes: NDArray[np.float32], pixels: int) -> Measured:
+    count = [int(value) for value in row]
+    selected = count[kernels.SELECTED]
+    seen = np.sort(sizes[sizes >= 0])  # several times as fast as numpy.percentile
+    return Measured(
+        selected=selected,
+        leaves=count[kernels.LEAVES],
+        frontier=count[kernels.FRONTIER],
+        in_frustum=count[kernels.IN_FRUSTUM],
+        outside=count[kernels.OUTSIDE],
+        behind=count[kernels.BEHIND],
+        level_min=count[kernels.LEVEL_MIN] if selected else None,
+        level_mean=count[kernels.LEVEL_SUM] / selected if selected else None,
+        level_max=count[kernels.LEVEL_MAX] if selected else None,
+        px_p50=_percentile(seen, 0.50),
+        px_p95=_percentile(seen, 0.95),
+        overdraw=count[kernels.AREA] / kernels.AREA_PARTS / pixels,
+    )
+
+
+def _percentile(ascending: NDArray[np.float32], share: float) -> float | None:
+    """Between two numbers it is interpolated linearly; None where there is no number."""
+    if not len(ascending):
+        return None
+    at = share * (len(ascending) - 1)
+    low = int(at)
+    below, above = float(ascending[low]), float(ascending[min(low + 1, len(ascending) - 1)])
+    return below + (at - low) * (above - below) if above > below else below  # both may be infinite
+
+
+class Changes:
+    """Compares each cut with the one before it.
+
+    Args:
+        forest: the trees.
+        instances: of them.
+    """
+
+    def __init__(self, forest: Forest, instances: Sequence[Instance]) -> None:
+        sizes = np.diff(forest.node_base)
+        bits = [int(sizes[instance.tree]) for instance in instances]
+        # Each instance begins a word of its own.
+        ends = np.cumsum([-(-count // 32) * 32 for count in bits])
+        self._base = np.concatenate([[0], ends[:-1]]).astype(np.int64)
+        self._drawn = np.zeros(int(ends[-1]) // 32, np.uint32)
+        self._last: tuple[NDArray[np.uint32], NDArray[np.uint16]] | None = None
+        self._counts = np.zeros(len(bits), np.int64)
+
+    def next(self, cut: Cut) -> list[tuple[int, int | None, int]]:
+        """For each instance how many nodes it has, how many of them the last cut had, and how many that had.
+
+        The second is None for the first cut, which nothing can be compared with.
+        """
+        kept = np.zeros(len(self._base), np.int64)
+        old = self._last or (cut.node[:0], cut.instance[:0])
+        kernels.exchange(self._drawn, self._base, cut.node, cut.instance, *old, kept)
+        counts = np.bincount(cut.instance, minlength=len(self._base))
+        first = self._last is None
+        result = [
+            (int(new), None if first else int(same), int(before))
+            for new, same, before in zip(counts, kept, self._counts, strict=True)
+        ]
+        self._last, self._counts = (cut.node, cut.instance), counts
+        return result

@@ -1,0 +1,83 @@
+"""`LodTree`, the links between the nodes of a Level-of-Detail tree, and its invariants."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..support.errors import TreeError
+
+#: The child count is stored as a uint16.
+MAX_CHILDREN = 65535
+
+
+@dataclass(frozen=True)
+class LodTree:
+    """The children of each of M nodes: `child_start .. child_start + child_count`, consecutive.
+
+    Attributes:
+        child_count: (M,) uint16, 0 for a leaf.
+        child_start: (M,) uint32 index of the first child, 0 for a leaf.
+    """
+
+    child_count: NDArray[np.uint16]
+    child_start: NDArray[np.uint32]
+
+    def __len__(self) -> int:
+        return len(self.child_count)
+
+    @property
+    def is_leaf(self) -> NDArray[np.bool_]:
+        """(M,) true where a node has no children."""
+        return self.child_count == 0
+
+    def depths(self) -> NDArray[np.int32]:
+        """(M,) number of edges from the root to each node.
+
+        Follows the tree level by level, so it wants a tree that `validate` has passed.
+        """
+        depth = np.zeros(len(self), np.int32)
+        frontier = np.zeros(1, np.int64)
+        level = 0
+        while frontier.size:
+            depth[frontier] = level
+            count = self.child_count[frontier].astype(np.int64)
+            start = self.child_start[frontier].astype(np.int64)
+            first = np.cumsum(count) - count
+            frontier = np.repeat(start - first, count) + np.arange(count.sum())
+            level += 1
+        return depth
+
+    def validate(self) -> None:
+        """Checks that this is one tree with its root at 0; linear time.
+
+        Every node but the root is the child of exactly one node, which comes before it; a leaf starts at 0.
+
+        Raises:
+            TreeError: naming the first node that breaks an invariant.
+        """
+        if len(self.child_count) != len(self.child_start):
+            raise TreeError(f"{len(self.child_count)} child counts but {len(self.child_start)} child starts")
+        if len(self) == 0:
+            raise TreeError("the tree has no node")
+        node = np.flatnonzero(self.child_count)
+        start = self.child_start[node].astype(np.int64)
+        end = start + self.child_count[node]
+        self._fail_at(np.flatnonzero(self.is_leaf & (self.child_start != 0)), "is a leaf with a child_start")
+        self._fail_at(node[start <= node], "comes after one of its children")
+        self._fail_at(node[end > len(self)], "has children past the last node")
+        # Runs of children that are sorted by their start tile 1..M exactly when each begins where the last one ended.
+        by_start = np.argsort(start, kind="stable")
+        expected = np.concatenate([[1], end[by_start]])
+        self._fail_at(
+            node[by_start[start[by_start] != expected[:-1]]], "shares children with another node or skips some"
+        )
+        if expected[-1] != len(self):
+            raise TreeError(f"node {expected[-1]} is nobody's child")
+
+    @staticmethod
+    def _fail_at(nodes: NDArray[np.int64], what: str) -> None:
+        if nodes.size:
+            raise TreeError(f"node {nodes[0]} {what}")

@@ -1,0 +1,84 @@
+"""Which splats go into a scene: what cannot be drawn is dropped, what is not wanted cropped, all of it counted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..support.errors import InvalidSplatsError
+from .splats import INVALID, Splats, describe_invalid
+
+Vector = tuple[float, float, float]
+
+#: Why a splat was left out, in the order in which the reasons are tried, and how a report says it.
+REASONS = INVALID | {
+    "zero_opacity": "zero opacity",
+    "zero_scale": "zero scale",
+    "low_opacity": "below --min-opacity",
+    "cropped": "cropped",
+}
+
+
+@dataclass(frozen=True)
+class Selection:
+    """What to keep.
+
+    Attributes:
+        drop_invalid: drop splats that are invalid (`splats.INVALID`), instead of failing.
+        min_opacity: keep splats of at least this opacity, 0..1.
+        min_box, max_box: keep centres inside this box, borders (as float32) included; world units.
+        within: keep centres in this ball, x y z and radius.
+    """
+
+    drop_invalid: bool = False
+    min_opacity: float = 0.0
+    min_box: Vector | None = None
+    max_box: Vector | None = None
+    within: tuple[Vector, float] | None = None
+
+    def apply(self, splats: Splats) -> tuple[Splats, dict[str, int]]:
+        """The splats that are kept, in order, and how many were dropped for each of `REASONS` that occurred.
+
+        Raises:
+            InvalidSplatsError: some are invalid and `drop_invalid` is not set, or none is left.
+        """
+        if len(splats) == 0:
+            raise InvalidSplatsError("it has no splats")
+        invalid = splats.invalid()
+        if invalid and not self.drop_invalid:
+            raise InvalidSplatsError(f"{describe_invalid(invalid)}, add --on-invalid drop to leave them out")
+        keeps = {kind: ~mask for kind, mask in invalid.items()} | {
+            "zero_opacity": splats.opacity > 0,
+            "zero_scale": splats.scale.max(axis=1, initial=0) > 0,
+            "low_opacity": splats.opacity >= self.min_opacity,
+            "cropped": self._inside(splats.center),
+        }
+        keep = np.ones(len(splats), np.bool_)
+        dropped = {}
+        for reason in (reason for reason in REASONS if reason in keeps):
+            before = int(np.count_nonzero(keep))
+            keep &= keeps[reason]
+            dropped[reason] = before - int(np.count_nonzero(keep))
+        dropped = {reason: count for reason, count in dropped.items() if count}
+        if not keep.any():
+            raise InvalidSplatsError(f"no splat is left of {len(splats):,} ({describe(dropped)})")
+        return (splats if keep.all() else splats.take(keep)), dropped
+
+    def _inside(self, center: NDArray[np.float32]) -> NDArray[np.bool_]:
+        inside = np.ones(len(center), np.bool_)
+        if self.min_box is not None:
+            inside &= (center >= np.asarray(self.min_box, np.float32)).all(axis=1)
+        if self.max_box is not None:
+            inside &= (center <= np.asarray(self.max_box, np.float32)).all(axis=1)
+        if self.within is not None:
+            middle, radius = self.within
+            offset = center.astype(np.float64) - middle
+            inside &= np.einsum("ij,ij->i", offset, offset) <= radius * radius
+        return inside
+
+
+def describe(dropped: dict[str, int]) -> str:
+    """ "12 not finite, 3 cropped", for people."""
+    return ", ".join(f"{count:,} {REASONS[reason]}" for reason, count in dropped.items())

@@ -1,0 +1,26 @@
+"""Spherical harmonics: constants and the table of degrees."""
+
+from __future__ import annotations
+
+from ..support.defaults import MAX_SH_DEGREE
+from ..support.errors import FormatError
+
+#: Y_00, the constant term of the real spherical harmonics: 1 / (2 * sqrt(pi)).
+SH_C0 = 0.28209479177387814
+
+#: Coefficients a colour channel above the constant term, by degree: (degree + 1) ** 2 - 1.
+COEFFICIENTS = (0, 3, 8, 15, 24)
+
+
+def degree_of(coefficients: int) -> int:
+    """The degree that has this many coefficients a channel; `FormatError` where there is none."""
+    try:
+        return COEFFICIENTS.index(coefficients)
+    except ValueError:
+        known = ", ".join(map(str, COEFFICIENTS))
+        raise FormatError(f"{coefficients} SH coefficients a channel, expected one of {known}") from None
+
+
+def notes_on_degree(degree: int) -> tuple[str, ...]:
+    """What a reader says of a file of this degree: that it is cut, where it is."""
+    return (f"SH degree {degree} is cut to {MAX_SH_DEGREE}",) if degree > MAX_SH_DEGREE else ()

@@ -1,0 +1,157 @@
+"""What colours mean where they are not the splats' own: numbers of splats, or of pixels, on a scale."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..cameras.camera import Camera
+from ..lod.traversal import CHUNK_NODES
+from ..model.gaussian import lod_opacity, moved, spark_size
+from ..model.splats import FloatArray
+from ..scenery import Index, Piece, Scenery, Source
+from ..support.errors import SparklodError
+from ..support.ticks import ticks
+from .color_scales import (
+    CLIPPED,
+    MAGMA,
+    PLASMA,
+    Coloring,
+    log_marks,
+    log_range,
+    smooth,
+    top_opacity,
+    whole_numbers,
+    with_ends,
+)
+from .settings import RasterSettings
+
+#: So many splats and cameras are looked at to find the ends of a scale.
+SAMPLE, CAMERAS = 1 << 18, 64
+
+#: So many cuts are found for that, which takes longer.
+CUTS = 16
+
+#: Marks nearer to an end of a scale than this would touch its own.
+APART = 0.05
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Which numbers have which colours; the same for all pictures of a run.
+
+    Attributes:
+        bar: the colours, with their meaning.
+        low, high: numbers of the first colour and of the last; those beyond have these, too.
+        log: they are powers of ten.
+    """
+
+    bar: Coloring
+    low: float
+    high: float
+    log: bool = False
+
+    def rgb(self, values: FloatArray) -> NDArray[np.float32]:
+        """(..., 3) colours, 0..1, of numbers; what is not a number has the first."""
+        values = np.asarray(values, np.float64)
+        if self.log:
+            values = np.log10(np.clip(values, 1e-30, 1e30))
+        at = np.nan_to_num((values - self.low) / ((self.high - self.low) or 1))
+        index = np.rint(np.clip(at, 0, 1) * (len(self.bar.ramp) - 1)).astype(np.intp)
+        colors: NDArray[np.float32] = (self.bar.ramp[index] / 255).astype(np.float32)
+        return colors
+
+
+def values_of(by: str, piece: Piece) -> FloatArray:
+    """(M,) the numbers that some splats are coloured by: "level", "lod-opacity", "size" or "chunk".
+
+    Sizes are in world units; splats of files without a tree are of level 0.
+    """
+    if by in ("level", "chunk"):
+        return numbers_of(by, piece.source, piece.index).astype(np.float64)
+    if by == "lod-opacity":
+        return lod_opacity(np.maximum(piece.splats.opacity, 0))
+    return spark_size(piece.splats) * np.float32(np.cbrt(np.linalg.det(piece.object_to_world[:3, :3])))
+
+
+def scale_of_splats(by: str, scenery: Scenery, cameras: Sequence[Camera]) -> Scale:
+    """The scale of a colour that is of splats, for all that cameras may see; of whole numbers, for what they do see.
+
+    Raises:
+        SparklodError: by level, where no file is a tree.
+    """
+    if by == "level" and all(source.level is None for source in scenery.sources):
+        raise SparklodError("there are no levels to colour by: no file is a Level-of-Detail tree")
+    if by in ("chunk", "level"):
+        return _whole(by, scenery, cameras)
+    pieces = scenery.candidates()
+    every = max(1, sum(len(piece.index) for piece in pieces) // SAMPLE)
+    values = np.concatenate([values_of(by, piece)[::every] for piece in pieces])
+    return _opacities(values) if by == "lod-opacity" else _sizes(values)
+
+
+def scale_of_depth(scenery: Scenery, cameras: Sequence[Camera], look: RasterSettings) -> Scale:
+    """From the nearest splats to the farthest that cameras see, but for a few."""
+    pieces = scenery.candidates()
+    every = max(1, sum(len(piece.index) for piece in pieces) // SAMPLE)
+    centers = np.concatenate([moved(piece.splats.center[::every], piece.object_to_world) for piece in pieces])
+    seen = [np.empty(0)]
+    for camera in cameras[:: max(1, len(cameras) // CAMERAS)]:
+        local = (centers - camera.position) @ camera.camera_to_world[:3, :3]
+        depth = -local[:, 2]
+        with np.errstate(all="ignore"):
+            inside = (depth > look.near) & (depth < look.far)
+            inside &= abs(camera.focal[0] * local[:, 0] / depth) <= camera.width / 2
+            inside &= abs(camera.focal[1] * local[:, 1] / depth) <= camera.height / 2
+        seen.append(depth[inside])
+    depths = np.concatenate(seen)
+    low, high = np.percentile(depths, [CLIPPED, 100 - CLIPPED]) if len(depths) else (look.near, look.near + 1)
+    # A scene that is as good as flat gets no more contrast than there is.
+    high = max(high, low + 1e-3 * abs(low))
+    return _linear("depth", float(low), float(high), tuple(reversed(PLASMA)), ends=True)
+
+
+def scale_of_overdraw(counts: Sequence[FloatArray]) -> Scale:
+    """From none to the most that but a few pixels of some pictures have."""
+    most = max(float(np.percentile(count, 99.9)) for count in counts)
+    return _linear("overdraw", 0.0, max(1.0, float(math.ceil(most))), MAGMA, ends=True)
+
+
+def _whole(by: str, scenery: Scenery, cameras: Sequence[Camera]) -> Scale:
+    """From the least to the most that some cameras see; others may see less, or more."""
+    every = -(-len(cameras) // CUTS)
+    seen = [numbers_of(by, source, index) for camera in cameras[::every] for source, index in scenery.drawn(camera)]
+    ends = [(int(numbers.min()), int(numbers.max())) for numbers in seen if len(numbers)] or [(0, 0)]
+    low, high = min(low for low, _ in ends), max(high for _, high in ends)
+    beyond = int(every > 1)
+    return Scale(whole_numbers(by, np.arange(low - beyond, high + 1 + beyond), low, high), low, high)
+
+
+def numbers_of(by: str, source: Source, index: Index) -> NDArray[np.int64]:
+    """(M,) the "level" or the "chunk" of some splats of a file; without a tree, all are of level 0."""
+    if by == "chunk":
+        return source.first_chunk + index // CHUNK_NODES
+    return np.zeros(len(index), np.int64) if source.level is None else source.level[index].astype(np.int64)
+
+
+def _linear(title: str, low: float, high: float, stops: tuple[str, ...], *, ends: bool) -> Scale:
+    marks = [((tick - low) / (high - low), text) for tick, text in ticks(low, high, (high - low) / 6)]
+    if ends:
+        marks = with_ends(marks, f"{low:.3g} or less" if low else None, f"{high:.3g} or more", APART)
+    return Scale(smooth(title, np.empty(0), stops, marks), low, high)
+
+
+def _opacities(values: FloatArray) -> Scale:
+    top = top_opacity(values)
+    return _linear("LoD opacity", 0.0, top, MAGMA, ends=bool(values.max() > top))
+
+
+def _sizes(values: FloatArray) -> Scale:
+    logs = np.log10(np.clip(values, 1e-30, 1e30).astype(np.float64))
+    low, high = log_range(logs)
+    marks = with_ends(log_marks(low, high), f"{10**low:.2g} or less", f"{10**high:.2g} or more", APART)
+    return Scale(smooth("feature size", np.empty(0), PLASMA, marks), low, high, log=True)

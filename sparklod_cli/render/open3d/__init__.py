@@ -1,0 +1,1 @@
+"""The Open3D backend, which draws in a process of its own."""

@@ -1,0 +1,230 @@
+"""Draws splats with Open3D: a program by itself, since Open3D ends its process where it fails.
+
+`process` runs it, and keeps it running. It answers as it starts, and to each request on its standard input; it
+ends when that is closed. A message is a line of JSON and the bytes of an array, if its "array" says so.
+
+How Open3D 0.20 wants a splat, from its sources (`GaussianSplatDataPacking.cpp`, and the shaders `gaussian_*.comp` in
+its package): linear scales, quaternions w x y z, opacity as a logit, colour as the first spherical harmonic. It keeps
+scales and colours as float16, and quaternions as bytes. Its camera is OpenCV's; the upper left corner of the upper left
+pixel is at 0, 0. Splats are blended over the background as they are, without tone mapping.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import signal
+import sys
+from typing import IO, Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+#: Columns of the splats of a request: centre, scale, quaternion w x y z, logit of opacity, first spherical harmonics.
+COLUMNS = 14
+
+#: Pixels, the sides of a tile in which Open3D collects splats, and of the largest picture that it is asked for: so
+#: small, since it keeps positions on the picture as float16. Pictures are squares of 2 ** n tiles, since Open3D forgets
+#: a barrier where tiles are missing to one; and of no more than 256, since it leaves out splats that touch more.
+TILE, PIECE = 16, 256
+
+#: Open3D makes room for so many tiles a splat, and does without those that are left. Its material has a number for it,
+#: which 0.20 does not heed off screen, and so it does not know of the 256 either.
+TILES_A_SPLAT = 32
+
+#: A splat that is drawn nowhere, for the camera is at the same place.
+NOWHERE = np.array([0, 0, 0, 1, 1, 1, 1, 0, 0, 0, 9, 0, 0, 0], np.float32)
+
+#: The first version that draws splats.
+VERSION = "0.20"
+
+#: What Open3D says, once, when it leaves out splats.
+LEFT_OUT = "dropped", "culled"
+
+#: Libraries that Open3D loads, and the packages of Debian and Ubuntu that bring them; the last one draws in software.
+PACKAGES = "libegl1 libgl1 libusb-1.0-0 libvulkan1 mesa-vulkan-drivers"
+
+Array = NDArray[Any]
+
+
+def send(file: IO[bytes], message: dict[str, Any], array: Array | None = None) -> None:
+    """Writes a message, with an array if there is one."""
+    # Not as .npy, which numpy seeks in, and these are pipes.
+    about = None if array is None else {"type": array.dtype.str, "shape": array.shape}
+    file.write(json.dumps({**message, "array": about}).encode() + b"\n")
+    if array is not None:
+        file.write(np.ascontiguousarray(array).data.cast("B"))
+    file.flush()
+
+
+def receive(file: IO[bytes]) -> tuple[dict[str, Any], Array | None]:
+    """A message and its array.
+
+    Raises:
+        EOFError: there is none, for the other side has ended.
+    """
+    line = file.readline()
+    if not line.endswith(b"\n"):
+        raise EOFError
+    message = json.loads(line)
+    if message["array"] is None:
+        return message, None
+    array = np.empty(message["array"]["shape"], message["array"]["type"])
+    if cast(io.BufferedReader, file).readinto(array.data.cast("B")) != array.nbytes:
+        raise EOFError
+    return message, array
+
+
+class _Heard(io.TextIOBase):
+    """Where Python prints in this process: Open3D's messages go through here."""
+
+    def __init__(self) -> None:
+        self.text = ""
+
+    def write(self, text: str) -> int:
+        self.text += text
+        sys.stderr.write(text)
+        return len(text)
+
+
+class Artist:
+    """Open3D's renderer, and what it renders.
+
+    Raises:
+        RuntimeError: Open3D cannot draw splats here; the text is for people.
+    """
+
+    def __init__(self, heard: _Heard) -> None:
+        self._heard = heard
+        self._renderers: dict[int, Any] = {}
+        try:
+            import open3d
+        except ModuleNotFoundError as error:
+            raise RuntimeError(
+                f"it takes the package {error.name}, which is not installed: pip install 'open3d>={VERSION}'"
+            ) from None
+        except (ImportError, OSError) as error:
+            reason = " ".join(str(error).split())
+            raise RuntimeError(
+                f"Open3D does not load: {reason} (on Debian and Ubuntu: apt install {PACKAGES})"
+            ) from None
+        self._open3d = open3d
+        self._material = open3d.visualization.rendering.MaterialRecord()
+        if not hasattr(self._material, "gaussian_splat_antialias"):
+            raise RuntimeError(
+                f"Open3D {open3d.__version__} cannot draw splats: pip install --upgrade 'open3d>={VERSION}'"
+            )
+        self._material.shader = "gaussianSplat"
+        self._material.gaussian_splat_sh_degree = 0
+        self._material.gaussian_splat_antialias = True
+
+    def probe(self) -> None:
+        """Draws a splat, since without a device for Vulkan, Open3D goes on and draws nothing.
+
+        Raises:
+            RuntimeError: it is not on the picture.
+        """
+        splat = np.array([[0.0, 0.0, 1.0, 0.2, 0.2, 0.2, 1.0, 0.0, 0.0, 0.0, 9.0, -1.7, 1.7, -1.7]], np.float32)
+        request = {
+            "side": 32,
+            "intrinsic": [[16.0, 0.0, 16.5], [0.0, 16.0, 16.5], [0.0, 0.0, 1.0]],
+            "rotation": np.eye(3).tolist(),
+            "range": [0.1, 10.0],
+            "entries": 4,
+        }
+        on_black, on_white = self.draw(request, splat)
+        red, green, blue = on_black[16, 16]
+        if green < 200 or red > 50 or blue > 50 or on_white[0, 0].min() < 250:
+            raise RuntimeError(
+                f"Open3D draws no splats here, for want of Vulkan 1.3 (on Debian and Ubuntu: apt install {PACKAGES})"
+            )
+
+    def draw(self, request: dict[str, Any], splats: Array) -> Array:
+        """(2, side, side, 3) uint8: what is seen on black, and on white.
+
+        Args:
+            request: "side" of the picture; "intrinsic", (3, 3); "rotation", (3, 3) world to camera, with y down,
+                looking along z from the origin; "range", what is nearest and farthest; "entries", the number of pairs
+                of a splat and a tile of 16 x 16 pixels, or more.
+            splats: (N, COLUMNS) float32.
+
+        Raises:
+            RuntimeError: Open3D left out splats.
+        """
+        side = request["side"]
+        renderer = self._renderer(side)
+        scene = renderer.scene
+        missing = -(-request["entries"] // TILES_A_SPLAT) - len(splats)
+        if missing > 0:
+            splats = np.concatenate([splats, np.tile(NOWHERE, (missing, 1))])
+        scene.clear_geometry()
+        scene.add_geometry("splats", self._cloud(splats), self._material, False)
+        intrinsic, extrinsic = np.array(request["intrinsic"]), np.eye(4)
+        extrinsic[:3, :3] = request["rotation"]
+        renderer.setup_camera(intrinsic, extrinsic, side, side)
+        # Again, since that has chosen a range by the boxes of what is in the scene.
+        scene.camera.set_projection(intrinsic, *request["range"], side, side)
+        pictures = []
+        for background in (0.0, 1.0):
+            scene.set_background(np.array([background, background, background, 1], np.float32))
+            pictures.append(np.array(renderer.render_to_image()))
+        if any(word in self._heard.text for word in LEFT_OUT):
+            raise RuntimeError("Open3D has left out splats, since too many overlap on the picture")
+        return np.stack(pictures)
+
+    def _renderer(self, side: int) -> Any:
+        if side not in self._renderers:
+            renderer = self._open3d.visualization.rendering.OffscreenRenderer(side, side)
+            # Tone mapping and dithering, which would change the background.
+            renderer.scene.view.set_post_processing(False)
+            self._renderers[side] = renderer
+        return self._renderers[side]
+
+    def _cloud(self, splats: Array) -> Any:
+        cloud = self._open3d.t.geometry.PointCloud(self._tensor(splats[:, :3]))
+        for name, first, end in (("scale", 3, 6), ("rot", 6, 10), ("opacity", 10, 11), ("f_dc", 11, 14)):
+            cloud.point[name] = self._tensor(splats[:, first:end])
+        return cloud
+
+    def _tensor(self, columns: Array) -> Any:
+        return self._open3d.core.Tensor(np.ascontiguousarray(columns))
+
+
+def main() -> None:
+    """Answers requests until there are no more."""
+    signal.signal(
+        signal.SIGINT, signal.SIG_IGN
+    )  # it is for the program that runs this one, which then closes the input
+    answers, requests = os.fdopen(os.dup(1), "wb"), sys.stdin.buffer
+    os.dup2(2, 1)  # what libraries print themselves
+    sys.stdout = heard = _Heard()
+    try:
+        artist = Artist(heard)
+        artist.probe()
+    except RuntimeError as error:
+        send(answers, {"error": str(error)})
+    else:
+        send(answers, {})
+        _answer(artist, requests, answers)
+    # Open3D takes itself apart in an order that may crash, and there is nothing left to write.
+    os._exit(0)
+
+
+def _answer(artist: Artist, requests: IO[bytes], answers: IO[bytes]) -> None:
+    while True:
+        try:
+            request, splats = receive(requests)
+        except EOFError:
+            return
+        try:
+            assert splats is not None
+            pictures = artist.draw(request, splats)
+        except Exception as error:
+            send(answers, {"error": " ".join(str(error).split())})
+        else:
+            send(answers, {}, pictures)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,125 @@
+"""The process in which Open3D draws, as its parent has it; `child` is what runs there."""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import os
+import re
+import subprocess
+import sys
+import tempfile
+import threading
+from pathlib import Path
+from typing import Any
+
+from ..backends import BackendError
+from .child import PACKAGES, Array, receive, send
+
+COMMAND = [sys.executable, "-m", f"{__package__}.child"]
+
+#: Seconds that it may take to begin, and to draw a piece.
+START_LIMIT, DRAW_LIMIT = 180.0, 300.0
+
+#: Pairs of splats and tiles that are drawn at once: as many as Open3D ever makes room for; and in software by an old
+#: Mesa. That of Debian 12, 22.3.6, sorts more than some 100,000 wrongly, and tiles are missing; 25.0.7 does not.
+MOST_ENTRIES, MOST_ENTRIES_OF_OLD_MESA, NEW_MESA = 1 << 25, 1 << 15, 25
+
+
+class Child:
+    """A process in which Open3D draws; it ends with this one.
+
+    Raises:
+        BackendError: it cannot draw here.
+    """
+
+    def __init__(self) -> None:
+        # It finds the same modules, wherever this process has them from.
+        env = {**os.environ, "PYTHONPATH": os.pathsep.join(path or str(Path.cwd()) for path in sys.path)}
+        # A file, since nobody need read it while the child writes there.
+        self._folder = tempfile.TemporaryDirectory(prefix="sparklod-", ignore_cleanup_errors=True)
+        self._said = Path(self._folder.name, "said")
+        try:
+            with self._said.open("wb") as said:
+                self._process = subprocess.Popen(
+                    COMMAND, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=said, env=env
+                )
+        except OSError as error:
+            self._folder.cleanup()
+            raise BackendError(f"the process for Open3D does not start: {error}") from None
+        atexit.register(self.close)
+        self._answer(START_LIMIT, hint=f" (on Debian and Ubuntu: apt install {PACKAGES})")
+        mesa = re.search(r"llvmpipe Mesa (\d+)", self._words())
+        #: What may be asked at once, see `Artist.draw`.
+        self.most_entries = MOST_ENTRIES_OF_OLD_MESA if mesa and int(mesa[1]) < NEW_MESA else MOST_ENTRIES
+
+    def alive(self) -> bool:
+        """Whether it can be asked."""
+        return self._process.poll() is None
+
+    def ask(self, request: dict[str, Any], splats: Array) -> Array:
+        """See `Artist.draw`.
+
+        Raises:
+            BackendError: it has crashed, takes too long, or says why it cannot.
+        """
+        pictures = self._answer(DRAW_LIMIT, request, splats)
+        assert pictures is not None
+        return pictures
+
+    def _answer(
+        self, limit: float, request: dict[str, Any] | None = None, splats: Array | None = None, hint: str = ""
+    ) -> Array | None:
+        assert self._process.stdin is not None and self._process.stdout is not None
+        too_late = threading.Event()
+
+        def stop() -> None:  # which ends what waits below, on each system
+            too_late.set()
+            self._process.kill()
+
+        timer = threading.Timer(limit, stop)
+        timer.daemon = True
+        timer.start()
+        try:
+            if request is not None:
+                send(self._process.stdin, request, splats)
+            answer, array = receive(self._process.stdout)
+        except (EOFError, OSError):
+            if too_late.is_set():
+                raise self._error(f"Open3D has not answered for {limit:g} seconds") from None
+            raise self._error(f"Open3D has crashed: {self._last_words()}{hint}") from None
+        except BaseException:  # the rest of the answer would be taken for the next one
+            self.close()
+            raise
+        finally:
+            timer.cancel()
+        if "error" in answer:
+            raise self._error(answer["error"])
+        return array
+
+    def _error(self, text: str) -> BackendError:
+        self.close()
+        return BackendError(text)
+
+    def _words(self) -> str:
+        return re.sub(r"\x1b\[[0-9;]*m", "", self._said.read_text("utf-8", "replace"))
+
+    def _last_words(self) -> str:
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(10)
+        lines = [line.strip() for line in self._words().splitlines() if line.strip()]
+        return lines[-1] if lines else f"exit code {self._process.returncode}"
+
+    def close(self) -> None:
+        """Ends it; it does so by itself when its input is closed."""
+        atexit.unregister(self.close)
+        assert self._process.stdin is not None and self._process.stdout is not None
+        with contextlib.suppress(OSError):
+            self._process.stdin.close()
+        try:
+            self._process.wait(2)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._process.stdout.close()
+        self._folder.cleanup()

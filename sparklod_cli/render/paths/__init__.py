@@ -1,1 +1,0 @@
-"""Formats of camera paths, a module each; none imports another."""

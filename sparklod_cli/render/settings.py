@@ -1,0 +1,46 @@
+"""`RasterSettings`: how splats become pixels; the defaults are Spark 2's."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+#: How far out a splat is drawn, in standard deviations: Spark's `maxStdDev`, sqrt(8); a merged one farther, by this for
+#: each that its D is above 1.
+MAX_STD_DEV, STD_DEV_PER_D = 8**0.5, 0.7
+
+#: Pixels squared that are added to the covariance on the screen, for which opacity makes up: Spark's `blurAmount`.
+BLUR = 0.3
+
+#: Where a splat adds less than half a step of 8 bits, it is not drawn: Spark's `minAlpha`.
+MIN_ALPHA = 0.5 / 255
+
+#: No splat is drawn farther from its centre, in pixels of the picture that is shown: Spark's `maxPixelRadius`.
+MAX_PIXEL_RADIUS = 512.0
+
+#: Splats whose centres are so many times farther out than the picture's edges are not drawn: Spark's `clipXY`.
+CLIP = 1.4
+
+#: How opacity falls off from the centre of a splat that is more than opaque.
+PROFILES = ("spark", "shifted")
+
+#: What splats are sorted by: the distance from the camera, or along its axis.
+SORTS = ("radial", "z")
+
+
+@dataclass(frozen=True)
+class RasterSettings:
+    """How splats become pixels.
+
+    Attributes:
+        near, far: splats nearer or farther along the axis are not drawn, world units.
+        profile: one of `PROFILES`; both are exp(-z^2 / 2) up to D = 1. Above, Spark's is
+            1 - (1 - exp(-z^2 / 2)) ** exp((D^2 - 1) / e), and that of its LoD design exp(-D / 2 * (z - (D - 1))^2).
+        sort: one of `SORTS`.
+        max_radius: no splat is drawn farther from its centre, pixels.
+    """
+
+    near: float = 0.01
+    far: float = 1000.0
+    profile: str = PROFILES[0]
+    sort: str = SORTS[0]
+    max_radius: float = MAX_PIXEL_RADIUS

@@ -1,0 +1,123 @@
+"""Simpler ways to draw splats than as splats, and how often a pixel is drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..cameras.camera import Camera
+from . import rasterizer
+from .backends import BACKENDS
+from .kernels import bands
+from .rasterizer import Image
+from .settings import CLIP, MIN_ALPHA, RasterSettings
+from .shading import ShadedSplats
+
+#: How opaque a billboard is.
+BILLBOARD_ALPHA = 0.5
+
+#: How much larger a merged splat is, for each that its D is above 1; as in Spark's feature size.
+SIZE_PER_D = 0.7
+
+
+@dataclass(frozen=True)
+class OnScreen:
+    """Splats whose centres a camera sees; M of them.
+
+    Attributes:
+        index: (M,) which of those that are shown.
+        x, y: (M,) float32 pixels from the upper left corner.
+        depth: (M,) float32 along the axis.
+        distance: (M,) float32 from the camera.
+    """
+
+    index: NDArray[np.intp]
+    x: NDArray[np.float32]
+    y: NDArray[np.float32]
+    depth: NDArray[np.float32]
+    distance: NDArray[np.float32]
+
+
+def draw(
+    style: str,
+    backend: str,
+    shown: ShadedSplats,
+    camera: Camera,
+    look: RasterSettings,
+    options: Mapping[str, Any] | None = None,
+) -> Image:
+    """What a camera sees; the image is that of `rasterizer.draw`.
+
+    Args:
+        style: one of `defaults.STYLES`. "points" are opaque, a pixel each, "billboards" discs of one opacity, as wide
+            as the splats; both are drawn in the order of the file. "sorted-billboards" are drawn from far to near, as
+            "splats" are.
+        backend: one of `BACKENDS`, which draws splats.
+        shown: what is drawn.
+        camera: that sees it.
+        look: how.
+        options: of the backend.
+
+    Raises:
+        BackendError: the backend cannot draw here.
+    """
+    if style == "splats":
+        return BACKENDS[backend].draw(shown, camera, look, **(options or {}))
+    seen = on_screen(shown, camera, look)
+    image: Image = np.zeros((camera.height, camera.width, 4), np.float32)
+    if style == "points":
+        inside = (seen.x >= 0) & (seen.x < camera.width) & (seen.y >= 0) & (seen.y < camera.height)
+        row, column = seen.y[inside].astype(np.intp), seen.x[inside].astype(np.intp)
+        image[row, column, :3] = np.minimum(shown.rgb[seen.index[inside]], 1)  # of several, the last one stays
+        image[row, column, 3] = 1
+        return image
+    order = np.arange(len(seen.index))
+    if style == "sorted-billboards":
+        order = np.argsort(-(seen.distance if look.sort == "radial" else seen.depth), kind="stable")
+    index, depth = seen.index[order], seen.depth[order]
+    width = shown.scale[index].mean(axis=1) * (1 + SIZE_PER_D * np.maximum(shown.lod_opacity[index] - 1, 0))
+    radius = np.clip(width * np.float32(camera.focal[1]) / depth, 0.5, look.max_radius)
+    rgb = np.minimum(shown.rgb[index], 1)
+    bands.draw_discs(
+        np.ascontiguousarray(seen.x[order]),
+        np.ascontiguousarray(seen.y[order]),
+        radius.astype(np.float32),
+        rgb,
+        np.float32(BILLBOARD_ALPHA),
+        image,
+    )
+    return image
+
+
+def on_screen(shown: ShadedSplats, camera: Camera, look: RasterSettings) -> OnScreen:
+    """The splats between near and far whose centres are in the picture, or as far beside it as splats are drawn."""
+    local = (shown.center - camera.position.astype(np.float32)) @ camera.camera_to_world[:3, :3].astype(np.float32)
+    depth = -local[:, 2]
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        dx, dy = camera.focal[0] * local[:, 0] / depth, -camera.focal[1] * local[:, 1] / depth
+        seen = (depth > look.near) & (depth < look.far) & (shown.lod_opacity >= MIN_ALPHA)
+        seen &= (abs(dx) <= CLIP * camera.width / 2) & (abs(dy) <= CLIP * camera.height / 2)
+    index = np.flatnonzero(seen)
+    return OnScreen(
+        index,
+        (dx[index] + camera.principal[0]).astype(np.float32),
+        (dy[index] + camera.principal[1]).astype(np.float32),
+        depth[index],
+        np.linalg.norm(local[index], axis=1),
+    )
+
+
+def overdraw(shown: ShadedSplats, camera: Camera, look: RasterSettings) -> NDArray[np.float32]:
+    """(height, width) how many splats are blended into each pixel, those too that others hide.
+
+    Splats are those that the backend numba draws.
+    """
+    counts = np.zeros((camera.height, camera.width), np.int32)
+    bands.count_fragments(
+        rasterizer.seen(shown, camera, look), look.profile == "shifted", np.float32(MIN_ALPHA), counts
+    )
+    return counts.astype(np.float32)

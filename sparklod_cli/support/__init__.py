@@ -1,0 +1,1 @@
+"""What everything else stands on: errors, defaults, units, compiled kernels, threads, progress."""

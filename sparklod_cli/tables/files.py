@@ -1,0 +1,159 @@
+"""Rows as files: CSV, JSON and Parquet. The same rows give the same cells in each of them, and the same bytes again."""
+
+from __future__ import annotations
+
+import difflib
+import io
+import json
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from types import ModuleType
+from typing import Any
+
+from ..support.errors import SparklodError
+from .columns import COLUMNS, TIMING, Cell, Column, Row
+
+FORMS = ("csv", "json", "parquet")
+
+#: Counts up when a column changes its meaning or goes away; new ones may come without that.
+SCHEMA_VERSION = 1
+
+#: What Table Schema calls the types of columns (specs.frictionlessdata.io/table-schema).
+TYPES = {int: "integer", float: "number", str: "string"}
+
+#: A text with one of these is quoted in CSV (RFC 4180).
+QUOTED = ',"\r\n'
+
+#: How texts begin that spreadsheets run, or skip to what they run.
+FORMULAS = ("=", "+", "-", "@", "\t", "\r", "\n")
+
+
+class UnknownColumnError(SparklodError):
+    """There is no column of such a name."""
+
+
+def select(names: Sequence[str] = (), *, timing: bool = True) -> tuple[Column, ...]:
+    """Columns by their names, in this order; all of them, in the order of `COLUMNS`, for no names.
+
+    Args:
+        names: of columns; one that comes twice is taken once.
+        timing: with those that differ from run to run.
+
+    Raises:
+        UnknownColumnError: there is no such column; names those that come near.
+    """
+    every = {column.name: column for column in COLUMNS}
+    for name in names:
+        if name not in every:
+            raise UnknownColumnError(f"there is no column {name!r}{near(name, every)}")
+    chosen = dict.fromkeys(names) if names else every
+    return tuple(every[name] for name in chosen if timing or name not in TIMING)
+
+
+def near(name: str, known: Iterable[str], *, cutoff: float = 0.6) -> str:
+    """The end of a message about a name that is not known: ", did you mean ...?"; empty where none comes near."""
+    found = difflib.get_close_matches(name, list(known), n=3, cutoff=cutoff)
+    return f", did you mean {' or '.join(found)}?" if found else ""
+
+
+def encode(rows: Iterable[Row], columns: Sequence[Column], form: str) -> Iterator[bytes]:
+    """The pieces of a file of rows. CSV and JSON are made row by row, so that endless paths take no memory.
+
+    An empty text is an empty cell, as no CSV can tell them apart; what UTF-8 cannot hold becomes "?". In CSV, a text
+    that a spreadsheet would run begins with a ' more.
+
+    Args:
+        rows: with a cell for each column; cells beyond them are left out.
+        columns: of the file, in this order.
+        form: one of `FORMS`.
+
+    Raises:
+        SparklodError: pyarrow is not installed, for Parquet; at once, before the first row is asked for.
+        ValueError: a number is not finite; while the pieces are taken.
+    """
+    if form == "csv":
+        return _csv(rows, columns)
+    if form == "json":
+        return _json(rows, columns)
+    if form == "parquet":
+        return _parquet(rows, columns, load_pyarrow())
+    raise ValueError(f"form is {form}, not one of {', '.join(FORMS)}")
+
+
+def load_pyarrow() -> ModuleType:
+    """Imports pyarrow.
+
+    Raises:
+        SparklodError: it is not installed.
+    """
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ImportError as error:
+        raise SparklodError(f"Parquet is written by pyarrow: pip install 'sparklod[parquet]' ({error})") from None
+    return pyarrow
+
+
+def _cell(column: Column, row: Row) -> Cell:
+    """A cell as every format has it."""
+    value = row[column.name]
+    if isinstance(value, str):
+        return value.encode("utf-8", "replace").decode("utf-8") or None
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ValueError(f"{column.name} is {value}")
+    return value
+
+
+def _csv(rows: Iterable[Row], columns: Sequence[Column]) -> Iterator[bytes]:
+    yield (",".join(column.name for column in columns) + "\n").encode()
+    for row in rows:
+        yield (",".join(_field(column, row) for column in columns) + "\n").encode()
+
+
+def _field(column: Column, row: Row) -> str:
+    """A field of CSV; a text that a spreadsheet would take for a formula gets a mark that makes it a text."""
+    text = column.text(_cell(column, row))
+    return _quoted("'" + text if column.kind is str and text.startswith(FORMULAS) else text)
+
+
+def _quoted(text: str) -> str:
+    """A field of CSV. The module csv quotes carriage returns in some versions of Python only."""
+    return '"' + text.replace('"', '""') + '"' if any(mark in text for mark in QUOTED) else text
+
+
+def _json(rows: Iterable[Row], columns: Sequence[Column]) -> Iterator[bytes]:
+    fields = [
+        {"name": column.name, "type": TYPES[column.kind], "unit": column.unit, "description": column.meaning}
+        for column in columns
+    ]
+    yield f'{{"schema_version": {SCHEMA_VERSION}, "schema": {{"fields": [\n'.encode()
+    yield ",\n".join(map(_dumped, fields)).encode()
+    yield b'\n]}, "data": ['
+    start = "\n"
+    for row in rows:
+        yield (start + _dumped({column.name: _cell(column, row) for column in columns})).encode()
+        start = ",\n"
+    yield b"\n]}\n"
+
+
+def _dumped(value: dict[str, Any]) -> str:
+    return json.dumps(value, ensure_ascii=False, allow_nan=False)
+
+
+def _parquet(rows: Iterable[Row], columns: Sequence[Column], pyarrow: ModuleType) -> Iterator[bytes]:
+    types = {int: pyarrow.int64(), float: pyarrow.float64(), str: pyarrow.string()}
+    fields = [
+        pyarrow.field(column.name, types[column.kind], metadata={"unit": column.unit, "description": column.meaning})
+        for column in columns
+    ]
+    schema = pyarrow.schema(fields, metadata={"schema_version": str(SCHEMA_VERSION)})
+    cells: list[list[Cell]] = [[] for _ in columns]
+    for row in rows:
+        for column, values in zip(columns, cells, strict=True):
+            values.append(_cell(column, row))
+    table = pyarrow.Table.from_arrays(
+        [pyarrow.array(values, field.type) for values, field in zip(cells, fields, strict=True)], schema=schema
+    )
+    file = io.BytesIO()
+    pyarrow.parquet.write_table(table, file)
+    yield file.getvalue()
