@@ -5,8 +5,7 @@ from __future__ import annotations
 import click
 
 from sparklod_cli.cli import cli
-
-from ..conftest import ROOT
+from tests.conftest import ROOT
 
 FOLDER = ROOT / "docs" / "cli"
 

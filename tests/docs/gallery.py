@@ -12,7 +12,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from ..conftest import FIXTURES, ROOT
+from tests.conftest import FIXTURES, ROOT
 
 PAGE = ROOT / "docs" / "gallery.md"
 FOLDER = ROOT / "docs" / "images" / "gallery"

@@ -9,8 +9,8 @@ import click
 import pytest
 
 from sparklod_cli.cli import cli
+from tests.conftest import FIXTURES
 
-from ..conftest import FIXTURES
 from .gallery import FOLDER, SCENE, commands, pictures
 
 #: Bytes of one picture, so that a checkout stays small.
