@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import os
 import sys
-import traceback
-from importlib import import_module
 from typing import Any, NoReturn
 
 import click
 
 from . import __version__
-from .commands.console import say, say_error, say_usage_error
-from .commands.options import Verbosity
+from .commands.command import Group
+from .commands.console import Verbosity, say, say_error, say_usage_error
 from .support import interrupts, stdout
 from .support.errors import SparklodError, out_of_memory
 from .support.printable import printable
@@ -20,8 +18,15 @@ from .support.printable import printable
 #: Characters that are quoted of an error that nobody foresaw.
 QUOTED = 200
 
-#: Sub-commands, each a module of `commands` with a function of its name; imported when it is called for.
-COMMANDS = {name: name.replace("-", "_") for name in ("build-lod", "inspect", "traverse", "render", "warmup")}
+#: The commands, and what `sparklod --help` says of them.
+COMMANDS = {
+    "build-lod": "Bake splat files into Level-of-Detail files.",
+    "inspect": "Report on splat files and check them.",
+    "traverse": "Simulate what a viewer draws along a camera path.",
+    "render": "Draw pictures of splat files, and compare them.",
+    "warmup": "Compile all kernels ahead of the first run.",
+    "help": "Print the help of a command.",
+}
 
 EPILOG = """
 \b
@@ -34,8 +39,8 @@ class _EndOfFileError(Exception):
     """Carries an `EOFError` past click, which takes it for Ctrl-D and says that a person interrupted."""
 
 
-class LazyGroup(click.Group):
-    """A group that imports a command when it is asked for."""
+class Sparklod(Group):
+    """The group of all commands."""
 
     def invoke(self, ctx: click.Context) -> Any:
         try:
@@ -43,18 +48,8 @@ class LazyGroup(click.Group):
         except EOFError as error:
             raise _EndOfFileError from error
 
-    def list_commands(self, ctx: click.Context) -> list[str]:
-        return list(COMMANDS)
 
-    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        if cmd_name not in COMMANDS:
-            return None
-        module = import_module(f".commands.{COMMANDS[cmd_name]}", __package__)
-        command: click.Command = getattr(module, COMMANDS[cmd_name])
-        return command
-
-
-@click.group(cls=LazyGroup, epilog=EPILOG, context_settings={"help_option_names": ["-h", "--help"]})
+@click.group(cls=Sparklod, rows=COMMANDS, epilog=EPILOG, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, package_name="sparklod")
 def cli() -> None:
     """Bake Level-of-Detail trees for 3D Gaussian splat scenes."""
@@ -98,6 +93,8 @@ def _failed(error: BaseException, verbosity: Verbosity) -> int:
     This is the last guard: whatever gets here is ours to mend, but a person has no use for a traceback.
     """
     if verbosity.verbose:
+        import traceback
+
         for line in "".join(traceback.format_exception(error)).splitlines():
             say(line)
     told = out_of_memory(error)

@@ -24,18 +24,15 @@ from .support.defaults import MAX_SH_DEGREE
 from .support.errors import SparklodError
 from .support.parallel import ordered_map
 from .support.progress import Progress, silent
-from .tables.columns import COLUMNS as OF_SIMULATION
-from .tables.columns import Column, Row
+from .tables.columns import FRAME, Column, Row
 from .tables.statistics import numbers, statistic
 from .world import World
 
 #: Threads that measure pictures; each has a few that wait, which take memory.
 MEASURERS = 4
 
-WHERE = ("frame", "time_s", "name")
-
 COLUMNS = (
-    *(column for column in OF_SIMULATION if column.name in WHERE),
+    *FRAME,
     Column("budget", int, "", "splats", "the most that may be drawn, all instances together"),
     Column("share", float, ".6g", "share", "budget over the splats of full detail"),
     Column("selected", int, "", "splats", "what is drawn; with `--continuous` more than the budget, as some fade"),

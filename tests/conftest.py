@@ -16,6 +16,8 @@ ROOT = Path(__file__).resolve().parents[1]
 FIXTURES = ROOT / "fixtures"
 #: Real scenes, which are not part of the repository: where SPARKLOD_SCENES says, or beside the checkout.
 SCENES = Path(os.environ.get("SPARKLOD_SCENES") or ROOT.parent / "shared" / "scenes")
+#: Root may read and write everything, whatever the permissions.
+IS_ROOT = hasattr(os, "geteuid") and os.geteuid() == 0
 
 
 def real_scene(name: str) -> Path:
@@ -28,7 +30,8 @@ def real_scene(name: str) -> Path:
 
 def pytest_sessionstart(session: pytest.Session) -> None:
     """Compiles all kernels that no cache has, so that no test meets a notice of it, or waits for one of its own."""
-    from sparklod_cli import jit, warmup
+    from sparklod_cli import warmup
+    from sparklod_cli.support import jit
 
     if not hasattr(session.config, "workerinput") and jit.CACHE_FOLDER is not None:  # once, not in each of xdist's
         warmup.warm_up(processes=2)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from fixtures import by_hand
-from sparklod_cli.gaussian import normalized_quat
-from sparklod_cli.sh import COEFFICIENTS, SH_C0
-from sparklod_cli.splats import Splats
+from sparklod_cli.model.gaussian import normalized_quat
+from sparklod_cli.model.sh import COEFFICIENTS, SH_C0
+from sparklod_cli.model.splats import Splats
 
 
 def random_splats(count: int, *, sh_degree: int = 0, seed: int = 0, extent: float = 1.0) -> Splats:

@@ -15,9 +15,8 @@ from fuzz import runner
 from fuzz.__main__ import main
 from fuzz.case import TARGETS, Case, case_of, target_of, unpacked
 from fuzz.child import Child
-
-from . import planted
-from .conftest import ROOT
+from tests import planted
+from tests.conftest import ROOT
 
 if sys.platform != "linux":
     pytest.skip("the process that runs cases is watched by what Linux offers", allow_module_level=True)

@@ -10,16 +10,16 @@ from pathlib import Path
 
 import pytest
 
-from sparklod_cli import jit, warmup
+from sparklod_cli import warmup
 from sparklod_cli.cli import run
-
-from .conftest import ROOT
+from sparklod_cli.support import jit
+from tests.conftest import ROOT
 
 #: Runs a command line of JSON and prints which kernels Python has called, since numba knows what it has code for.
 CALLED = """
 import json, sys
 from sparklod_cli.cli import run
-from sparklod_cli.jit_cache import stem_of
+from sparklod_cli.support.jit_cache import stem_of
 code = run(json.loads(sys.argv[1]))
 from numba.core.dispatcher import Dispatcher
 kernels = {f for name, module in list(sys.modules.items()) if ".kernels." in name for f in vars(module).values()

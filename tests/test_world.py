@@ -13,17 +13,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sparklod_cli import world
-from sparklod_cli.errors import FormatError, SparklodError, TreeError
-from sparklod_cli.gaussian import moved, placed, spark_size
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod.traversal import CHUNK_NODES, Cones, Frustum
-from sparklod_cli.splats import COLUMNS
+from sparklod_cli.model.gaussian import moved, placed, spark_size
+from sparklod_cli.model.splats import COLUMNS
+from sparklod_cli.support.errors import FormatError, SparklodError, TreeError
 from sparklod_cli.world import Placement, World, names_of, read_world
-
-from . import reference
-from .conftest import FIXTURES
-from .lod.forests import transform
-from .scenes import random_splats
+from tests.conftest import FIXTURES
+from tests.lod.forests import transform
+from tests.references import gaussians
+from tests.scenes import random_splats
 
 TREE, TOWN = FIXTURES / "golden" / "tree-v3.spz", FIXTURES / "traverse" / "town.spz"
 HAND = FIXTURES / "golden" / "hand-tree-v3.spz"
@@ -42,8 +41,8 @@ def test_placed_splats_have_the_covariance_of_the_matrix(matrix: np.ndarray) -> 
     splats = random_splats(200, sh_degree=1)
     there = placed(splats, matrix)
     axes = matrix[:3, :3]
-    expected = axes @ reference.covariance(splats.scale, splats.quat_xyzw) @ axes.T
-    found = reference.covariance(there.scale, there.quat_xyzw)
+    expected = axes @ gaussians.covariance(splats.scale, splats.quat_xyzw) @ axes.T
+    found = gaussians.covariance(there.scale, there.quat_xyzw)
     size = np.abs(expected).max(axis=(1, 2), keepdims=True)
     assert (np.abs(found - expected) <= 2e-6 * size).all()
     assert np.allclose(np.linalg.norm(there.quat_xyzw, axis=1), 1, atol=1e-6)
@@ -218,7 +217,7 @@ stems = st.sampled_from(["a", "a 2", "a 2 2", "a 3", "total", "total.spz", "tota
 
 
 @given(st.lists(stems, max_size=12), st.lists(stems, max_size=4))
-def test_names_are_unique(names: list[str], taken: list[str]) -> None:
+def test_instances_get_names_that_nobody_has(names: list[str], taken: list[str]) -> None:
     given_names = names_of([Path(f"{name}.spz") for name in names], taken)
     assert len(set(given_names)) == len(names)
     assert not {"total", *taken} & set(given_names)

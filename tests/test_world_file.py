@@ -12,8 +12,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from sparklod_cli.errors import FormatError, SparklodError
 from sparklod_cli.lod.traversal import Cones, Frustum
+from sparklod_cli.support.errors import FormatError, SparklodError
 from sparklod_cli.world import Placement
 from sparklod_cli.world_file import KEYS, WorldFileError, read_placements
 
@@ -42,7 +42,7 @@ def test_a_file_may_be_anywhere(scene: Path) -> None:
     ]
 
 
-def test_every_key(scene: Path) -> None:
+def test_every_key_of_an_instance_is_used(scene: Path) -> None:
     turn = [0, math.sqrt(0.5), 0, math.sqrt(0.5)]  # a quarter around y: z goes to x
     (place,) = written(
         scene,
@@ -98,7 +98,7 @@ def test_parts_that_are_left_out_change_nothing(scene: Path) -> None:
         assert np.array_equal(place.object_to_world, expected)
 
 
-def test_foveation_of_cones(scene: Path) -> None:
+def test_a_foveation_is_of_cones_or_a_frustum_by_its_keys(scene: Path) -> None:
     cones = {"cone_fov0": 90, "cone_fov": 120, "cone_foveate": 0.4, "behind_foveate": 0.2}
     kinds = [cones, {}, {"behind_foveate": 0.5}, {"outside_foveate": 0}, None]
     found = [

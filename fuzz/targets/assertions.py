@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from sparklod_cli.simulation.columns import COLUMNS
 from sparklod_cli.tables.assertions import parse
 
 from ..case import Case, Rng
@@ -37,6 +38,6 @@ def check(case: Case, folder: Path) -> None:
     if arguments:
         command([*arguments, f"--assert={text}"])
         return
-    asserted = parse(text)
+    asserted = parse(text, COLUMNS)
     asserted.holds(1)
     asserted.holds(0.5)

@@ -5,8 +5,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import json
-import os
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,10 +13,13 @@ import click
 
 from ..support import defaults
 from ..support.printable import MOST, shortened
-from .console import Console, is_terminal
-from .options import AutoOr, Ball, Numbers, Real, common_options, is_given
-from .paths import InputPath, OutputPath, keep_apart
+from .command import Command
+from .console import Console
+from .options.common import common_options, overwrite_option
+from .options.types import AutoOr, Ball, Numbers, Real
+from .paths import DASH, InputPath, OutputPath, claim_stdout, keep_apart
 from .reports import report_baked, report_unbaked
+from .usage import is_given, refuse
 
 if TYPE_CHECKING:
     from ..bake import Baked
@@ -27,8 +28,6 @@ if TYPE_CHECKING:
 
     #: Makes the output of an input through a sink, and reports what came of it.
     Work = Callable[[Path, Path, Sink], Baked | Unbaked]
-
-STDOUT = Path("-")
 
 #: Options that only mean something for a tree that is built, and for SPZ.
 OF_BAKING = (
@@ -57,7 +56,7 @@ Examples:
 """
 
 
-@click.command("build-lod", epilog=EXAMPLES, context_settings={"show_default": True})
+@click.command("build-lod", cls=Command, epilog=EXAMPLES, context_settings={"show_default": True})
 @click.argument("inputs", metavar="INPUT...", nargs=-1, required=True, type=InputPath())
 @click.option(
     "-o",
@@ -75,7 +74,7 @@ Examples:
     help="Directory for the outputs; made if it is not there.",
     show_default=False,
 )
-@click.option("--overwrite", is_flag=True, help="Replace outputs that exist.")
+@overwrite_option
 @click.option(
     "--method",
     type=click.Choice(defaults.METHODS),
@@ -174,10 +173,7 @@ def build_lod(
     outputs = _outputs(inputs, output, output_dir, settings)
     keep_apart(ctx, {"output" if output_dir is None else "output_dir": outputs})
     _check_usage(ctx, inputs, output, settings)
-    if output == STDOUT and as_json:
-        raise click.UsageError("--json and -o - both want standard output")
-    if output == STDOUT and is_terminal(sys.stdout):
-        raise click.UsageError("-o - writes binary data; redirect it to a file or a pipe")
+    claim_stdout(ctx, "output", as_json=as_json, binary=True)
     failed = False
     with Console(quiet=quiet, verbose=verbose) as console:
         work = _unlod(ctx, settings, console) if settings["unlod"] else _bake(settings, output, console)
@@ -186,7 +182,7 @@ def build_lod(
 
         for source, target in zip(inputs, outputs, strict=True):
             try:
-                if target == STDOUT:
+                if target == DASH:
                     write: Sink = io.write_stdout
                 else:
                     io.check_writable(target, overwrite=overwrite, make_parent=output_dir is not None)
@@ -206,21 +202,15 @@ def build_lod(
 
 def _check_usage(ctx: click.Context, inputs: tuple[Path, ...], output: Path | None, settings: dict[str, Any]) -> None:
     """A usage error where options contradict each other or the name of the output."""
-
-    def refuse(names: tuple[str, ...], why: str) -> None:
-        for name in names:
-            if is_given(ctx, name):
-                raise click.UsageError(f"--{name.replace('_', '-')} {why}")
-
-    suffix = output.suffix.lower() if output is not None and output != STDOUT else ""
+    suffix = output.suffix.lower() if output is not None and output != DASH else ""
     if settings["unlod"]:
-        refuse(OF_BAKING, "is of no use with --unlod, which writes what there is")
+        refuse(ctx, OF_BAKING, "is of no use with --unlod, which writes what there is")
         if suffix and suffix not in defaults.PLAIN_SUFFIXES:
             raise click.UsageError(f"--unlod writes {', '.join(defaults.PLAIN_SUFFIXES)}, not {suffix}")
         if suffix not in ("", ".spz"):
-            refuse(OF_SPZ, f"is of SPZ, not of {suffix}")
+            refuse(ctx, OF_SPZ, f"is of SPZ, not of {suffix}")
     elif settings["encoding"]:
-        refuse(OF_SPZ, "is of SPZ, not of --encoding")
+        refuse(ctx, OF_SPZ, "is of SPZ, not of --encoding")
         if suffix not in ("", ".npz", *defaults.RAW_SUFFIXES):
             known = ", ".join((".npz", *defaults.RAW_SUFFIXES))
             raise click.UsageError(f"--encoding writes {known}, not {suffix}")
@@ -232,7 +222,7 @@ def _check_usage(ctx: click.Context, inputs: tuple[Path, ...], output: Path | No
         raise click.UsageError(f"a tree is written as SPZ, not as {suffix}; name the output .spz")
     for method, names in OF_METHOD.items():
         if method != settings["method"]:
-            refuse(names, f"is of --method {method}, not of {settings['method']}")
+            refuse(ctx, names, f"is of --method {method}, not of {settings['method']}")
     if settings["rgba"] is not None and len(inputs) > 1:
         raise click.UsageError(f"--rgba takes one input, not {len(inputs)}")
 
@@ -249,12 +239,6 @@ def _outputs(
         outputs = [output]
     else:
         outputs = [(output_dir or source.parent) / _output_name(source, settings) for source in inputs]
-    first: dict[str, Path] = {}
-    for source, target in zip(inputs, outputs, strict=True):
-        place = os.path.realpath(target)
-        if place in first:
-            raise click.UsageError(f"{first[place]} and {source} would both be written to {target}")
-        first[place] = source
     return outputs
 
 
@@ -310,11 +294,11 @@ def _unlod(ctx: click.Context, settings: dict[str, Any], console: Console) -> Wo
     """What writes the leaves of a file and reports it."""
     from ..extract_leaves import Target, unlod
 
-    chosen = ctx.get_parameter_source("spz_version") != click.core.ParameterSource.DEFAULT
+    chosen = is_given(ctx, "spz_version")
 
     def work(source: Path, target: Path, write: Sink) -> Unbaked:
         how = Target(
-            suffix=".spz" if target == STDOUT else target.suffix.lower() or ".spz",
+            suffix=".spz" if target == DASH else target.suffix.lower() or ".spz",
             version=int(settings["spz_version"]) if chosen else None,
             fractional_bits=settings["fractional_bits"],
             compression_level=settings["compression_level"],

@@ -13,7 +13,8 @@ from ..cameras.axes import Axes
 from ..cameras.formats.table import FORMATS, NAMES
 from ..support.errors import CameraPathError, SparklodError, TooManyCamerasError
 from .camera_values import Size, View, Views
-from .options import Command, Numbers, Real
+from .options.common import Command
+from .options.types import Numbers, Real
 from .paths import InputPath
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from .options import Numbers
+from .options.types import Numbers
 
 #: Pixels along a side of a picture, and digits of no more than a few times that.
 MAX_SIDE, DIGITS = 1 << 16, 6

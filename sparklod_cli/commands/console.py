@@ -6,6 +6,7 @@ import contextlib
 import os
 import sys
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, TextIO
 
@@ -14,6 +15,13 @@ import click
 from ..support.printable import MOST, printable
 from ..support.stdout import silence
 from ..support.units import count_of as count_of
+
+
+@dataclass
+class Verbosity:
+    """Whether -v was given, for who ends a run after its command is gone; `cli.run` hands one to click."""
+
+    verbose: bool = False
 
 
 def size_of(size: int) -> str:
@@ -39,25 +47,23 @@ def say_error(text: str) -> None:
 
 
 def say_usage_error(error: click.ClickException) -> None:
-    """What is wrong with a command line, as click says it."""
-    command = error.ctx.command if isinstance(error, click.UsageError) and error.ctx is not None else None
+    """How the command is called, where its help is, and in the last line what is wrong."""
+    ctx = error.ctx if isinstance(error, click.UsageError) else None
+    if ctx is not None:
+        _echo(f"{ctx.get_usage()}\nTry '{ctx.command_path} --help'.\n")
     text = error.format_message()
-    if isinstance(error, click.NoSuchOption) and command is not None:
-        text = _chosen_otherwise(command, error.option_name) or text
-    if sys.stderr is None:
-        return
-    shown = click.UsageError(printable(text, MOST), getattr(error, "ctx", None))
-    with _unheard():
-        shown.show()
+    if isinstance(error, click.NoSuchOption):
+        text = f"there is no option {error.option_name}" + _meant(error)
+    say_error(text)
 
 
-def _chosen_otherwise(command: click.Command, option: str) -> str | None:
-    """What to say of an option that there is not, where its name is a value of another, as in --quality."""
-    value = option.lstrip("-")
-    for param in command.params:
+def _meant(error: click.NoSuchOption) -> str:
+    """Which option was meant: one that is spelled nearly so, or one that has a value of that name (--quality)."""
+    value = error.option_name.lstrip("-")
+    for param in error.ctx.command.params if error.ctx is not None else ():
         if isinstance(param.type, click.Choice) and value in param.type.choices:
-            return f"there is no option {option}; did you mean {param.opts[0]} {value}?"
-    return None
+            return f"; did you mean {param.opts[0]} {value}?"
+    return f"; did you mean {error.possibilities[0]}?" if error.possibilities else ""
 
 
 def for_screen(pieces: Iterable[bytes]) -> Iterator[bytes]:

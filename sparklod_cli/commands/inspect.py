@@ -11,10 +11,13 @@ import click
 
 from ..support.defaults import MAX_SH_DEGREE, PLOT_BY
 from ..support.units import parse_size
+from .command import Command
 from .console import Console
 from .inspect_job import Job
-from .options import Quantity, Real, common_options, is_given
+from .options.common import common_options, overwrite_option
+from .options.types import Quantity, Real
 from .paths import InputPath, OutputPath, keep_apart
+from .usage import refuse
 
 if TYPE_CHECKING:
     from ..inspection.expectations import Expectations
@@ -23,9 +26,6 @@ if TYPE_CHECKING:
 
 #: Options that are expectations, by the names that `Expectations` has for them.
 EXPECTED = ("max_bytes", "min_splats", "max_splats", "sh", "max_growth")
-
-#: Options that have another name here.
-NAMES = {"style": "format", "fail_on": "fail-on", "plot_level": "plot-level", "plot_by": "plot-by"}
 
 EXAMPLES = """
 \b
@@ -47,7 +47,7 @@ def _print_schema(ctx: click.Context, param: click.Parameter, value: bool) -> No
         ctx.exit()
 
 
-@click.command("inspect", epilog=EXAMPLES, context_settings={"show_default": True})
+@click.command("inspect", cls=Command, epilog=EXAMPLES, context_settings={"show_default": True})
 @click.argument("files", metavar="FILE...", nargs=-1, required=True, type=InputPath())
 @click.option("--stats", is_flag=True, help="Statistics of all quantities, not only of the main ones.")
 @click.option("--histogram", metavar="NAME", multiple=True, help="Text bars of a quantity that --stats names.")
@@ -85,7 +85,7 @@ def _print_schema(ctx: click.Context, param: click.Parameter, value: bool) -> No
 @click.option(
     "--html", metavar="FILE", type=OutputPath(suffixes=[".html", ".htm"]), help="Write the reports as one HTML page."
 )
-@click.option("--overwrite", is_flag=True, help="Replace pictures and pages that exist.")
+@overwrite_option
 @click.option(
     "--json-schema",
     is_flag=True,
@@ -155,18 +155,12 @@ def _check_usage(ctx: click.Context, files: tuple[Path, ...], settings: dict[str
     if settings["stats"] and holds and not as_json:
         what = "--check prints" if settings["check"] else "expectations print"
         raise click.UsageError(f"{what} findings; with --stats that is possible only as --json")
-
-    def refuse(names: tuple[str, ...], why: str) -> None:
-        for name in names:
-            if is_given(ctx, name):
-                raise click.UsageError(f"--{NAMES.get(name, name)} {why}")
-
     if not holds:
-        refuse(("style", "fail_on"), "needs --check or an expectation")
+        refuse(ctx, ("style", "fail_on"), "needs --check or an expectation")
     if settings["field"] or as_json:
-        refuse(("style",), "is of findings in lines, which neither --json nor --field prints")
+        refuse(ctx, ("style",), "is of findings in lines, which neither --json nor --field prints")
     if settings["plot"] is None and settings["html"] is None:
-        refuse(("plot_level", "plot_by"), "needs --plot or --html")
+        refuse(ctx, ("plot_level", "plot_by"), "needs --plot or --html")
 
 
 def _asserts(settings: dict[str, Any]) -> bool:

@@ -121,7 +121,6 @@ class Job:
         from ..inspection import html as pages
         from ..inspection import values
         from ..io import write_whole
-        from ..tables import histograms
 
         picture = None
         if scene is not None:
@@ -138,7 +137,7 @@ class Job:
             drawn = {}
             if scene is not None and len(scene.splats):
                 names = values.names_of(scene.splats)
-                drawn = {name: histograms.of_quantity(scene.splats, name) for name in names}
+                drawn = {name: values.histogram_of(scene.splats, name) for name in names}
             self.sections.append(pages.Section(report.as_dict(), picture, drawn))
 
     def write_page(self) -> None:
@@ -159,10 +158,10 @@ def _fails(findings: list[Finding], fail_on: str) -> bool:
 
 def _print_histograms(scene: Scene, names: tuple[str, ...]) -> None:
     from ..inspection import values
-    from ..tables.histograms import as_text, of_quantity
+    from ..tables.histograms import as_text
 
     for name in names:
         if name not in values.names_of(scene.splats):
             continue  # SH of a degree that this file has not
         click.echo(f"\n  {name}")
-        click.echo(as_text(of_quantity(scene.splats, name)))
+        click.echo(as_text(values.histogram_of(scene.splats, name)))

@@ -6,14 +6,21 @@ import functools
 import os
 import re
 import stat
+import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import click
 
+from .console import is_terminal
+from .usage import flag_of
+
 #: Standard input or output, where a command takes those.
 DASH = Path("-")
+
+#: What a place is taken by.
+INPUT, OUTPUT = "an input", "an output"
 
 #: How addresses begin. A letter and a colon alone are a drive of Windows.
 URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+://")
@@ -88,11 +95,29 @@ def keep_apart(ctx: click.Context, stands_for: Mapping[str, Iterable[Path]] | No
             )
 
 
+def claim_stdout(ctx: click.Context, name: str, *, as_json: bool, binary: bool = False) -> None:
+    """Raises a `click.UsageError` where an output is - and standard output is taken, or no place for it.
+
+    Args:
+        ctx: of the command.
+        name: of the parameter.
+        as_json: standard output gets JSON.
+        binary: the output is nothing that a terminal could show.
+    """
+    if ctx.params[name] != DASH:
+        return
+    flag = flag_of(ctx, name)
+    if as_json:
+        raise click.UsageError(f"{flag} - and --json cannot both go to standard output; name a file")
+    if binary and is_terminal(sys.stdout):
+        raise click.UsageError(f"{flag} - writes binary data; redirect it to a file or a pipe")
+
+
 def _keep_apart(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:
     files = set[tuple[int, int]]()
     places = dict[str, str]()
     for path in _all_read(inputs):
-        places[_place(path)] = "an input"
+        places[_place(path)] = INPUT
         found = _identity(path)
         if found is not None:
             files.add(found)
@@ -100,10 +125,12 @@ def _keep_apart(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:
         if path == DASH or _is_stream(path):
             continue
         place = _place(path)
-        taken = "an input" if _identity(path) in files else places.get(place)
+        taken = INPUT if _identity(path) in files else places.get(place)
+        if taken == OUTPUT:
+            raise click.UsageError(f"two outputs would be written to {path}; give each a name of its own")
         if taken is not None:
             raise click.UsageError(f"{path} is {taken}; write elsewhere")
-        places[place] = "an output already"
+        places[place] = OUTPUT
 
 
 def _all_read(paths: Iterable[Path]) -> Iterator[Path]:

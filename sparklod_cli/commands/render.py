@@ -12,12 +12,15 @@ import click
 
 from .camera_options import camera_options
 from .camera_values import View
+from .command import Command
 from .console import Console
-from .options import Real, common_options, flag_of, is_given, refuse
-from .paths import InputPath, OutputPath, keep_apart
+from .options.common import common_options, overwrite_option
+from .options.types import Real
+from .paths import InputPath, OutputPath, claim_stdout, keep_apart
 from .render_cameras import check_cameras, framed, least_cameras
 from .render_compare import BUDGETS, compare_options
 from .render_options import background_from, blend_from, check_size, look_options, manner_from, of_pictures
+from .usage import exclude, given, require
 from .world_options import cut_options, files_meant, placements_from, viewer_from, world_options
 
 if TYPE_CHECKING:
@@ -78,7 +81,7 @@ Examples:
 """
 
 
-@click.command("render", epilog=EXAMPLES, context_settings={"show_default": True})
+@click.command("render", cls=Command, epilog=EXAMPLES, context_settings={"show_default": True})
 @world_options
 @functools.partial(camera_options, orbit=1)
 @click.option("--view", "views", type=View(), multiple=True, help="As --look-at; several of them make a contact sheet.")
@@ -104,7 +107,7 @@ Examples:
     help="A .png, .webp or .npy (floats), or out.%04d.png for many; .mp4, .gif or .webp for an animation; - for a PNG"
     " on standard output.  [default: NAME.png, here]",
 )
-@click.option("--overwrite", is_flag=True, help="Replace outputs that exist.")
+@overwrite_option
 @click.option(
     "--jobs",
     metavar="N",
@@ -131,8 +134,9 @@ def render(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, **s
         ctx.exit(_compare(ctx, settings, Console(quiet=quiet, verbose=verbose), as_json=as_json))
     viewer = viewer_from(ctx, settings | {"budget": _one_budget(ctx, settings)})
     if settings["full"]:
-        refuse(ctx, "--full", CUTS)
-    _check_usage(settings, as_json)
+        exclude(ctx, CUTS, "--full")
+    _check_usage(settings)
+    claim_stdout(ctx, "output", as_json=as_json)
     manner = manner_from(ctx, settings)
     placements = placements_from(settings)
     # Before much is read, what is wrong with the output already.
@@ -155,7 +159,7 @@ def render(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, **s
         sheet = _is_sheet(settings)
         output = _output(settings, placements, len(path.cameras))
         if output.form == "npy":
-            refuse(ctx, "a .npy, which holds numbers", of_pictures(settings["color_by"]))
+            exclude(ctx, of_pictures(settings["color_by"]), "a .npy, which holds numbers")
         background = background_from(ctx, settings, output.form)
         for camera in path.cameras:
             has_bar = (manner.color_by or settings["diff"]) and not settings["no_bar"]
@@ -170,7 +174,7 @@ def render(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, **s
         if output.kind == "animation":
             animation.check(output.form, frame_rate(path))
         notes = [*path.notes, *scenery().notes]
-        cuts = [flag_of(ctx, name) for name in CUTS if is_given(ctx, name)]
+        cuts = given(ctx, CUTS)
         if cuts and all(source.level is None for source in scenery().sources):
             say = f"{' and '.join(cuts)} say{'s' * (len(cuts) == 1)}"
             notes.append(f"no file is a Level-of-Detail tree, so all splats are drawn, whatever {say}")
@@ -203,9 +207,7 @@ def render(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, **s
 
 def _one_budget(ctx: click.Context, settings: Mapping[str, Any]) -> int | None:
     """The budget of a picture, None where none is given."""
-    for name in COMPARED:
-        if is_given(ctx, name):
-            raise click.UsageError(f"{flag_of(ctx, name)} only means something with --compare")
+    require(ctx, COMPARED, "--compare")
     budgets = settings["budget"]
     if budgets is None:
         return None
@@ -218,8 +220,8 @@ def _one_budget(ctx: click.Context, settings: Mapping[str, Any]) -> int | None:
 
 def _compare(ctx: click.Context, settings: dict[str, Any], console: Console, *, as_json: bool) -> int:
     """What --compare does; the exit status."""
-    refuse(ctx, "--compare", NOT_COMPARED)
-    _check_standard_output(settings, as_json)
+    exclude(ctx, NOT_COMPARED, "--compare")
+    claim_stdout(ctx, "output", as_json=as_json)
     viewer = viewer_from(ctx, settings | {"budget": None})
     manner = manner_from(ctx, settings)
     with console:
@@ -249,7 +251,7 @@ def _compare(ctx: click.Context, settings: dict[str, Any], console: Console, *, 
         return run(console, world, viewer, path, how, wanted, threads=settings["threads"])
 
 
-def _check_usage(settings: Mapping[str, Any], as_json: bool) -> None:
+def _check_usage(settings: Mapping[str, Any]) -> None:
     if settings["diff"] is None and settings["gain"] is not None:
         raise click.UsageError("--gain only means something with --diff")
     if settings["diff"] is not None:
@@ -257,13 +259,6 @@ def _check_usage(settings: Mapping[str, Any], as_json: bool) -> None:
             raise click.UsageError("--diff is between colours as they are; leave out --color-by")
         if settings["alpha"] or settings["background"] is None:
             raise click.UsageError("--diff is between pictures without alpha; name a --background")
-    _check_standard_output(settings, as_json)
-
-
-def _check_standard_output(settings: Mapping[str, Any], as_json: bool) -> None:
-    if as_json and str(settings["output"]) == "-":
-        what = "table" if settings["compare"] else "picture"
-        raise click.UsageError(f"--json and the {what} cannot both go to standard output")
 
 
 def _is_sheet(settings: Mapping[str, Any]) -> bool:

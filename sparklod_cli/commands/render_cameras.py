@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from .camera_options import SOURCES, cameras_from
-from .options import is_given, refuse
+from .usage import exclude, is_given
 
 if TYPE_CHECKING:
     from ..cameras.framing import Balls
@@ -39,7 +39,7 @@ def check_cameras(ctx: click.Context, settings: Mapping[str, Any]) -> None:
     if settings["views"] and given:
         raise click.UsageError(f"--view and {' and '.join(given)} cannot go together")
     if settings["views"] or not given:
-        refuse(ctx, "a camera that does not move", OF_PATHS)
+        exclude(ctx, OF_PATHS, "a camera that does not move")
 
 
 def is_free(settings: Mapping[str, Any]) -> bool:

@@ -15,7 +15,8 @@ import click
 
 from ..support import defaults
 from .console import Console, count_of, for_screen, is_terminal
-from .options import Command, Quantity, table_form
+from .options.common import Command, table_form
+from .options.types import Quantity
 from .paths import OutputPath
 
 if TYPE_CHECKING:
@@ -163,7 +164,7 @@ def run(
 
     Cuts go down to the budget, not to the size of a pixel, unless the viewer has a limit of its own.
     """
-    from ..compare import COLUMNS, Comparison
+    from ..compare import COLUMNS, Comparison, rows_of
     from ..io import write_stdout, write_whole
     from ..tables.files import encode
 
@@ -194,7 +195,9 @@ def run(
         from ..figures.comparison_chart import plot
 
         title = ", ".join(dict.fromkeys(tree.file.name for tree in world.trees))
-        write_whole(wanted.plot, [plot(rows, wanted.budgets, title)], overwrite=wanted.overwrite)
+        texts = (budget.text for budget in wanted.budgets)
+        series = list(zip(texts, rows_of(rows, wanted.budgets), strict=True))
+        write_whole(wanted.plot, [plot(series, title)], overwrite=wanted.overwrite)
     return _report(console, wanted, comparison, path, rows)
 
 

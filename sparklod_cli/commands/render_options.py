@@ -11,7 +11,9 @@ import click
 from ..render.settings import PROFILES, SORTS, RasterSettings
 from ..support import defaults
 from ..support.defaults import OF_PIXELS
-from .options import Command, Real, is_given, refuse
+from .options.common import Command
+from .options.types import Real
+from .usage import exclude, is_given
 
 if TYPE_CHECKING:
     from ..images.pixels import Color
@@ -171,10 +173,10 @@ def manner_from(ctx: click.Context, settings: Mapping[str, Any]) -> RenderSettin
         raise click.UsageError(f"--near {settings['near']:g} is not less than --far {settings['far']:g}")
     if style != "splats" and is_given(ctx, "backend"):
         raise click.UsageError(f"--backend draws splats, and has no --style {style}")
-    refuse(ctx, f"--style {style}", UNSTYLED.get(style, ()))
-    refuse(ctx, f"--backend {settings['backend']}", UNKNOWN_TO.get(settings["backend"], ()))
+    exclude(ctx, UNSTYLED.get(style, ()), f"--style {style}")
+    exclude(ctx, UNKNOWN_TO.get(settings["backend"], ()), f"--backend {settings['backend']}")
     if by == "overdraw":
-        refuse(ctx, "--color-by overdraw, which counts splats", ["sort"])
+        exclude(ctx, ["sort"], "--color-by overdraw, which counts splats")
     if by == "overdraw" and (style != "splats" or is_given(ctx, "backend")):
         raise click.UsageError("--color-by overdraw counts splats; leave out --style and --backend")
     if settings["no_bar"] and by is None and settings["diff"] is None:

@@ -9,9 +9,11 @@ import click
 
 from ..support import defaults
 from .camera_options import camera_options, cameras_from
+from .command import Command
 from .console import Console
-from .options import common_options, refuse, table_form
-from .paths import OutputPath, keep_apart
+from .options.common import common_options, overwrite_option, table_form
+from .paths import OutputPath, claim_stdout, keep_apart
+from .usage import exclude
 from .world_options import files_meant, placements_from, viewer_from, viewer_options, world_options
 
 #: Below this share of splats in front of the cameras, path and scene probably do not share their axes.
@@ -32,12 +34,12 @@ Examples:
 """
 
 
-@click.command("traverse", epilog=EXAMPLES, context_settings={"show_default": True})
+@click.command("traverse", cls=Command, epilog=EXAMPLES, context_settings={"show_default": True})
 @world_options
 @camera_options
 @viewer_options
 @click.option("-o", "--output", metavar="FILE", type=OutputPath(), help="Of the table.  [default: standard output]")
-@click.option("--overwrite", is_flag=True, help="Replace outputs that exist.")
+@overwrite_option
 @click.option(
     "--format",
     "form",
@@ -81,8 +83,9 @@ def traverse(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, *
 
     Coordinates are those of the files; --up, --world-transform and --camera-axes bring cameras into them.
     """
+    from ..simulation import columns
     from ..simulation.frames import Simulation
-    from ..tables import assertions, files
+    from ..tables import assertions
     from ..world import TRAVERSED, read_world
     from .traverse_job import Job, Wanted
 
@@ -91,13 +94,13 @@ def traverse(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, *
     keep_apart(ctx, files_meant(settings, placements))
     form = table_form("--output", settings["output"], settings["form"])
     try:
-        asserts = [assertions.parse(text) for text in settings["asserts"]]
+        asserts = [assertions.parse(text, columns.COLUMNS) for text in settings["asserts"]]
     except assertions.BadAssertionError as error:
         raise click.UsageError(f"--assert {error}") from None
     wanted = Wanted(
         output=settings["output"],
         form=form,
-        columns=files.select(timing=not settings["no_timing"]),
+        columns=columns.select(timing=not settings["no_timing"]),
         summary=settings["summary"],
         as_json=as_json,
         asserts=asserts,
@@ -106,10 +109,9 @@ def traverse(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, *
         padded=settings["padded"],
         overwrite=settings["overwrite"],
     )
-    if as_json and str(wanted.output) == "-":
-        raise click.UsageError("--json and the table cannot both go to standard output")
+    claim_stdout(ctx, "output", as_json=as_json)
     if as_json and wanted.output is None:
-        refuse(ctx, "--json without --output, which writes no table", OF_TABLES)
+        exclude(ctx, OF_TABLES, "--json without --output, which writes no table")
     if wanted.padded and wanted.indices is None:
         raise click.UsageError("--padded only means something with --indices-out")
     with Console(quiet=quiet, verbose=verbose) as console:

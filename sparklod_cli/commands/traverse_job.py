@@ -115,11 +115,12 @@ class Job:
 
     def report(self) -> int:
         """Says what is asked for; the exit status."""
+        from ..simulation.columns import EMPTY
         from ..simulation.summary import summarize
         from ..tables.assertions import check
 
         wanted = self.wanted
-        outcomes = check(wanted.asserts, self.rows)
+        outcomes = check(wanted.asserts, self.rows, empty=EMPTY)
         summary = summarize(self.rows)
         if wanted.as_json:
             asserts = [{"assert": each.assertion.text, "held": each.held, "value": each.value} for each in outcomes]
@@ -193,7 +194,8 @@ class Job:
             at,
         )
         title = ", ".join(dict.fromkeys(tree.file.name for tree in world.trees))
-        drawn = plot(self.rows, title, scenery)
+        marked = {moment.what: moment.frame for moment in self._lookout.moments()}
+        drawn = plot(self.rows, marked, title, scenery)
         if drawn.note:
             self.console.say(f"{target}: {drawn.note}")
         write_whole(target, [drawn.png], overwrite=self.wanted.overwrite)

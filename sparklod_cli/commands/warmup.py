@@ -8,9 +8,9 @@ import time
 import click
 
 from .. import __version__
-from ..support.parallel import processors
+from .command import GENERAL, Command, option
 from .console import Console, count_of
-from .options import verbose_option
+from .options.common import processors_to_use, verbose_option
 
 EXAMPLES = """
 \b
@@ -21,18 +21,19 @@ Examples:
 """
 
 
-@click.command("warmup", epilog=EXAMPLES, context_settings={"show_default": True})
-@click.option(
+@click.command("warmup", cls=Command, epilog=EXAMPLES, context_settings={"show_default": True})
+@option(
     "--jobs",
+    heading=GENERAL,
     metavar="N",
     type=click.IntRange(1, 64),
-    default=lambda: min(processors(), 4),
+    default=lambda: min(processors_to_use(), 4),
     show_default="processors, up to 4",
-    help="Processes to compile in.",
+    help="Number of processes to compile in.",
 )
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object on standard output.")
-@click.option("-q", "--quiet", is_flag=True, help="Say nothing but errors.")
-@verbose_option("Say which kernels are missing.")
+@option("--json", "as_json", heading=GENERAL, is_flag=True, help="Print one JSON object on standard output.")
+@option("-q", "--quiet", heading=GENERAL, is_flag=True, help="Print nothing but errors.")
+@verbose_option("Print which kernels are missing.")
 @click.version_option(__version__, package_name="sparklod")
 def warmup(jobs: int, as_json: bool, quiet: bool, verbose: bool) -> None:
     """Compile all inner loops for this machine, so that no later command has to.

@@ -10,8 +10,10 @@ import click
 
 from ..support import defaults
 from ..support.units import parse_bandwidth, parse_count, parse_latency
-from .options import Command, Quantity, Real, is_given, refuse
+from .options.common import Command
+from .options.types import Quantity, Real
 from .paths import InputPath, file_of
+from .usage import exclude, is_given
 
 if TYPE_CHECKING:
     from ..simulation.frames import LodSettings
@@ -195,7 +197,7 @@ def viewer_from(ctx: click.Context, settings: Mapping[str, Any]) -> LodSettings:
 
     behind, outside = settings["behind_foveate"], settings["outside_foveate"]
     if outside is not None:
-        refuse(ctx, "--outside-foveate", CONES)
+        exclude(ctx, CONES, "--outside-foveate")
     for name in OF_BANDWIDTH:
         if settings.get(name) is not None and settings["bandwidth"] is None:
             raise click.UsageError(f"--{name} only means something with --bandwidth")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
@@ -11,11 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..simulation.summary import Moment, coarseness, look_at
+from ..images.text import BACKGROUND, FAINT, INK, LINE
 from ..support.errors import SparklodError
 from ..tables.columns import Row
 from ..tables.statistics import numbers
-from .labels import BACKGROUND, FAINT, INK, LINE
 
 #: Pixels an inch, and in them the width of all charts together and the height of a row of two.
 DPI, WIDTH, ROW = 100, 1600, 255
@@ -77,9 +76,10 @@ class Frames:
         """(N,) numbers; NaN where a cell is empty."""
         return np.array([np.nan if row[name] is None else row[name] for row in self.rows], np.float64)
 
-    def coarseness(self) -> Series:
-        """(N,) how many times the limit the pixel scale is."""
-        return np.array([np.nan if (value := coarseness(row)) is None else value for row in self.rows], np.float64)
+    def ratio(self, name: str, of: str) -> Series:
+        """(N,) one column over another; NaN where a cell is empty, or the other is 0."""
+        above, below = self.column(name), self.column(of)
+        return np.divide(above, below, out=np.full(len(above), np.nan), where=below != 0)
 
 
 @dataclass(frozen=True)
@@ -145,7 +145,7 @@ def _beside(axes: Axes) -> Axes:
 
 
 def _coarse(axes: Axes, frames: Frames, matplotlib: ModuleType) -> Series:
-    values = frames.coarseness()
+    values = frames.ratio("pixel_scale_min", "pixel_scale_limit")
     values[~(values > 0)] = np.nan
     axes.plot(frames.x, values, color=ORANGE, linewidth=1.4)
     axes.axhline(1, color=FAINT, linewidth=1, linestyle=(0, (4, 3)), label="the limit")
@@ -237,18 +237,19 @@ PANELS = (
 )
 
 
-def draw(rows: Sequence[Row]) -> NDArray[np.uint8]:
-    """(H, WIDTH, 3) the charts of a path. Columns that are empty have none.
+def draw(rows: Sequence[Row], marked: Mapping[str, int]) -> NDArray[np.uint8]:
+    """(H, WIDTH, 3) the charts of a path; a column without a number has none.
 
     Args:
         rows: one for each frame, at least one.
+        marked: numbers of frames worth a look, by the reason (`Panel.marks`).
 
     Raises:
         SparklodError: matplotlib is not installed.
     """
     matplotlib = load_matplotlib()
     with styled(matplotlib):
-        return _draw(matplotlib, rows)
+        return _draw(matplotlib, rows, marked)
 
 
 @contextlib.contextmanager
@@ -273,8 +274,8 @@ def style() -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _draw(matplotlib: ModuleType, rows: Sequence[Row]) -> NDArray[np.uint8]:
-    frames, moments = Frames(rows), look_at(rows)
+def _draw(matplotlib: ModuleType, rows: Sequence[Row], marked: Mapping[str, int]) -> NDArray[np.uint8]:
+    frames = Frames(rows)
     panels = [panel for panel in PANELS if frames.has(*panel.columns)]
     lines = max(1, -(-len(panels) // 2))
     figure = matplotlib.figure.Figure((WIDTH / DPI, ROW * lines / DPI), DPI, layout="constrained")
@@ -292,20 +293,20 @@ def _draw(matplotlib: ModuleType, rows: Sequence[Row]) -> NDArray[np.uint8]:
         axes.xaxis.set_major_formatter(frames.tick)
         if axes.get_legend_handles_labels()[0]:
             axes.legend(loc="lower right", bbox_to_anchor=(1.0, 0.98), ncols=4, borderpad=0, handlelength=1.4)
-        for moment in moments:
-            at = places[moment.frame]
+        for reason, number in marked.items():
+            at = places[number]
             axes.axvline(frames.x[at], color=PINK, alpha=0.28, linewidth=0.9)
-            if moment.what in panel.marks:
-                _mark(axes, moment, frames.x[at], heights[at], at > 0.85 * len(rows))
+            if reason in panel.marks:
+                _mark(axes, number, frames.x[at], heights[at], at > 0.85 * len(rows))
     canvas.draw()
     pixels: NDArray[np.uint8] = np.asarray(canvas.buffer_rgba())[..., :3].copy()
     return pixels
 
 
-def _mark(axes: Axes, moment: Moment, x: float, y: float, left: bool) -> None:
+def _mark(axes: Axes, number: int, x: float, y: float, left: bool) -> None:
     axes.plot([x], [y], "o", color=PINK, markersize=6, zorder=5, clip_on=False)
     axes.annotate(
-        f"frame {moment.frame:,}",
+        f"frame {number:,}",
         (x, y),
         (-8 if left else 8, 3),
         textcoords="offset points",

@@ -11,12 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from ..compare import rows_of
-from ..lod.budget import Budget
+from ..images.text import BACKGROUND, FAINT, write_title
 from ..tables.columns import Row
 from ..tables.statistics import numbers
 from .charts import BLUE, DPI, GREEN, INDIGO, ORANGE, PINK, WIDTH, YELLOW, Frames, load_matplotlib, styled
-from .labels import BACKGROUND, FAINT, write_title
 
 #: Pixels of a row of charts, and of the title above them.
 ROW, HEAD = 420, 122
@@ -26,13 +24,15 @@ COLORS = (INDIGO, BLUE, GREEN, YELLOW, ORANGE, PINK)
 
 Axes = Any
 
+#: The rows of a budget, one for each frame, and the budget as it was given ("5%").
+Series = tuple[str, Sequence[Row]]
 
-def plot(rows: Sequence[Row], budgets: Sequence[Budget], title: str) -> bytes:
+
+def plot(series: Sequence[Series], title: str) -> bytes:
     """The PNG of charts: PSNR and SSIM by budget and along the path.
 
     Args:
-        rows: of `Comparison.run`.
-        budgets: that it was made with.
+        series: one for each budget, all of the same frames.
         title: the name of the scene.
 
     Raises:
@@ -40,9 +40,9 @@ def plot(rows: Sequence[Row], budgets: Sequence[Budget], title: str) -> bytes:
     """
     matplotlib = load_matplotlib()
     with styled(matplotlib):
-        charts = _charts(matplotlib, rows_of(rows, budgets), budgets)
+        charts = _charts(matplotlib, series)
     head = Image.new("RGB", (WIDTH, HEAD), BACKGROUND)
-    frames = len(rows) // len(budgets)
+    frames = len(series[0][1])
     about = f"against full detail, {frames:,} frame{'s' * (frames > 1)}, on black and on white"
     write_title(ImageDraw.Draw(head), 1.0, title, [(about, FAINT)])
     out = io.BytesIO()
@@ -50,15 +50,16 @@ def plot(rows: Sequence[Row], budgets: Sequence[Budget], title: str) -> bytes:
     return out.getvalue()
 
 
-def _charts(matplotlib: ModuleType, groups: Sequence[Sequence[Row]], budgets: Sequence[Budget]) -> NDArray[np.uint8]:
+def _charts(matplotlib: ModuleType, series: Sequence[Series]) -> NDArray[np.uint8]:
+    groups = [rows for _, rows in series]
     figure = matplotlib.figure.Figure((WIDTH / DPI, 2 * ROW / DPI), DPI, layout="constrained")
     canvas = matplotlib.backends.backend_agg.FigureCanvasAgg(figure)
     figure.get_layout_engine().set(rect=(0.012, 0.008, 0.976, 0.992), wspace=0.05, hspace=0.05)
     grid = figure.subplots(2, 2)
     _by_budget(matplotlib, grid[0, 0], groups, "psnr", "PSNR by budget", "dB")
     _by_budget(matplotlib, grid[0, 1], groups, "ssim", "SSIM by budget", "")
-    _by_frame(grid[1, 0], groups, budgets, "psnr", "PSNR along the path", "dB")
-    _by_frame(grid[1, 1], groups, budgets, "worst_tile_psnr", "PSNR of the worst tile", "dB")
+    _by_frame(grid[1, 0], series, "psnr", "PSNR along the path", "dB")
+    _by_frame(grid[1, 1], series, "worst_tile_psnr", "PSNR of the worst tile", "dB")
     canvas.draw()
     pixels: NDArray[np.uint8] = np.asarray(canvas.buffer_rgba())[..., :3].copy()
     return pixels
@@ -85,15 +86,13 @@ def _by_budget(
     axes.legend(loc="lower right", ncols=4, borderpad=0, handlelength=1.4)
 
 
-def _by_frame(
-    axes: Axes, groups: Sequence[Sequence[Row]], budgets: Sequence[Budget], name: str, title: str, unit: str
-) -> None:
+def _by_frame(axes: Axes, series: Sequence[Series], name: str, title: str, unit: str) -> None:
     """A line for each budget."""
-    for at, (rows, budget) in enumerate(zip(groups, budgets, strict=True)):
+    for at, (budget, rows) in enumerate(series):
         frames = Frames(rows)
-        axes.plot(frames.x, frames.column(name), color=COLORS[at % len(COLORS)], linewidth=1.4, label=budget.text)
+        axes.plot(frames.x, frames.column(name), color=COLORS[at % len(COLORS)], linewidth=1.4, label=budget)
         axes.xaxis.set_major_formatter(frames.tick)
         axes.set_xlim(frames.x[0], frames.x[-1])
     axes.set_title(title)
     axes.set_ylabel(unit)
-    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=len(budgets), borderpad=0, handlelength=1.4)
+    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=len(series), borderpad=0, handlelength=1.4)

@@ -4,27 +4,19 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw
 
+from ..images.text import FAINT, INK, LINE, font, write_scale, write_title
 from ..render.color_scales import Coloring
-from ..support.printable import printable
 from ..support.ticks import ticks
 from .ellipsoids import Points
 from .viewpoint import Viewpoint
 
-BACKGROUND, INK, FAINT, LINE = "#0f141b", "#e6edf3", "#9aa7b4", "#7d8996"
-
 #: Least distance of the labels of an axis, in thousandths of the picture's height.
 LABEL_DISTANCE = 62
-
-#: Characters of a title; more do not fit.
-MOST_TITLE = 120
-
-Font = Any
 
 
 def write_png(
@@ -54,45 +46,6 @@ def write_png(
     out = io.BytesIO()
     image.save(out, "PNG", optimize=True)
     return out.getvalue()
-
-
-def _font(unit: float, size: float) -> Font:
-    return ImageFont.load_default(size=max(7, size * unit))
-
-
-def write_title(draw: ImageDraw.ImageDraw, unit: float, title: str, lines: Sequence[tuple[str, str]]) -> None:
-    """A title, and below it lines and their colours, at the upper left of a picture.
-
-    Args:
-        draw: the picture.
-        unit: a thousandth of the picture's height; 1 is for one of 1600 x 1000.
-        title, lines: in words that fit into its width.
-    """
-    left, top = 40 * unit, 30 * unit
-    draw.text((left, top), printable(title, MOST_TITLE), INK, _font(unit, 32))
-    for number, (line, color) in enumerate(lines):
-        draw.text((left, top + (46 + 26 * number) * unit), line, color, _font(unit, 19))
-
-
-def write_scale(image: Image.Image, draw: ImageDraw.ImageDraw, unit: float, coloring: Coloring) -> None:
-    """What the colours mean, at the right of a picture.
-
-    Args:
-        image, draw: the picture.
-        unit: a thousandth of the picture's height; 1 is for one of 1600 x 1000.
-        coloring: what they mean.
-    """
-    left, right = image.width - 170 * unit, image.width - 146 * unit
-    top, bottom = 0.26 * image.height, 0.84 * image.height
-    draw.text((left, top - 18 * unit), coloring.title, INK, _font(unit, 21), anchor="ls")
-    height = max(1, round(bottom - top))
-    rows = np.arange(height)[::-1] * len(coloring.ramp) // height
-    bar = np.broadcast_to(coloring.ramp[rows][:, None], (height, max(1, round(right - left)), 3))
-    image.paste(Image.fromarray(np.ascontiguousarray(bar)), (round(left), round(top)))
-    for place, text in coloring.marks:
-        y = bottom - place * (bottom - top)
-        draw.line([(right, y), (right + 6 * unit, y)], LINE, max(1, round(unit)))
-        draw.text((right + 12 * unit, y), text, FAINT, _font(unit, 17), anchor="lm")
 
 
 def _axes(
@@ -128,10 +81,10 @@ def _axes(
             point[axis] = value
             at = (eye.project(point[None]) * size)[0]
             draw.line([tuple(at), tuple(at + 7 * unit * out)], LINE, max(1, round(1.5 * unit)))
-            draw.text(tuple(at + 24 * unit * out), text, FAINT, _font(unit, 17), anchor="mm")
+            draw.text(tuple(at + 24 * unit * out), text, FAINT, font(unit, 17), anchor="mm")
         name = "xyz"[axis]
         place = (first + last) / 2 + 62 * unit * out
         if axis == upright:  # its name stands above it
             name += ", down" if down else ""
             place = first - 26 * unit * along if down else last + 26 * unit * along
-        draw.text(tuple(place), name, INK, _font(unit, 20), anchor="mm")
+        draw.text(tuple(place), name, INK, font(unit, 20), anchor="mm")

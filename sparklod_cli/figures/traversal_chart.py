@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,14 +12,13 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from ..cameras.camera import Camera
+from ..images.text import BACKGROUND, FAINT, write_title
 from ..model.splats import Splats
-from ..simulation.summary import look_at
 from ..support.errors import SparklodError
 from ..tables.columns import Row
 from ..tables.statistics import numbers, totals
 from . import charts
 from .camera_path import picture_of_path
-from .labels import BACKGROUND, FAINT, write_title
 
 #: What the frames to look at are called.
 CALLED = {
@@ -57,11 +56,12 @@ class Plot:
     note: str | None
 
 
-def plot(rows: Iterable[Row], title: str, scenery: Scenery | None = None) -> Plot:
+def plot(rows: Iterable[Row], marked: Mapping[str, int], title: str, scenery: Scenery | None = None) -> Plot:
     """Draws a simulation: charts of all its columns that are not empty and, where it can be drawn, the path.
 
     Args:
         rows: of all frames; those of single instances are left out.
+        marked: numbers of frames worth a look, by the reason, a key of `CALLED`.
         title: the name of the scene.
         scenery: what the path leads through; None for charts alone.
 
@@ -71,7 +71,7 @@ def plot(rows: Iterable[Row], title: str, scenery: Scenery | None = None) -> Plo
     frames = totals(rows)
     if not frames:
         raise SparklodError("there is nothing to draw: the path has no frames")
-    images, note = [_head(title, frames), Image.fromarray(charts.draw(frames))], None
+    images, note = [_head(title, frames, marked), Image.fromarray(charts.draw(frames, marked))], None
     if scenery is not None:
         try:
             picture = picture_of_path(scenery.cameras, scenery.splats, scenery.level, frame=scenery.frame)
@@ -81,10 +81,10 @@ def plot(rows: Iterable[Row], title: str, scenery: Scenery | None = None) -> Plo
     return Plot(_stacked(images), note)
 
 
-def _head(title: str, frames: Sequence[Row]) -> Image.Image:
+def _head(title: str, frames: Sequence[Row], marked: Mapping[str, int]) -> Image.Image:
     """What stands above the charts."""
     lines = [(_about(frames), FAINT)]
-    said = ", ".join(f"{CALLED[moment.what]}: frame {moment.frame:,}" for moment in look_at(frames))
+    said = ", ".join(f"{CALLED[reason]}: frame {number:,}" for reason, number in marked.items())
     if said:
         lines.append((said, charts.PINK))
     image = Image.new("RGB", (charts.WIDTH, 96 + 26 * len(lines)), BACKGROUND)

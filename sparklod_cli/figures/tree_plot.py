@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..images.text import BACKGROUND
 from ..lod.kernels.tree_links import walk
 from ..lod.traversal import CHUNK_NODES
 from ..model.gaussian import spark_size
@@ -17,7 +18,7 @@ from ..support.defaults import DEFAULT_BASE, PLOT_BY
 from ..support.errors import SparklodError
 from ..support.ticks import nice_step
 from .ellipsoids import Points, box_lines, cells, evenly, level_of_step, wall_lines
-from .labels import BACKGROUND, write_png
+from .labels import write_png
 from .node_colors import color_by
 from .pyvista_scene import Stage
 from .viewpoint import bounds, is_drawable, viewpoint

@@ -5,15 +5,12 @@ from __future__ import annotations
 import bisect
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from ..figures.labels import BACKGROUND, FAINT
 from .pixels import Pixels
-
-Font = Any
+from .text import BACKGROUND, FAINT, Font
 
 #: Pixels between pictures, and around them; height of a caption, and of its letters, for pictures 720 pixels high.
 GAP, CAPTION, LETTERS = 8, 34, 20

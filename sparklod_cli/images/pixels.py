@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from PIL import Image as Pillow
 from PIL import ImageDraw
 
-from ..figures.labels import BACKGROUND, write_scale
 from ..render.color_scales import Coloring, smooth
 from ..render.rasterizer import Image
+from .text import BACKGROUND, write_scale
 
 #: (H, W, 3) or, with alpha that red, green and blue are not multiplied by, (H, W, 4).
 Pixels = NDArray[np.uint8]

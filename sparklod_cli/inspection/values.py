@@ -15,6 +15,7 @@ from ..model.gaussian import spark_size
 from ..model.scene import Scene
 from ..model.sh import COEFFICIENTS
 from ..model.splats import FloatArray, Splats
+from ..tables.histograms import Histogram, histogram
 from .findings import Finding
 
 #: The quantities that are looked at, by name; each makes (N,) numbers of N splats. `SH_QUANTITIES` join them.
@@ -32,6 +33,9 @@ QUANTITIES: dict[str, Callable[[Splats], FloatArray]] = {
     "blue": lambda splats: splats.rgb[:, 2],
 }
 SH_QUANTITIES = ("sh1", "sh2", "sh3")  # root mean square of a splat's coefficients of a degree
+
+#: Quantities whose histograms have bins of equal width, however many decades the numbers span.
+LINEAR = ("x", "y", "z", "opacity", "red", "green", "blue")
 
 #: The codes of what makes a splat invalid (`splats.INVALID`), and what is said of it.
 OF_INVALID = {
@@ -99,6 +103,11 @@ def quantity(splats: Splats, name: str) -> FloatArray:
         return np.sqrt(
             np.square(splats.sh[:, COEFFICIENTS[degree] : COEFFICIENTS[degree + 1]], dtype=np.float64).mean((1, 2))
         )
+
+
+def histogram_of(splats: Splats, name: str, *, bins: int = 40) -> Histogram:
+    """The histogram of one of `names_of(splats)`, by its name."""
+    return histogram(quantity(splats, name), bins=bins, log=False if name in LINEAR else None)
 
 
 def examine(splats: Splats, *, all_quantities: bool = False) -> ValueFacts:

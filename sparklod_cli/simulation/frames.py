@@ -16,9 +16,10 @@ from ..lod.traversal import Cones, Cut, Frustum, Traversal, View, pixel_limit
 from ..support.parallel import ordered_map
 from ..support.progress import Progress, silent
 from ..support.units import count_of
-from ..tables.columns import COLUMNS, Row
+from ..tables.columns import Row
 from ..world import TOTAL, World
 from .chunk_cache import Chunks
+from .columns import COLUMNS
 from .streaming import Network, Stream
 
 #: A cut has the number of an instance as a uint16.

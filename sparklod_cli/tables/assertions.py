@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 import operator
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
+from types import MappingProxyType
 
 from ..support.errors import SparklodError
-from .columns import COLUMNS, Column, Row
+from .columns import Column, Row
 from .files import near
 from .statistics import STATISTICS, Number, is_statistic, numbers, statistic, totals
 
@@ -26,18 +27,6 @@ COMPARISONS: dict[str, Callable[[Number, Number], bool]] = {
 TEXT = re.compile(r"\s*(?P<left>[^<>=!]*?)\s*(?P<sign>[<>=!]+)\s*(?P<right>[^<>=!]*?)\s*")
 NUMBER = re.compile(r"(?P<number>[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]{1,3})?)\s*(?P<unit>[kKMG%]?)")
 UNITS: dict[str, int | Decimal] = {"": 1, "k": 10**3, "K": 10**3, "M": 10**6, "G": 10**9, "%": Decimal("0.01")}
-
-#: Why all cells of a column can be empty.
-EMPTY = {
-    "time_s": "the path has no times",
-    "complete_in_s": "it needs --bandwidth",
-    "traverse_ms": "--no-timing leaves it out",
-    "added": "it compares a frame with the one before, and there is one frame only",
-    "removed": "it compares a frame with the one before, and there is one frame only",
-    "churn": "it compares a frame with the one before, and there is one frame only",
-    "projected_px_p50": "no splat is in the picture on any frame",
-    "projected_px_p95": "no splat is in the picture on any frame",
-}
 
 
 class BadAssertionError(SparklodError):
@@ -107,7 +96,7 @@ class Outcome:
         return f"{found}; the worst is {where} with {number_text(cell)}"
 
 
-def parse(text: str, columns: Sequence[Column] = COLUMNS) -> Assertion:
+def parse(text: str, columns: Sequence[Column]) -> Assertion:
     """An assertion from `NAME[_STATISTIC] SIGN NUMBER`.
 
     NAME is that of a numeric column, and the longest name that fits is taken: `pixel_scale_min<1` is about every cell
@@ -162,12 +151,15 @@ def _bound(text: str, right: str) -> Number:
     return int(number) if number.is_integer() else number
 
 
-def check(assertions: Sequence[Assertion], rows: Iterable[Row]) -> list[Outcome]:
+def check(
+    assertions: Sequence[Assertion], rows: Iterable[Row], *, empty: Mapping[str, str] = MappingProxyType({})
+) -> list[Outcome]:
     """Whether assertions hold, in their order.
 
     Args:
         assertions: the questions.
         rows: of all frames; those of single instances, in a table that has any, are left out.
+        empty: why all cells of a column may be empty, by the column's name, for the error.
 
     Raises:
         BadAssertionError: there is no frame, or all cells of a column are empty.
@@ -175,17 +167,17 @@ def check(assertions: Sequence[Assertion], rows: Iterable[Row]) -> list[Outcome]
     frames = totals(rows)
     if not frames:
         raise BadAssertionError("there are no frames that an assertion could be about")
-    return [_outcome(assertion, frames) for assertion in assertions]
+    return [_outcome(assertion, frames, empty) for assertion in assertions]
 
 
-def _outcome(assertion: Assertion, rows: Sequence[Row]) -> Outcome:
+def _outcome(assertion: Assertion, rows: Sequence[Row], empty: Mapping[str, str]) -> Outcome:
     name = assertion.column.name
     filled = [row for row in rows if row[name] is not None]
     values = numbers(filled, name)
     if assertion.statistic == "count":
         return Outcome(assertion, assertion.holds(len(values)), len(values), 0, len(values), None)
     if not values:
-        why = EMPTY.get(name, "there is nothing to say on any frame")
+        why = empty.get(name, "no frame has a value")
         raise BadAssertionError(f"{assertion.text!r}: {name} is empty: {why}")
     failed = [not assertion.holds(value) for value in values]
     worst = max(range(len(values)), key=lambda at: (failed[at], _badness(assertion, values[at])))

@@ -11,7 +11,7 @@ from types import ModuleType
 from typing import Any
 
 from ..support.errors import SparklodError
-from .columns import COLUMNS, TIMING, Cell, Column, Row
+from .columns import Cell, Column, Row
 
 FORMS = ("csv", "json", "parquet")
 
@@ -26,28 +26,6 @@ QUOTED = ',"\r\n'
 
 #: How texts begin that spreadsheets run, or skip to what they run.
 FORMULAS = ("=", "+", "-", "@", "\t", "\r", "\n")
-
-
-class UnknownColumnError(SparklodError):
-    """There is no column of such a name."""
-
-
-def select(names: Sequence[str] = (), *, timing: bool = True) -> tuple[Column, ...]:
-    """Columns by their names, in this order; all of them, in the order of `COLUMNS`, for no names.
-
-    Args:
-        names: of columns; one that comes twice is taken once.
-        timing: with those that differ from run to run.
-
-    Raises:
-        UnknownColumnError: there is no such column; names those that come near.
-    """
-    every = {column.name: column for column in COLUMNS}
-    for name in names:
-        if name not in every:
-            raise UnknownColumnError(f"there is no column {name!r}{near(name, every)}")
-    chosen = dict.fromkeys(names) if names else every
-    return tuple(every[name] for name in chosen if timing or name not in TIMING)
 
 
 def near(name: str, known: Iterable[str], *, cutoff: float = 0.6) -> str:

@@ -8,17 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..inspection.values import quantity
-from ..model.splats import FloatArray, Splats
+from ..model.splats import FloatArray
 
 #: Positive numbers that span more than this factor are counted in bins of equal ratios.
 LOG_SPAN = 100
 
 #: Where all numbers span more than this many times what the inner 99 % do, the bins span these only.
 FAR_SPAN = 3
-
-#: Quantities that people think of in equal steps, however many decades they span.
-LINEAR = ("x", "y", "z", "opacity", "red", "green", "blue")
 
 #: Eighths of a character, from none to seven.
 EIGHTHS = " ▏▎▍▌▋▊▉"
@@ -78,11 +74,6 @@ def histogram(values: FloatArray, *, bins: int = 40, log: bool | None = None) ->
         edges = np.exp(edges)  # which rounds: the outermost are known
         edges[0], edges[-1] = edges[0] if below else least, edges[-1] if above else most
     return Histogram(edges, counts.astype(np.int64), log, below, above, not_finite)
-
-
-def of_quantity(splats: Splats, name: str, *, bins: int = 40) -> Histogram:
-    """The histogram of a quantity of `values.QUANTITIES`."""
-    return histogram(quantity(splats, name), bins=bins, log=False if name in LINEAR else None)
 
 
 def _range(values: NDArray[np.float64]) -> tuple[float, float]:

@@ -17,9 +17,8 @@ from pathlib import Path
 import pytest
 
 from fixtures import by_hand, by_hand_sog
-
-from ..conftest import FIXTURES
-from ..scenes import splat_columns
+from tests.conftest import FIXTURES
+from tests.scenes import splat_columns
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="memory is limited and counted as Linux does")
 

@@ -13,14 +13,13 @@ import pytest
 
 from fixtures import by_hand_compressed_ply
 from sparklod_cli.codecs import compressed_ply
-from sparklod_cli.errors import FormatError
 from sparklod_cli.io import read_scene
-from sparklod_cli.scene import Scene
-from sparklod_cli.splats import COLUMNS
-
-from ..conftest import FIXTURES
-from ..scenes import random_splats
-from .writers import linear
+from sparklod_cli.model.scene import Scene
+from sparklod_cli.model.splats import COLUMNS
+from sparklod_cli.support.errors import FormatError
+from tests.codecs.writers import linear
+from tests.conftest import FIXTURES
+from tests.scenes import random_splats
 
 GOLDEN = FIXTURES / "golden" / "sh3-compressed.ply"
 
@@ -130,7 +129,7 @@ LAYOUTS: dict[str, Callable[[bytes], bytes]] = {
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_layout_makes_no_difference(layout: str, tmp_path: Path) -> None:
+def test_layouts_of_compressed_ply_hold_the_same_scene(layout: str, tmp_path: Path) -> None:
     path = tmp_path / "scene.ply"
     path.write_bytes(LAYOUTS[layout](GOLDEN.read_bytes()))
     one, other = read_scene(path), read_scene(GOLDEN)
@@ -177,7 +176,7 @@ REFUSED: dict[str, tuple[Callable[[], bytes], str]] = {
 
 
 @pytest.mark.parametrize("what", REFUSED)
-def test_refused_with_a_reason(what: str) -> None:
+def test_broken_compressed_ply_is_refused_with_a_reason(what: str) -> None:
     make, reason = REFUSED[what]
     with pytest.raises(FormatError, match=reason):
         decode(make())

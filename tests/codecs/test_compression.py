@@ -14,8 +14,8 @@ import pytest
 import zstandard
 
 from sparklod_cli.codecs import compression
-from sparklod_cli.errors import FormatError
-from sparklod_cli.progress import silent
+from sparklod_cli.support.errors import FormatError
+from sparklod_cli.support.progress import silent
 
 BLOCK = compression.BLOCK
 SIZES = (0, 1, 2, BLOCK - 1, BLOCK, BLOCK + 1, 2 * BLOCK, 3 * BLOCK, 3 * BLOCK + 7)
@@ -51,7 +51,7 @@ def test_it_is_one_member_without_a_time_that_python_reads(size: int) -> None:
 
 @pytest.mark.parametrize("kind", ["mixed", "noise", "zeros"])
 @pytest.mark.parametrize("size", SIZES)
-def test_threads_do_not_change_a_byte(size: int, kind: str) -> None:
+def test_threads_do_not_change_a_byte_of_gzip(size: int, kind: str) -> None:
     data = sample(size, kind)
     one = packed(data)
     assert gzip.decompress(one) == data.tobytes()

@@ -18,10 +18,9 @@ import pytest
 
 from fixtures import by_hand, by_hand_sog
 from sparklod_cli.codecs.formats import FORMATS, HEAD, Format, sniff
-from sparklod_cli.errors import FormatError
-from sparklod_cli.scene import Scene
-
-from ..conftest import FIXTURES
+from sparklod_cli.model.scene import Scene
+from sparklod_cli.support.errors import FormatError
+from tests.conftest import FIXTURES
 
 #: Files to damage: small ones of every kind that is read.
 FILES = (
@@ -115,7 +114,7 @@ def test_a_file_that_is_cut_is_refused_wherever_it_is_cut(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_single_bits(name: str) -> None:
+def test_a_flipped_bit_gives_a_scene_or_a_format_error(name: str) -> None:
     data = content(name)
     rng = np.random.default_rng(10)
     every = [8 * place + bit for place in header(name, data) for bit in range(8)]
@@ -180,7 +179,7 @@ WORDS = (
 
 @pytest.mark.parametrize("name", FILES)
 @pytest.mark.parametrize("seed", range(2))
-def test_worse_damage(name: str, seed: int) -> None:
+def test_bytes_put_in_cut_out_or_changed_give_a_scene_or_a_format_error(name: str, seed: int) -> None:
     rng = np.random.default_rng([11, seed, len(name)])
     raw, packed = insides(name)[0]  # of SOG, meta.json
     reach = [len(header(name, raw)), len(raw)]
@@ -254,7 +253,7 @@ def test_random_bytes_with_a_suffix(suffix: str) -> None:
             assert attempt(f"scene{suffix}", rng.bytes(size)) != "scene" or (size == 0 and suffix == ".splat")
 
 
-def test_a_header_alone() -> None:
+def test_a_header_without_its_splats_is_no_scene() -> None:
     for version in (1, 2, 3):
         for count in (0, 1, 1_000_000, 4_294_967_295):
             result = attempt("", by_hand.spz_gzip(version, count, 3, 12, 0, []))

@@ -11,9 +11,8 @@ from typing import Any
 import pytest
 
 from fixtures import by_hand_sog
-
-from ..conftest import FIXTURES
-from .test_damaged import ZIPPED, attempt, content, members
+from tests.codecs.test_damaged import ZIPPED, attempt, content, members
+from tests.conftest import FIXTURES
 
 FOLDER = "golden/sh1-sog"
 FILES = {path.name: path.read_bytes() for path in (FIXTURES / FOLDER).iterdir()}

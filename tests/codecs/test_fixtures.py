@@ -5,7 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 
-from ..conftest import FIXTURES
+from tests.conftest import FIXTURES
 
 SCRIPT = FIXTURES / "make_fixtures.py"
 

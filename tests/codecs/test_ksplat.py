@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 
 from sparklod_cli.codecs import ksplat
-from sparklod_cli.errors import FormatError
-from sparklod_cli.scene import Scene
-
-from ..conftest import FIXTURES
+from sparklod_cli.model.scene import Scene
+from sparklod_cli.support.errors import FormatError
+from tests.conftest import FIXTURES
 
 GOLDEN = [FIXTURES / "golden" / f"sh2-level{level}.ksplat" for level in range(3)]
 SECTION = 4096
@@ -147,7 +146,7 @@ REFUSED: dict[str, tuple[Callable[[], bytes], str]] = {
 
 
 @pytest.mark.parametrize("what", REFUSED)
-def test_refused_with_a_reason(what: str) -> None:
+def test_broken_ksplat_is_refused_with_a_reason(what: str) -> None:
     make, reason = REFUSED[what]
     with pytest.raises(FormatError, match=reason):
         decode(make())

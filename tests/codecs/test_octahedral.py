@@ -12,8 +12,8 @@ from hypothesis.extra.numpy import arrays
 
 from sparklod_cli.codecs import octahedral
 from sparklod_cli.codecs.octahedral import STEPS_8_8_8, STEPS_10_10_12
-from sparklod_cli.errors import FormatError
-from sparklod_cli.gaussian import normalized_quat
+from sparklod_cli.model.gaussian import normalized_quat
+from sparklod_cli.support.errors import FormatError
 
 Steps = tuple[int, int]
 BOTH = pytest.mark.parametrize("steps", [STEPS_8_8_8, STEPS_10_10_12])
@@ -80,7 +80,7 @@ def test_angles_are_off_by_half_a_step(steps: Steps) -> None:
 
 
 @BOTH
-def test_codes_come_back(steps: Steps) -> None:
+def test_rotations_take_their_own_codes_back(steps: Steps) -> None:
     rng = np.random.default_rng(6)
     # On the rim of the square two codes mean the same axis, and a turn by 0 has none.
     u, v = rng.integers(1, steps[0], (2, 200_000))
@@ -125,7 +125,7 @@ def test_both_signs_are_one_rotation_and_what_comes_back_is_unit(steps: Steps) -
         ([-HALF_TURN, 0, -HALF_TURN, 0], 0, 191, 255),  # folded: x = -1, y = 1 / 2
     ],
 )
-def test_by_hand(quat: list[float], u: int, v: int, angle: int) -> None:
+def test_rotations_have_the_codes_worked_out_by_hand(quat: list[float], u: int, v: int, angle: int) -> None:
     codes = octahedral.encode_axis_angle(np.array([quat], np.float32), STEPS_8_8_8)
     assert [int(code[0]) for code in codes] == [u, v, angle]
 
@@ -150,19 +150,19 @@ def test_ties_go_away_from_zero() -> None:
     np.testing.assert_array_equal(octahedral.to_code(values, 255), expected)
 
 
-def test_codes_are_clamped() -> None:
+def test_values_beyond_the_codes_become_the_first_or_last() -> None:
     values = np.array([-np.inf, -1e30, -0.6, 255.4, 1e30, np.inf], np.float32)
     assert octahedral.to_code(values, 255).tolist() == [0, 0, 0, 255, 255, 255]
 
 
 @pytest.mark.parametrize(("opacity", "alpha"), [(0, 0), (0.3, 0.3), (1, 1), (np.exp(3 / np.e), 1.25), (1000, 1.8618)])
-def test_alpha_by_hand(opacity: float, alpha: float) -> None:
+def test_lod_alpha_is_opacity_up_to_1_and_d_above(opacity: float, alpha: float) -> None:
     """D is itself up to 1, 2 for exp(3 / e), 4.447 for 1000."""
     assert octahedral.encode_lod_alpha(np.array([opacity], np.float32))[0] == pytest.approx(alpha, abs=1e-4)
 
 
 @given(opacity=arrays(np.float32, 16, elements=st.floats(0, 1000, width=32)))
-def test_alpha_comes_back(opacity: np.ndarray) -> None:
+def test_decoding_lod_alpha_gives_the_opacity_back(opacity: np.ndarray) -> None:
     back = octahedral.decode_lod_alpha(octahedral.encode_lod_alpha(opacity))
     assert back.dtype == np.float32
     np.testing.assert_allclose(back, opacity, rtol=2e-5)

@@ -15,11 +15,10 @@ from plyfile import PlyElement
 
 from fixtures import by_hand
 from sparklod_cli.codecs import ply
-from sparklod_cli.errors import FormatError
-from sparklod_cli.scene import Scene
-from sparklod_cli.splats import COLUMNS
-
-from ..conftest import FIXTURES
+from sparklod_cli.model.scene import Scene
+from sparklod_cli.model.splats import COLUMNS
+from sparklod_cli.support.errors import FormatError
+from tests.conftest import FIXTURES
 
 SH_C0 = 0.28209479177387814
 
@@ -126,7 +125,7 @@ def crlf_header(data: bytes) -> bytes:
 
 @pytest.mark.parametrize("text", [False, True], ids=["binary", "ascii"])
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_layout_makes_no_difference(layout: str, text: bool) -> None:
+def test_layouts_of_ply_hold_the_same_scene(layout: str, text: bool) -> None:
     given = columns(sh_degree=1)
     given = {name: np.asarray(values, np.float32) for name, values in given.items()}  # so that doubles are no better
     assert_same(decode(LAYOUTS[layout](given, text)), decode(by_hand.ply(given)))
@@ -177,7 +176,7 @@ def test_rotations_of_any_length_become_unit() -> None:
     np.testing.assert_allclose(quats, np.tile([2, 3, 4, 1], (5, 1)) / 30**0.5, rtol=1e-6)
 
 
-def test_a_rotation_of_no_length_is_not_a_number() -> None:
+def test_a_quaternion_of_zeros_in_ply_is_not_a_number() -> None:
     given = columns()
     for name in ("rot_0", "rot_1", "rot_2", "rot_3"):
         given[name][2] = 0
@@ -231,7 +230,7 @@ REFUSED: dict[str, tuple[Callable[[], bytes], str]] = {
 
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("what", REFUSED)
-def test_refused_with_a_reason(what: str) -> None:
+def test_broken_ply_is_refused_with_a_reason(what: str) -> None:
     make, reason = REFUSED[what]
     with pytest.raises(FormatError, match=reason):
         decode(make())

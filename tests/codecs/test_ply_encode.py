@@ -10,12 +10,11 @@ from plyfile import PlyData
 
 from fixtures import by_hand
 from sparklod_cli.codecs import ply
-from sparklod_cli.errors import FormatError
-from sparklod_cli.scene import Scene
-from sparklod_cli.splats import COLUMNS, Splats
-from sparklod_cli.tree import LodTree
-
-from ..scenes import random_splats, splat_columns
+from sparklod_cli.model.lod_tree import LodTree
+from sparklod_cli.model.scene import Scene
+from sparklod_cli.model.splats import COLUMNS, Splats
+from sparklod_cli.support.errors import FormatError
+from tests.scenes import random_splats, splat_columns
 
 SH_C0 = 0.28209479177387814
 
@@ -40,7 +39,7 @@ def test_the_properties_are_inria_s_in_inria_s_order(sh_degree: int) -> None:
     np.testing.assert_array_equal(rest, splats.sh.transpose(0, 2, 1).reshape(7, -1))
 
 
-def test_every_value() -> None:
+def test_every_value_is_where_inria_writes_it() -> None:
     splats = random_splats(2)
     splats.center[:] = [[1.5, -2.25, 1e6], [0, 0, 0]]
     splats.scale[:] = [[1, np.e, 1 / np.e]] * 2
@@ -83,7 +82,7 @@ def test_what_was_read_is_written_as_it_was() -> None:
 
 
 @pytest.mark.parametrize("count", [0, 1, 40_000])
-def test_threads_do_not_change_a_byte(count: int) -> None:
+def test_threads_do_not_change_a_byte_of_ply(count: int) -> None:
     scene = Scene(random_splats(max(count, 1), sh_degree=1).take(slice(count)))
     one = b"".join(ply.encode(scene))
     assert b"".join(ply.encode(scene, threads=3)) == one
@@ -93,7 +92,7 @@ def test_threads_do_not_change_a_byte(count: int) -> None:
         np.testing.assert_allclose(getattr(back, column), getattr(scene.splats, column), rtol=1e-5, atol=1e-6)
 
 
-def test_a_tree_is_not_written() -> None:
+def test_ply_refuses_to_write_a_tree() -> None:
     tree = LodTree(np.array([1, 0], np.uint16), np.array([1, 0], np.uint32))
     with pytest.raises(FormatError, match="PLY holds no Level-of-Detail tree"):
         encode(random_splats(2), tree=tree)

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from sparklod_cli.codecs import quantize
-from sparklod_cli.gaussian import linear_opacity, lod_opacity, normalized_quat
-from sparklod_cli.sh import SH_C0
+from sparklod_cli.model.gaussian import linear_opacity, lod_opacity, normalized_quat
+from sparklod_cli.model.sh import SH_C0
 
 CODES = np.arange(256, dtype=np.uint8)
 ROUNDING = 1.001  # float32's own errors, which no docstring counts
@@ -130,7 +130,7 @@ def test_log_scale_reaches_its_error() -> None:
         ("color", 0.5, 128),  # 127.5, a tie: to even
     ],
 )
-def test_ends_and_ties(name: str, value: float, code: int) -> None:
+def test_ends_of_ranges_and_ties_have_the_codes_stated(name: str, value: float, code: int) -> None:
     assert BYTE_CODINGS[name][0](np.array([value], np.float32)).tolist() == [code]
 
 
@@ -163,7 +163,7 @@ def test_sh_stores_the_middles_of_buckets() -> None:
 
 
 @pytest.mark.parametrize("coefficients", [3, 8, 15])
-def test_sh_clamps(coefficients: int) -> None:
+def test_sh_beyond_their_range_are_clamped(coefficients: int) -> None:
     values = np.array([-2.0, 2.0], np.float32)
     codes = quantize.encode_sh(in_all_coefficients(values)[:, :coefficients])
     assert codes.shape == (2, coefficients, 3)

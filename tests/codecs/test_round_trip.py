@@ -11,16 +11,15 @@ import pytest
 
 from sparklod_cli.codecs import spz
 from sparklod_cli.codecs.formats import FORMATS
-from sparklod_cli.gaussian import linear_opacity, lod_opacity
 from sparklod_cli.io import read_scene
-from sparklod_cli.scene import Scene
-from sparklod_cli.splats import COLUMNS, Splats
-from sparklod_cli.tree import LodTree
-
-from ..conftest import FIXTURES
-from ..scenes import random_splats
-from .test_quantize import rotation_degrees
-from .writers import WRITERS, Precision, put
+from sparklod_cli.model.gaussian import linear_opacity, lod_opacity
+from sparklod_cli.model.lod_tree import LodTree
+from sparklod_cli.model.scene import Scene
+from sparklod_cli.model.splats import COLUMNS, Splats
+from tests.codecs.test_quantize import rotation_degrees
+from tests.codecs.writers import WRITERS, Precision, put
+from tests.conftest import FIXTURES
+from tests.scenes import random_splats
 
 SCENES = ("sh0", "sh1", "sh2", "sh3", "flat", "needle", "coincident", "huge", "one")
 
@@ -95,7 +94,7 @@ def test_writing_again_changes_nothing(name: str, version: int, lod: bool) -> No
 
 
 @pytest.mark.parametrize("antialiased", [False, True])
-def test_antialiased_is_kept(antialiased: bool) -> None:
+def test_spz_keeps_whether_a_scene_is_antialiased(antialiased: bool) -> None:
     data = b"".join(spz.encode(Scene(scene("sh0").splats, antialiased=antialiased), spz.Options()))
     assert spz.decode(io.BytesIO(data)).antialiased is antialiased
 

@@ -18,14 +18,13 @@ from PIL import Image
 
 from fixtures import by_hand_sog
 from sparklod_cli.codecs import sog
-from sparklod_cli.errors import FormatError
 from sparklod_cli.io import read_scene
-from sparklod_cli.scene import Scene
-from sparklod_cli.splats import COLUMNS
-
-from ..conftest import FIXTURES
-from ..scenes import random_splats
-from .writers import linear
+from sparklod_cli.model.scene import Scene
+from sparklod_cli.model.splats import COLUMNS
+from sparklod_cli.support.errors import FormatError
+from tests.codecs.writers import linear
+from tests.conftest import FIXTURES
+from tests.scenes import random_splats
 
 SH_C0 = 0.28209479177387814
 FOLDER = FIXTURES / "golden" / "sh1-sog"
@@ -148,7 +147,7 @@ def test_a_rotation_that_says_of_none_that_it_is_the_largest_is_not_a_number() -
 
 
 @pytest.mark.parametrize("antialias", [True, False, None])
-def test_antialiased_is_told(antialias: bool | None) -> None:
+def test_meta_tells_whether_a_scene_is_antialiased(antialias: bool | None) -> None:
     assert decode(with_meta(META | {"antialias": antialias})).antialiased is bool(antialias)
 
 
@@ -323,7 +322,7 @@ REFUSED: dict[str, tuple[Callable[[], Files], str]] = {
 
 
 @pytest.mark.parametrize("what", REFUSED)
-def test_refused_with_a_reason(what: str) -> None:
+def test_broken_sog_is_refused_with_a_reason(what: str) -> None:
     make, reason = REFUSED[what]
     with pytest.raises(FormatError, match=reason):
         decode(make())

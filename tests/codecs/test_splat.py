@@ -10,14 +10,13 @@ import numpy as np
 import pytest
 
 from sparklod_cli.codecs import splat
-from sparklod_cli.errors import FormatError
 from sparklod_cli.io import read_scene
-from sparklod_cli.scene import Scene
-from sparklod_cli.splats import Splats
-from sparklod_cli.tree import LodTree
-
-from ..conftest import FIXTURES
-from ..scenes import random_splats
+from sparklod_cli.model.lod_tree import LodTree
+from sparklod_cli.model.scene import Scene
+from sparklod_cli.model.splats import Splats
+from sparklod_cli.support.errors import FormatError
+from tests.conftest import FIXTURES
+from tests.scenes import random_splats
 
 GOLDEN = FIXTURES / "golden" / "sh0.splat"
 
@@ -84,21 +83,21 @@ def test_importance_does_not_underflow() -> None:
     assert decode(encode(splats)).center[:, 0].tolist() == [3, 2, 1, 0]
 
 
-def test_threads_do_not_change_a_byte() -> None:
+def test_threads_do_not_change_a_byte_of_splat() -> None:
     scene = Scene(random_splats(40_000))
     one = b"".join(splat.encode(scene))
     assert len(one) == 32 * 40_000
     assert b"".join(splat.encode(scene, threads=3)) == one
 
 
-def test_a_tree_is_not_written() -> None:
+def test_splat_refuses_to_write_a_tree() -> None:
     tree = LodTree(np.array([1, 0], np.uint16), np.array([1, 0], np.uint32))
     with pytest.raises(FormatError, match="SPLAT holds no Level-of-Detail tree"):
         encode(random_splats(2), tree=tree)
 
 
 @pytest.mark.filterwarnings("error")
-def test_a_rotation_of_no_length_is_not_a_number() -> None:
+def test_a_quaternion_of_zeros_in_splat_is_not_a_number() -> None:
     quats = decode(ROWS[0][:28] + bytes([128] * 4) + ROWS[1]).quat_xyzw
     assert np.isnan(quats).any(axis=1).tolist() == [True, False]
 

@@ -15,12 +15,11 @@ from hypothesis import strategies as st
 
 from fixtures import by_hand
 from sparklod_cli.codecs import clamps, quantize, spz
-from sparklod_cli.errors import FormatError
-from sparklod_cli.scene import Scene
-from sparklod_cli.splats import COLUMNS, Splats
-
-from ..conftest import FIXTURES
-from ..scenes import random_splats
+from sparklod_cli.model.scene import Scene
+from sparklod_cli.model.splats import COLUMNS, Splats
+from sparklod_cli.support.errors import FormatError
+from tests.conftest import FIXTURES
+from tests.scenes import random_splats
 
 GOLDEN = FIXTURES / "golden"
 
@@ -274,7 +273,7 @@ REFUSED: dict[str, tuple[Callable[[], bytes], str]] = {
 
 
 @pytest.mark.parametrize("what", REFUSED)
-def test_refused_with_a_reason(what: str) -> None:
+def test_broken_spz_is_refused_with_a_reason(what: str) -> None:
     make, reason = REFUSED[what]
     with pytest.raises(FormatError, match=reason):
         spz.decode(io.BytesIO(make()))

@@ -14,12 +14,11 @@ from fixtures import by_hand
 from sparklod_cli.codecs import ply, splat, spz
 from sparklod_cli.codecs.formats import HEAD, sniff
 from sparklod_cli.codecs.stream import rows_of
-from sparklod_cli.errors import FormatError
-from sparklod_cli.parallel import CHUNK, ordered_map
-from sparklod_cli.scene import Scene
-from sparklod_cli.splats import COLUMNS, Splats
-
-from ..scenes import random_splats
+from sparklod_cli.model.scene import Scene
+from sparklod_cli.model.splats import COLUMNS, Splats
+from sparklod_cli.support.errors import FormatError
+from sparklod_cli.support.parallel import CHUNK, ordered_map
+from tests.scenes import random_splats
 
 COUNT = 12 * CHUNK
 
@@ -50,7 +49,7 @@ EXTRA = {"ply": 12e6, "splat": 3e6, "spz 3": 9e6, "spz 4": 9e6}
 
 
 @pytest.mark.parametrize("kind", WRITERS)
-def test_peak_memory(kind: str) -> None:
+def test_decoding_takes_little_memory_beside_the_splats(kind: str) -> None:
     file = io.BytesIO(WRITERS[kind](random_splats(COUNT, sh_degree=3)))
     head = file.read(HEAD)
     file.seek(0)

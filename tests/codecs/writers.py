@@ -13,11 +13,10 @@ from numpy.typing import NDArray
 
 from fixtures import by_hand, by_hand_compressed_ply, by_hand_ksplat, by_hand_sog, by_hand_splat
 from sparklod_cli.codecs import ply, splat, spz
-from sparklod_cli.scene import Scene
-from sparklod_cli.sh import SH_C0
-from sparklod_cli.splats import Splats
-
-from .test_quantize import stated_degrees
+from sparklod_cli.model.scene import Scene
+from sparklod_cli.model.sh import SH_C0
+from sparklod_cli.model.splats import Splats
+from tests.codecs.test_quantize import stated_degrees
 
 Array = NDArray[np.float64]
 Content = bytes | dict[str, bytes]

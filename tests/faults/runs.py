@@ -14,8 +14,7 @@ import pytest
 from PIL import Image
 
 from sparklod_cli.io import read_scene
-
-from ..conftest import FIXTURES, ROOT
+from tests.conftest import FIXTURES, ROOT
 
 DEMO = FIXTURES / "demo.ply"
 SMALL = FIXTURES / "sh3.ply"

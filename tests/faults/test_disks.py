@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from .runs import DEMO, SMALL, TREE, WRITERS, mounted, said_one_error, shell, sparklod
+from tests.faults.runs import DEMO, SMALL, TREE, WRITERS, mounted, said_one_error, shell, sparklod
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="Windows has other file systems")
 
@@ -25,7 +25,7 @@ LARGE = {
 
 
 @pytest.mark.parametrize("name", LARGE)
-def test_a_full_disk(name: str, tmp_path: Path) -> None:
+def test_a_full_disk_is_one_error_and_leaves_no_file(name: str, tmp_path: Path) -> None:
     arguments, output = LARGE[name]
     with mounted(tmp_path / "disk", "size=8k") as disk:
         done = sparklod(*arguments, disk / output)
@@ -59,7 +59,7 @@ def test_what_is_written_before_the_disk_is_full_is_whole(tmp_path: Path) -> Non
 
 @needs_full
 @pytest.mark.parametrize("name", ["build-lod", "inspect", "traverse"])
-def test_a_full_device(name: str) -> None:
+def test_a_full_device_is_one_error_that_names_it(name: str) -> None:
     arguments, _ = LARGE[name]
     done = sparklod(*arguments, FULL)
     assert done.returncode == 1

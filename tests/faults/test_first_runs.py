@@ -6,10 +6,9 @@ import subprocess
 import sys
 from pathlib import Path
 
-from sparklod_cli.jit_cache import SUFFIX
-
-from ..conftest import ROOT
-from .runs import ENVIRONMENT
+from sparklod_cli.support.jit_cache import SUFFIX
+from tests.conftest import ROOT
+from tests.faults.runs import ENVIRONMENT
 
 #: A small set of kernels, called from one another; says how many were compiled, and what came of it.
 SCRIPT = """

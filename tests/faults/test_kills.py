@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from .runs import ENVIRONMENT, TREE, WRITERS, check_whole, command, sparklod
+from tests.faults.runs import ENVIRONMENT, TREE, WRITERS, check_whole, command, sparklod
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="there is no kill -9 on Windows")
 
@@ -39,7 +39,7 @@ def run_again(arguments: list[object], folder: Path) -> None:
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_killed_at_random(name: str, tmp_path: Path) -> None:
+def test_a_run_killed_at_random_leaves_only_whole_files(name: str, tmp_path: Path) -> None:
     start = time.perf_counter()
     assert sparklod(*CASES[name], cwd=tmp_path).returncode == 0
     took = time.perf_counter() - start

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from .runs import ENVIRONMENT, TREE, WRITERS, check_whole, said_one_error, shell
+from tests.faults.runs import ENVIRONMENT, TREE, WRITERS, check_whole, said_one_error, shell
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no ulimit")
 
@@ -30,7 +30,7 @@ def test_the_size_of_files(name: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("name", "most"), [("build-lod", 10), ("traverse", 16), ("render", 10), ("inspect", 16)])
-def test_open_files(name: str, most: int, tmp_path: Path) -> None:
+def test_too_few_open_files_are_one_error_or_none(name: str, most: int, tmp_path: Path) -> None:
     arguments, output = WRITERS[name]
     done = shell(f'ulimit -n {most}; "$@"', *arguments, tmp_path / output)
     assert done.returncode in (0, 1), done.stderr
@@ -88,7 +88,7 @@ def large(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="this system does not tell what a process takes")
 @pytest.mark.parametrize("name", ["build-lod", "inspect", "render a scene", "render a picture"])
-def test_memory(name: str, large: Path, tmp_path: Path) -> None:
+def test_too_little_memory_is_one_error_in_every_command(name: str, large: Path, tmp_path: Path) -> None:
     small = tmp_path / "small.splat"
     small.write_bytes(large.read_bytes()[: 32 * 100])
     lines: dict[str, list[object]] = {

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from .runs import DEMO, TREE, WRITERS, check_whole, shell, sparklod
-from .test_disks import PRINTERS
+from tests.faults.runs import DEMO, TREE, WRITERS, check_whole, shell, sparklod
+from tests.faults.test_disks import PRINTERS
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="these are pipes and shells of Unix")
 

@@ -16,8 +16,7 @@ from sparklod_cli.codecs.compression import PIECE
 from sparklod_cli.commands.inspect_text import lines
 from sparklod_cli.inspection.findings import CODES, ERROR
 from sparklod_cli.inspection.report import Report, Wanted, inspect
-
-from ..conftest import FIXTURES, real_scene
+from tests.conftest import FIXTURES, real_scene
 
 FOLDER = FIXTURES / "faults"
 

@@ -8,9 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from sparklod_cli.inspection.histograms import Histogram, as_text, histogram, of_quantity
-
-from ..scenes import random_splats
+from sparklod_cli.tables.histograms import Histogram, as_text, histogram, of_quantity
+from tests.scenes import random_splats
 
 FLOATS = arrays.arrays(np.float32, st.integers(0, 300), elements=st.floats(width=32))
 
@@ -36,7 +35,7 @@ def test_everything_is_counted_once(values: np.ndarray, bins: int) -> None:
 
 
 @given(FLOATS)
-def test_logarithms(values: np.ndarray) -> None:
+def test_bins_of_a_logarithmic_histogram_have_one_ratio(values: np.ndarray) -> None:
     values = np.abs(values) + np.float32(1e-30)
     counted = histogram(values, log=True)
     check(counted, values)
@@ -45,7 +44,7 @@ def test_logarithms(values: np.ndarray) -> None:
         assert np.allclose(ratios, ratios[0], rtol=1e-5)
 
 
-def test_bins() -> None:
+def test_a_bin_has_its_lower_edge_and_the_last_one_both() -> None:
     counted = histogram(np.array([0, 1, 1.5, 2, 2.9, 3, np.nan], np.float32), bins=3)
     assert counted.edges.tolist() == [0, 1, 2, 3]
     assert counted.counts.tolist() == [1, 2, 3]
@@ -83,20 +82,20 @@ def test_the_same_number_over_and_over_is_one_bin() -> None:
 
 
 @pytest.mark.parametrize("values", [[], [np.nan, np.inf]])
-def test_no_numbers(values: list[float]) -> None:
+def test_a_histogram_of_no_finite_number_has_no_bins(values: list[float]) -> None:
     counted = histogram(np.array(values, np.float32))
     assert len(counted.counts) == 0
     assert as_text(counted) == (f"not finite  {len(values)}" if values else "no numbers")
 
 
-def test_wrong_use() -> None:
+def test_no_bins_and_logarithms_of_zero_are_errors() -> None:
     with pytest.raises(ValueError, match="0 bins"):
         histogram(np.ones(3, np.float32), bins=0)
     with pytest.raises(ValueError, match="has no logarithm"):
         histogram(np.array([0, 1], np.float32), log=True)
 
 
-def test_text() -> None:
+def test_bars_of_text_are_as_long_as_their_counts() -> None:
     values = np.repeat(np.arange(4), [1, 0, 1000, 500]).astype(np.float32)
     assert as_text(histogram(values, bins=4), width=8).splitlines() == [
         "   0      1  ▏",
@@ -113,7 +112,7 @@ def test_text_puts_bins_together() -> None:
     assert sum(int(line.split()[1]) for line in lines) == 100
 
 
-def test_quantities() -> None:
+def test_a_histogram_of_a_quantity_counts_every_splat() -> None:
     splats = random_splats(200)
     splats.opacity[0] = 1e-3
     assert not of_quantity(splats, "opacity").log

@@ -11,15 +11,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sparklod_cli.inspection.charts import children_groups
-from sparklod_cli.inspection.histograms import histogram, of_quantity
+from sparklod_cli.figures.svg import children_groups
+from sparklod_cli.figures.tree_plot import Picture
 from sparklod_cli.inspection.html import Section, page
-from sparklod_cli.inspection.plot import Picture
 from sparklod_cli.inspection.report import Wanted, inspect
 from sparklod_cli.inspection.values import names_of
-
-from ..conftest import FIXTURES
-from ..scenes import random_splats
+from sparklod_cli.tables.histograms import histogram, of_quantity
+from tests.conftest import FIXTURES
+from tests.scenes import random_splats
 
 VOID = {"meta", "img", "link", "br", "hr", "input"}
 
@@ -121,7 +120,7 @@ def said(section: Section) -> str:
     return " ".join(" ".join(read(page([section])).text).split())
 
 
-def test_a_report() -> None:
+def test_a_page_has_the_figures_of_its_report() -> None:
     text = said(Section(REPORT))
     for part in (
         "scene-lod.spz",
@@ -145,7 +144,7 @@ def test_levels_have_bars_of_their_shares() -> None:
     assert widths == {"0": [("0", "0.02")], "1": [("0", "0.02"), ("1", "0.04")], "2": [("1", "100.00")]}
 
 
-def test_both_colour_schemes() -> None:
+def test_a_page_suits_light_and_dark_and_loads_nothing() -> None:
     text = page([Section(REPORT)])
     assert "prefers-color-scheme: dark" in text
     assert "color-scheme: light dark" in text
@@ -215,7 +214,7 @@ def test_a_picture_is_inside_the_page() -> None:
     assert "coloured by level" in said(section)
 
 
-def test_histograms() -> None:
+def test_a_page_draws_every_histogram_that_has_bins() -> None:
     splats = random_splats(300, sh_degree=1)
     values = np.array([np.nan, 1, 2, 3, 1e9, -1e9] + [2] * 2000, np.float32)
     counted = {name: of_quantity(splats, name) for name in names_of(splats)}
@@ -237,7 +236,7 @@ def test_many_files_are_listed() -> None:
 
 
 @pytest.mark.parametrize("name", ["golden/tree-v3.spz", "golden/sh3-v2.sog", "sh1.ply", "points.ply"])
-def test_real_reports(name: str) -> None:
+def test_a_page_of_a_real_file_says_what_its_report_says(name: str) -> None:
     report, scene = inspect(FIXTURES / name, Wanted(values=True, all_quantities=True, check=True))
     counted = {} if scene is None else {name: of_quantity(scene.splats, name) for name in names_of(scene.splats)}
     text = said(Section(report.as_dict(), histograms=counted))
@@ -246,7 +245,7 @@ def test_real_reports(name: str) -> None:
     assert ("anisotropy" in text) == (scene is not None)
 
 
-def test_children_groups() -> None:
+def test_counts_of_children_are_grouped_by_powers_of_two() -> None:
     assert children_groups({}) == []
     assert children_groups({"1": 4}) == [("1", 4)]
     groups = children_groups({"2": 5, "9": 1, "16": 1, "17": 3, "65535": 2})

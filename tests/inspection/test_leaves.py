@@ -19,12 +19,11 @@ from sparklod_cli.inspection.findings import Finding
 from sparklod_cli.inspection.leaves import check
 from sparklod_cli.io import examine_scene, read_scene
 from sparklod_cli.lod import quick
-from sparklod_cli.scene import Scene
-from sparklod_cli.splats import Splats
-from sparklod_cli.tree import LodTree
-
-from ..conftest import FIXTURES, real_scene
-from ..scenes import random_splats
+from sparklod_cli.model.lod_tree import LodTree
+from sparklod_cli.model.scene import Scene
+from sparklod_cli.model.splats import Splats
+from tests.conftest import FIXTURES, real_scene
+from tests.scenes import random_splats
 
 
 def baked(source: Path, folder: Path, *options: object) -> Scene:

@@ -23,8 +23,8 @@ from sparklod_cli.inspection.expectations import value_at
 from sparklod_cli.inspection.findings import CODES
 from sparklod_cli.inspection.report import SCHEMA_VERSION, Wanted, inspect
 from sparklod_cli.lod import quick
-from sparklod_cli.scene import Scene
-from sparklod_cli.tree import MAX_CHILDREN, LodTree
+from sparklod_cli.model.lod_tree import MAX_CHILDREN, LodTree
+from sparklod_cli.model.scene import Scene
 from tests.conftest import FIXTURES, ROOT
 from tests.scenes import random_splats
 
@@ -96,7 +96,7 @@ def test_reports_of_the_fixtures(path: Path, wanted: Wanted) -> None:
 
 @pytest.mark.parametrize("wanted", WAYS.values(), ids=WAYS.keys())
 @pytest.mark.parametrize("sh_degree", range(4))
-def test_reports_of_trees(tmp_path: Path, sh_degree: int, wanted: Wanted) -> None:
+def test_reports_of_trees_follow_the_schema(tmp_path: Path, sh_degree: int, wanted: Wanted) -> None:
     path = tmp_path / "tree.spz"
     path.write_bytes(tree_bytes(sh_degree))
     report = report_of(path, wanted)
@@ -133,7 +133,7 @@ def test_reports_of_broken_trees(tmp_path: Path, count: int, most: int) -> None:
 
 @pytest.mark.parametrize("wanted", WAYS.values(), ids=WAYS.keys())
 @pytest.mark.parametrize("path", ["missing.spz", "."])
-def test_reports_of_nothing(tmp_path: Path, path: str, wanted: Wanted) -> None:
+def test_reports_of_unreadable_files_follow_the_schema(tmp_path: Path, path: str, wanted: Wanted) -> None:
     report = report_of(tmp_path / path, wanted)
     assert faults(report) == []
     assert report["findings"][0]["code"] == "file.unreadable"

@@ -11,17 +11,16 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from sparklod_cli.gaussian import design_size, spark_size
 from sparklod_cli.inspection import tree as facts_of
 from sparklod_cli.inspection.findings import Finding
 from sparklod_cli.inspection.tree import TreeFacts, examine
 from sparklod_cli.lod import quick
-from sparklod_cli.lod.kernels.walk import find_parents, walk
-from sparklod_cli.splats import Splats
-from sparklod_cli.tree import LodTree
-
-from .. import reference
-from ..scenes import random_splats
+from sparklod_cli.lod.kernels.tree_links import find_parents, walk
+from sparklod_cli.model.gaussian import design_size, spark_size
+from sparklod_cli.model.lod_tree import LodTree
+from sparklod_cli.model.splats import Splats
+from tests.references import tree_links
+from tests.scenes import random_splats
 
 Links = list[tuple[int, int]]
 
@@ -45,7 +44,7 @@ def codes(findings: list[Finding]) -> set[str]:
 def check_facts(splats: Splats, tree: LodTree, facts: TreeFacts) -> None:
     """All but the coarse cut, node by node."""
     size = spark_size(splats).astype(np.float64)
-    depth = reference.walk(tree.child_count, tree.child_start, size).depth
+    depth = tree_links.walk(tree.child_count, tree.child_start, size).depth
     counts = tree.child_count.tolist()
     leaves = sum(count == 0 for count in counts)
     assert (facts.leaves, facts.inner) == (leaves, len(counts) - leaves)
@@ -95,14 +94,14 @@ def test_the_coarse_cut_divides_the_largest_first(most: int, seed: int, monkeypa
     monkeypatch.setattr(facts_of, "CHUNK_NODES", most)
     nodes, tree = quick.build(random_splats(150, seed=seed), 1.3)
     facts, _ = examine(nodes, tree)
-    cut = reference.coarse_cut(tree.child_count, tree.child_start, spark_size(nodes), most)
+    cut = tree_links.coarse_cut(tree.child_count, tree.child_start, spark_size(nodes), most)
     assert facts.chunks == math.ceil(len(tree) / most)
     assert facts.chunks_of_coarse_cut == len({node // most for node in cut})
 
 
 def is_cut(tree: LodTree, cut: set[int]) -> bool:
     """Whether each way from the root to a leaf has exactly one node of a set."""
-    links = reference.links_of(tree.child_count, tree.child_start)
+    links = tree_links.links_of(tree.child_count, tree.child_start)
 
     def on_ways_from(node: int) -> set[int]:
         """How many nodes of the set the ways from here have."""
@@ -133,7 +132,7 @@ def test_the_coarse_cut_is_a_cut_whatever_the_sizes(most: int, seed: int, fallin
         cut = set(facts_of._coarse_cut(tree, limit).tolist())
     assert is_cut(tree, cut)
     assert len(cut) <= most
-    expected = reference.coarse_cut(tree.child_count, tree.child_start, size, most)
+    expected = tree_links.coarse_cut(tree.child_count, tree.child_start, size, most)
     assert is_cut(tree, expected)
     if falling:
         assert cut == expected

@@ -15,12 +15,11 @@ from sparklod_cli.codecs import ply, splat, spz
 from sparklod_cli.inspection import values
 from sparklod_cli.inspection.report import Wanted, inspect
 from sparklod_cli.inspection.values import MAIN, PERCENTILES, QUANTITIES, check, examine, names_of, quantity
-from sparklod_cli.scene import Scene
-from sparklod_cli.sh import COEFFICIENTS
-from sparklod_cli.splats import COLUMNS, Splats
-from sparklod_cli.tree import LodTree
-
-from ..scenes import random_splats
+from sparklod_cli.model.lod_tree import LodTree
+from sparklod_cli.model.scene import Scene
+from sparklod_cli.model.sh import COEFFICIENTS
+from sparklod_cli.model.splats import COLUMNS, Splats
+from tests.scenes import random_splats
 
 NAN, INF = math.nan, math.inf
 EXACT = 1e-5  # of six digits

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from . import npm
-from .foreign import PACKAGES, Foreign
-from .page import Page
-from .spark import Spark
+from tests.interop import npm
+from tests.interop.foreign import PACKAGES, Foreign
+from tests.interop.page import Page
+from tests.interop.spark import Spark
 
 #: The version that these tests were tried with; layouts and file names inside the package may change with it.
 SPARK = {"@sparkjsdev/spark": "2.2.0"}

@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sparklod_cli.gaussian import normalized_quat
-from sparklod_cli.sh import COEFFICIENTS, SH_C0
-from sparklod_cli.splats import Splats
-
-from .node import Node
+from sparklod_cli.model.gaussian import normalized_quat
+from sparklod_cli.model.sh import COEFFICIENTS, SH_C0
+from sparklod_cli.model.splats import Splats
+from tests.interop.node import Node
 
 #: What these tests were tried with. playcanvas is a peer of splat-transform, three.js one of mkkellogg's viewer.
 PACKAGES = {

@@ -9,13 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sparklod_cli.codecs import spz
-from sparklod_cli.gaussian import lod_opacity
-from sparklod_cli.scene import Scene
-from sparklod_cli.sh import SH_C0
-from sparklod_cli.splats import Splats
-from sparklod_cli.tree import LodTree
-
-from .spark import ExtSplats, Spark
+from sparklod_cli.model.gaussian import lod_opacity
+from sparklod_cli.model.lod_tree import LodTree
+from sparklod_cli.model.scene import Scene
+from sparklod_cli.model.sh import SH_C0
+from sparklod_cli.model.splats import Splats
+from tests.interop.spark import ExtSplats, Spark
 
 Floats = NDArray[np.floating]
 

@@ -8,10 +8,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sparklod_cli.render.camera import Camera
-from sparklod_cli.render.look import Look
-
-from .node import Node
+from sparklod_cli.cameras.camera import Camera
+from sparklod_cli.render.settings import RasterSettings
+from tests.interop.node import Node
 
 PROGRAM = Path(__file__).with_name("spark_page.mjs")
 
@@ -47,13 +46,13 @@ class Page:
         self._node = Node([str(PROGRAM), str(package_dir), chromium], scratch / "stderr.txt")
         self.close = self._node.close
 
-    def open(self, file: Path, camera: Camera, look: Look) -> int:
+    def open(self, file: Path, camera: Camera, look: RasterSettings) -> int:
         """Loads a file, for pictures of this size and these planes; tells how many splats or nodes it has."""
         size = {"width": camera.width, "height": camera.height, "near": look.near, "far": look.far}
         answer = self._node.ask({"do": "open", "path": str(file.resolve()), **size})
         return int(answer["lod"] or answer["numSplats"])
 
-    def draw(self, camera: Camera, look: Look, *, budget: int | None = None) -> Picture:
+    def draw(self, camera: Camera, look: RasterSettings, *, budget: int | None = None) -> Picture:
         """What a camera sees; its principal point is in the middle and its pixels are square.
 
         Args:

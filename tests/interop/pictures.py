@@ -10,19 +10,18 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sparklod_cli.codecs import ext_splats, lod_tree
+from sparklod_cli.cameras.camera import Camera
+from sparklod_cli.cameras.framing import framing
+from sparklod_cli.cameras.pose import look_at
+from sparklod_cli.codecs.gpu import ext_splats, lod_tree
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod.traversal import Forest, Instance, Traversal, View, pixel_limit
-from sparklod_cli.render.camera import Camera
-from sparklod_cli.render.framing import framing
-from sparklod_cli.render.look import Look
-from sparklod_cli.render.pose import look_at
+from sparklod_cli.model.scene import Scene
+from sparklod_cli.model.splats import Splats
 from sparklod_cli.render.rasterizer import draw
-from sparklod_cli.render.shown import show
-from sparklod_cli.scene import Scene
-from sparklod_cli.splats import Splats
-
-from .page import Page
+from sparklod_cli.render.settings import RasterSettings
+from sparklod_cli.render.shading import show
+from tests.interop.page import Page
 
 FOV_Y = math.radians(50)
 
@@ -79,7 +78,9 @@ def cut_of(held: Scene, camera: Camera, budget: int) -> NDArray[np.uint32]:
     return Traversal(Forest([nodes]), [Instance()]).cut(view, budget=budget, smallest=smallest).indices()[0]
 
 
-def compare(page: Page, file: Path, cameras: Sequence[Camera], look: Look, budget: int = 0) -> Iterator[Difference]:
+def compare(
+    page: Page, file: Path, cameras: Sequence[Camera], look: RasterSettings, budget: int = 0
+) -> Iterator[Difference]:
     """Draws a file from several places, one after the other.
 
     Args:
@@ -97,7 +98,9 @@ def compare(page: Page, file: Path, cameras: Sequence[Camera], look: Look, budge
         yield _difference(page, scene.splats, held, camera, look, budget)
 
 
-def _difference(page: Page, splats: Splats, held: Scene, camera: Camera, look: Look, budget: int) -> Difference:
+def _difference(
+    page: Page, splats: Splats, held: Scene, camera: Camera, look: RasterSettings, budget: int
+) -> Difference:
     theirs = page.draw(camera, look, budget=budget or None)
     nodes = cut_of(held, camera, budget) if budget else None
     rows = slice(None) if nodes is None else nodes

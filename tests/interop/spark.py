@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .node import Node
+from tests.interop.node import Node
 
 PROGRAM = Path(__file__).with_name("spark_load.mjs")
 

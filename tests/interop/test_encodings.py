@@ -19,21 +19,21 @@ import pytest
 from numpy.typing import NDArray
 
 from fixtures import by_hand
-from sparklod_cli import gaussian
-from sparklod_cli.codecs import ext_splats, lod_tree, packed_splats, spz
-from sparklod_cli.codecs.packed_splats import Encoding
-from sparklod_cli.gaussian import lod_opacity
+from sparklod_cli.codecs import spz
+from sparklod_cli.codecs.gpu import ext_splats, lod_tree, packed_splats
+from sparklod_cli.codecs.gpu.packed_splats import Encoding
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod import quick
-from sparklod_cli.scene import Scene
-from sparklod_cli.sh import SH_C0
-from sparklod_cli.splats import Splats
+from sparklod_cli.model import gaussian
+from sparklod_cli.model.gaussian import lod_opacity
+from sparklod_cli.model.scene import Scene
+from sparklod_cli.model.sh import SH_C0
+from sparklod_cli.model.splats import Splats
 from tests.conftest import real_scene
+from tests.interop import ties
+from tests.interop.spark import Spark
+from tests.interop.ties import Floats, Words, check, ext_codes, ext_steps, packed_codes, packed_steps
 from tests.scenes import random_splats
-
-from . import ties
-from .spark import Spark
-from .ties import Floats, Words, check, ext_codes, ext_steps, packed_codes, packed_steps
 
 WIDE = Encoding(rgb_min=-0.5, rgb_max=2, ln_scale_min=-8, ln_scale_max=1, sh1_max=0.5, sh2_max=2, sh3_max=0.25)
 PROGRAM = Path(__file__).with_name("spark_encode.mjs")
@@ -133,20 +133,20 @@ def edges() -> Splats:
 
 
 @pytest.mark.parametrize("sh_degree", range(4))
-def test_random_ply(spark: Spark, tmp_path: Path, sh_degree: int) -> None:
+def test_words_of_random_splats_are_those_of_spark(spark: Spark, tmp_path: Path, sh_degree: int) -> None:
     path = ply(tmp_path / "random.ply", random_splats(50_000, sh_degree=sh_degree))
     check_file(spark, path, share=2e-4)
 
 
 @pytest.mark.parametrize("encoding", [packed_splats.DEFAULT, WIDE])
-def test_edges_and_ranges(spark: Spark, tmp_path: Path, encoding: Encoding) -> None:
+def test_words_at_the_ends_of_ranges_are_those_of_spark(spark: Spark, tmp_path: Path, encoding: Encoding) -> None:
     """Ranges of ours to PackedSplats, and all their ends; ties are many here, as the numbers are round."""
     check_file(spark, ply(tmp_path / "edges.ply", edges()), 0.2, encoding)
 
 
 @pytest.mark.parametrize("sh_degree", range(4))
 @pytest.mark.parametrize("version", [2, 3])
-def test_tree(spark: Spark, tmp_path: Path, version: int, sh_degree: int) -> None:
+def test_words_of_a_tree_are_those_of_spark(spark: Spark, tmp_path: Path, version: int, sh_degree: int) -> None:
     """The few numbers that SPZ has make the same ties again and again."""
     path = baked(tmp_path / "tree.spz", random_splats(20_000, sh_degree=sh_degree), version)
     assert lod_opacity(read_scene(path).splats.opacity).max() > 1.5
@@ -154,7 +154,7 @@ def test_tree(spark: Spark, tmp_path: Path, version: int, sh_degree: int) -> Non
 
 
 @pytest.mark.parametrize("name", ["biker.ply", "playbot-125k.ply"])
-def test_real_scene(spark: Spark, name: str) -> None:
+def test_words_of_a_real_scene_are_those_of_spark(spark: Spark, name: str) -> None:
     check_file(spark, real_scene(name), share=2e-3)
 
 
@@ -196,7 +196,7 @@ def cut_off(values: Floats) -> NDArray[np.float16]:
 
 
 @pytest.mark.parametrize("encoding", [packed_splats.DEFAULT, WIDE, Encoding(lod_opacity=True)])
-def test_javascript(spark_dir: Path, tmp_path: Path, encoding: Encoding) -> None:
+def test_words_are_those_of_sparks_encoders_in_javascript(spark_dir: Path, tmp_path: Path, encoding: Encoding) -> None:
     """Its float64 against our float32; where the Node at hand has no Float16Array, it cuts float16s off."""
     if shutil.which("node") is None:
         pytest.skip("Node is not installed")

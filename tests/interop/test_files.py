@@ -9,14 +9,13 @@ import pytest
 
 from sparklod_cli.bake import BUILDERS
 from sparklod_cli.codecs import spz
-from sparklod_cli.limits import METHODS
-from sparklod_cli.scene import Scene
-from sparklod_cli.splats import Splats
-from sparklod_cli.tree import MAX_CHILDREN
+from sparklod_cli.model.lod_tree import MAX_CHILDREN
+from sparklod_cli.model.scene import Scene
+from sparklod_cli.model.splats import Splats
+from sparklod_cli.support.defaults import METHODS
+from tests.interop import laws
+from tests.interop.spark import Spark
 from tests.scenes import random_splats
-
-from . import laws
-from .spark import Spark
 
 
 def baked(splats: Splats, method: str = "quick") -> Scene:
@@ -30,7 +29,7 @@ def encoded(scene: Scene) -> bytes:
 @pytest.mark.parametrize("sh_degree", range(4))
 @pytest.mark.parametrize("version", [2, 3])
 @pytest.mark.parametrize("method", METHODS)
-def test_tree(spark: Spark, method: str, version: int, sh_degree: int) -> None:
+def test_spark_reads_a_tree_as_it_was_baked(spark: Spark, method: str, version: int, sh_degree: int) -> None:
     scene = baked(random_splats(2000, sh_degree=sh_degree), method)
     got = laws.check(spark, scene, spz.Options(version=version))
     assert got.sh.shape == scene.splats.sh.shape
@@ -39,12 +38,12 @@ def test_tree(spark: Spark, method: str, version: int, sh_degree: int) -> None:
 
 @pytest.mark.parametrize("sh_degree", range(4))
 @pytest.mark.parametrize("version", [2, 3])
-def test_plain(spark: Spark, version: int, sh_degree: int) -> None:
+def test_spark_reads_plain_splats_as_they_were_written(spark: Spark, version: int, sh_degree: int) -> None:
     laws.check(spark, Scene(random_splats(2000, sh_degree=sh_degree)), spz.Options(version=version))
 
 
 @pytest.mark.parametrize("extent, bits", [(5e3, 0), (1, 12), (0.05, 24), (0.05, None), (1, None), (5e3, None)])
-def test_fractional_bits(spark: Spark, extent: float, bits: int | None) -> None:
+def test_spark_reads_any_number_of_fractional_bits(spark: Spark, extent: float, bits: int | None) -> None:
     scene = baked(random_splats(2000, extent=extent))
     laws.check(spark, scene, spz.Options(fractional_bits=bits))
 
@@ -56,7 +55,7 @@ def test_coordinates_at_the_limit(spark: Spark) -> None:
     laws.check(spark, Scene(splats), spz.Options(fractional_bits=0))
 
 
-def test_one_splat(spark: Spark) -> None:
+def test_spark_reads_a_tree_of_one_node(spark: Spark) -> None:
     got = laws.check(spark, baked(random_splats(1, sh_degree=3)), spz.Options())
     assert len(got.center) == 1
 

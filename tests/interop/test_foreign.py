@@ -15,12 +15,11 @@ import pytest
 from sparklod_cli.cli import run
 from sparklod_cli.codecs import ply, splat
 from sparklod_cli.io import read_scene
-from sparklod_cli.splats import Splats
+from sparklod_cli.model.splats import Splats
 from tests.conftest import FIXTURES, real_scene
-
-from .foreign import Foreign
-from .laws import EXT_DEGREES, HALF, TINY, Floats, degrees_between, held_by_ext_sh, within
-from .spark import Spark
+from tests.interop.foreign import Foreign
+from tests.interop.laws import EXT_DEGREES, HALF, TINY, Floats, degrees_between, held_by_ext_sh, within
+from tests.interop.spark import Spark
 
 #: Makes a file in a folder of what is in a PLY file, and says where.
 Writer = Callable[[Foreign, Path, Path], Path]
@@ -244,7 +243,7 @@ LOSSES = {
 @pytest.mark.parametrize(
     "file", [row for row in WRITTEN if row.values[0][0].removesuffix(" in sections") in LOSSES], indirect=True
 )
-def test_near_the_source(file: File) -> None:
+def test_splats_of_other_writers_are_near_their_source(file: File) -> None:
     """What is read is what was written, to the steps of the format's codings."""
     loss = LOSSES[file.writer.removesuffix(" in sections")]
     got, source = read_scene(file.path).splats, read_scene(file.source).splats
@@ -262,5 +261,5 @@ def test_near_the_source(file: File) -> None:
 
 
 @pytest.mark.parametrize("file", [*WRITTEN[3::4], *FILES[len(WRITTEN) :]], indirect=True)
-def test_bakes(file: File, tmp_path: Path) -> None:
+def test_files_of_other_writers_can_be_baked(file: File, tmp_path: Path) -> None:
     assert run(["build-lod", str(file.path), "-o", str(tmp_path / "out.spz")]) == 0

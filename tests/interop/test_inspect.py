@@ -19,13 +19,13 @@ import numpy as np
 import pytest
 
 from sparklod_cli.cli import run
-from sparklod_cli.codecs import ext_splats, lod_tree, spz
+from sparklod_cli.codecs import spz
+from sparklod_cli.codecs.gpu import ext_splats, lod_tree
 from sparklod_cli.io import read_scene
-from sparklod_cli.scene import Scene
+from sparklod_cli.model.scene import Scene
 from tests.conftest import FIXTURES, real_scene
-
-from .laws import degrees_between
-from .spark import Spark
+from tests.interop.laws import degrees_between
+from tests.interop.spark import Spark
 
 #: Spark's names for its two builders, the tiny one and Bhattacharyya's, by ours.
 BUILDERS: dict[str, Any] = {"quick": True, "quality": "quality"}

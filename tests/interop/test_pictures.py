@@ -12,14 +12,13 @@ import pytest
 from sparklod_cli.codecs import spz
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod import quick
-from sparklod_cli.render.look import SORTS, Look
-from sparklod_cli.scene import Scene
-from sparklod_cli.splats import Splats
+from sparklod_cli.model.scene import Scene
+from sparklod_cli.model.splats import Splats
+from sparklod_cli.render.settings import SORTS, RasterSettings
 from tests.conftest import FIXTURES
+from tests.interop.page import Page
+from tests.interop.pictures import Difference, cameras_around, compare
 from tests.scenes import random_splats
-
-from .page import Page
-from .pictures import Difference, cameras_around, compare
 
 SIZE = 320, 180
 
@@ -48,22 +47,22 @@ def written(folder: Path, scene: Scene) -> Path:
 
 
 @pytest.mark.parametrize("sort", SORTS)
-def test_splats(page: Page, sort: str) -> None:
+def test_spark_draws_plain_splats_as_we_do(page: Page, sort: str) -> None:
     cameras = cameras_around(demo().center, *SIZE)
-    check(compare(page, FIXTURES / "demo.ply", cameras[::2], Look(sort=sort)))
+    check(compare(page, FIXTURES / "demo.ply", cameras[::2], RasterSettings(sort=sort)))
 
 
 @pytest.mark.parametrize("budget", [300, 8_000])
-def test_tree(page: Page, tmp_path: Path, budget: int) -> None:
+def test_spark_draws_the_cut_of_a_tree_as_we_do(page: Page, tmp_path: Path, budget: int) -> None:
     """Most of 300 are merged splats, many of them more than opaque."""
     file = written(tmp_path, Scene(*quick.build(demo())))
-    check(compare(page, file, cameras_around(demo().center, *SIZE)[1::2], Look(), budget))
+    check(compare(page, file, cameras_around(demo().center, *SIZE)[1::2], RasterSettings(), budget))
 
 
 @pytest.mark.parametrize("sh_degree", range(1, 4))
-def test_spherical_harmonics(page: Page, tmp_path: Path, sh_degree: int) -> None:
+def test_spark_draws_spherical_harmonics_as_we_do(page: Page, tmp_path: Path, sh_degree: int) -> None:
     splats = random_splats(3_000, sh_degree=sh_degree)
-    check(compare(page, written(tmp_path, Scene(splats)), cameras_around(splats.center, *SIZE)[:2], Look()))
+    check(compare(page, written(tmp_path, Scene(splats)), cameras_around(splats.center, *SIZE)[:2], RasterSettings()))
 
 
 @pytest.mark.parametrize("sort", SORTS)
@@ -72,13 +71,13 @@ def test_splats_in_one_place(page: Page, tmp_path: Path, sort: str) -> None:
     splats = random_splats(300).take(np.repeat(np.arange(300), 3))
     splats.rgb[:] = np.random.default_rng(1).uniform(0, 1, splats.rgb.shape)
     file = written(tmp_path, Scene(splats))
-    check(compare(page, file, cameras_around(splats.center, *SIZE)[1:2], Look(sort=sort)))
+    check(compare(page, file, cameras_around(splats.center, *SIZE)[1:2], RasterSettings(sort=sort)))
 
 
-def test_planes(page: Page, tmp_path: Path) -> None:
+def test_spark_drops_splats_outside_the_clip_planes_as_we_do(page: Page, tmp_path: Path) -> None:
     """Splats that are nearer, farther or too far out are dropped as a whole."""
     splats = random_splats(3_000)
     cameras = cameras_around(splats.center, *SIZE)
     distance = float(np.linalg.norm(cameras[0].position))
-    look = Look(near=0.8 * distance, far=1.1 * distance)
+    look = RasterSettings(near=0.8 * distance, far=1.1 * distance)
     check(compare(page, written(tmp_path, Scene(splats)), cameras[:1], look))

@@ -10,11 +10,10 @@ import pytest
 from sparklod_cli.bake import BUILDERS
 from sparklod_cli.codecs import spz
 from sparklod_cli.io import read_scene
-from sparklod_cli.scene import Scene
+from sparklod_cli.model.scene import Scene
 from tests.conftest import real_scene
-
-from . import laws
-from .spark import Spark
+from tests.interop import laws
+from tests.interop.spark import Spark
 
 
 @cache
@@ -27,7 +26,9 @@ def baked(name: str, method: str = "quick") -> Scene:
     ("name", "method"),
     [("biker.ply", "quick"), ("biker.spz", "quick"), ("playbot-125k.ply", "quick"), ("biker.ply", "quality")],
 )
-def test_tree(spark: Spark, name: str, method: str, version: int) -> None:
+def test_spark_reads_the_tree_of_a_real_scene_as_it_was_baked(
+    spark: Spark, name: str, method: str, version: int
+) -> None:
     laws.check(spark, baked(name, method), spz.Options(version=version, threads=2))
 
 

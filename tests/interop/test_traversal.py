@@ -13,15 +13,14 @@ import numpy as np
 import pytest
 
 from sparklod_cli.bake import BUILDERS
-from sparklod_cli.codecs import ext_splats, lod_tree
-from sparklod_cli.codecs.lod_tree import Nodes
+from sparklod_cli.codecs.gpu import ext_splats, lod_tree
+from sparklod_cli.codecs.gpu.lod_tree import Nodes
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod.traversal import CHUNK_NODES, Cones, Cut, Forest, Instance, Traversal, View, pixel_limit, views_of
-from tests import reference
 from tests.conftest import FIXTURES, real_scene
+from tests.interop.spark import NODE, Spark
 from tests.lod.forests import rotation, transform
-
-from .spark import NODE, Spark
+from tests.references import budgeted_cuts
 
 SPARKS_CONES = Cones(90, 120, 0.4, 0.2)
 FOVEATIONS = (
@@ -103,7 +102,7 @@ class Both:
     def pixel_scale(self, instance: Instance, camera: np.ndarray) -> np.float32:
         """Of the root."""
         (view,) = views_of(self._forest, [instance], View(camera, FOV_Y, FOV_Y))
-        return reference.pixel_scale(self._forest.nodes[view["node_base"]], view)
+        return budgeted_cuts.pixel_scale(self._forest.nodes[view["node_base"]], view)
 
     def _instance(self, instance: Instance, camera: np.ndarray) -> dict[str, Any]:
         view_to_object = np.linalg.inv(instance.object_to_world) @ camera
@@ -153,7 +152,7 @@ def facing(backward: np.ndarray) -> np.ndarray:
     "name, method, views",
     [("demo.ply", "quick", 88), ("biker.spz", "quick", 88), ("playbot.sog", "quick", 48), ("demo.ply", "quality", 44)],
 )
-def test_one_tree(spark: Spark, name: str, method: str, views: int) -> None:
+def test_the_cut_of_one_tree_is_that_of_spark(spark: Spark, name: str, method: str, views: int) -> None:
     tree = baked(scene(name), method)
     both = Both(spark, [tree])
     reasons = set()
@@ -175,7 +174,7 @@ def test_every_cone_at_a_budget_that_is_used_up(spark: Spark) -> None:
             assert cut.reason == "budget" or foveation.behind == 0  # there, everything may count nothing
 
 
-def test_every_budget(spark: Spark) -> None:
+def test_the_cut_of_every_budget_is_that_of_spark(spark: Spark) -> None:
     """From a single node to all."""
     tree = baked(scene("demo.ply"))
     both = Both(spark, [tree])
@@ -206,7 +205,7 @@ def test_instances_compete_for_one_budget(spark: Spark, names: list[str], views:
 
 
 @pytest.mark.parametrize("name", ["demo.ply", "biker.ply"])
-def test_trees_of_spark(spark: Spark, name: str) -> None:
+def test_the_cut_of_a_tree_that_spark_built_is_that_of_spark(spark: Spark, name: str) -> None:
     """Its own builder's, which measures after another coding than ours; four words a node as they lie in memory."""
     words = spark.load_words("Packed", scene(name), lod=True)["lodTree"]
     tree = Tree.of(words)
@@ -236,7 +235,7 @@ def test_pixel_scales_are_those_of_spark_bit_for_bit(spark: Spark) -> None:
 
 
 @pytest.mark.parametrize("name", ["biker.spz", "playbot.sog"])
-def test_chunks(spark: Spark, name: str) -> None:
+def test_the_chunks_that_are_wanted_are_those_of_spark(spark: Spark, name: str) -> None:
     """Those of the largest nodes are looked into first."""
     tree = baked(scene(name))
     both = Both(spark, [tree])

@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sparklod_cli.codecs import ext_splats, octahedral, packed_splats
-from sparklod_cli.codecs.packed_splats import Encoding
-from sparklod_cli.gaussian import lod_opacity
-from sparklod_cli.splats import Splats
+from sparklod_cli.codecs import octahedral
+from sparklod_cli.codecs.gpu import ext_splats, packed_splats
+from sparklod_cli.codecs.gpu.packed_splats import Encoding
+from sparklod_cli.model.gaussian import lod_opacity
+from sparklod_cli.model.splats import Splats
 
 Words = dict[str, NDArray[np.uint32]]
 Floats = NDArray[np.floating[Any]]

@@ -8,11 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from hypothesis import strategies as st
 
-from sparklod_cli.codecs.lod_tree import Nodes
+from sparklod_cli.codecs.gpu.lod_tree import Nodes
 from sparklod_cli.lod.traversal import Cones, Cut, Forest, Frustum, Instance, Traversal, View
-from sparklod_cli.tree import LodTree
-
-from .. import reference
+from sparklod_cli.model.lod_tree import LodTree
+from tests.references import budgeted_cuts
 
 FOVEATIONS = (
     Cones(),
@@ -53,11 +52,11 @@ class Case:
         return sum(len(self.trees[instance.tree].size) for instance in self.instances)
 
 
-def expected_cut(case: Case, cut: Cut, resident: np.ndarray | None = None, bits: int = 16) -> reference.BudgetedCut:
+def expected_cut(case: Case, cut: Cut, resident: np.ndarray | None = None, bits: int = 16) -> budgeted_cuts.BudgetedCut:
     """The twin's, for the views of a cut."""
     forest = Forest(case.trees)
     there = np.ones(forest.chunks, bool) if resident is None else resident
-    return reference.budgeted_cut(forest.nodes, cut.views, case.budget, case.smallest, there.__getitem__, bits)
+    return budgeted_cuts.budgeted_cut(forest.nodes, cut.views, case.budget, case.smallest, there.__getitem__, bits)
 
 
 def drawn(cut: Cut) -> list[tuple[int, int]]:

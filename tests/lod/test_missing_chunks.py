@@ -13,11 +13,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sparklod_cli import jit
 from sparklod_cli.lod import traversal
 from sparklod_cli.lod.traversal import Forest, Instance, View
-
-from .forests import Case, ancestors_drawn, cases, check, random_tree, transform
+from sparklod_cli.support import jit
+from tests.lod.forests import Case, ancestors_drawn, cases, check, random_tree, transform
 
 #: Nodes of a chunk in tests of small trees, as a power of 2; so large that no node's children are in three.
 SMALL = 4
@@ -54,7 +53,7 @@ def some_chunks(data: st.DataObject, forest: Forest) -> np.ndarray:
 class TestSmallChunks:
     @given(cases(60), st.data())
     @settings(max_examples=300)
-    def test_the_cut_is_that_of_one_queue(self, case: Case, data: st.DataObject) -> None:
+    def test_the_cut_with_missing_chunks_is_that_of_one_queue(self, case: Case, data: st.DataObject) -> None:
         """Also where other chunks were there before."""
         found = case.traversal()
         for _ in range(data.draw(st.integers(1, 3))):
@@ -62,7 +61,7 @@ class TestSmallChunks:
             check(case, case.find(found, there), there, SMALL)
 
     @given(cases(60), st.data())
-    def test_every_leaf_is_drawn_once(self, case: Case, data: st.DataObject) -> None:
+    def test_every_leaf_of_a_resident_root_is_drawn_once(self, case: Case, data: st.DataObject) -> None:
         """Of each instance whose root is there."""
         found = case.traversal()
         there = some_chunks(data, found.forest)
@@ -95,7 +94,7 @@ class TestSmallChunks:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_large_trees(seed: int) -> None:
+def test_the_cut_of_large_trees_with_missing_chunks_is_that_of_one_queue(seed: int) -> None:
     rng = np.random.default_rng(seed)
     trees = [random_tree(rng, 200_000, 6), random_tree(rng, 100_000, 3)]
     instances = [Instance(tree, transform(rng, spread=2.0), 1.0 + tree) for tree in (0, 1, 0)]

@@ -12,34 +12,33 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sparklod_cli import jit
-from sparklod_cli.codecs import lod_tree
-from sparklod_cli.errors import InvalidSplatsError
-from sparklod_cli.gaussian import spark_size
+from sparklod_cli.cameras.camera import Camera
+from sparklod_cli.cameras.formats.source import Parsed
+from sparklod_cli.cameras.frame import DEFAULT_UP, Settings
+from sparklod_cli.cameras.framing import framing
+from sparklod_cli.cameras.generators import orbit
+from sparklod_cli.cameras.path import GENERATED, cameras_of
+from sparklod_cli.codecs.gpu import lod_tree
+from sparklod_cli.compare import on_background
+from sparklod_cli.images.metrics import psnr
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod import quality, quick
-from sparklod_cli.lod.kernels.keep import MOST_CHILDREN, STEPS
+from sparklod_cli.lod.kernels.prune import MOST_CHILDREN, STEPS
 from sparklod_cli.lod.traversal import Forest, Instance, Traversal
-from sparklod_cli.preview.compare import on_background
-from sparklod_cli.preview.metrics import psnr
-from sparklod_cli.render.camera import Camera
-from sparklod_cli.render.camera_path import GENERATED, cameras_of
-from sparklod_cli.render.frame import DEFAULT_UP, Settings
-from sparklod_cli.render.framing import framing
-from sparklod_cli.render.generate import orbit
-from sparklod_cli.render.look import Look
-from sparklod_cli.render.paths.source import Parsed
+from sparklod_cli.model.gaussian import spark_size
+from sparklod_cli.model.lod_tree import LodTree
+from sparklod_cli.model.selection import Selection
+from sparklod_cli.model.splats import Splats
 from sparklod_cli.render.rasterizer import Image, draw
-from sparklod_cli.render.shown import show
-from sparklod_cli.selection import Selection
-from sparklod_cli.simulation.simulate import view_of
-from sparklod_cli.splats import Splats
-from sparklod_cli.tree import LodTree
-
-from .. import reference
-from ..conftest import real_scene
-from ..scenes import random_splats
-from .trees import check_threads, check_tree, children, coincident, hard_cases, parents
+from sparklod_cli.render.settings import RasterSettings
+from sparklod_cli.render.shading import show
+from sparklod_cli.simulation.frames import view_of
+from sparklod_cli.support import jit
+from sparklod_cli.support.errors import InvalidSplatsError
+from tests.conftest import real_scene
+from tests.lod.trees import check_threads, check_tree, children, coincident, hard_cases, parents
+from tests.references import gaussians
+from tests.scenes import random_splats
 
 GROWTHS = [1.05, 1.4, 2.0]
 
@@ -73,13 +72,13 @@ def test_scenes_of_any_size_make_valid_trees(count: int, growth: float, seed: in
 
 @pytest.mark.parametrize("growth", GROWTHS)
 @pytest.mark.parametrize("name", hard_cases())
-def test_hard_scenes_make_valid_trees(name: str, growth: float) -> None:
+def test_quality_makes_valid_trees_of_hard_scenes(name: str, growth: float) -> None:
     check(hard_cases()[name], growth)
 
 
 @pytest.mark.parametrize("growth", GROWTHS)
 @pytest.mark.parametrize("count", [65_535, 65_536])
-def test_coincident_splats_do_not_wrap_the_child_count(count: int, growth: float) -> None:
+def test_coincident_splats_give_no_quality_node_many_children(count: int, growth: float) -> None:
     _, tree = check(coincident(count), growth)
     assert tree.child_count.max() < 1000  # where any pair is as good as another, no node has to have many
 
@@ -91,7 +90,7 @@ def test_one_splat_many_times_makes_a_shallow_tree() -> None:
 
 
 @pytest.mark.parametrize("growth", GROWTHS)
-def test_one_splat_is_the_root(growth: float) -> None:
+def test_quality_makes_one_splat_a_tree_of_one_node(growth: float) -> None:
     _, tree = check(random_splats(1, sh_degree=2), growth)
     assert len(tree) == 1
 
@@ -102,12 +101,12 @@ def test_two_splats_have_one_parent(growth: float) -> None:
     assert tree.child_count.tolist() == [2, 0, 0]
 
 
-def test_the_number_of_threads_does_not_change_a_bit() -> None:
+def test_threads_do_not_change_a_bit_of_a_quality_tree() -> None:
     check_threads(lambda: quality.build(random_splats(20_000, sh_degree=1, seed=3)))
 
 
 @pytest.mark.parametrize("growth", GROWTHS)
-def test_a_prefix_is_a_coarser_scene(growth: float) -> None:
+def test_a_prefix_of_a_quality_tree_is_a_coarser_scene(growth: float) -> None:
     nodes, tree = quality.build(random_splats(5_000, seed=4), growth)
     parent = parents(tree)
     assert (parent[1:] < np.arange(1, len(tree))).all()
@@ -133,7 +132,7 @@ def test_colours_are_means_of_the_leaves_by_what_they_cover(growth: float, sh_de
     nodes, tree = quality.build(random_splats(2_000, sh_degree=sh_degree, seed=8), growth)
     parent = parents(tree)
     color = np.concatenate([nodes.rgb, nodes.sh.reshape(len(nodes), -1)], axis=1).astype(np.float64)
-    weight = np.where(tree.is_leaf, nodes.opacity.astype(np.float64) * reference.ellipsoid_area(nodes.scale), 0)
+    weight = np.where(tree.is_leaf, nodes.opacity.astype(np.float64) * gaussians.ellipsoid_area(nodes.scale), 0)
     total = weight[:, None] * color
     for node in range(len(tree) - 1, 0, -1):
         weight[parent[node]] += weight[node]
@@ -175,7 +174,7 @@ def test_splats_farther_apart_than_float32_holds_make_a_node_as_large_as_it_hold
     assert nodes.scale.max() == np.finfo(np.float32).max
 
 
-def test_no_splat_is_an_error() -> None:
+def test_quality_makes_no_tree_of_no_splats() -> None:
     with pytest.raises(InvalidSplatsError, match="no splat"):
         quality.build(random_splats(0))
 
@@ -211,7 +210,7 @@ def cameras_around(splats: Splats) -> tuple[Camera, ...]:
 
 
 def picture(splats: Splats, camera: Camera) -> Image:
-    return draw(show([(splats, np.eye(4))], camera), camera, Look())
+    return draw(show([(splats, np.eye(4))], camera), camera, RasterSettings())
 
 
 def fidelity(splats: Splats, built: tuple[Splats, LodTree], share: float) -> float:

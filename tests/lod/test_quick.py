@@ -11,16 +11,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sparklod_cli.errors import InvalidSplatsError
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod import quick
-from sparklod_cli.splats import Splats
-from sparklod_cli.tree import MAX_CHILDREN, LodTree
-
-from .. import reference
-from ..conftest import real_scene
-from ..scenes import random_splats
-from .trees import check_threads, check_tree, children, coincident, hard_cases, parents
+from sparklod_cli.model.lod_tree import MAX_CHILDREN, LodTree
+from sparklod_cli.model.splats import Splats
+from sparklod_cli.support.errors import InvalidSplatsError
+from tests.conftest import real_scene
+from tests.lod.trees import check_threads, check_tree, children, coincident, hard_cases, parents
+from tests.references import gaussians, quick_trees
+from tests.scenes import random_splats
 
 
 def as_merged(nodes: Splats, tree: LodTree) -> Splats:
@@ -32,13 +31,13 @@ def as_merged(nodes: Splats, tree: LodTree) -> Splats:
 
 def check_merge(nodes: Splats, tree: LodTree, node: int) -> None:
     """One merged node of `as_merged` has the moments of its children."""
-    expected = reference.merge(nodes.take(children(tree, node)))
+    expected = gaussians.merge(nodes.take(children(tree, node)))
     extent = math.sqrt(np.abs(expected.covariance).max())
     size = np.abs(expected.center).max()
     assert np.allclose(nodes.center[node], expected.center, atol=1e-5 * extent + 1e-6 * size)
-    got = reference.covariance(nodes.scale[node], nodes.quat_xyzw[node])
+    got = gaussians.covariance(nodes.scale[node], nodes.quat_xyzw[node])
     assert np.allclose(got, expected.covariance, atol=1e-5 * extent**2)
-    opacity = reference.opacity_of(expected.weight, nodes.scale[node])
+    opacity = gaussians.opacity_of(expected.weight, nodes.scale[node])
     assert nodes.opacity[node] == pytest.approx(opacity, rel=1e-4)
     assert np.allclose(nodes.rgb[node], expected.rgb, atol=1e-5)
     assert np.allclose(nodes.sh[node], expected.sh, atol=1e-5)
@@ -55,7 +54,7 @@ def test_every_merged_node_has_the_moments_of_its_children(base: float, sh_degre
         check_merge(merged, tree, node)
 
 
-def shape_of(tree: LodTree, leaf_of: dict[int, int], node: int = 0) -> reference.Tree:
+def shape_of(tree: LodTree, leaf_of: dict[int, int], node: int = 0) -> quick_trees.Tree:
     if node in leaf_of:
         return (leaf_of[node],)
     part = children(tree, node)
@@ -81,11 +80,11 @@ def test_the_tree_is_the_one_that_the_method_describes(count: int, base: float, 
         below[node] = frozenset({leaf_of[node]}) if node in leaf_of else frozenset().union(*parts)
     center_of = {leaves: nodes.center[node] for node, leaves in reversed(below.items())}
 
-    def leaves_of(shape: reference.Tree) -> frozenset[int]:
+    def leaves_of(shape: quick_trees.Tree) -> frozenset[int]:
         return frozenset(shape) if isinstance(shape[0], int) else frozenset().union(*map(leaves_of, shape))
 
-    levels = [reference.natural_level(scale, base) for scale in splats.scale]
-    expected = reference.quick_tree(
+    levels = [quick_trees.natural_level(scale, base) for scale in splats.scale]
+    expected = quick_trees.quick_tree(
         {(i,): splats.center[i] for i in range(count)},
         levels,
         base,
@@ -94,11 +93,11 @@ def test_the_tree_is_the_one_that_the_method_describes(count: int, base: float, 
     assert shape_of(tree, leaf_of) == expected
 
 
-def test_the_number_of_threads_does_not_change_a_bit() -> None:
+def test_threads_do_not_change_a_bit_of_a_quick_tree() -> None:
     check_threads(lambda: quick.build(random_splats(60_000, sh_degree=1, seed=3)))
 
 
-def test_a_prefix_is_a_coarser_scene() -> None:
+def test_a_prefix_of_a_quick_tree_is_a_coarser_scene() -> None:
     splats = random_splats(5_000, seed=4)
     nodes, tree = quick.build(splats)
     # Cells of a level are base times those of the level below, so what lies before has parents at least as coarse; the
@@ -111,14 +110,14 @@ def test_a_prefix_is_a_coarser_scene() -> None:
     assert (parents(tree)[1:] < np.arange(1, len(tree))).all()
 
 
-def test_one_splat_is_the_root() -> None:
+def test_quick_makes_one_splat_a_tree_of_one_node() -> None:
     splats = random_splats(1, sh_degree=2)
     nodes, tree = quick.build(splats)
     assert len(tree) == 1
     check_tree(splats, nodes, tree)
 
 
-def test_no_splat_is_an_error() -> None:
+def test_quick_makes_no_tree_of_no_splats() -> None:
     with pytest.raises(InvalidSplatsError, match="no splat"):
         quick.build(random_splats(0))
 
@@ -130,7 +129,7 @@ def test_a_base_out_of_range_is_an_error(base: float) -> None:
 
 
 @pytest.mark.parametrize("count", [MAX_CHILDREN, MAX_CHILDREN + 1, 3 * MAX_CHILDREN + 5])
-def test_coincident_splats_do_not_wrap_the_child_count(count: int) -> None:
+def test_coincident_splats_are_split_among_intermediate_nodes(count: int) -> None:
     splats = coincident(count)
     nodes, tree = quick.build(splats)
     check_tree(splats, nodes, tree)
@@ -145,7 +144,7 @@ def test_coincident_splats_do_not_wrap_the_child_count(count: int) -> None:
 
 @pytest.mark.parametrize("name", hard_cases())
 @pytest.mark.parametrize("base", [1.1, 2.0])
-def test_hard_scenes_make_valid_trees(name: str, base: float) -> None:
+def test_quick_makes_valid_trees_of_hard_scenes(name: str, base: float) -> None:
     splats = hard_cases()[name]
     nodes, tree = quick.build(splats, base)
     check_tree(splats, nodes, tree)

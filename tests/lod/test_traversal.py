@@ -12,21 +12,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sparklod_cli.codecs.lod_tree import Nodes
-from sparklod_cli.lod.traversal import (
-    CHUNK_NODES,
-    LOOKS,
-    Cones,
-    Forest,
-    Frustum,
-    Instance,
-    View,
-    pixel_limit,
-    views_of,
-)
-
-from .. import reference
-from .forests import Case, ancestors_drawn, cases, check, drawn, links, random_tree, rotation, transform, views
+from sparklod_cli.codecs.gpu.lod_tree import Nodes
+from sparklod_cli.lod.traversal import CHUNK_NODES, LOOKS, Cones, Forest, Frustum, Instance, View, pixel_limit, views_of
+from tests.lod.forests import Case, ancestors_drawn, cases, check, drawn, links, random_tree, rotation, transform, views
+from tests.references import budgeted_cuts
 
 #: Pixel scales at which nothing happens, something does, and everything does.
 LIMITS = (0.0, 0.02, 0.3)
@@ -45,7 +34,7 @@ def test_what_is_no_larger_than_the_limit_is_not_divided(case: Case, data: st.Da
     sight = views_of(found.forest, case.instances, case.view)
     number = data.draw(st.integers(0, len(sight) - 1))
     node = data.draw(st.integers(0, len(case.trees[case.instances[number].tree].size) - 1))
-    smallest = float(reference.pixel_scale(found.forest.nodes[sight[number]["node_base"] + node], sight[number]))
+    smallest = float(budgeted_cuts.pixel_scale(found.forest.nodes[sight[number]["node_base"] + node], sight[number]))
     case = dataclasses.replace(case, smallest=smallest)
     check(case, case.find(found))
 
@@ -121,7 +110,7 @@ def large_case(seed: int, *, nodes: int = 150_000, instances: int = 3) -> Case:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_large_trees(seed: int) -> None:
+def test_the_cut_of_large_trees_is_that_of_one_queue(seed: int) -> None:
     case = large_case(seed)
     found = case.traversal()
     for budget, smallest in [(3, 0.0), (20_000, 0.0), (1_000, 0.0), (20_000, pixel_limit(math.radians(60), 100))]:
@@ -216,12 +205,12 @@ def test_pixel_scales_are_those_of_the_world(seed: int, foveation: Cones | Frust
         seen = (abs(x) <= np.tan(view.fov_x / 2) * -z) & (abs(y) <= np.tan(view.fov_y / 2) * -z)
         weight = np.where(z < 0, np.where(seen, 1, foveation.outside), foveation.behind)
     expected = scale * tree.size / distance * placed.lod_scale * weight
-    got = np.array([reference.pixel_scale(node, sight) for node in forest.nodes])
+    got = np.array([budgeted_cuts.pixel_scale(node, sight) for node in forest.nodes])
     # One in a thousand lies on an edge, where it falls to the other side.
     assert np.count_nonzero(~np.isclose(got, expected, rtol=1e-4)) <= 1
 
 
-def test_a_pixel() -> None:
+def test_the_pixel_limit_is_a_pixels_size_at_distance_1() -> None:
     """At distance 1 the picture is 2 * tan(fov_y / 2) high."""
     assert pixel_limit(math.radians(90), 1000) == pytest.approx(2 / 1000)
     assert pixel_limit(math.radians(60), 1080, 2.0) == pytest.approx(2 * pixel_limit(math.radians(60), 1080))
@@ -247,5 +236,5 @@ def children_of(nodes: Nodes, node: int) -> range:
     return range(start, start + int(nodes.tree.child_count[node]))
 
 
-def test_rotations_are_rotations() -> None:
+def test_random_rotations_do_not_mirror() -> None:
     assert np.linalg.det(rotation(np.random.default_rng(0))) == pytest.approx(1)

@@ -7,12 +7,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from sparklod_cli import jit
-from sparklod_cli.gaussian import MAX_OPACITY, MIN_OPACITY
-from sparklod_cli.splats import COLUMNS, Splats
-from sparklod_cli.tree import LodTree
-
-from ..scenes import random_splats
+from sparklod_cli.model.gaussian import MAX_OPACITY, MIN_OPACITY
+from sparklod_cli.model.lod_tree import LodTree
+from sparklod_cli.model.splats import COLUMNS, Splats
+from sparklod_cli.support import jit
+from tests.scenes import random_splats
 
 
 def children(tree: LodTree, node: int) -> slice:

@@ -12,17 +12,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sparklod_cli import jit
-from sparklod_cli.gaussian import normalized_quat
-from sparklod_cli.render.camera import Camera
-from sparklod_cli.render.look import PROFILES, SORTS, Look
-from sparklod_cli.render.pose import look_at
+from sparklod_cli.cameras.camera import Camera
+from sparklod_cli.cameras.pose import look_at
+from sparklod_cli.model.gaussian import normalized_quat
+from sparklod_cli.model.splats import Splats
 from sparklod_cli.render.rasterizer import Image, draw
-from sparklod_cli.render.shown import Shown, show
-from sparklod_cli.splats import Splats
-
-from .. import reference
-from ..scenes import random_splats
+from sparklod_cli.render.settings import PROFILES, SORTS, RasterSettings
+from sparklod_cli.render.shading import ShadedSplats, show
+from sparklod_cli.support import jit
+from tests.references import spark_pictures
+from tests.scenes import random_splats
 
 #: Largest difference to the twin, which computes in float64, at pixels of which float32 can tell what they are in.
 MOST = 1e-3
@@ -44,11 +43,11 @@ def camera_at(
     return Camera(look_at(eye, (0, 0, 0), (0, -1, 0)), *size, focal, principal or middle)
 
 
-def shown(count: int, *, seed: int = 0, scale: float = 0.08, spread: float = 0.7, most: float = 1.0) -> Shown:
+def shown(count: int, *, seed: int = 0, scale: float = 0.08, spread: float = 0.7, most: float = 1.0) -> ShadedSplats:
     """Splats around the origin: scales over a decade, D up to `most`, colours up to 1.3."""
     rng = np.random.default_rng(seed)
     f32 = np.float32
-    return Shown(
+    return ShadedSplats(
         center=rng.normal(0, spread, (count, 3)).astype(f32),
         scale=(scale * np.exp(rng.normal(0, 0.8, (count, 3)))).astype(f32),
         quat_xyzw=normalized_quat(rng.normal(size=(count, 4)).astype(f32)),
@@ -57,21 +56,23 @@ def shown(count: int, *, seed: int = 0, scale: float = 0.08, spread: float = 0.7
     )
 
 
-def joined(*parts: Shown) -> Shown:
-    names = [field.name for field in dataclasses.fields(Shown)]
-    return Shown(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
+def joined(*parts: ShadedSplats) -> ShadedSplats:
+    names = [field.name for field in dataclasses.fields(ShadedSplats)]
+    return ShadedSplats(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
 
 
-def rows(of: Shown, index: np.ndarray | slice) -> Shown:
-    return Shown(**{field.name: getattr(of, field.name)[index] for field in dataclasses.fields(Shown)})
+def rows(of: ShadedSplats, index: np.ndarray | slice) -> ShadedSplats:
+    return ShadedSplats(**{field.name: getattr(of, field.name)[index] for field in dataclasses.fields(ShadedSplats)})
 
 
-def one(center: tuple[float, float, float], scale: float, d: float, rgb: tuple[float, float, float]) -> Shown:
+def one(center: tuple[float, float, float], scale: float, d: float, rgb: tuple[float, float, float]) -> ShadedSplats:
     columns = [center, (scale, scale, scale), (0, 0, 0, 1), d, rgb]
-    return Shown(*(np.array([column], np.float32) for column in columns))
+    return ShadedSplats(*(np.array([column], np.float32) for column in columns))
 
 
-def check(of: Shown, camera: Camera, look: Look | None = None, *, most: float = MOST, unsure: float = 0.1) -> Image:
+def check(
+    of: ShadedSplats, camera: Camera, look: RasterSettings | None = None, *, most: float = MOST, unsure: float = 0.1
+) -> Image:
     """Holds a picture against the twin's.
 
     Args:
@@ -79,8 +80,8 @@ def check(of: Shown, camera: Camera, look: Look | None = None, *, most: float = 
         most: the largest difference.
         unsure: the share of pixels that may be left out, because a splat ends there.
     """
-    look = look or Look()
-    image, twin = draw(of, camera, look), reference.picture(of, camera, look)
+    look = look or RasterSettings()
+    image, twin = draw(of, camera, look), spark_pictures.picture(of, camera, look)
     assert image.shape == (camera.height, camera.width, 4) and image.dtype == np.float32
     assert twin.unsure.mean() <= unsure
     difference = (image - twin.rgba)[~twin.unsure]
@@ -103,12 +104,12 @@ def threads(count: int) -> Iterator[None]:
 @pytest.mark.parametrize("most", [1.0, 5.0])
 def test_it_draws_what_the_twin_draws(most: float, profile: str, sort: str) -> None:
     for seed in range(3):
-        image = check(shown(150, seed=seed, most=most), camera_at(), Look(profile=profile, sort=sort))
+        image = check(shown(150, seed=seed, most=most), camera_at(), RasterSettings(profile=profile, sort=sort))
         assert image[..., 3].mean() > 0.1
 
 
 @pytest.mark.parametrize("size", [(1, 1), (17, 33), (16, 16), (64, 3), (2, 70)])
-def test_sizes(size: tuple[int, int]) -> None:
+def test_pictures_of_any_size_are_those_of_the_twin(size: tuple[int, int]) -> None:
     count = 10 if size == (1, 1) else 100  # so that no splat ends at that one pixel
     check(shown(count, most=3.0), camera_at(size=size, focal=(0.8 * size[0], 0.8 * size[1])), unsure=0.3)
 
@@ -120,7 +121,7 @@ def test_a_principal_point_that_is_not_in_the_middle(principal: tuple[float, flo
     assert image[..., 3].mean() > 0.02
 
 
-def test_needles() -> None:
+def test_needles_are_drawn_as_the_twin_draws_them() -> None:
     """A thousand times longer than they are thick."""
     needles = shown(40, seed=5, most=3.0)
     needles.scale[:] = np.float32([0.5, 0.0005, 0.0005])
@@ -138,52 +139,52 @@ def test_no_splat_is_larger_than_512_pixels(thin: float, most: float) -> None:
 
 def test_the_edge_of_a_huge_splat_is_512_pixels_from_its_centre() -> None:
     camera = camera_at((0, 0, 5), size=(1201, 9), focal=(1000.0, 1000.0))
-    image = draw(one((0, 0, 0), 4.0, 1.0, (1, 1, 1)), camera, Look())
+    image = draw(one((0, 0, 0), 4.0, 1.0, (1, 1, 1)), camera, RasterSettings())
     [seen] = np.nonzero(image[4, :, 3])
     assert 511 <= 600 - seen.min() <= 512 and 511 <= seen.max() - 600 <= 512
 
 
-def test_tiny_splats() -> None:
+def test_splats_below_a_pixel_are_drawn_as_the_twin_draws_them() -> None:
     """Blur makes them half a pixel large, and opacity as much lower."""
     check(shown(500, scale=0.003, seed=7), camera_at())
     check(shown(500, scale=1e-9, seed=8), camera_at())
 
 
-def test_planes() -> None:
-    look = Look(near=3.7, far=4.3)
+def test_splats_before_near_and_beyond_far_are_not_drawn() -> None:
+    look = RasterSettings(near=3.7, far=4.3)
     near_and_far = shown(300, seed=9)
     image = check(near_and_far, camera_at(), look)
-    assert not np.array_equal(image, draw(near_and_far, camera_at(), Look()))
+    assert not np.array_equal(image, draw(near_and_far, camera_at(), RasterSettings()))
     inside = camera_at((0.01, 0.02, 0.1))  # splats are behind it, and all around it
-    check(near_and_far, inside, Look(near=0.2))
-    nothing = draw(near_and_far, camera_at(), Look(near=100.0, far=200.0))
+    check(near_and_far, inside, RasterSettings(near=0.2))
+    nothing = draw(near_and_far, camera_at(), RasterSettings(near=100.0, far=200.0))
     assert not nothing.any()
 
 
-def test_the_clip() -> None:
+def test_a_splat_is_dropped_when_its_center_is_beyond_the_clip() -> None:
     """A splat is drawn as long as its centre is within 1.4 times the picture's half width, and then not at all."""
     camera = camera_at((0, 0, 5), size=(40, 30), focal=(50.0, 50.0))
     for pixels, drawn in ((1.39 * 20, True), (1.41 * 20, False)):
         for sign in (-1, 1):
-            image = draw(one((sign * pixels / 50 * 5, 0, 0), 1.0, 1.0, (1, 1, 1)), camera, Look())
+            image = draw(one((sign * pixels / 50 * 5, 0, 0), 1.0, 1.0, (1, 1, 1)), camera, RasterSettings())
             assert image.any() == drawn
     for pixels, drawn in ((1.39 * 15, True), (1.41 * 15, False)):
-        image = draw(one((0, pixels / 50 * 5, 0), 1.0, 1.0, (1, 1, 1)), camera, Look())
+        image = draw(one((0, pixels / 50 * 5, 0), 1.0, 1.0, (1, 1, 1)), camera, RasterSettings())
         assert image.any() == drawn
 
 
 def test_more_than_opaque_is_never_more_than_five() -> None:
     camera = camera_at()
-    five, more = (draw(one((0, 0, 0), 0.3, d, (1, 0.5, 0)), camera, Look()) for d in (5.0, 7.5))
+    five, more = (draw(one((0, 0, 0), 0.3, d, (1, 0.5, 0)), camera, RasterSettings()) for d in (5.0, 7.5))
     np.testing.assert_array_equal(five, more)
 
 
 @pytest.mark.parametrize("sh_degree", range(4))
-def test_spherical_harmonics(sh_degree: int) -> None:
+def test_colours_follow_the_direction_by_spherical_harmonics(sh_degree: int) -> None:
     splats = random_splats(200, sh_degree=sh_degree)
     eye = (1.0, -2.0, 3.0)
     seen = show([(splats, np.eye(4))], camera_at(eye))
-    np.testing.assert_allclose(seen.rgb, reference.seen_rgb(splats, np.array(eye)), atol=2e-6)
+    np.testing.assert_allclose(seen.rgb, spark_pictures.seen_rgb(splats, np.array(eye)), atol=2e-6)
     check(seen, camera_at(eye))
 
 
@@ -195,8 +196,8 @@ def test_placing_splats_is_moving_the_camera(size: float) -> None:
     moved = matrix @ camera.camera_to_world
     moved[:3, :3] /= size
     there = dataclasses.replace(camera, camera_to_world=moved)
-    placed = draw(show([(splats, matrix)], there), there, Look())
-    plain = draw(show([(splats, np.eye(4))], camera), camera, Look())
+    placed = draw(show([(splats, matrix)], there), there, RasterSettings())
+    plain = draw(show([(splats, np.eye(4))], camera), camera, RasterSettings())
     close = np.abs(placed - plain).max(axis=-1) < MOST
     assert close.mean() > 0.99 and plain[..., 3].mean() > 0.02
 
@@ -204,18 +205,18 @@ def test_placing_splats_is_moving_the_camera(size: float) -> None:
 def test_several_objects_are_drawn_as_one() -> None:
     splats, camera = random_splats(300, sh_degree=2), camera_at()
     parts = [(splats.take(slice(0, 100)), np.eye(4)), (splats.take(slice(100, 300)), np.eye(4))]
-    whole = draw(show([(splats, np.eye(4))], camera), camera, Look())
-    np.testing.assert_array_equal(draw(show(parts, camera), camera, Look()), whole)
+    whole = draw(show([(splats, np.eye(4))], camera), camera, RasterSettings())
+    np.testing.assert_array_equal(draw(show(parts, camera), camera, RasterSettings()), whole)
 
 
 @pytest.mark.parametrize("profile", PROFILES)
-def test_the_number_of_threads_does_not_change_a_bit(profile: str) -> None:
+def test_threads_do_not_change_a_bit_of_a_picture(profile: str) -> None:
     camera = camera_at(size=(200, 150), focal=(200.0, 200.0))
     scene = shown(5000, most=3.0, seed=11)
     pictures = []
     for count in (1, 2, 3):
         with threads(count):
-            pictures.append(draw(scene, camera, Look(profile=profile)).tobytes())
+            pictures.append(draw(scene, camera, RasterSettings(profile=profile)).tobytes())
     assert pictures[0] == pictures[1] == pictures[2]
 
 
@@ -223,14 +224,16 @@ def test_the_number_of_threads_does_not_change_a_bit(profile: str) -> None:
 def test_the_order_of_splats_does_not_matter(sort: str) -> None:
     scene, camera = shown(300, most=3.0, seed=12), camera_at()
     mixed = rows(scene, np.random.default_rng(0).permutation(len(scene)))
-    np.testing.assert_array_equal(draw(mixed, camera, Look(sort=sort)), draw(scene, camera, Look(sort=sort)))
+    np.testing.assert_array_equal(
+        draw(mixed, camera, RasterSettings(sort=sort)), draw(scene, camera, RasterSettings(sort=sort))
+    )
 
 
 def test_of_splats_in_one_place_the_last_is_in_front() -> None:
     """As Spark's sort has it."""
     red, blue = one((0, 0, 0), 0.5, 5.0, (1, 0, 0)), one((0, 0, 0), 0.5, 5.0, (0, 0, 1))
     for scene, seen in (((red, blue), 2), ((blue, red), 0)):
-        middle = draw(joined(*scene), camera_at(), Look())[20, 28]
+        middle = draw(joined(*scene), camera_at(), RasterSettings())[20, 28]
         np.testing.assert_allclose(middle[:3], np.eye(3)[seen], atol=1e-3)
 
 
@@ -238,7 +241,7 @@ def test_of_splats_in_one_place_the_last_is_in_front() -> None:
 def test_what_is_opaque_and_near_hides_all(profile: str) -> None:
     camera = camera_at((0, 0, 4))
     wall = one((0, 0, 2.5), 2.0, 5.0, (0.2, 0.4, 0.6))
-    image = draw(joined(shown(200, spread=0.4), wall), camera, Look(profile=profile))
+    image = draw(joined(shown(200, spread=0.4), wall), camera, RasterSettings(profile=profile))
     np.testing.assert_allclose(image, np.broadcast_to(np.float32([0.2, 0.4, 0.6, 1]), image.shape), atol=2 * EARLY)
 
 
@@ -246,39 +249,41 @@ def test_the_two_sorts_differ() -> None:
     """Off the axis, what is deeper may be nearer."""
     camera = camera_at((0, 0, 4), size=(60, 40))
     deep, wide = one((0.0, 0, 0.0), 0.3, 5.0, (1, 0, 0)), one((1.4, 0, 0.2), 0.5, 5.0, (0, 0, 1))
-    radial, along = (draw(joined(deep, wide), camera, Look(sort=sort)) for sort in ("radial", "z"))
+    radial, along = (draw(joined(deep, wide), camera, RasterSettings(sort=sort)) for sort in ("radial", "z"))
     assert (radial - along)[..., 0].max() > 0.3  # red is in front by distance, blue by depth
 
 
 @given(seed=st.integers(0, 1000), most=st.sampled_from([1.0, 5.0]), profile=st.sampled_from(PROFILES))
 def test_alpha_is_no_more_than_one(seed: int, most: float, profile: str) -> None:
-    image = draw(shown(60, seed=seed, scale=0.3, most=most), camera_at(size=(24, 20)), Look(profile=profile))
+    image = draw(shown(60, seed=seed, scale=0.3, most=most), camera_at(size=(24, 20)), RasterSettings(profile=profile))
     assert np.isfinite(image).all() and image.min() >= 0 and image[..., 3].max() <= 1
 
 
 def test_an_empty_scene_is_transparent() -> None:
-    assert not draw(shown(0), camera_at(), Look()).any()
+    assert not draw(shown(0), camera_at(), RasterSettings()).any()
     no_splats = Splats(*(column[:0] for column in dataclasses.astuple(random_splats(1))))
-    assert not draw(show([(no_splats, np.eye(4))], camera_at()), camera_at(), Look()).any()
+    assert not draw(show([(no_splats, np.eye(4))], camera_at()), camera_at(), RasterSettings()).any()
 
 
 def test_splats_without_opacity_are_not_drawn() -> None:
     scene = shown(200)
     faint = dataclasses.replace(scene, lod_opacity=np.zeros(200, np.float32))
-    assert not draw(faint, camera_at(), Look()).any()
-    np.testing.assert_array_equal(draw(joined(scene, faint), camera_at(), Look()), draw(scene, camera_at(), Look()))
+    assert not draw(faint, camera_at(), RasterSettings()).any()
+    np.testing.assert_array_equal(
+        draw(joined(scene, faint), camera_at(), RasterSettings()), draw(scene, camera_at(), RasterSettings())
+    )
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 3e38, -3e38])
-@pytest.mark.parametrize("name", [field.name for field in dataclasses.fields(Shown)])
+@pytest.mark.parametrize("name", [field.name for field in dataclasses.fields(ShadedSplats)])
 def test_a_broken_splat_harms_no_other(name: str, value: float) -> None:
     """It is a small one; if it is drawn, then where it is."""
     scene, camera = shown(60, seed=13), camera_at()
-    unharmed = draw(scene, camera, Look())
+    unharmed = draw(scene, camera, RasterSettings())
     for at in range(getattr(scene, name)[0].size):
         broken = one((0, 0, 1), 0.05, 0.9, (1, 1, 1))
         getattr(broken, name).reshape(-1)[at] = value
-        image = draw(joined(scene, broken), camera, Look())
+        image = draw(joined(scene, broken), camera, RasterSettings())
         assert np.isfinite(image).all() and image.min() >= 0 and image[..., 3].max() <= 1
         assert (np.abs(image - unharmed).max(axis=-1) > 1e-6).mean() < 0.1
 

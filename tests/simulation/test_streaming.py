@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
 import math
-from dataclasses import dataclass, field
 from fractions import Fraction
 
 import numpy as np
@@ -12,15 +10,11 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from sparklod_cli.simulation.chunks import Chunks
+from sparklod_cli.simulation.chunk_cache import Chunks
 from sparklod_cli.simulation.streaming import Network, Stream
-
-from .test_chunks import NaiveCache, roots_first
+from tests.references.streaming import NaiveCache, Twin, roots_first
 
 MB = 1_000_000
-#: Nearer than this to each other, rounding decides which of two events comes first.
-TIE = Fraction(1, 10**9)
-
 networks = st.builds(
     Network,
     bandwidth=st.integers(1, 50).map(lambda k: k * 997.0),
@@ -28,66 +22,6 @@ networks = st.builds(
     fetchers=st.integers(1, 5),
 )
 tree_sizes = st.lists(st.lists(st.integers(1, 9999), min_size=1, max_size=6), min_size=1, max_size=3)
-
-
-@dataclass
-class Fetch:
-    """A fetch under way."""
-
-    asked: Fraction
-    chunk: int
-    latency: Fraction
-    left: Fraction
-
-
-@dataclass
-class Twin:
-    """What `Stream` does, in fractions, one fetch at a time, with a cache that is looked through."""
-
-    chunks: Chunks
-    network: Network
-    cache: NaiveCache
-    now: Fraction = Fraction(0)
-    fetches: list[Fetch] = field(default_factory=list)
-    arrivals: list[tuple[Fraction, int]] = field(default_factory=list)
-    tied: bool = False  # rounding may have decided otherwise
-
-    def advance(self, to_time: Fraction) -> None:
-        while True:
-            active = [fetch for fetch in self.fetches if fetch.latency == 0]
-            rate = Fraction(self.network.bandwidth) / max(1, len(active))
-            due = [fetch.left / rate for fetch in active]
-            due += [fetch.latency for fetch in self.fetches if fetch.latency > 0]
-            ends = sorted((fetch.left / rate, fetch.asked, self.chunks.sizes[fetch.chunk]) for fetch in active)
-            self.tied |= any(b[0] - a[0] <= TIE and a != b for a, b in itertools.pairwise(ends))
-            self.tied |= any(abs(end[0] - (to_time - self.now)) <= TIE for end in ends)
-            step = min([to_time - self.now, *due])
-            self.now += step
-            for fetch in self.fetches:
-                if fetch in active:
-                    fetch.left -= step * rate
-                else:
-                    fetch.latency -= step
-            done = [fetch for fetch in active if fetch.left == 0]
-            if not done and self.now == to_time:
-                return
-            for fetch in done[:1]:
-                self.fetches.remove(fetch)
-                self.arrivals.append((self.now, fetch.chunk))
-                self.cache.arrive(fetch.chunk)
-                self.ask()
-
-    def want(self, wanted: list[int]) -> None:
-        self.cache.want(roots_first(self.chunks, wanted))
-        self.ask()
-
-    def ask(self) -> None:
-        for place, chunk in enumerate(self.cache.wanted):
-            if place < self.cache.capacity and len(self.fetches) < self.network.fetchers:
-                under_way = [fetch.chunk for fetch in self.fetches]
-                if chunk not in self.cache.used and chunk not in under_way:
-                    latency = Fraction(self.network.latency)
-                    self.fetches.append(Fetch(self.now, chunk, latency, Fraction(self.chunks.sizes[chunk])))
 
 
 def here(stream: Stream) -> set[int]:
@@ -318,7 +252,7 @@ def test_the_default_network_brings_at_once_what_fits(data: st.DataObject, sizes
         assert stream.complete_in(wanted) == (0.0 if fits else None)
 
 
-def test_time_goes_forward() -> None:
+def test_a_stream_refuses_to_go_back_in_time() -> None:
     stream = Stream(Chunks([[1]]), start=1.0)
     for time in (0.5, math.nan, math.inf):
         with pytest.raises(ValueError, match="only go forward"):

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 from sparklod_cli.commands.traverse_text import WIDTH, lines
-from sparklod_cli.simulation.assertions import check, parse
 from sparklod_cli.simulation.columns import COLUMNS
 from sparklod_cli.simulation.summary import IN_FRUSTUM, MOMENTS, QUANTITIES, summarize
-
-from .rows import flight, row
+from sparklod_cli.tables.assertions import check, parse
+from tests.tables.rows import flight, row
 
 
 def test_its_statistics_are_what_assertions_compare() -> None:
@@ -32,7 +31,7 @@ def test_the_share_in_the_picture() -> None:
     assert quantity.p95 == pytest.approx(np.percentile(shares, 95), rel=1e-8)
 
 
-def test_totals() -> None:
+def test_totals_are_sums_over_all_frames() -> None:
     rows = flight()
     summary = summarize(rows)
     assert summary.frames == 300
@@ -69,18 +68,18 @@ def test_what_is_empty_or_nothing_is_left_out() -> None:
     assert summary.stop_reasons == {}
 
 
-def test_single_instances_are_left_out() -> None:
+def test_a_summary_leaves_single_instances_out() -> None:
     rows = flight(20)
     assert summarize([*rows, *(each | {"instance": "tree"} for each in rows)]) == summarize(rows)
 
 
-def test_no_frames() -> None:
+def test_a_summary_of_no_frames_is_empty() -> None:
     summary = summarize([])
     assert (summary.frames, summary.seconds, summary.quantities, summary.moments) == (0, 0, (), ())
     assert lines(summary) == ["  path       0 frames, 0.000 s"]
 
 
-def test_it_is_json() -> None:
+def test_a_summary_survives_json() -> None:
     plain = summarize(flight()).as_dict()
     assert json.loads(json.dumps(plain, allow_nan=False)) == plain
     assert set(plain["quantities"]) == set(QUANTITIES)
@@ -88,12 +87,12 @@ def test_it_is_json() -> None:
     assert plain["moments"]["churn"]["frame"] == 219
 
 
-def test_quantities_are_columns() -> None:
+def test_every_quantity_of_a_summary_is_a_column() -> None:
     assert set(QUANTITIES) - {IN_FRUSTUM} <= {column.name for column in COLUMNS}
 
 
 class TestText:
-    def test_it_fits(self) -> None:
+    def test_a_summary_fits_the_width_of_a_terminal(self) -> None:
         text = lines(summarize(flight()))
         assert max(map(len, text)) <= WIDTH
         assert len(text) == 3 + 1 + len(QUANTITIES) + 1 + len(MOMENTS)

@@ -1,0 +1,127 @@
+"""Commands whose `--help` has headings, and the group that finds them, loads them late and says what came near."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable, Sequence
+from importlib import import_module
+from typing import Any, TypeVar
+
+import click
+
+Decorated = TypeVar("Decorated", bound=Callable[..., Any])
+
+#: Headings that several commands have: of what most people need, and of what every command has.
+COMMON, GENERAL = "Common options", "General"
+
+#: What else people type, and what they mean by it.
+ALIASES = {
+    "bake": "build-lod",
+    "build": "build-lod",
+    "convert": "build-lod",
+    "lod": "build-lod",
+    "unlod": "build-lod --unlod",
+    "check": "inspect",
+    "info": "inspect",
+    "report": "inspect",
+    "stats": "inspect",
+    "validate": "inspect",
+    "benchmark": "traverse",
+    "simulate": "traverse",
+    "compare": "render --compare",
+    "draw": "render",
+    "preview": "render",
+    "compile": "warmup",
+}
+
+
+class Option(click.Option):
+    """An option that stands under a heading of `--help`."""
+
+    def __init__(self, *arguments: Any, heading: str = GENERAL, **attributes: Any) -> None:
+        super().__init__(*arguments, **attributes)
+        self.heading = heading
+
+
+def option(*names: str, heading: str, **attributes: Any) -> Callable[[Decorated], Decorated]:
+    """`click.option` with the heading under which `--help` has it."""
+    return click.option(*names, cls=Option, heading=heading, **attributes)
+
+
+class Command(click.Command):
+    """A command whose `--help` lists options under headings.
+
+    Args:
+        headings: the order of the headings; those that are not named follow in the order of their first options, and
+            `GENERAL` is the last one.
+    """
+
+    def __init__(self, *arguments: Any, headings: Sequence[str] = (COMMON,), **attributes: Any) -> None:
+        super().__init__(*arguments, **attributes)
+        self.headings = headings
+
+    def by_heading(self, ctx: click.Context) -> dict[str, list[click.Parameter]]:
+        """The options that `--help` lists, by heading, in the order of both."""
+        listed: dict[str, list[click.Parameter]] = {heading: [] for heading in self.headings}
+        last: list[click.Parameter] = []
+        for param in self.get_params(ctx):
+            if isinstance(param, click.Option) and not param.hidden:
+                heading = getattr(param, "heading", GENERAL)
+                (last if heading == GENERAL else listed.setdefault(heading, [])).append(param)
+        return {heading: params for heading, params in (*listed.items(), (GENERAL, last)) if params}
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        for heading, params in self.by_heading(ctx).items():
+            with formatter.section(heading):
+                formatter.write_dl([record for param in params if (record := param.get_help_record(ctx))])
+
+
+class Group(click.Group):
+    """A group of commands that are each imported when they are called for.
+
+    Args:
+        rows: by the name of a command what `--help` says of it. Its module in `commands`, and the function there, have
+            the same name, with _ for -.
+    """
+
+    def __init__(self, *arguments: Any, rows: dict[str, str], **attributes: Any) -> None:
+        super().__init__(*arguments, **attributes)
+        self.rows = rows
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(self.rows)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name not in self.rows:
+            return None
+        name = cmd_name.replace("-", "_")
+        command: click.Command = getattr(import_module(f".{name}", __package__), name)
+        return command
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        if args and args[0] not in self.rows and not args[0].startswith("-"):
+            raise click.UsageError(self.unknown(args[0]), ctx)
+        return super().resolve_command(ctx, args)
+
+    def unknown(self, name: str) -> str:
+        """What to say of a command that there is not: which one was meant, or which there are."""
+        meant = near_command(name, list(self.rows))
+        hint = f"did you mean {meant}?" if meant else f"the commands are {', '.join(self.rows)}"
+        return f"there is no command {name!r}; {hint}"
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """The rows, without loading a command."""
+        with formatter.section("Commands"):
+            formatter.write_dl(list(self.rows.items()))
+
+
+def near_command(name: str, names: Sequence[str]) -> str | None:
+    """The command that somebody meant by another name, if that can be told."""
+    plain = name.lower().replace("_", "-")
+    if plain in names or plain in ALIASES:
+        return plain if plain in names else ALIASES[plain]
+    for found in difflib.get_close_matches(plain, [*names, *ALIASES], n=1, cutoff=0.7):
+        return ALIASES.get(found, found)
+    return None

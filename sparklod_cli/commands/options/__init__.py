@@ -1,0 +1,1 @@
+"""Groups of options that commands share, each of which gives one frozen dataclass."""

@@ -1,0 +1,113 @@
+"""Options that every command has, or several have."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import click
+
+from ... import __version__
+from ...support.defaults import MAX_THREADS, TABLES
+from ..command import COMMON, GENERAL, option
+from ..console import Console, Verbosity
+
+#: Suffixes, without a point, of what is no table, whatever format is asked for.
+NO_TABLES = ("gif", "html", "ksplat", "mp4", "npy", "npz", "ply", "png", "sog", "splat", "spz", "webp")
+
+Command = TypeVar("Command", bound=Callable[..., Any])
+
+
+@dataclass(frozen=True)
+class General:
+    """What `common_options` were given.
+
+    Attributes:
+        threads: to work on.
+        as_json: print JSON on standard output.
+        quiet, verbose: say less or more on standard error.
+    """
+
+    threads: int
+    as_json: bool
+    quiet: bool
+    verbose: bool
+
+    def console(self) -> Console:
+        """What says as much as is wanted."""
+        return Console(quiet=self.quiet, verbose=self.verbose)
+
+
+def table_form(flag: str, output: Path | None, form: str | None = None) -> str:
+    """The format of a table that is asked for, or by a name; CSV where that has no suffix, or goes to standard output.
+
+    Raises:
+        click.UsageError: nothing is written by that suffix, or it promises something else than `form`.
+    """
+    suffix = output.suffix.lower() if output is not None else ""
+    if not suffix:
+        return form or TABLES[0]
+    if form is not None:
+        if suffix[1:] != form and suffix[1:] in (*TABLES, *NO_TABLES):
+            raise click.UsageError(f"{flag} {output} does not end in .{form}, which --format asks for")
+        return form
+    if suffix[1:] not in TABLES:
+        raise click.UsageError(f"{flag} {output}: tables are written as {', '.join(f'.{form}' for form in TABLES)}")
+    return suffix[1:]
+
+
+def _note_verbosity(ctx: click.Context, param: click.Parameter, value: bool) -> bool:
+    verbosity = ctx.find_object(Verbosity)
+    if verbosity is not None:
+        verbosity.verbose = value
+    return value
+
+
+def verbose_option(text: str) -> Callable[[Command], Command]:
+    """`-v`, with its help; whoever ends the run hears of it, too."""
+    return option("-v", "--verbose", heading=GENERAL, is_flag=True, callback=_note_verbosity, help=text)
+
+
+def overwrite_option(command: Command) -> Command:
+    """`-f`, `--overwrite`."""
+    return option("-f", "--overwrite", heading=COMMON, is_flag=True, help="Replace outputs that exist.")(command)
+
+
+def processors_to_use() -> int:
+    """What --threads is by default."""
+    from ...support.parallel import processors
+
+    return min(processors(), MAX_THREADS)
+
+
+def common_options(
+    command: Command,
+    *,
+    json: str = "Print one JSON object for each file on standard output.",
+    quiet: str = "Print nothing but errors.",
+) -> Command:
+    """`--threads`, `--json`, `-q`, `-v`, `--version`, of which `General` has the values.
+
+    Args:
+        command: that gets them.
+        json, quiet: help texts of the options of these names.
+    """
+    for add in (
+        click.version_option(__version__, package_name="sparklod"),
+        verbose_option("Print how long each stage took, and which settings were chosen."),
+        option("-q", "--quiet", heading=GENERAL, is_flag=True, help=quiet),
+        option("--json", "as_json", heading=GENERAL, is_flag=True, help=json),
+        option(
+            "--threads",
+            heading=GENERAL,
+            metavar="N",
+            type=click.IntRange(1, MAX_THREADS),
+            default=processors_to_use,
+            show_default="all processors",
+            help="Number of threads to work on.",
+        ),
+    ):
+        command = add(command)
+    return command

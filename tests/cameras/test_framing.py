@@ -1,0 +1,156 @@
+"""Where cameras stand that are to see a scene: laws over any scene, size of picture and direction."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sparklod_cli.cameras.camera import Camera
+from sparklod_cli.cameras.frame import DEFAULT_UP, Settings, camera_of
+from sparklod_cli.cameras.framing import (
+    FILLED,
+    OUTSIDE,
+    Balls,
+    balls_of,
+    covered,
+    distance,
+    fitted,
+    framing,
+    middle_of,
+    with_reach,
+)
+from sparklod_cli.cameras.generators import orbit
+from sparklod_cli.model.splats import Splats
+from sparklod_cli.render.settings import RasterSettings
+from sparklod_cli.support.errors import InvalidSplatsError
+
+SIZES = st.sampled_from([(1280, 720), (720, 1280), (500, 500), (2000, 100)])
+
+
+@st.composite
+def scenes(draw: st.DrawFn) -> Balls:
+    random = np.random.default_rng(draw(st.integers(0, 1 << 30)))
+    count, size = draw(st.integers(1, 300)), draw(st.sampled_from([1e-4, 1.0, 1e6]))
+    stretch = np.array(draw(st.tuples(*[st.sampled_from([0.0, 0.01, 0.3, 1.0])] * 3)))
+    shift = np.array(draw(st.tuples(*[st.integers(-10, 10)] * 3)))
+    center = size * (random.normal(size=(count, 3)) * stretch + shift)
+    return Balls(center, size * draw(st.sampled_from([0.0, 0.01, 1.0])) * random.random(count))
+
+
+def places(camera: Camera, scene: Balls) -> np.ndarray:
+    """(N, 4) how far each ball reaches to the right, left, top and bottom: 1 is the edge of the picture."""
+    local = (scene.center - camera.position) @ camera.camera_to_world[:3, :3]
+    half = np.array([camera.width, camera.height]) / (2 * np.asarray(camera.focal))
+    assert (local[:, 2] < 0).all(), "in front of the camera"
+    reach = []
+    for axis in (0, 1):
+        for sign in (1, -1):
+            # A sphere is seen between its two tangents from the eye, which are so far to either side of its centre.
+            away = np.hypot(local[:, axis], local[:, 2])
+            angle = np.arctan2(sign * local[:, axis], -local[:, 2]) + np.arcsin(np.minimum(1, scene.radius / away))
+            assert (angle < math.pi / 2).all()
+            reach.append(np.tan(angle) / half[axis])
+    return np.stack(reach, axis=1)
+
+
+@given(scene=scenes(), size=SIZES, azimuth=st.floats(0, 360), tilt=st.floats(-80, 80), fov=st.floats(20, 100))
+def test_a_fitted_camera_has_all_in_its_picture_and_fills_it(
+    scene: Balls, size: tuple[int, int], azimuth: float, tilt: float, fov: float
+) -> None:
+    scene = covered(scene)
+    start = orbit(360, (0, 0, 0), 1, math.radians(tilt), DEFAULT_UP)[int(azimuth) % 360]
+    settings = Settings(size=size, fov_y=math.radians(fov))
+    camera = fitted(camera_of(start.matrix, start.lens, 0, "", settings), scene)
+    reach = places(camera, scene)
+    assert reach.max() <= FILLED * (1 + 1e-4)
+    # Along one of the sides it is as large as it can be: it touches both margins.
+    sides = reach.max(axis=0)
+    assert max(sides[:2].min(), sides[2:].min()) >= FILLED * (1 - 1e-4)
+
+
+@given(scene=scenes(), size=SIZES, count=st.integers(1, 24), tilt=st.floats(-80, 80))
+def test_every_camera_of_an_orbit_has_all_in_its_picture(
+    scene: Balls, size: tuple[int, int], count: int, tilt: float
+) -> None:
+    scene = covered(scene)
+    middle = middle_of(scene)
+    settings = Settings(size=size)
+
+    def around(away: float, at: np.ndarray) -> list[Camera]:
+        frames = orbit(count, at, away, math.radians(tilt), DEFAULT_UP)
+        return [camera_of(frame.matrix, frame.lens, 0, "", settings) for frame in frames]
+
+    away = distance(around(1, np.zeros(3)), middle, scene)
+    reach = [places(camera, scene).max() for camera in around(away, middle)]
+    assert max(reach) == pytest.approx(FILLED, rel=1e-4), "and one of them as large as it can be"
+
+
+def test_all_but_one_in_a_thousand_are_covered_with_all_that_they_cover() -> None:
+    random = np.random.default_rng(0)
+    scene = Balls(random.uniform(-1, 1, (20_000, 3)), np.full(20_000, 0.1))
+    scene.radius[:10] = 2.2  # few, and large
+    kept = covered(scene)
+    assert 0.999 * 20_000 <= len(kept.center) <= 0.999 * 20_000 + 1
+    assert kept.radius.max() == 0.1
+    assert np.allclose(middle_of(kept), 0, atol=0.1)
+    one = covered(Balls(np.zeros((1, 3)), np.array([50.0])))
+    assert one.radius.tolist() == [50], "all that there is counts, however large it is"
+    assert covered(Balls(np.full((3, 3), 2.0), np.zeros(3))).radius.min() > 0, "a point has some size"
+    assert covered(Balls(np.zeros((3, 3)), np.zeros(3))).radius.min() > 0
+
+
+def test_a_backdrop_is_not_framed() -> None:
+    random = np.random.default_rng(0)
+    center = random.normal(size=(20_000, 3)) + np.array([5, 6, 7])
+    center[:1000] = 1e6 * random.normal(size=(1000, 3))
+    kept = covered(Balls(center, np.zeros(20_000)))
+    middle, radius = framing(center)
+    assert np.linalg.norm(kept.center - middle, axis=1).max() <= OUTSIDE * radius
+    assert len(kept.center) == pytest.approx(19_000, rel=0.01)
+
+
+def test_framing_is_not_impressed_by_what_is_far_away() -> None:
+    random = np.random.default_rng(0)
+    center = random.normal(size=(20_000, 3)).astype(np.float32) + np.array([5, 6, 7])
+    center[:500] = 1e6
+    center[500:600] = np.nan
+    middle, radius = framing(center)
+    assert np.allclose(middle, (5, 6, 7), atol=0.1)
+    assert 2 < radius < 3.5
+    assert framing(np.full((3, 3), 2.0))[1] == 1, "a scene of one point has some size"
+    assert framing(np.repeat(center, 20, axis=0))[1] == pytest.approx(radius, rel=0.02)
+    with pytest.raises(InvalidSplatsError, match="no finite centres"):
+        framing(np.full((3, 3), np.nan))
+
+
+@pytest.mark.filterwarnings("error")
+def test_balls_stand_where_splats_do_and_leave_out_what_is_no_number() -> None:
+    splats = Splats.zeros(5, 0)
+    splats.scale[:] = (0.1, 0.5, 0.2)
+    splats.center[:, 0] = (1, 2, np.nan, 3e38, 4)
+    splats.scale[4] = np.inf
+    matrix = np.diag([2.0, 2.0, 2.0, 1.0])
+    matrix[:3, 3] = (0, 0, 7)
+    found = balls_of(splats, slice(None), matrix)
+    assert np.allclose(found.center, [(2, 0, 7), (4, 0, 7), (2 * float(np.float32(3e38)), 0, 7)])
+    assert np.allclose(found.radius, 2.0)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("size", [1e-6, 1e-4, 1.0, 1e5, 1e30])
+def test_a_scene_of_any_size_is_in_reach(size: float) -> None:
+    scene = covered(Balls(np.random.default_rng(0).normal(size=(500, 3)) * size, np.zeros(500)))
+    frames = orbit(5, (0, 0, 0), 1, 0, DEFAULT_UP)
+    cameras = [fitted(camera_of(frame.matrix, frame.lens, 0, "", Settings()), scene) for frame in frames]
+    look = with_reach(RasterSettings(), cameras, scene)
+    for camera in cameras:
+        depth = (scene.center - camera.position) @ camera.forward
+        assert look.near < depth.min()
+        assert look.far > depth.max()
+    assert look.near <= RasterSettings().near
+    assert look.far >= RasterSettings().far
+    assert np.isfinite(np.float32(look.far))

@@ -1,0 +1,176 @@
+"""`sparklod build-lod` as a shell sees it: inputs, outputs, messages and exit codes."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sparklod_cli.cli import run
+from sparklod_cli.codecs import spz
+from sparklod_cli.io import read_scene
+from sparklod_cli.lod import quality, quick
+from sparklod_cli.model.lod_tree import LodTree
+from sparklod_cli.model.scene import Scene
+from sparklod_cli.model.splats import Splats
+from sparklod_cli.support.progress import Progress
+from tests.commands.build_lod.runs import ONE, SMALL, build
+from tests.conftest import FIXTURES
+
+
+def test_an_input_is_baked_beside_itself(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert build(scene) == 0
+    out, err = capsys.readouterr()
+    assert out == ""
+    output = scene.with_name("scene-lod.spz")
+    baked = read_scene(output)
+    assert baked.tree is not None
+    assert f"{baked.tree.is_leaf.sum():,} splats, SH 2  ->  {output}  {len(baked.splats):,} nodes" in err
+
+
+def test_several_inputs_go_into_a_directory_that_is_made(tmp_path: Path) -> None:
+    assert build(ONE, SMALL, "--output-dir", tmp_path / "new" / "web") == 0
+    assert sorted(path.name for path in (tmp_path / "new" / "web").iterdir()) == ["one-lod.spz", "sh2-lod.spz"]
+
+
+def test_a_failure_does_not_stop_the_others(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    missing, broken = tmp_path / "missing.ply", tmp_path / "broken.ply"
+    broken.write_bytes(b"ply\nnonsense\nend_header\n")
+    assert build(missing, ONE, broken, SMALL, "--output-dir", tmp_path) == 1
+    err = capsys.readouterr().err
+    assert f"error: {missing}: cannot be read: no such file or directory\n" in err
+    assert f"error: {broken}: bad PLY header" in err
+    assert err.count("error:") == 2
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["broken.ply", "one-lod.spz", "sh2-lod.spz"]
+
+
+def test_an_existing_output_is_refused_without_overwrite(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    output = scene.with_name("scene-lod.spz")
+    output.write_bytes(b"precious")
+    assert build(scene) == 1
+    assert "exists, add --overwrite" in capsys.readouterr().err
+    assert output.read_bytes() == b"precious"
+    assert build(scene, "--overwrite") == 0
+    assert read_scene(output).tree is not None
+
+
+def test_json_is_an_object_a_file(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert build(scene, tmp_path / "missing.ply", "--json", "-q", "--base", 2, "--max-sh", 1) == 1
+    good, bad = map(json.loads, capsys.readouterr().out.splitlines())
+    output = scene.with_name("scene-lod.spz")
+    assert good["output"] == str(output)
+    assert good["bytes"] == output.stat().st_size
+    assert good["nodes"] == len(read_scene(output).splats)
+    assert (good["splats"], good["sh_degree"], good["dropped"]) == (len(read_scene(scene).splats), 1, {})
+    assert set(good["seconds"]) == {"read", "build", "write"}
+    assert bad == {"input": str(tmp_path / "missing.ply"), "error": "cannot be read: no such file or directory"}
+
+
+def test_merged_splats_outside_of_the_box_of_the_leaves(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The quality builder may put them there: they get fewer bits where they would not fit."""
+
+    def moved(splats: Splats, growth: float, *, progress: Progress) -> tuple[Splats, LodTree]:
+        nodes, tree = quick.build(splats)
+        nodes.center[0] = 2.1 * np.abs(splats.center).max()
+        return nodes, tree
+
+    monkeypatch.setattr(quality, "build", moved)
+    splats = read_scene(scene).splats
+    splats.center[:] *= 1e5  # so that it is the extent that bounds the bits
+    far = tmp_path / "far.spz"
+    far.write_bytes(b"".join(spz.encode(Scene(splats), spz.Options())))
+    most = spz.largest_fractional_bits(read_scene(far).splats.center)
+    assert build(far, "-o", tmp_path / "out.spz", "--method", "quality", "--json") == 0
+    assert json.loads(capsys.readouterr().out)["fractional_bits"] < most
+
+
+def test_what_is_dropped_is_said(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    splats = read_scene(scene).splats
+    x = float(sorted(splats.center[:, 0])[len(splats) // 2])
+    assert build(scene, "--max-box", f"{x},1e9,1e9", "--json") == 0
+    out, err = capsys.readouterr()
+    record = json.loads(out)
+    cropped = int((splats.center[:, 0] > x).sum())
+    assert record["dropped"] == {"cropped": cropped}
+    assert record["splats"] + cropped == record["read"] == len(splats)
+    assert f"dropped {cropped} cropped" in err
+
+
+def test_quiet_says_nothing_and_verbose_more(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert build(scene, "-q") == 0
+    assert capsys.readouterr() == ("", "")
+    assert build(scene, "-v", "--overwrite") == 0
+    assert "fractional bits; read" in capsys.readouterr().err
+
+
+def test_what_belongs_to_the_file_is_kept_or_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    golden = FIXTURES / "golden"
+    assert build(golden / "hand-v4.spz", golden / "hand-v4-sh4.spz", "--output-dir", tmp_path) == 0
+    assert "SH degree 4 is cut to 3" in capsys.readouterr().err
+    for name in ("hand-v4", "hand-v4-sh4"):
+        before, after = read_scene(golden / f"{name}.spz"), read_scene(tmp_path / f"{name}-lod.spz")
+        assert after.antialiased == before.antialiased
+    assert read_scene(golden / "hand-v4.spz").antialiased
+
+
+def test_a_tree_is_not_baked_again(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert build(scene) == 0
+    assert build(scene.with_name("scene-lod.spz")) == 1
+    assert "it is a Level-of-Detail file already" in capsys.readouterr().err
+
+
+def test_what_does_not_fit_into_memory_does_not_stop_the_others(
+    scene: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(*args: object, **kwargs: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr(quick, "build", full)
+    assert build(scene, ONE, "--output-dir", scene.parent) == 1
+    err = capsys.readouterr().err
+    assert err.count("it does not fit into memory") == 2
+
+
+@pytest.mark.parametrize("options", [[], ["--encoding", "ext"], ["--unlod"]])
+def test_a_name_without_a_suffix_promises_nothing(options: list[str], scene: Path, tmp_path: Path) -> None:
+    source = FIXTURES / "golden" / "tree-v3.spz" if options == ["--unlod"] else scene
+    assert build(source, "-o", tmp_path / "out", *options) == 0
+    assert (tmp_path / "out").stat().st_size
+
+
+def test_a_file_that_may_not_be_read_does_not_stop_the_others(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    closed = tmp_path / "closed.ply"
+    closed.write_bytes(SMALL.read_bytes())
+    opened, access = Path.open, os.access
+
+    def refused(path: Path, *args: object, **kwargs: object) -> object:
+        if path == closed:
+            raise PermissionError(13, "Permission denied")
+        return opened(path, *args, **kwargs)  # type: ignore[call-overload]
+
+    # As for anybody but root, whom a test may be run by.
+    monkeypatch.setattr(Path, "open", refused)
+    monkeypatch.setattr(os, "access", lambda path, *args, **how: Path(path) != closed and access(path, *args, **how))
+    assert build(scene, closed, ONE, "--output-dir", tmp_path / "web") == 1
+    assert f"error: {closed}: cannot be read: permission denied\n" in capsys.readouterr().err
+    assert sorted(path.name for path in (tmp_path / "web").iterdir()) == ["one-lod.spz", "scene-lod.spz"]
+    assert run(["inspect", str(closed), str(ONE), "--check"]) == 3
+    assert f"{closed}: error: file.unreadable: cannot be read: permission denied\n" in capsys.readouterr().out
+    assert run(["inspect", str(ONE), str(closed)]) == 1
+
+
+def test_build_lod_never_writes_over_its_input(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = scene.read_bytes()
+    assert build(scene, "-o", scene, "--overwrite") == 2
+    assert "is an input" in capsys.readouterr().err
+    link = scene.with_name("link.ply")
+    link.symlink_to(scene)
+    assert build(link, "-o", scene, "--overwrite") == 2
+    assert scene.read_bytes() == before

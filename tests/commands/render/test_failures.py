@@ -1,0 +1,164 @@
+"""What `sparklod render` refuses or wonders at, and that failures leave nothing half written."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sparklod_cli.render.renderer import Renderer
+from tests.commands.render.runs import CAMERAS, FAULTS, PLAIN, SIZE, TREE, Said, pixels, render
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "a FILE is missing, or --scene"),
+        ([TREE, "--scene", "s.json"], "--scene names the files; leave out FILE"),
+        ([TREE, "--budget", "many"], "--budget"),
+        ([TREE, "--budget", "5k", "--preset", "quest"], "--budget and --preset exclude each other"),
+        ([TREE, "--far", "1e308"], "--far"),
+        ([TREE, "--full", "--budget", "5k"], "--budget cannot be used with --full"),
+        ([TREE, TREE, "--budget", "1"], "a budget of 1 splat is less than one for each of 2 instances"),
+        ([TREE, "--chunk-cache", "5"], "No such option"),
+        ([TREE, "--bandwidth", "5Mbit"], "No such option"),
+        ([TREE, "--view", "0,0,9:0,0,0", "--orbit", "3"], "--view and --orbit cannot go together"),
+        ([TREE, "--view", "0,0,0:0,0,0"], "looks at the point where it is"),
+        ([TREE, "--orbit", "3", "--dolly"], "--orbit and --dolly cannot go together"),
+        ([TREE, "--background", "red"], "'red' is not a colour"),
+        ([TREE, "--background", "#12345"], "is not a colour"),
+        ([TREE, "--alpha", "--background", "white"], "--alpha keeps what --background would fill"),
+        ([TREE, "--alpha", "-o", "x.gif"], ".gif has no alpha"),
+        ([TREE, "--alpha", "-o", "x.mp4"], ".mp4 has no alpha"),
+        ([TREE, "--supersample", "5"], "--supersample"),
+        ([TREE, "--supersample", "0"], "--supersample"),
+        ([TREE, "--size", "65536x65536"], "are more than 134,217,728; see --size"),
+        ([TREE, "--size", "9000x9000", "--supersample", "2"], "9,000 x 9,000 pixels x 4 (--supersample 2)"),
+        ([TREE, "--size", "17000x10", "-o", "x.webp"], "more than 16,383 a side"),
+        ([TREE, "--near", "5", "--far", "5"], "--near 5 is not less than --far 5"),
+        ([TREE, "--near", "0"], "--near"),
+        ([TREE, "--style", "cubes"], "--style"),
+        ([TREE, "--style", "points", "--backend", "numba"], "has no --style points"),
+        ([TREE, "--color-by", "opacity"], "--color-by"),
+        ([TREE, "--color-by", "overdraw", "--style", "points"], "--color-by overdraw counts splats"),
+        ([TREE, "--no-bar"], "--no-bar only means something with --color-by or --diff"),
+        ([TREE, "--gain", "3"], "--gain only means something with --diff"),
+        ([TREE, "--diff", TREE, "--color-by", "level"], "leave out --color-by"),
+        ([TREE, "--diff", TREE, "--alpha"], "--diff is between pictures without alpha"),
+        ([TREE, "--through", "ply"], "--through"),
+        ([TREE, "--backend", "cuda"], "--backend"),
+        ([TREE, "-o", "x.jpg"], "--output x.jpg is none of .png, .webp, .npy, .gif, .mp4"),
+        ([TREE, "-o", "x"], "--output x is none of .png"),
+        ([TREE, "--orbit", "3", "-o", "x.png"], "there are 3 cameras: write frames (x.%04d.png)"),
+        ([TREE, "--orbit", "3", "-o", "-"], "standard output takes one picture, not 3"),
+        ([TREE, "--orbit", "3", "-o", "%d.%d.png"], "does not name frames"),
+        ([TREE, "--orbit", "3", "-o", "%d.mp4"], "does not name frames"),
+        ([TREE, "--sheet", "-o", "x.npy"], "a contact sheet is one .png or .webp"),
+        ([TREE, "--json", "-o", "-"], "--json and the picture cannot both go to standard output"),
+        ([TREE, "--jobs", "0"], "--jobs"),
+        ([TREE, "--threads", "0"], "--threads"),
+    ],
+)
+def test_wrong_usage_of_render_is_exit_code_2(
+    arguments: list[object], message: str, capsys: Said, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert render(*arguments) == 2
+    out, err = capsys.readouterr()
+    assert message in err
+    assert out == ""
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named", "message"),
+    [
+        ([FAULTS / "missing.spz"], FAULTS / "missing.spz", "no such file"),
+        ([TREE, "--diff", FAULTS / "missing.spz"], FAULTS / "missing.spz", "no such file"),
+        ([FAULTS / "spz-flipped-bit.spz"], FAULTS / "spz-flipped-bit.spz", "corrupt gzip data"),
+        ([FAULTS / "tree-cycle.spz"], FAULTS / "tree-cycle.spz", "its tree is broken"),
+        ([FAULTS / "no-splats.ply"], FAULTS / "no-splats.ply", "it has no splats"),
+        ([PLAIN, "--color-by", "level"], "level", "no file is a Level-of-Detail tree"),
+        ([TREE, "--camera-path", FAULTS / "no.json"], FAULTS / "no.json", "no such file"),
+        (["--scene", FAULTS / "no.json"], FAULTS / "no.json", "no such file"),
+        ([TREE, "-o", "no/such/folder/out.png"], "no/such/folder", "does not exist"),
+    ],
+    ids=str,
+)
+def test_a_file_that_cannot_be_drawn_is_named_in_a_line(
+    arguments: list[object],
+    named: object,
+    message: str,
+    capsys: Said,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert render(*arguments, *SIZE) == 1
+    out, err = capsys.readouterr()
+    assert err.startswith("error: ")
+    assert str(named) in err
+    assert message in err
+    assert (out, err.count("\n")) == ("", 1)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_render_never_writes_over_its_inputs(tmp_path: Path, capsys: Said) -> None:
+    scene, path, sheet = tmp_path / "scene.png", tmp_path / "0001.png", tmp_path / "x.png"
+    shutil.copy(PLAIN, scene)
+    shutil.copy(CAMERAS / "sparklod.json", path)
+    sheet.symlink_to(scene)
+    before = {each: each.read_bytes() for each in tmp_path.iterdir()}
+    for said in (
+        (scene, "-o", scene),
+        (scene, "-o", sheet),
+        (PLAIN, "--diff", scene, "-o", scene),
+        (PLAIN, "--camera-path", path, "-o", tmp_path / "%04d.png"),
+    ):
+        assert render(*said, "--overwrite") == 2
+        assert "is an input; write elsewhere" in capsys.readouterr().err
+    assert {each: each.read_bytes() for each in before} == before
+
+
+def test_an_existing_frame_stays_without_overwrite(tmp_path: Path, capsys: Said) -> None:
+    (tmp_path / "out.0002.png").write_text("precious")
+    assert render(TREE, *SIZE, "--orbit", 3, "-o", tmp_path / "out.%04d.png") == 1
+    assert "out.0002.png exists, add --overwrite to replace it" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["out.0002.png"]
+    assert render(TREE, *SIZE, "--orbit", 3, "-o", tmp_path / "out.%04d.png", "--overwrite", "-q") == 0
+    assert len(list(tmp_path.iterdir())) == 3
+
+
+def test_an_interrupted_render_leaves_no_half_picture(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Said
+) -> None:
+    draw, count = Renderer.draw, []
+
+    def falling(self: Renderer, *arguments: Any) -> Any:
+        count.append(1)
+        if len(count) == 3:
+            raise KeyboardInterrupt
+        return draw(self, *arguments)
+
+    monkeypatch.setattr(Renderer, "draw", falling)
+    for name in ("x.gif", "out.%04d.png"):
+        count.clear()
+        assert render(TREE, *SIZE, "--orbit", 5, "--jobs", 1, "-o", tmp_path / name) == 130
+    # Frames that are done are whole.
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out.0000.png", "out.0001.png"]
+    assert all(pixels(path).shape == (90, 160, 3) for path in tmp_path.iterdir())
+    assert "interrupted" in capsys.readouterr().err
+
+
+def test_cameras_that_see_nothing_are_wondered_at(tmp_path: Path, capsys: Said) -> None:
+    assert render(PLAIN, *SIZE, "--look-at", "0,0,50:0,0,99", "-o", tmp_path / "x.png") == 0
+    assert capsys.readouterr().err.startswith("warning: nothing is in view")
+    assert render(PLAIN, *SIZE, "--look-at", "0,0,50:0,0,99", "-o", tmp_path / "x.png", "--overwrite", "-q") == 0
+    assert capsys.readouterr().err == ""
+
+
+def test_a_budget_for_files_without_a_tree_is_wondered_at(tmp_path: Path, capsys: Said) -> None:
+    assert render(PLAIN, *SIZE, "--budget", 50, "-o", tmp_path / "x.png") == 0
+    assert "no file is a Level-of-Detail tree, so all splats are drawn" in capsys.readouterr().err

@@ -1,0 +1,129 @@
+"""Messages that say what is wrong, with the value, and what to do."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sparklod_cli.cli import run
+from sparklod_cli.codecs import ply
+from sparklod_cli.commands.reports import CLAMPED
+from sparklod_cli.io import read_scene
+from tests.conftest import FIXTURES
+
+TREE, PLAIN = FIXTURES / "golden" / "tree-v3.spz", FIXTURES / "one.ply"
+Said = pytest.CaptureFixture[str]
+
+#: A plural of one.
+ONES = re.compile(r"(?<![\d.,])1 (?:\w+ )?(splats|nodes|levels|leaves|frames|cameras|chunks|texels|rows|instances)\b")
+
+
+@pytest.mark.parametrize(
+    ("size", "said"),
+    [
+        ("100000x100000", "is too large; give at most 65,536 pixels along a side, such as 1280x720"),
+        (f"8x{'9' * 5000}", "is too large"),
+        ("8x65537", "is too large"),
+        ("8x" + "0" * 5000, "is not a width and a height"),
+        ("0x8", "is not a width and a height in pixels, such as 1280x720"),
+        ("8", "is not a width and a height"),
+        ("8x-8", "is not a width and a height"),
+        ("8x²", "is not a width and a height"),
+    ],
+)
+def test_a_wrong_size_is_said_with_its_value(size: str, said: str, capsys: Said) -> None:
+    assert run(["render", str(TREE), "--size", size]) == 2
+    err = capsys.readouterr().err
+    assert said in err
+    assert size[:20] in err
+
+
+@pytest.mark.parametrize(("size", "status"), [("3MB", 0), ("3MiB", 0), ("10", 3), ("0.01kB", 3), ("1GiB", 0)])
+def test_files_are_held_to_a_size_with_a_unit(size: str, status: int) -> None:
+    assert run(["inspect", str(TREE), "--max-bytes", size]) == status
+
+
+@pytest.mark.parametrize("size", ["-1", "3Mbit", "3 apples", "1.5", "3iB"])
+def test_what_is_no_size(size: str, capsys: Said) -> None:
+    assert run(["inspect", str(TREE), f"--max-bytes={size}"]) == 2
+    assert f"{size!r} is not a size: whole bytes, such as 3000000, 3MB or 3MiB" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("first", "said"),
+    [
+        ("x,y,z,yaw,pitch", "lacks target_x, target_y, target_z; a camera takes x, y, z, and"),
+        ("x,y,z,qx,qy,qz", "lacks qw; a camera takes"),
+        ("X, Y, target_x, target_y, target_z", "lacks z; a camera takes"),
+        ("frame,position,rotation", "lacks x, y, z, target_x, target_y, target_z"),
+    ],
+)
+def test_a_camera_csv_is_told_its_columns(first: str, said: str, tmp_path: Path, capsys: Said) -> None:
+    path = tmp_path / "cameras.csv"
+    path.write_text(f"{first}\n0,0,0,0,0\n")
+    for arguments in ([], ["--camera-format", "csv"]):
+        assert run(["traverse", str(TREE), "--camera-path", str(path), *arguments]) == 1
+        err = capsys.readouterr().err
+        assert f"error: {path}: its first line, which names the columns, {said}" in err
+        assert "target_x, target_y, target_z or qx, qy, qz, qw" in err
+
+
+def clamped_scene(tmp_path: Path, **values: float) -> Path:
+    """A scene with one splat that has such values."""
+    splats = read_scene(FIXTURES / "sh1.ply").splats
+    changed = {name: np.array(getattr(splats, name)) for name in values}
+    for name, value in values.items():
+        changed[name][0] = value
+    scene = read_scene(FIXTURES / "sh1.ply")
+    path = tmp_path / "clamped.ply"
+    path.write_bytes(b"".join(ply.encode(dataclasses.replace(scene, splats=dataclasses.replace(splats, **changed)))))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [
+        ("scale", 1e-7, r"scales of \d+ nodes? \(.* %\) are below 4.4e-05, down to 1e-07"),
+        ("scale", 4e3, r"scales of \d+ nodes? \(.* %\) are above 391, up to 4e\+03"),
+        ("rgb", -3.0, r"colours of \d+ nodes? \(.* %\) are below -0.444, down to -3"),
+        ("rgb", 4.0, r"colours of \d+ nodes? \(.* %\) are above 1.44, up to 4"),
+        ("sh", -2.0, r"SH of \d+ nodes? \(.* %\) are below -1, down to -2"),
+        ("sh", 2.5, r"SH of \d+ nodes? \(.* %\) are above 0.996, up to 2.5"),
+    ],
+)
+def test_what_is_clamped_is_said_with_its_end_and_what_to_do(
+    name: str, value: float, said: str, tmp_path: Path, capsys: Said
+) -> None:
+    assert run(["build-lod", str(clamped_scene(tmp_path, **{name: value}))]) == 0
+    err = capsys.readouterr().err
+    advice = CLAMPED[name, "above" in said][1]
+    assert re.search(rf"\n  {said}, and are clamped to what SPZ holds: {re.escape(advice)}\n", err), err
+    assert err.count("clamped to") == 1
+
+
+def test_one_is_not_many(tmp_path: Path, capsys: Said) -> None:
+    look = ("--look-at", "0,-1,4:0,0,0", "--size", "8x8")
+    lod = tmp_path / "one-lod.spz"
+    for arguments in (
+        ["build-lod", PLAIN, "-o", lod, "-v"],
+        ["build-lod", lod, "--unlod", "-o", tmp_path / "back.ply"],
+        ["inspect", PLAIN],
+        ["inspect", lod],
+        ["inspect", lod, "--min-splats", 2],
+        ["inspect", PLAIN, "--min-splats", 2],
+        ["inspect", lod, "--leaves-of", FIXTURES / "sh1.ply"],
+        ["inspect", TREE, "--leaves-of", PLAIN],
+        ["traverse", lod, *look, "--summary"],
+        ["traverse", lod, TREE, *look, "--budget", 1],
+        ["render", lod, *look, "-o", tmp_path / "a.png"],
+        ["render", lod, *look, "--compare", "--budget", "1"],
+        ["build-lod", PLAIN, "--rgba", FIXTURES / "sh1.ply"],
+    ):
+        run([str(argument) for argument in arguments])
+        out, err = capsys.readouterr()
+        assert out + err
+        assert ONES.search(out + err) is None, (arguments, out, err)

@@ -1,0 +1,119 @@
+"""The law of options for `sparklod traverse`: what is given is used, or refused by its name."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sparklod_cli.cli import run
+from sparklod_cli.commands.traverse import traverse as command
+from sparklod_cli.figures import traversal_chart
+from tests.commands.render.test_options import GIVEN as OF_RENDER
+from tests.conftest import FIXTURES
+
+TOWN = FIXTURES / "traverse" / "town.spz"
+CAMERAS = FIXTURES / "cameras"
+
+#: Options that only this command has, or that take something else here.
+OWN: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "files": ((), (str(FIXTURES / "golden" / "hand-tree-v3.spz"),)),
+    "scene": ((), ("--scene", "scene.json")),
+    "precision": (("--budget", "5k"), ("--precision", "float16")),
+    "preset": ((), ("--preset", "quest")),
+    "lod_splat_scale": ((), ("--lod-splat-scale", "1e-4")),
+    "cone_fov0": (("--budget", "5k"), ("--cone-fov0", "0")),
+    "cone_fov": (("--budget", "5k"), ("--cone-fov0", "0", "--cone-fov", "5")),
+    "cone_foveate": (("--budget", "5k", "--cone-fov0", "0"), ("--cone-foveate", "0.01")),
+    "outside_foveate": (("--budget", "5k"), ("--outside-foveate", "0.01")),
+    "behind_foveate": (("--budget", "5k"), ("--behind-foveate", "0.001")),
+    "distance": ((), ("--distance", "2")),
+    "chunk_cache": ((), ("--chunk-cache", "2")),
+    "bandwidth": ((), ("--bandwidth", "1Mbit")),
+    "latency": (("--bandwidth", "1Mbit"), ("--latency", "90ms")),
+    "fetchers": (("--bandwidth", "1Mbit", "--latency", "90ms"), ("--fetchers", "1")),
+    "output": ((), ("-o", "table.csv")),
+    "form": (("-o", "table"), ("--format", "json")),
+    "per_instance": ((), ("--per-instance",)),
+    "no_timing": ((), ("--no-timing",)),
+    "asserts": ((), ("--assert", "churn>1000")),
+    "plot": ((), ("--plot", "plot.png")),
+    "indices_out": ((), ("--indices-out", "cuts")),
+    "padded": (("--indices-out", "cuts"), ("--padded",)),
+    "as_json": ((), ("--json",)),
+}
+
+#: Options that change how work is done, or what is said, and nothing that comes out.
+OF_WORK = {"overwrite", "threads", "quiet", "verbose", "summary"}
+
+MODES: dict[str, tuple[str, ...]] = {
+    "an orbit": ("--orbit", "3", "--distance", "1"),
+    "a view": ("--look-at", "0.5,-0.5,0.5:3,0,3"),
+    "a dolly over a network": ("--dolly", "--every", "20", "--bandwidth", "2Mbit", "--latency", "20ms"),
+    "a camera path": ("--camera-path", str(CAMERAS / "inria.json")),
+    "keyframes": ("--keyframes", "0.5,-0.5,0.5:3,0,3 -0.5,-0.5,0.5:3,0,-3", "--every", "20"),
+    "a summary": ("--orbit", "3", "--distance", "6", "--json"),
+    "a summary and a table": ("--orbit", "3", "--distance", "6", "--json", "-o", "out.csv"),
+}
+
+#: Options that ask for what is so already: nothing is behind cameras that see all.
+THE_SAME = {"a dolly over a network": {"behind_foveate"}}
+
+GIVEN = {param.name: (OF_RENDER | OWN)[param.name] for param in command.params if param.name in OF_RENDER | OWN}
+
+
+def tidy(text: str, *, table: bool) -> Any:
+    """What is said, without the times that it took."""
+    if text.startswith("{") and not table:
+        whole = json.loads(text)
+        whole.get("quantities", {}).pop("traverse_ms", None)
+        return whole
+    lines = [line.split(",") for line in text.splitlines()]
+    timed = bool(lines) and lines[0][-1] == "traverse_ms"
+    return [line[:-1] if timed and number else line for number, line in enumerate(lines)]
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_every_option_of_traverse_is_used_or_refused(
+    mode: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(
+        traversal_chart, "plot", lambda *arguments: traversal_chart.Plot(b"a plot", None)
+    )  # takes seconds, and has its tests
+    (tmp_path / "town.spz").write_bytes(TOWN.read_bytes())
+    (tmp_path / "scene.json").write_text(json.dumps({"instances": [{"file": "town.spz", "scale": 3}]}))
+    inputs = {path.name for path in tmp_path.iterdir()}
+    known: dict[tuple[str, ...], Any] = {}
+
+    def came(*arguments: str) -> Any:
+        if arguments not in known:
+            files = () if "--scene" in arguments else ("town.spz",)
+            code = run(["traverse", *files, *MODES[mode], *arguments])
+            out, err = capsys.readouterr()
+            written = {}
+            for path in sorted(tmp_path.rglob("*")):
+                if path.is_file() and path.name not in inputs:
+                    table = path.suffix in ("", ".csv")
+                    written[path.name] = tidy(path.read_text(), table=True) if table else path.read_bytes()
+                    path.unlink()
+            known[arguments] = code, written, tidy(out, table=False), err
+        return known[arguments]
+
+    assert came()[0] == 0, came()[3]
+    ignored = []
+    for name, (needs, given) in GIVEN.items():
+        if name in THE_SAME.get(mode, ()) or all(part in MODES[mode] for part in given):
+            continue
+        before, after = came(*needs), came(*needs, *given)
+        if after[0] in (1, 2):
+            assert "error: " in after[3].lower(), (name, after[3])
+        elif after[:3] == before[:3]:
+            ignored.append(str(name))
+    assert " ".join(ignored) == ""
+
+
+def test_every_option_of_traverse_has_a_row() -> None:
+    assert {param.name for param in command.params} == set(GIVEN) | OF_WORK | {"version"}

@@ -1,0 +1,252 @@
+"""The examples of docs/ci.md and docs/inspect.md do what they say, as far as a shell can tell."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import textwrap
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from sparklod_cli.cli import run
+from tests.conftest import FIXTURES, ROOT
+
+CI = (ROOT / "docs" / "ci.md").read_text(encoding="utf-8")
+PAGE = (ROOT / "docs" / "inspect.md").read_text(encoding="utf-8")
+HOOKS = (ROOT / ".pre-commit-hooks.yaml").read_text(encoding="utf-8")
+
+Shell = Callable[..., subprocess.CompletedProcess[str]]
+
+
+def blocks(page: str, language: str) -> list[str]:
+    """The code blocks of a page in a language."""
+    return re.findall(rf"^```{language}\n(.*?)^```$", page, re.DOTALL | re.MULTILINE)
+
+
+def steps(workflow: str) -> dict[str, str]:
+    """The scripts of a workflow of GitHub Actions by the names of their steps; knows no more of YAML than it needs."""
+    scripts = {}
+    for name, indent, first, rest in re.findall(
+        r"^ *- name: (.*)\n(?: +(?!run:)\w.*\n)*( +)run: (.*)\n((?:\2 +.*\n)*)", workflow, re.MULTILINE
+    ):
+        assert indent
+        scripts[name] = textwrap.dedent(rest) if first == "|" else first
+    return scripts
+
+
+def settings(hook: str) -> dict[str, str]:
+    """The plain values of a hook of pre-commit, by their keys."""
+    pairs = re.findall(r"^[ -]*(\w+): (.*?)(?: #.*)?$", hook, re.MULTILINE)
+    assert len(dict(pairs)) == len(pairs)
+    return dict(pairs)
+
+
+@pytest.fixture
+def project(tmp_path: Path) -> Path:
+    """A folder as the examples have it, with scenes and the page's expectations."""
+    (tmp_path / "scenes").mkdir()
+    for name in ("demo", "sh0"):
+        shutil.copy(FIXTURES / f"{name}.ply", tmp_path / "scenes")
+    (tmp_path / "scenes" / "expect.toml").write_text(blocks(PAGE, "toml")[0])
+    return tmp_path
+
+
+@pytest.fixture
+def shell(project: Path) -> Shell:
+    """Runs a script there, as bash runs the steps of a workflow, with a `sparklod` that is the one under test."""
+    bash = shutil.which("bash")
+    if bash is None:
+        pytest.skip("there is no bash")
+    command = project / "bin" / "sparklod"
+    command.parent.mkdir()
+    command.write_text(f'#!/bin/sh\nexec {shlex.quote(sys.executable)} -m sparklod_cli "$@"\n')
+    command.chmod(0o755)
+    extra = {"PATH": f"{command.parent}{os.pathsep}{os.environ['PATH']}", "GITHUB_STEP_SUMMARY": "summary.md"}
+    environment = os.environ | extra | {"PYTHONPATH": str(ROOT)}
+
+    def go(*words: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            words if len(words) > 1 else [bash, "-e", "-c", *words],
+            cwd=project,
+            env=environment,
+            capture_output=True,
+            encoding="utf-8",
+            timeout=300,
+            check=False,
+        )
+
+    return go
+
+
+@pytest.fixture
+def web(project: Path) -> Path:
+    """The trees of the scenes, baked."""
+    scenes = map(str, (project / "scenes").glob("*.ply"))
+    assert run(["build-lod", *scenes, "--output-dir", str(project / "web"), "-q"]) == 0
+    return project / "web"
+
+
+def spoil(path: Path) -> None:
+    """Cuts a file short."""
+    path.write_bytes(path.read_bytes()[:-100])
+
+
+# --- GitHub Actions ---------------------------------------------------------------------------------------------------
+
+STEPS = steps(blocks(CI, "yaml")[0])
+
+
+def test_every_step_of_the_workflow_succeeds(project: Path, shell: Shell) -> None:
+    assert next(iter(STEPS)) == "Install sparklod"
+    assert re.fullmatch(r"python -m pip install \./sparklod", STEPS["Install sparklod"])
+    for name, script in list(STEPS.items())[1:]:
+        done = shell(script)
+        assert done.returncode == 0, (name, done.stderr)
+        assert "::" not in done.stdout, name
+    assert sorted(path.name for path in (project / "web").iterdir()) == ["demo-lod.spz", "sh0-lod.spz"]
+    assert (project / "summary.md").read_text().count("leaves") >= 2
+
+
+def test_the_workflow_stops_at_a_broken_file(web: Path, shell: Shell) -> None:
+    spoil(web / "sh0-lod.spz")
+    done = shell(STEPS["Check"])
+    assert done.returncode == 3
+    assert re.fullmatch(r"::error file=web/sh0-lod\.spz,title=container\.[\w-]+::.+\n", done.stdout)
+    assert shell(STEPS["Hold to the budget"]).returncode == 3
+
+
+def test_the_workflow_stops_beyond_the_budget(web: Path, shell: Shell) -> None:
+    script = STEPS["Hold to the budget"].replace("2000000", "10000")
+    assert script != STEPS["Hold to the budget"]
+    done = shell(script)
+    assert done.returncode == 3
+    assert re.fullmatch(r"::error file=web/demo-lod\.spz,title=expect\.bytes::.+\n", done.stdout)
+
+
+def test_the_workflow_stops_at_another_original(project: Path, web: Path, shell: Shell) -> None:
+    shutil.copy(FIXTURES / "needle.ply", project / "scenes" / "sh0.ply")
+    done = shell(STEPS["Compare with the originals"])
+    assert done.returncode == 3
+    assert "file=web/sh0-lod.spz,title=expect.leaves::" in done.stdout
+
+
+# --- pre-commit -------------------------------------------------------------------------------------------------------
+
+OURS = settings(HOOKS)
+THEIRS, LOCAL = map(settings, blocks(CI, "yaml")[1:])
+
+
+def test_hooks_name_what_there_is() -> None:
+    assert THEIRS["id"] == OURS["id"]
+    assert re.search(r"^\[project\.scripts\]\nsparklod = ", (ROOT / "pyproject.toml").read_text(), re.MULTILINE)
+    for hook in (OURS, LOCAL):
+        assert shlex.split(hook["entry"])[:3] == ["sparklod", "inspect", "--check"]
+
+
+@pytest.mark.parametrize("name", ["scene.spz", "web/scene-lod.spz", "a b/c.d.spz"])
+@pytest.mark.parametrize("files", [OURS["files"], LOCAL["files"]])
+def test_hooks_look_at_splat_files(files: str, name: str) -> None:
+    assert re.search(files, name)
+
+
+@pytest.mark.parametrize("name", ["scene.spz.md", "spz", "scenespz", "scene.spz/readme", "splat.py", "x.plyx"])
+@pytest.mark.parametrize("files", [OURS["files"], LOCAL["files"]])
+def test_hooks_leave_other_files_alone(files: str, name: str) -> None:
+    assert not re.search(files, name)
+
+
+@pytest.mark.parametrize(
+    "hook, more", [(OURS, ""), (OURS, THEIRS["args"]), (LOCAL, "")], ids=["ours", "ours with arguments", "local"]
+)
+def test_a_hook_passes_good_files_and_fails_on_spoilt_ones(
+    web: Path, shell: Shell, hook: dict[str, str], more: str
+) -> None:
+    """As pre-commit puts them together: the entry, its arguments, the files."""
+    arguments = [word.strip().strip('"') for word in more.strip("[]").split(",") if word]
+    command = [*shlex.split(hook["entry"]), *arguments, "web/demo-lod.spz", "web/sh0-lod.spz"]
+    done = shell(shlex.join(command))
+    assert (done.returncode, done.stdout) == (0, "")
+    spoil(web / "sh0-lod.spz")
+    done = shell(shlex.join(command))
+    assert done.returncode == 3
+    assert done.stdout.startswith("web/sh0-lod.spz: error: container.")
+
+
+def test_a_pointer_of_git_lfs_is_no_splat_file(project: Path, shell: Shell) -> None:
+    pointer = f"version https://git-lfs.github.com/spec/v1\noid sha256:{'0' * 64}\nsize 123\n"
+    (project / "scene.spz").write_text(pointer)
+    done = shell(f"{OURS['entry']} scene.spz")
+    assert done.returncode == 3
+    assert "error: file.format: " in done.stdout
+
+
+# --- Make and the shell -----------------------------------------------------------------------------------------------
+
+
+def test_the_makefile_bakes_once_and_deletes_what_falls_short(project: Path, shell: Shell) -> None:
+    if shutil.which("make") is None:
+        pytest.skip("there is no make")
+    (project / "Makefile").write_text(blocks(CI, "make")[0])
+    done = shell("make")
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert done.stdout.count("build-lod") == 2
+    assert "build-lod" not in shell("make").stdout
+    (project / "scenes" / "expect.toml").write_text("max_growth = 1.0\n")
+    done = shell("make", "-k")
+    assert done.returncode == 2
+    assert done.stdout.count("expect.growth") == 2
+    assert not list((project / "web").iterdir())
+
+
+def test_the_script_bakes_and_reports(project: Path, web: Path, shell: Shell) -> None:
+    script = blocks(CI, "sh")[0]
+    done = shell(script)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "web/demo-lod.spz has 27800 splats\n" in done.stdout
+    reports = [json.loads(line) for line in (project / "web" / "report.jsonl").read_text().splitlines()]
+    assert [report["tree"]["leaves"] for report in reports] == [27800, 60]
+
+
+def test_the_script_stops_at_a_broken_tree(web: Path, shell: Shell) -> None:
+    script = blocks(CI, "sh")[0]
+    check = script[script.index("status=0") :]
+    assert check != script
+    spoil(web / "sh0-lod.spz")
+    done = shell(check)
+    assert done.returncode == 3
+    assert "stay here" in done.stderr
+    assert shell(script).returncode == 1  # there is no number of leaves to print
+
+
+# --- Expectations -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("language", ["toml", "json"])
+def test_expectations_of_the_page(web: Path, capsys: pytest.CaptureFixture[str], language: str) -> None:
+    path = web / f"expect.{language}"
+    (text,) = blocks(PAGE, language)
+    path.write_text(text)
+    assert run(["inspect", str(web / "demo-lod.spz"), str(web / "sh0-lod.spz"), "--expect", str(path)]) == 0
+    assert capsys.readouterr().out == ""
+    assert run(["inspect", str(FIXTURES / "golden" / "tree-v2.spz"), "--expect", str(path)]) == 3
+
+
+@pytest.mark.parametrize("page", ["ci.md", "inspect.md"])
+def test_links_of_the_pages(page: str) -> None:
+    text = (ROOT / "docs" / page).read_text(encoding="utf-8")
+    links = re.findall(r"\]\(([^)#]*)(?:#([^)]+))?\)", text)
+    assert links
+    for name, anchor in links:
+        target = (ROOT / "docs" / (name or page)).read_text(encoding="utf-8")
+        headings = [
+            re.sub(r"[^\w -]", "", line).lower().replace(" ", "-")
+            for line in re.findall("^#+ (.*)", target, re.MULTILINE)
+        ]
+        assert not anchor or anchor in headings, (name, anchor)

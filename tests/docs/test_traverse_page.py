@@ -1,0 +1,45 @@
+"""What the page about `traverse` promises of columns, assertions and the summary."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from sparklod_cli.simulation.columns import COLUMNS
+from sparklod_cli.simulation.summary import MOMENTS, QUANTITIES
+from sparklod_cli.tables.assertions import check, parse
+from tests.conftest import ROOT
+from tests.tables.rows import flight
+
+PAGE = ROOT / "docs" / "traverse.md"
+
+
+def test_the_page_about_traverse_lists_the_columns() -> None:
+    """Made by `python -m tests.docs.test_traverse_page`."""
+    text = PAGE.read_text()
+    assert with_columns(text) == text
+
+
+def with_columns(text: str) -> str:
+    """The page with all columns in the table of its section of that name."""
+    pattern = re.compile(r"(?<=\n\| column \| type \| unit \| meaning \|\n\| --- \| --- \| --- \| --- \|\n)(?:\|.*\n)*")
+    assert pattern.search(text)
+    kinds = {int: "whole", float: "number", str: "text"}
+    rows = (f"| `{each.name}` | {kinds[each.kind]} | {each.unit} | {each.meaning} |\n" for each in COLUMNS)
+    table = "".join(rows)
+    return pattern.sub(lambda _: table, text, count=1)
+
+
+@pytest.mark.parametrize("text", re.findall(r"--assert '(.*?)'", PAGE.read_text()))
+def test_assertions_on_the_page_are_understood(text: str) -> None:
+    assert check([parse(text)], flight(20))
+
+
+def test_the_page_names_what_is_in_the_summary() -> None:
+    names = set(re.findall(r"`(\w+)`", PAGE.read_text().partition("\n## Summary\n")[2].partition("\n## ")[0]))
+    assert set(QUANTITIES) | set(MOMENTS) <= names
+
+
+if __name__ == "__main__":
+    PAGE.write_text(with_columns(PAGE.read_text()))

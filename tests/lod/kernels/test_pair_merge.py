@@ -1,0 +1,186 @@
+"""Merging two nodes into one, against integrals."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sparklod_cli.lod.kernels import pair_cost, pair_merge, profile
+from sparklod_cli.lod.kernels.pair_cost import CENTER, COLOR, COVARIANCE, COVERED, DENSITY, LOG_DET, WEIGHT
+from sparklod_cli.model.gaussian import lod_opacity
+from tests.references import gaussians
+from tests.references import quality as twin
+
+PLANES = {(0, 1): pair_merge.PLANES[0], (0, 2): pair_merge.PLANES[1], (1, 2): pair_merge.PLANES[2]}
+
+
+def test_semi_axes_are_roots_of_eigenvalues() -> None:
+    rows = twin.random_rows(200, seed=4)
+    for row in rows:
+        got = pair_merge.semi_axes(*row[COVARIANCE : COVARIANCE + 6].astype(np.float64))
+        expected = np.sqrt(np.linalg.eigvalsh(twin.matrix(row)))[::-1]
+        np.testing.assert_allclose(got, expected, rtol=1e-7)
+
+
+@pytest.mark.parametrize(
+    "variances", [(1.0, 1.0, 1.0), (4.0, 1.0, 0.0), (9.0, 0.0, 0.0), (1e30, 1e30, 1e28), (1e-30, 1e-31, 1e-32)]
+)
+def test_semi_axes_of_what_is_round_or_flat(variances: tuple[float, float, float]) -> None:
+    xx, yy, zz = variances[1], variances[2], variances[0]
+    largest = math.sqrt(max(variances))
+    got = pair_merge.semi_axes(xx, yy, zz, 0.0, 0.0, 0.0)
+    np.testing.assert_allclose(got, np.sqrt(variances), atol=1e-7 * largest + pair_merge.SHORTEST)
+    assert min(got) >= pair_merge.SHORTEST
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_products_on_planes_are_integrals(seed: int) -> None:
+    a, b = twin.random_rows(2, seed, spread=0.7)
+    for axes, plane in PLANES.items():
+        expected = np.array(twin.integrals(a, b, axes)) / (2 * math.pi)
+        np.testing.assert_allclose(pair_merge.product(a, b, plane), expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_shared_share_is_that_of_integrals(seed: int) -> None:
+    a, b = twin.random_rows(2, seed + 10, spread=0.7)
+    shared = alone = 0.0
+    for axes in PLANES:
+        both, area_a, area_b = twin.integrals(a, b, axes)
+        area_a, area_b = a[DENSITY] * area_a, b[DENSITY] * area_b
+        shared += min(a[DENSITY] * b[DENSITY] * both, area_a, area_b)
+        alone += area_a + area_b
+    assert pair_merge.shared_share(a, b) == pytest.approx(shared / alone, rel=1e-5)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_the_error_of_a_picture_is_an_integral(seed: int) -> None:
+    a, b, merged = twin.random_rows(3, seed + 20, spread=0.7)
+    total = 0.0
+    for channel in range(4):
+        high = [min(r[DENSITY], 1) * (r[COLOR + channel] if channel < 3 else 1) for r in (a, b, merged)]
+        for axes in PLANES:
+
+            def over(one: np.ndarray, other: np.ndarray, axes: tuple[int, int] = axes) -> float:
+                return twin.integrals(one, other, axes)[0]
+
+            total += high[0] ** 2 * over(a, a) + high[1] ** 2 * over(b, b) + high[2] ** 2 * over(merged, merged)
+            total += 2 * high[0] * high[1] * over(a, b)
+            total -= 2 * high[2] * (high[0] * over(a, merged) + high[1] * over(b, merged))
+    assert pair_merge.picture_error(a, b, merged) == pytest.approx(total / (2 * math.pi), rel=1e-4)
+
+
+def test_a_merged_node_that_looks_as_its_two_is_without_error() -> None:
+    a, nothing = twin.random_rows(2, seed=5)
+    nothing[DENSITY] = 0
+    assert pair_merge.picture_error(a, nothing, a) == pytest.approx(0, abs=1e-5)
+
+
+def united(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    merged = np.zeros_like(a)
+    pair_merge.unite(a, b, merged)
+    return merged
+
+
+def test_a_quarter_of_what_two_equals_cover_both_do() -> None:
+    """A Gaussian's square sums to half of it, so two opaque equals cover 3/2 of one, with (2 - 1/4) / (3/2) of V."""
+    a = twin.random_rows(1, seed=6)[0]
+    a[COVERED] /= a[DENSITY]
+    a[DENSITY] = 1
+    merged = united(a, a)
+    assert pair_merge.shared_share(a, a) == pytest.approx(1 / 4)
+    assert merged[COVERED] == pytest.approx(1.5 * a[COVERED], rel=1e-6)
+    np.testing.assert_allclose(merged[CENTER : CENTER + 3], a[CENTER : CENTER + 3], atol=1e-6)
+    expected = 7 / 6 * twin.matrix(a)
+    np.testing.assert_allclose(twin.matrix(merged), expected, atol=1e-5 * np.trace(expected))
+
+
+def test_two_that_share_nothing_are_merged_by_their_moments() -> None:
+    a, b = twin.random_rows(2, seed=7)
+    b[CENTER : CENTER + 3] += np.float32([60, -50, 40])
+    merged = united(a, b)
+    share = a[COVERED] / (a[COVERED] + b[COVERED])
+    center = share * a[CENTER : CENTER + 3] + (1 - share) * b[CENTER : CENTER + 3]
+    assert merged[COVERED] == pytest.approx(a[COVERED] + b[COVERED], rel=1e-6)
+    np.testing.assert_allclose(merged[CENTER : CENTER + 3], center, rtol=1e-5)
+    expected = twin.joint_covariance(a, b)
+    np.testing.assert_allclose(twin.matrix(merged), expected, atol=1e-5 * np.trace(expected))
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.5, 3.0])
+def test_a_union_is_of_two_whichever_is_first(spread: float) -> None:
+    for seed in range(20):
+        a, b = twin.random_rows(2, seed, spread)
+        one, other = united(a, b), united(b, a)
+        trace = np.trace(twin.matrix(one))
+        np.testing.assert_allclose(one[CENTER : CENTER + 3], other[CENTER : CENTER + 3], atol=1e-5 * math.sqrt(trace))
+        np.testing.assert_allclose(twin.matrix(one), twin.matrix(other), atol=1e-5 * trace)
+        assert one[COVERED] == pytest.approx(other[COVERED], rel=1e-6)
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(0, 5), st.sampled_from([(1, 1, 1), (1, 1, 0), (1, 0, 0), (1, 1, 1e-6)]))
+@settings(max_examples=60)
+def test_a_union_covers_no_less_than_the_larger_and_no_more_than_both(
+    seed: int, spread: float, flat: tuple[float, float, float]
+) -> None:
+    rows = twin.random_rows(2, seed, spread)
+    rows[:, DENSITY] = np.minimum(rows[:, DENSITY], 1)
+    for row in rows:
+        squashed = np.diag(flat) @ twin.matrix(row) @ np.diag(flat)
+        row[COVARIANCE : COVARIANCE + 6] = [squashed[i, j] for i, j in twin.ELEMENTS]
+        row[COVERED] = row[DENSITY]
+    merged = united(*rows)
+    assert np.isfinite(merged).all()
+    assert merged[COVERED] <= rows[:, COVERED].sum() * (1 + 1e-6)
+    assert merged[COVERED] >= rows[:, COVERED].sum() / 2 * (1 - 1e-6)
+    trace = np.trace(twin.matrix(merged))
+    assert np.linalg.eigvalsh(twin.matrix(merged))[0] >= -1e-5 * trace
+
+
+def needle(rng: np.random.Generator, center: np.ndarray, thickness: float) -> np.ndarray:
+    """A needle of length 1 that points nearly along x."""
+    axes = np.linalg.qr(np.eye(3) + rng.normal(0, 0.02, (3, 3)))[0]
+    return twin.row(center, (axes * np.array([1, thickness, thickness]) ** 2) @ axes.T, 0.2)
+
+
+@pytest.mark.parametrize("thickness", [0.03, 0.01, 0.003])
+def test_needles_side_by_side_are_as_long_together_as_each(thickness: float) -> None:
+    """Seen along y or z they overlap, but where their lines come nearest may be far beyond their ends."""
+    rng = np.random.default_rng(10)
+    for _ in range(300):
+        a, b = (needle(rng, rng.normal(0, (0.5, 3 * thickness, 0.2), 3), thickness) for _ in range(2))
+        merged = united(a, b)
+        matrix, plain = twin.matrix(merged), twin.joint_covariance(a, b)
+        assert np.trace(matrix) >= 0.5 * np.trace(plain)
+        assert np.linalg.eigvalsh(matrix)[0] >= -1e-5 * np.trace(plain)
+        middle = (a[CENTER : CENTER + 3] + b[CENTER : CENTER + 3]) / 2
+        assert np.linalg.norm(merged[CENTER : CENTER + 3] - middle) <= math.sqrt(np.trace(plain))
+        assert merged[COVERED] <= (a[COVERED] + b[COVERED]) * (1 + 1e-6)
+
+
+def test_pairs_become_rows_that_cover_as_much_and_are_as_large_as_they_are_drawn() -> None:
+    rows = np.zeros((30, pair_cost.WIDTH), np.float32)
+    rows[:20] = twin.random_rows(20, seed=8, spread=0.5)
+    joined = np.arange(20, dtype=np.uint32).reshape(10, 2)[::-1].copy()
+    children = np.zeros((30, 2), np.uint32)
+    size, error = np.zeros(30, np.float32), np.zeros(30, np.float32)
+    pair_merge.unite_pairs(joined, 20, rows, children, size, error)
+    assert np.array_equal(children[20:], joined)
+    for (a, b), row, seen, off in zip(rows[joined], rows[20:], size[20:], error[20:], strict=True):
+        expected = united(a, b)
+        assert np.array_equal(row[COVARIANCE : COVARIANCE + 6], expected[COVARIANCE : COVARIANCE + 6])
+        assert row[COVERED] == expected[COVERED]
+        assert row[WEIGHT] == pytest.approx(a[WEIGHT] + b[WEIGHT])
+        color = np.average([a[COLOR : COLOR + 3], b[COLOR : COLOR + 3]], axis=0, weights=[a[WEIGHT], b[WEIGHT]])
+        np.testing.assert_allclose(row[COLOR : COLOR + 3], color, rtol=1e-5)
+        axes = np.sqrt(np.linalg.eigvalsh(twin.matrix(row)))
+        assert row[DENSITY] == pytest.approx(row[COVERED] / gaussians.ellipsoid_area(axes), rel=1e-5)
+        assert row[LOG_DET] == pytest.approx(np.linalg.slogdet(twin.matrix(row))[1], abs=1e-4)
+        opacity, spread = profile.profile_of(float(row[DENSITY]))
+        larger = 1 + 0.7 * max(0.0, float(lod_opacity(np.float32([opacity]))[0]) - 1)
+        assert seen == pytest.approx(2 * axes.mean() / math.sqrt(spread) * larger, rel=1e-5)
+        assert off == pytest.approx(pair_merge.picture_error(a, b, row), rel=1e-6)

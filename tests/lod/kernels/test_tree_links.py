@@ -1,0 +1,177 @@
+"""The kernels that follow the links of broken trees against slow, obvious twins."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from sparklod_cli.lod.kernels.tree_links import STEPS, find_cycles, find_parents, sizes_below, sum_levels, walk
+from sparklod_cli.model.gaussian import spark_size
+from tests.conftest import ROOT
+from tests.references import gaussians, tree_links
+from tests.scenes import random_splats
+
+Links = list[tuple[int, int]]
+
+#: Child counts and child starts as good trees have them, and as broken files do.
+COUNTS = st.one_of(st.integers(0, 4), st.sampled_from([0, 0, 255, 65535]))
+STARTS = st.one_of(st.integers(0, 40), st.sampled_from([0, 65536, 2**31 - 1, 2**31, 2**32 - 1]))
+ANY_LINKS = st.lists(st.tuples(COUNTS, STARTS), min_size=1, max_size=40)
+
+
+def arrays(links: Links) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Counts, starts, and sizes that differ from node to node."""
+    count, start = zip(*links, strict=True)
+    sizes = np.random.default_rng(len(links)).permutation(len(links)).astype(np.float32) + 1
+    return np.array(count, np.uint16), np.array(start, np.uint32), sizes
+
+
+def followed(links: Links) -> int:
+    """Links to nodes that there are."""
+    return sum(map(len, tree_links.links_of(*arrays(links)[:2])))
+
+
+@st.composite
+def trees(draw: st.DrawFn) -> Links:
+    """Any tree, breadth first."""
+    links = [(0, 0)]
+    for node in range(20):
+        if node < len(links):
+            children = draw(st.integers(0, 4))
+            links[node] = (children, len(links) if children else 0)
+            links += [(0, 0)] * children
+    return links
+
+
+@st.composite
+def broken_trees(draw: st.DrawFn) -> Links:
+    """A tree of which some nodes say something else."""
+    links = draw(trees())
+    for node in draw(st.lists(st.integers(0, len(links) - 1), min_size=1, max_size=3)):
+        links[node] = draw(st.tuples(COUNTS, STARTS))
+    return links
+
+
+ANY = st.one_of(trees(), broken_trees(), ANY_LINKS)
+
+
+@given(ANY)
+@example([(1, 0)])
+@example([(2, 1), (65535, 2**32 - 1), (2, 3), (0, 0), (0, 0)])
+def test_every_node_is_visited_once_by_the_shortest_way(links: Links) -> None:
+    count, start, size = arrays(links)
+    depth, limit = walk(count, start, size)
+    expected = tree_links.walk(count, start, size)
+    if followed(links) <= STEPS * len(links):
+        assert depth.tolist() == expected.depth
+        assert limit.tolist() == expected.limit
+    else:  # nodes share so many children that some of them are not looked at
+        known = depth >= 0
+        assert depth[known].tolist() == np.array(expected.depth)[known].tolist()
+        assert limit[known].tolist() == np.array(expected.limit)[known].tolist()
+    assert depth.dtype == np.int32
+    assert limit.dtype == np.float32
+
+
+@given(ANY)
+def test_parents_are_those_that_have_a_node_as_a_child(links: Links) -> None:
+    count, start, size = arrays(links)
+    parent, references = find_parents(count, start)
+    expected = tree_links.walk(count, start, size).parents
+    assert references.tolist() == [len(parents) for parents in expected]
+    for found, parents in zip(parent.tolist(), expected, strict=True):
+        assert found in parents or found == -1
+        assert found != -1 or not parents or followed(links) > STEPS * len(links)
+
+
+@given(st.lists(st.tuples(st.integers(-1, 29), st.sampled_from([-1, -1, -1, 0, 2])), min_size=1, max_size=30))
+def test_cycles_are_what_one_never_leaves_upwards(nodes: Links) -> None:
+    parent = [above if above < len(nodes) else -1 for above, _ in nodes]
+    depth = [edges for _, edges in nodes]
+    found = find_cycles(np.array(parent, np.int32), np.array(depth, np.int32))
+    assert found.tolist() == tree_links.on_cycles(parent, depth)
+
+
+@given(ANY, st.integers(0, 2**32 - 1))
+def test_children_count_by_what_they_cover(links: Links, seed: int) -> None:
+    count, start, _ = arrays(links)
+    splats = random_splats(len(links), seed=seed % 1000)
+    rng = np.random.default_rng(seed)
+    for column in (splats.opacity, splats.scale, splats.scale[:, 1:]):
+        column[rng.random(len(links)) < 0.2] = 0
+    parent, size = find_parents(count, start)[0], spark_size(splats)
+    found = sizes_below(parent, size, splats.scale, splats.opacity)
+    for node in range(len(links)):
+        below = np.flatnonzero((parent == node) & (splats.opacity > 0) & (size > 0))
+        if len(below):
+            # The thinnest of needles count for something.
+            scale = np.maximum(splats.scale[below], 1e-20 * splats.scale[below].max(axis=1, keepdims=True))
+            weight = splats.opacity[below] * gaussians.ellipsoid_area(scale)
+            assert found[node] == pytest.approx(np.average(size[below], weights=weight), rel=1e-4)
+        else:
+            assert found[node] == 0
+
+
+@given(ANY)
+def test_sums_over_levels_count_every_node_once(links: Links) -> None:
+    count, start, size = arrays(links)
+    depth, _ = walk(count, start, size)
+    nodes, leaves, logs, children = sum_levels(depth, count, size)
+    for level in range(int(depth.max()) + 1):
+        there = depth == level
+        assert nodes[level] == there.sum()
+        assert leaves[level] == (there & (count == 0)).sum()
+        assert logs[level] == pytest.approx(np.log(size[there].astype(np.float64)).sum(), rel=1e-6, abs=1e-6)
+    assert len(nodes) == len(leaves) == len(logs) == depth.max() + 1
+    assert np.array_equal(children, np.bincount(count, minlength=65536))
+
+
+@pytest.mark.parametrize("start", [0, 1, 100_000])
+def test_links_to_nearly_everything_take_no_longer(start: int) -> None:
+    """Followed one by one these were 2 * 10 ** 11."""
+    nodes = 3_000_000
+    count, begin = np.full(nodes, 65535, np.uint16), np.full(nodes, start, np.uint32)
+    depth, _ = walk(count, begin, np.ones(nodes, np.float32))
+    assert depth[0] == 0
+    assert depth[max(1, start)] == 1
+    _, references = find_parents(count, begin)
+    assert np.count_nonzero(references) == 65535
+    assert references.max() == nodes
+
+
+def test_a_tree_as_deep_as_it_has_nodes() -> None:
+    nodes = 200_000
+    count = np.ones(nodes, np.uint16)
+    count[-1] = 0
+    start = np.arange(1, nodes + 1, dtype=np.uint32)
+    depth, limit = walk(count, start, np.arange(nodes, 0, -1, dtype=np.float32))
+    assert np.array_equal(depth, np.arange(nodes))
+    assert np.array_equal(limit, np.arange(nodes, 0, -1))
+    nodes_of, *_ = sum_levels(depth, count, np.ones(nodes, np.float32))
+    assert (nodes_of == 1).all()
+
+
+def test_it_runs_as_python() -> None:
+    """A kernel that is debugged wraps no integers that the compiled one does not."""
+    twins = (
+        test_every_node_is_visited_once_by_the_shortest_way,
+        test_parents_are_those_that_have_a_node_as_a_child,
+        test_cycles_are_what_one_never_leaves_upwards,
+        test_sums_over_levels_count_every_node_once,
+    )
+    tests = [f"{__file__}::{test.__name__}" for test in twins]
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *tests],
+        cwd=ROOT,
+        env={**os.environ, "NUMBA_DISABLE_JIT": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout

@@ -1,0 +1,220 @@
+"""Laws of continuous cuts: weights sum to one on every way to a leaf, do not jump, and become those of the cut."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sparklod_cli.lod.continuous import BlendedCut, ContinuousCuts, faded, find_threshold, pixel_scales, shares
+from sparklod_cli.lod.traversal import Cones, Forest, Instance, Traversal, View
+from sparklod_cli.model.gaussian import lod_opacity
+from tests.lod.forests import Case, cases, random_tree, transform
+from tests.references import budgeted_cuts
+
+WIDTHS = (1.05, 1.25, 2.0)
+SPARK = Cones(90, 120, 0.4, 0.2)
+
+
+def view_from(position: tuple[float, ...]) -> View:
+    camera = np.eye(4)
+    camera[:3, 3] = position
+    return View(camera, math.radians(80), math.radians(60))
+
+
+def weights_of(case: Case, cut: BlendedCut) -> list[np.ndarray]:
+    """Of each instance, the weight of every node of its tree."""
+    weights = [np.zeros(len(case.trees[instance.tree].size)) for instance in case.instances]
+    for instance, node, weight in zip(cut.instance, cut.node, cut.weight, strict=True):
+        assert weights[instance][node] == 0  # no node comes twice
+        weights[instance][node] = weight
+    return weights
+
+
+def sums_to_leaves(case: Case, weights: list[np.ndarray]) -> Iterator[float]:
+    """Of each leaf of each instance, the sum of the weights on the way to it."""
+    for instance, of_nodes in zip(case.instances, weights, strict=True):
+        tree = case.trees[instance.tree].tree
+        total = of_nodes.copy()
+        for node in np.flatnonzero(tree.child_count):
+            start = int(tree.child_start[node])
+            total[start : start + int(tree.child_count[node])] += total[node]
+        yield from total[tree.is_leaf]
+
+
+def some_case(seed: int, count: int = 400, foveation: Cones = SPARK) -> Case:
+    """A tree twice."""
+    rng = np.random.default_rng(seed)
+    tree = random_tree(rng, count, 5)
+    instances = [Instance(0, np.eye(4), 1.0, foveation), Instance(0, transform(rng, spread=4), 0.7, foveation)]
+    return Case([tree], instances, view_from((0.3, -0.2, 6.0)), count // 2, 0.0)
+
+
+@given(cases(), st.sampled_from(WIDTHS))
+def test_weights_are_shares_that_sum_to_one_on_every_way_to_a_leaf(case: Case, width: float) -> None:
+    cut = ContinuousCuts(case.traversal()).cut(case.view, budget=case.budget, smallest=case.smallest, width=width)
+    assert ((cut.weight > 0) & (cut.weight <= 1)).all()
+    assert cut.threshold >= case.smallest
+    np.testing.assert_allclose(list(sums_to_leaves(case, weights_of(case, cut))), 1)
+
+
+@given(cases(), st.sampled_from(WIDTHS))
+def test_weights_sum_to_no_more_than_the_budget(case: Case, width: float) -> None:
+    cut = ContinuousCuts(case.traversal()).cut(case.view, budget=case.budget, smallest=case.smallest, width=width)
+    assert cut.weight.sum() <= case.budget * (1 + 1e-9)
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+@pytest.mark.parametrize("share", [0.01, 0.1, 0.5, 0.9])
+def test_weights_sum_to_the_budget_where_that_is_what_ends_the_cut(width: float, share: float) -> None:
+    case = some_case(1)
+    leaves = len(case.instances) * int(case.trees[0].tree.is_leaf.sum())
+    budget = max(2, int(share * leaves))
+    cut = ContinuousCuts(case.traversal()).cut(case.view, budget=budget, width=width)
+    assert cut.weight.sum() == pytest.approx(budget, rel=1e-6)
+
+
+@given(cases(), st.sampled_from(WIDTHS))
+def test_all_leaves_where_the_budget_does_not_matter(case: Case, width: float) -> None:
+    case = Case(case.trees, case.instances, case.view, case.most, 0.0)
+    cut = ContinuousCuts(case.traversal()).cut(case.view, budget=case.budget, width=width)
+    ordinary = case.find()
+    assert [cut.node[cut.instance == number].tolist() for number in range(len(case.instances))] == [
+        nodes.tolist() for nodes in ordinary.indices()
+    ]
+    assert (cut.weight == 1).all()
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_the_ordinary_cut_where_nothing_has_time_to_fade(seed: int) -> None:
+    case = some_case(seed)
+    ordinary = case.find()
+    cut = ContinuousCuts(case.traversal()).cut(case.view, budget=case.budget, width=1 + 1e-9)
+    # Both divide in the same order; what does not fit any more is divided by a share here, and not at all there.
+    assert ordinary.stop is not None
+    _, instance, node = ordinary.stop
+    tree = case.trees[0].tree
+    partly = {(instance, node)} | {
+        (instance, int(tree.child_start[node]) + child) for child in range(int(tree.child_count[node]))
+    }
+    whole = {
+        (int(i), int(n)) for i, n, w in zip(cut.instance, cut.node, cut.weight, strict=True) if w == pytest.approx(1)
+    }
+    drawn = set(zip(ordinary.instance.tolist(), ordinary.node.tolist(), strict=True))
+    assert whole - partly == drawn - partly
+    assert len(drawn) > 100
+
+
+@given(cases())
+def test_at_a_threshold_the_cut_is_that_of_all_larger_nodes(case: Case) -> None:
+    """Without a budget, the nodes far above the limit are divided, and none below it."""
+    cut = ContinuousCuts(case.traversal()).cut(case.view, budget=case.most, smallest=0.5, width=1.25)
+    case = Case(case.trees, case.instances, case.view, case.most, 0.5)
+    fine, coarse = case.find(), Case(case.trees, case.instances, case.view, case.most, 0.5 * 1.25).find()
+    drawn = set(zip(cut.instance.tolist(), cut.node.tolist(), strict=True))
+    both = {(int(i), int(n)) for i, n in zip(fine.instance, fine.node, strict=True)} & {
+        (int(i), int(n)) for i, n in zip(coarse.instance, coarse.node, strict=True)
+    }
+    assert both <= drawn
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+@pytest.mark.parametrize("seed", range(3))
+def test_weights_move_no_faster_than_pixel_scales(width: float, seed: int) -> None:
+    case = some_case(seed)
+    cuts = ContinuousCuts(case.traversal())
+    before = scales = None
+    changed = 0
+    for step in range(60):
+        view = view_from((0.3, -0.2, 6.0 - 0.004 * step**1.5))
+        cut = cuts.cut(view, budget=case.budget, width=width)
+        weights, now = np.concatenate(weights_of(case, cut)), log_scales(case, view)
+        if before is not None:
+            bound = 6 * np.abs(now - scales).max() / math.log(width)
+            change = np.abs(weights - before)
+            assert change.max() <= bound + 1e-5  # pixel scales are float32
+            changed += int((change > 0).sum())
+        before, scales = weights, now
+    assert changed > 1000  # there was something to see
+
+
+def log_scales(case: Case, view: View) -> np.ndarray:
+    """Logarithms of the pixel scales of the nodes with children, of all instances."""
+    scales = []
+    for instance in case.instances:
+        nodes = case.trees[instance.tree]
+        place = Traversal(Forest(case.trees), [instance])
+        record = place.cut(view, budget=1).views[0]
+        inner = np.flatnonzero(nodes.tree.child_count)
+        values = [np.ascontiguousarray(column[inner]) for column in (*nodes.center.T, nodes.size)]
+        scales.append(pixel_scales(values, record))
+    return np.log(np.concatenate(scales).astype(np.float64))
+
+
+def test_a_tiny_step_across_the_place_where_a_node_is_divided_changes_next_to_nothing() -> None:
+    case = some_case(3, foveation=Cones())
+    cuts = ContinuousCuts(case.traversal())
+    far, near = 6.0, 3.0
+    drawn = [
+        {tuple(node) for node in zip(cut.instance.tolist(), cut.node.tolist(), strict=True)}
+        for cut in (case.traversal().cut(view_from((0.3, -0.2, z)), budget=case.budget) for z in (far, near))
+    ]
+    assert drawn[0] != drawn[1]
+    for _ in range(40):  # to where the ordinary cut changes
+        middle = (far + near) / 2
+        ordinary = case.traversal().cut(view_from((0.3, -0.2, middle)), budget=case.budget)
+        same = set(zip(ordinary.instance.tolist(), ordinary.node.tolist(), strict=True)) == drawn[0]
+        far, near = (middle, near) if same else (far, middle)
+    a, b = (
+        np.concatenate(weights_of(case, cuts.cut(view_from((0.3, -0.2, z)), budget=case.budget, width=1.25)))
+        for z in (far, near)
+    )
+    assert np.abs(a - b).max() < 1e-4
+
+
+@given(cases())
+def test_pixel_scales_are_those_of_the_traversal(case: Case) -> None:
+    traversal = case.traversal()
+    views = traversal.cut(case.view, budget=len(case.instances)).views
+    nodes = traversal.forest.nodes
+    for view in views:
+        some = nodes[view["node_base"] : view["node_base"] + 20]
+        found = pixel_scales([np.ascontiguousarray(some[name]) for name in ("x", "y", "z", "size")], view)
+        expected = [
+            budgeted_cuts.number_of(budgeted_cuts.bits_of(budgeted_cuts.pixel_scale(node, view))) for node in some
+        ]
+        np.testing.assert_array_equal(found, np.array([math.inf if math.isnan(e) else e for e in expected], np.float32))
+
+
+def test_shares_rise_from_nothing_at_the_threshold_to_all_at_its_multiple() -> None:
+    limit = np.array([0, 0.5, 1, math.sqrt(1.5), 1.5, 3, np.inf])
+    np.testing.assert_allclose(shares(limit, 1.0, 1.5), [0, 0, 0, 0.5, 1, 1, 1], atol=1e-15)
+    np.testing.assert_array_equal(shares(limit, 0.0, 1.5), [0, 1, 1, 1, 1, 1, 1])
+    fine = shares(np.geomspace(0.9, 1.7, 1000), 1.0, 1.5)
+    assert (np.diff(fine) >= 0).all()
+
+
+@given(
+    st.lists(st.tuples(st.sampled_from([0.0, 0.5, 1.0, 1.01, 1.5, 2.0, 7.0, 1e30]), st.integers(0, 5)), max_size=30),
+    st.integers(0, 60),
+    st.sampled_from(WIDTHS),
+)
+def test_the_threshold_uses_the_room_and_no_more(nodes: list[tuple[float, int]], room: int, width: float) -> None:
+    limit = np.array([node[0] for node in nodes])
+    more = np.array([node[1] for node in nodes], np.int64)
+    threshold = find_threshold(limit, more, room, width)
+    used = float(more @ shares(limit, threshold, width)) if len(nodes) else 0.0
+    assert used <= room + 1e-6
+    assert used == pytest.approx(min(room, more[limit > 0].sum()), abs=1e-6)
+
+
+def test_fading_is_even_in_d_and_ends_at_the_splat_itself() -> None:
+    opacity = np.array([0.01, 0.5, 1.0, 1.0001, 3.0, 1000.0], np.float32)
+    np.testing.assert_array_equal(faded(opacity, np.ones(6)), opacity)
+    np.testing.assert_array_equal(faded(opacity, np.zeros(6)), 0)
+    for weight in (1e-3, 0.25, 0.5, 0.999, 1 - 1e-9):
+        np.testing.assert_allclose(lod_opacity(faded(opacity, np.full(6, weight))), weight * lod_opacity(opacity), 1e-5)

@@ -1,0 +1,112 @@
+"""Streaming, exactly: a cache that is looked through, and a stream that moves every byte of every transfer."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass, field
+from fractions import Fraction
+
+from sparklod_cli.simulation.chunk_cache import Chunks
+from sparklod_cli.simulation.streaming import Network
+
+#: Nearer than this to each other, rounding decides which of two events comes first.
+TIE = Fraction(1, 10**9)
+
+
+class NaiveCache:
+    """Of each chunk that is here, when it was last used, in which place of the list; the smallest goes first."""
+
+    def __init__(self, capacity: int | None) -> None:
+        self.capacity = math.inf if capacity is None else capacity
+        self.wanted: list[int] = []
+        self.used: dict[int, tuple[int, float]] = {}
+        self.clock = 0
+
+    def want(self, wanted: list[int]) -> None:
+        self.wanted = wanted
+        self.use()
+
+    def arrive(self, chunk: int) -> int | None:
+        self.used[chunk] = (self.clock + 1, -math.inf)
+        self.use()
+        if len(self.used) <= self.capacity:
+            return None
+        evicted = min(self.used, key=lambda each: self.used[each])
+        del self.used[evicted]
+        return evicted
+
+    def use(self) -> None:
+        self.clock += 1
+        for place, chunk in enumerate(self.wanted):
+            if chunk in self.used:
+                self.used[chunk] = (self.clock, -place)
+
+
+def roots_first(chunks: Chunks, wanted: list[int]) -> list[int]:
+    """What a list of wanted chunks comes to."""
+    result: list[int] = []
+    for chunk in [each for each in wanted if each in chunks.roots] + chunks.roots + wanted:
+        if chunk not in result:
+            result.append(chunk)
+    return result
+
+
+@dataclass
+class Fetch:
+    """A fetch under way."""
+
+    asked: Fraction
+    chunk: int
+    latency: Fraction
+    left: Fraction
+
+
+@dataclass
+class Twin:
+    """What `Stream` does, in fractions, one fetch at a time, with a cache that is looked through."""
+
+    chunks: Chunks
+    network: Network
+    cache: NaiveCache
+    now: Fraction = Fraction(0)
+    fetches: list[Fetch] = field(default_factory=list)
+    arrivals: list[tuple[Fraction, int]] = field(default_factory=list)
+    tied: bool = False  # rounding may have decided otherwise
+
+    def advance(self, to_time: Fraction) -> None:
+        while True:
+            active = [fetch for fetch in self.fetches if fetch.latency == 0]
+            rate = Fraction(self.network.bandwidth) / max(1, len(active))
+            due = [fetch.left / rate for fetch in active]
+            due += [fetch.latency for fetch in self.fetches if fetch.latency > 0]
+            ends = sorted((fetch.left / rate, fetch.asked, self.chunks.sizes[fetch.chunk]) for fetch in active)
+            self.tied |= any(b[0] - a[0] <= TIE and a != b for a, b in itertools.pairwise(ends))
+            self.tied |= any(abs(end[0] - (to_time - self.now)) <= TIE for end in ends)
+            step = min([to_time - self.now, *due])
+            self.now += step
+            for fetch in self.fetches:
+                if fetch in active:
+                    fetch.left -= step * rate
+                else:
+                    fetch.latency -= step
+            done = [fetch for fetch in active if fetch.left == 0]
+            if not done and self.now == to_time:
+                return
+            for fetch in done[:1]:
+                self.fetches.remove(fetch)
+                self.arrivals.append((self.now, fetch.chunk))
+                self.cache.arrive(fetch.chunk)
+                self.ask()
+
+    def want(self, wanted: list[int]) -> None:
+        self.cache.want(roots_first(self.chunks, wanted))
+        self.ask()
+
+    def ask(self) -> None:
+        for place, chunk in enumerate(self.cache.wanted):
+            if place < self.cache.capacity and len(self.fetches) < self.network.fetchers:
+                under_way = [fetch.chunk for fetch in self.fetches]
+                if chunk not in self.cache.used and chunk not in under_way:
+                    latency = Fraction(self.network.latency)
+                    self.fetches.append(Fetch(self.now, chunk, latency, Fraction(self.chunks.sizes[chunk])))

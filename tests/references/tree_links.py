@@ -1,0 +1,69 @@
+"""What the links of a tree lead to, with sets and queues."""
+
+from __future__ import annotations
+
+import heapq
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass
+class Walked:
+    """What the links of a tree lead to, however broken they are."""
+
+    parents: list[list[int]]  # the nodes that have each as a child
+    depth: list[int]
+    limit: list[float]
+
+
+def links_of(child_count: np.ndarray, child_start: np.ndarray) -> list[range]:
+    """The children of each node that there are."""
+    starts, counts = child_start.tolist(), child_count.tolist()
+    return [range(start, min(len(starts), start + count)) for start, count in zip(starts, counts, strict=True)]
+
+
+def walk(child_count: np.ndarray, child_start: np.ndarray, size: np.ndarray) -> Walked:
+    """Breadth first, with sets."""
+    links = links_of(child_count, child_start)
+    every = range(len(links))
+    parents = [[node for node in every if child in links[node]] for child in every]
+    depth, limit = {0: 0}, {0: float(size[0])}
+    waiting = deque([0])
+    while waiting:
+        node = waiting.popleft()
+        for child in links[node]:
+            if child not in depth:
+                depth[child], limit[child] = depth[node] + 1, min(limit[node], float(size[child]))
+                waiting.append(child)
+    return Walked(parents, [depth.get(node, -1) for node in every], [limit.get(node, 0.0) for node in every])
+
+
+def on_cycles(parent: list[int], depth: list[int]) -> list[bool]:
+    """Whether one who goes up from a node never comes to an end, nor to a node that has a depth."""
+    found = []
+    for node in range(len(parent)):
+        seen: set[int] = set()
+        while node >= 0 and depth[node] < 0 and node not in seen:
+            seen.add(node)
+            node = parent[node]
+        found.append(node in seen)
+    return found
+
+
+def coarse_cut(child_count: np.ndarray, child_start: np.ndarray, size: np.ndarray, most: int) -> set[int]:
+    """The cut of a tree that is left when the largest node is divided as long as the cut has no more than `most`."""
+    links = links_of(child_count, child_start)
+    heap = [(-float(size[0]), 0)]
+    leaves: set[int] = set()
+    while heap:
+        _, node = heap[0]
+        if links[node] and len(heap) + len(leaves) - 1 + len(links[node]) > most:
+            break
+        heapq.heappop(heap)
+        if not links[node]:
+            leaves.add(node)
+        for child in links[node]:
+            heapq.heappush(heap, (-float(size[child]), child))
+    return leaves | {node for _, node in heap}

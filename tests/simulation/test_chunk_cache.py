@@ -1,0 +1,123 @@
+"""Chunks: their order, and the cache against a list that is looked through."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sparklod_cli.simulation.chunk_cache import ChunkCache, Chunks, by_priority
+from tests.references.streaming import NaiveCache, roots_first
+
+
+def here(cache: ChunkCache) -> set[int]:
+    present = set(np.flatnonzero(cache.resident()).tolist())
+    assert len(cache) == len(present)
+    assert all((chunk in cache) == (chunk in present) for chunk in range(len(cache.resident())))
+    return present
+
+
+@settings(max_examples=400)  # what goes wrong here takes several steps that suit each other
+@given(st.data())
+def test_what_was_least_recently_used_is_given_up(data: st.DataObject) -> None:
+    trees = data.draw(st.lists(st.integers(1, 5), min_size=1, max_size=3))
+    chunks = Chunks([np.ones(count, np.int64) for count in trees])
+    capacity = data.draw(st.none() | st.integers(len(trees), len(chunks) + 1))
+    cache, naive = ChunkCache(chunks, capacity), NaiveCache(capacity)
+    numbers = st.integers(0, len(chunks) - 1)
+    rooted = False
+    for _ in range(data.draw(st.integers(1, 25))):
+        absent = [chunk for chunk in range(len(chunks)) if chunk not in cache]
+        if absent and data.draw(st.booleans()):
+            chunk = data.draw(st.sampled_from(absent))
+            importance = {each: -place for place, each in enumerate(cache.wanted)}
+            before = here(cache)
+            evicted = cache.arrive(chunk)
+            assert evicted == naive.arrive(chunk)
+            assert evicted not in cache.admitted
+            assert here(cache) == (before | {chunk}) - {evicted}
+            if evicted in importance:  # all that are here are wanted, and it is the least important of them
+                assert importance[evicted] == min(importance[each] for each in before | {chunk})
+        else:
+            wanted = data.draw(st.lists(numbers, max_size=10))
+            cache.want(wanted)
+            rooted = True
+            assert cache.wanted == roots_first(chunks, wanted)
+            assert cache.admitted == cache.wanted[:capacity]
+            naive.want(cache.wanted)
+        assert here(cache) == set(naive.used)
+        assert len(cache) <= naive.capacity
+        assert cache.missing() == [chunk for chunk in cache.admitted if chunk not in naive.used]
+        assert not rooted or set(chunks.roots) <= set(cache.admitted)
+
+
+def test_what_came_late_goes_before_what_is_wanted() -> None:
+    cache = ChunkCache(Chunks([[1, 1, 1], [1]]), 3)
+    cache.want([])
+    for chunk in (0, 3, 1):  # the last is not wanted, and there is room
+        assert cache.arrive(chunk) is None
+    cache.want([2])
+    assert cache.arrive(2) == 1
+    cache = ChunkCache(Chunks([[1, 1, 1], [1]]), 3)
+    cache.want([2])
+    assert [cache.arrive(chunk) for chunk in (0, 3, 1, 2)] == [None, None, None, 1]
+
+
+def test_a_copy_goes_its_own_way() -> None:
+    cache = ChunkCache(Chunks([[1, 1, 1]]), 2)
+    cache.want([1])
+    cache.arrive(0)
+    twin = cache.copy()
+    twin.arrive(1)
+    twin.want([2])
+    assert twin.arrive(2) == 1
+    assert here(cache) == {0}
+    assert cache.wanted == [0, 1]
+
+
+def test_wanted_may_be_an_array() -> None:
+    cache = ChunkCache(Chunks([[1, 1, 1]]))
+    cache.want(np.array([2, 1], np.uint32))
+    assert cache.wanted == [0, 2, 1]
+    assert all(type(chunk) is int for chunk in cache.wanted)
+
+
+@pytest.mark.parametrize("wanted", [[3], [-1], [0, 1, 7]])
+def test_a_chunk_that_no_tree_has_cannot_be_wanted(wanted: list[int]) -> None:
+    with pytest.raises(ValueError, match="there are 3"):
+        ChunkCache(Chunks([[1, 1], [1]])).want(wanted)
+
+
+def test_the_roots_have_to_fit() -> None:
+    chunks = Chunks([[1], [1, 1]])
+    with pytest.raises(ValueError, match="the roots of 2 trees"):
+        ChunkCache(chunks, 1)
+    ChunkCache(chunks, 2)
+
+
+def test_chunks_are_numbered_through() -> None:
+    chunks = Chunks([[5, 6], np.array([7], np.uint32), [8, 9]])
+    assert chunks.sizes == [5, 6, 7, 8, 9]
+    assert chunks.roots == [0, 2, 3]
+    assert len(chunks) == 5
+    assert chunks.bytes_of([1, 4]) == 15
+    assert chunks.bytes_of([]) == 0
+
+
+@pytest.mark.parametrize("sizes", [[[1], []], [[1], [2, -1]], [[1], [[2]]]])
+def test_sizes_that_cannot_be(sizes: list[list[int]]) -> None:
+    with pytest.raises(ValueError, match="chunks of tree 1"):
+        Chunks(sizes)
+
+
+@given(st.lists(st.tuples(st.integers(0, 8), st.sampled_from([0.0, 0.25, 0.5, 3.0, math.inf, math.nan]))))
+def test_priority_is_the_greatest_pixel_scale_of_a_chunk(looks: list[tuple[int, float]]) -> None:
+    greatest: dict[int, float] = {}
+    for chunk, scale in looks:
+        greatest[chunk] = max(greatest.get(chunk, 0.0), math.inf if math.isnan(scale) else scale)
+    expected = sorted(greatest, key=lambda chunk: (-greatest[chunk], chunk))
+    touched = np.array([chunk for chunk, _ in looks], np.int64)
+    assert by_priority(touched, np.array([scale for _, scale in looks], np.float32)) == expected

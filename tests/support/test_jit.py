@@ -1,0 +1,120 @@
+"""How kernels are compiled and run."""
+
+from __future__ import annotations
+
+import ast
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numba
+import pytest
+
+from sparklod_cli.support import jit
+from tests.conftest import ROOT
+
+PACKAGE = ROOT / "sparklod_cli"
+
+
+def add(a: float, b: float) -> float:
+    return a + b
+
+
+def test_a_kernel_works_where_no_cache_can_be_written(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(jit, "CACHE_FOLDER", None)
+    assert jit.kernel()(add)(1.0, 2.0) == 3
+
+
+def test_where_compiled_code_is_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "given"))
+    given = jit._cache_folder()
+    assert given is not None
+    assert given.parent == tmp_path / "given"
+    monkeypatch.setenv("NUMBA_CACHE_DIR", "/dev/null/no/folder")
+    assert jit._cache_folder() is None
+
+
+def imported(path: Path) -> set[Path]:
+    """The modules of the package that a module imports when it runs."""
+    found = set()
+    package = path.relative_to(ROOT).with_suffix("").parts[:-1]
+    for node in ast.parse(path.read_text()).body:  # not those under `if TYPE_CHECKING`
+        if isinstance(node, ast.ImportFrom) and node.level:
+            base = ROOT.joinpath(*package[: len(package) + 1 - node.level], *(node.module or "").split("."))
+            found |= {base.with_suffix(".py"), *(base / f"{name.name}.py" for name in node.names)}
+    return {path for path in found if path.is_file()}
+
+
+def test_the_cache_is_named_by_all_that_kernels_are_made_of() -> None:
+    made_of, new = set(), {*PACKAGE.glob("*/kernels/*.py"), PACKAGE / "jit.py"}
+    while new:
+        made_of |= new
+        new = set().union(*map(imported, new)) - made_of
+    assert {PACKAGE / "tree.py", PACKAGE / "gaussian.py"} < made_of
+    assert made_of == {path for pattern in jit.SOURCES for path in PACKAGE.glob(pattern)}
+
+
+def test_a_change_of_any_kernel_or_constant_is_a_new_cache(tmp_path: Path) -> None:
+    copy = tmp_path / "sparklod_cli"
+    shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
+    code = "from sparklod_cli import jit; print(jit.CACHE_FOLDER)"
+    folders = []
+    for name in ("tree.py", "tree.py", "lod/kernels/merge.py"):
+        command = [sys.executable, "-c", code]
+        folders.append(subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True).stdout)
+        (copy / name).write_text((copy / name).read_text() + "# changed\n")
+    assert len(set(folders)) == 3
+
+
+def test_kernels_can_be_debugged() -> None:
+    code = "from sparklod_cli.lod.kernels.geometry import ellipsoid_area; print(ellipsoid_area(1.0, 1.0, 1.0))"
+    environment = {**os.environ, "NUMBA_DISABLE_JIT": "1"}
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=True)
+    assert float(done.stdout) == pytest.approx(12.566, abs=1e-3)
+
+
+def test_kernels_that_are_compiled_are_told_and_not_those_inside_them() -> None:
+    inner = numba.njit(lambda x: x + 1)
+
+    def outer(x: int) -> int:
+        result: int = inner(x)
+        return result
+
+    begun: list[str] = []
+    seconds: list[float] = []
+    stop = jit.listen(begun.append, seconds.append, lambda text: None)
+    try:
+        assert numba.njit(outer)(1) == 2
+        numba.njit(add)(1, 2)
+    finally:
+        stop()
+    numba.njit(add)(1, 2)
+    assert begun == ["test_jit.outer", "test_jit.add"]
+    assert len(seconds) == 2
+    assert all(value > 0 for value in seconds)
+
+
+@pytest.mark.parametrize("given", [{}, {"OMP_WAIT_POLICY": "ACTIVE"}, {"GOMP_SPINCOUNT": "7"}])
+def test_threads_do_not_spin_unless_somebody_says_so(given: dict[str, str]) -> None:
+    code = "import os; from sparklod_cli import jit; print(os.environ.get('GOMP_SPINCOUNT'))"
+    clean = {name: value for name, value in os.environ.items() if name not in (*jit.WAITING, "OMP_WAIT_POLICY")}
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, cwd=ROOT, env={**clean, **given}, capture_output=True, text=True, check=True)
+    expected = given.get("GOMP_SPINCOUNT", "None" if given else jit.WAITING["GOMP_SPINCOUNT"])
+    assert done.stdout.strip() == expected
+
+
+def test_small_work_runs_on_one_thread_and_large_on_all() -> None:
+    before = numba.get_num_threads()
+    with jit.threads_for(jit.SMALL - 1) as threads:
+        assert threads == numba.get_num_threads() == 1
+        with jit.threads_for(10 * jit.SMALL) as inner:
+            assert inner == 1
+    with jit.threads_for(jit.SMALL) as threads:
+        assert threads == before
+    with pytest.raises(KeyError), jit.threads_for(1):
+        raise KeyError
+    assert numba.get_num_threads() == before

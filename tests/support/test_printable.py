@@ -1,0 +1,124 @@
+"""Nothing from outside acts on a terminal, or in the log of a CI run."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sparklod_cli.cli import run
+from sparklod_cli.commands.console import for_screen
+from sparklod_cli.support.printable import MOST, printable, shortened
+from tests.conftest import FIXTURES
+
+TREE, PLAIN = FIXTURES / "golden" / "tree-v3.spz", FIXTURES / "one.ply"
+LOOK = ("--look-at", "0,-1,4:0,0,0")
+
+Said = pytest.CaptureFixture[str]
+
+#: Any text, with half surrogate pairs, and what is looked for more often than chance would have it.
+TEXTS = st.lists(st.one_of(st.text(st.characters()), st.sampled_from(["::", "##[", "\x1b[2J", "\u202e", "\udce9"])))
+
+EVIL = {
+    "escape": "a\x1b[31m\x9b2Jb",
+    "line": "a\n::error::b",
+    "command": "::error::b",
+    "old command": "##[error]b",
+    "return": "a\r\bb",
+    "direction": "a\u202eb\u2066",
+    "bytes": os.fsdecode(b"caf\xe9"),
+    "long": "n" * 240,
+}
+
+
+@given(TEXTS.map("".join), st.none() | st.integers(40, 200))
+def test_it_stands_on_one_line_and_does_nothing(text: str, most: int | None) -> None:
+    shown = printable(text, most)
+    assert shown.isprintable()
+    shown.encode()
+    assert "##[" not in shown
+    assert not shown.lstrip().startswith("::")
+    assert most is None or len(shown) <= most
+    assert printable(shown, most) == shown
+
+
+@given(st.text(st.characters(codec="ascii", exclude_categories=["Cc"])).filter(lambda text: not set(text) & set("#:")))
+def test_plain_text_stays_as_it_is(text: str) -> None:
+    assert printable(text) == text
+
+
+def test_it_is_spelt_as_in_strings() -> None:
+    assert printable("a\n\x1b\x9b\u202e\U000e0001\udce9é 漢") == r"a\n\x1b\x9b\u202e\U000e0001\xe9é 漢"
+
+
+def test_a_long_text_keeps_both_ends() -> None:
+    short = shortened("begin" + "x" * 10_000 + "end", 100)
+    assert (len(short), short[:5], short[-3:]) == (100, "begin", "end")
+    assert shortened("short", 5) == "short"
+
+
+def is_harmless(text: str) -> bool:
+    lines = text.split("\n")
+    return all(
+        line.isprintable() and not line.lstrip().startswith("::error::b") and "##[" not in line for line in lines
+    )
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="names of any bytes are of Linux")
+@pytest.mark.parametrize("name", EVIL)
+def test_names_of_files_do_nothing_in_any_command(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Said
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    evil = EVIL[name]
+    Path(f"{evil}.spz").write_bytes(TREE.read_bytes())
+    Path(f"{evil}.ply").write_bytes(PLAIN.read_bytes())
+    Path(f"{evil}.json").write_text("{")
+    tree, plain, broken, missing = f"{evil}.spz", f"{evil}.ply", f"{evil}.json", f"{evil}.no"
+    for arguments, status in (
+        (["build-lod", plain], 0),
+        (["build-lod", plain], 1),  # exists
+        (["build-lod", missing, "--json"], 1),
+        (["build-lod", plain, f"--{evil}"], 2),
+        (["build-lod", plain, "--method", evil], 2),
+        (["build-lod", plain, "-o", f"out.{evil}"], None),
+        (["build-lod", plain, "-o", f"{evil}/{evil}/{evil}.spz"], 1),
+        (["inspect", tree], 0),
+        (["inspect", tree, "--json"], 0),
+        (["inspect", tree, "--field", "file"], 0),
+        (["inspect", missing], 1),
+        (["inspect", missing, tree, "--check"], 3),
+        (["inspect", tree, "--expect", broken], 1),
+        (["traverse", tree, *LOOK, "-v", "--summary"], 0),
+        (["traverse", missing, *LOOK], 1),
+        (["traverse", tree, "--camera-path", broken], 1),
+        (["traverse", "--scene", broken, *LOOK], 1),
+        (["render", missing, *LOOK], 1),
+        (["render", tree, *LOOK, "-o", f"{evil}.tiff"], 2),
+        (["render", tree, *LOOK, "--size", "8x8"], 0),
+    ):
+        found = run(arguments)
+        out, err = capsys.readouterr()
+        assert status is None or found == status, (arguments, out, err)
+        assert is_harmless(out) if "--json" not in arguments else out[:-1].isprintable(), (arguments, out)
+        assert is_harmless(err), (arguments, err)
+        assert all(len(line) <= MOST + 20 for line in err.split("\n")), arguments
+
+
+def test_annotations_hold_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Said) -> None:
+    monkeypatch.chdir(tmp_path)
+    for evil in EVIL.values():
+        assert run(["inspect", f"{evil}.no", "--check", "--format", "github"]) == 3
+        out = capsys.readouterr().out
+        assert out.count("\n") == 1
+        assert out.startswith("::error file=")
+        assert out[:-1].isprintable()
+
+
+def test_a_table_on_a_screen() -> None:
+    pieces = [b"frame,name\n", "0,\x1b[2Ja\rb\n1,\u202e\n".encode()]
+    assert b"".join(for_screen(pieces)) == b"frame,name\n0,\\x1b[2Ja\\rb\n1,\\u202e\n"

@@ -1,0 +1,96 @@
+"""Quantities with units."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sparklod_cli.support.units import parse_bandwidth, parse_count, parse_latency
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("20Mbit", 2.5e6),
+        ("20Mbit/s", 2.5e6),
+        ("20Mbps", 2.5e6),
+        ("20Mb/s", 2.5e6),
+        ("20 MBit", 2.5e6),  # a word, of any case
+        ("20mbit", 2.5e6),
+        (" 20 Mbits ", 2.5e6),
+        ("2.5MB/s", 2.5e6),
+        ("2.5MBps", 2.5e6),
+        ("2.5Mbyte", 2.5e6),
+        ("2.5 Mbytes/s", 2.5e6),
+        ("800kbit", 1e5),
+        ("800Kbit", 1e5),
+        ("1Gbit", 1.25e8),
+        ("8b", 1.0),
+        ("8B", 8.0),
+        (".5kB", 500.0),
+        ("1e3bit", 125.0),
+    ],
+)
+def test_bandwidths_are_bytes_a_second(text: str, expected: float) -> None:
+    assert parse_bandwidth(text) == expected
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"), [("60ms", 0.06), ("0ms", 0.0), ("0.1s", 0.1), ("2 s", 2.0), (" 1e2ms", 0.1)]
+)
+def test_latencies_are_seconds(text: str, expected: float) -> None:
+    assert parse_latency(text) == expected
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("0", 0),
+        ("65536", 65_536),
+        ("500k", 500_000),
+        ("500K", 500_000),
+        ("1.5M", 1_500_000),
+        ("1.234567M", 1_234_567),
+        ("0.001k", 1),
+        ("2 G", 2_000_000_000),
+        ("1e6", 1_000_000),
+        ("9007199254740993", 9_007_199_254_740_993),  # not a float
+    ],
+)
+def test_counts_may_have_the_units_k_m_and_g(text: str, expected: int) -> None:
+    assert parse_count(text) == expected
+
+
+BAD = ["", "k", "Mbit", "-1", "-5ms", "-20Mbit", "nan", "inf", "1e999", "1,000", "٣", "1 2", "0x10", "a\nb"]
+
+
+@pytest.mark.parametrize("text", [*BAD, "20", "20M", "0Mbit", "0.0B/s", "20Mibit", "20MiB/s", "20Mbit/h", "20Tbit"])
+def test_bandwidths_that_are_none(text: str) -> None:
+    with pytest.raises(ValueError, match="bandwidth") as caught:
+        parse_bandwidth(text)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("text", [*BAD, "60", "0", "60us", "60 m", "infs", "60m s"])
+def test_latencies_that_are_none(text: str) -> None:
+    with pytest.raises(ValueError, match="is not a latency") as caught:
+        parse_latency(text)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("text", [*BAD, "1.5", "1.2345k", "500kk", "500ki", "9" * 40, "1e-1"])
+def test_counts_that_are_none(text: str) -> None:
+    with pytest.raises(ValueError, match="is not a count") as caught:
+        parse_count(text)
+    assert "\n" not in str(caught.value)
+
+
+@given(text=st.text(max_size=12) | st.from_regex(r"[0-9.eE+-]{1,8}[kKmMgGbBits/]{0,6}", fullmatch=True))
+@pytest.mark.parametrize("parse", [parse_bandwidth, parse_latency, parse_count])
+def test_any_text_is_understood_or_refused(parse: Callable[[str], float], text: str) -> None:
+    with contextlib.suppress(ValueError):
+        assert parse(text) >= 0

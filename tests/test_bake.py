@@ -1,0 +1,299 @@
+"""Whatever `build-lod` writes passes `inspect --check --leaves-of` its source, or it is not written at all.
+
+The bakes are made in this process, through files, over scenes at the ends of what formats hold.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import tempfile
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fixtures import by_hand, by_hand_ksplat, by_hand_splat
+from sparklod_cli.bake import Recipe, bake
+from sparklod_cli.codecs import ply, spz
+from sparklod_cli.inspection import leaves, values
+from sparklod_cli.inspection.findings import ERROR, NOTE, Finding
+from sparklod_cli.inspection.report import Wanted, inspect
+from sparklod_cli.io import read_scene
+from sparklod_cli.model.gaussian import normalized_quat
+from sparklod_cli.model.scene import Scene
+from sparklod_cli.model.selection import Selection
+from sparklod_cli.model.sh import COEFFICIENTS
+from sparklod_cli.model.splats import Splats
+from sparklod_cli.support.defaults import ENCODINGS, MAX_FRACTIONAL_BITS, METHODS, SPZ_VERSIONS
+from sparklod_cli.support.errors import InvalidSplatsError, SparklodError
+from sparklod_cli.tables import histograms
+from tests.conftest import FIXTURES, real_scene
+from tests.scenes import random_splats, splat_columns
+
+pytestmark = pytest.mark.filterwarnings("error")
+
+BITS = st.one_of(st.none(), st.integers(0, MAX_FRACTIONAL_BITS))
+
+#: How far coordinates reach; SPZ's end, and float32's.
+REACHES = (
+    0.0,
+    1e-30,
+    1e-6,
+    0.1,
+    1.0,
+    100.0,
+    2047.9998,
+    65_504.0,
+    1e6,
+    8_388_606.0,
+    8_388_607.0,
+    8_388_608.0,
+    1e30,
+    3e38,
+)
+SIZES = (1e-38, 1e-20, 1e-6, 4e-5, 0.01, 1.0, 376.0, 1e5, 1e18, 1e30, 1e38)
+SHAPES = ((1, 1, 1), (1, 1, 0), (1, 0, 0), (1, 1e-4, 1e-4), (1, 0.3, 1e-12))
+OPACITIES = (1e-30, 1e-6, 0.001, 0.002, 0.5, 0.9999999, 1.0)
+COLORS = (0.5, -1e38, 3e38, -0.44, 1.44)
+
+
+@st.composite
+def scenes(draw: st.DrawFn) -> Splats:
+    """Splats of which each column is drawn from a few extremes, with some chance in between."""
+    count, degree = draw(st.sampled_from([1, 2, 3, 20, 60])), draw(st.sampled_from([0, 0, 1, 3]))
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+
+    def some(values: tuple[float, ...], most: int) -> np.ndarray:
+        chosen = draw(st.lists(st.sampled_from(values), min_size=1, max_size=most))
+        return rng.choice(np.array(chosen), count)
+
+    reach = some(REACHES, 2)[:, None]
+    places = {
+        "around": rng.uniform(-1, 1, (count, 3)),
+        "corners": rng.choice([-1.0, 1.0], (count, 3)),
+        "one place": np.ones((count, 3)),
+        "a line": rng.uniform(-1, 1, (count, 1)) * [1, 0, 0],
+    }
+    shape = np.array(SHAPES)[rng.integers(len(SHAPES), size=count)]
+    sh = rng.choice(
+        np.array([0, 0.1, -0.9, draw(st.sampled_from([1.0, 3e38, -1e38]))]), (count, COEFFICIENTS[degree], 3)
+    )
+    # Below float32's largest, which a product may round up to.
+    columns = {
+        "center": np.clip(places[draw(st.sampled_from(sorted(places)))] * reach, -3e38, 3e38),
+        "scale": np.clip(some(SIZES, 3)[:, None] * shape * rng.uniform(0.5, 1, (count, 1)), 0, 1e38),
+        "quat_xyzw": normalized_quat(rng.normal(size=(count, 4))),
+        "opacity": some(OPACITIES, 3),
+        "rgb": np.stack([some(COLORS, 2) for _ in range(3)], axis=1),
+        "sh": sh,
+    }
+    with np.errstate(under="ignore"):
+        return Splats(**{name: np.ascontiguousarray(column, np.float32) for name, column in columns.items()})
+
+
+def write(path: Path, pieces: Iterable[bytes]) -> int:
+    return path.write_bytes(b"".join(pieces))
+
+
+def reported(source: Path) -> None:
+    """Makes everything that `inspect` can say of a file."""
+    report, scene = inspect(source, Wanted(values=True, all_quantities=True, check=True))
+    json.dumps(report.as_dict(), allow_nan=False)
+    assert scene is not None
+    for name in values.names_of(scene.splats):
+        histograms.as_text(histograms.of_quantity(scene.splats, name))
+
+
+def checked(output: Path, source: Path) -> list[Finding]:
+    """What `inspect --check --leaves-of` finds."""
+    report, scene = inspect(output, Wanted(check=True))
+    assert scene is not None
+    return [*(report.findings or []), *leaves.check(scene, read_scene(source))]
+
+
+def findings_of(source: Path, recipe: Recipe) -> list[Finding]:
+    """What it finds in a bake."""
+    with tempfile.TemporaryDirectory() as folder:
+        output = Path(folder, "out.spz")
+        bake(source, lambda pieces: write(output, pieces), recipe)
+        return checked(output, source)
+
+
+def file_of(folder: str | Path, splats: Splats) -> Path:
+    path = Path(folder, "scene.ply")
+    write(path, ply.encode(Scene(splats)))
+    return path
+
+
+def refused(error: SparklodError) -> bool:
+    """Whether it is an error that a person can read: a line."""
+    return bool(str(error)) and "\n" not in str(error)
+
+
+@given(scenes(), st.sampled_from(METHODS), st.sampled_from(SPZ_VERSIONS), BITS)
+@settings(max_examples=300, deadline=None)
+def test_what_is_written_passes_our_own_check(splats: Splats, method: str, version: int, bits: int | None) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        recipe = Recipe(method=method, spz=spz.Options(version=version, fractional_bits=bits))
+        try:
+            found = findings_of(file_of(folder, splats), recipe)
+        except SparklodError as error:
+            assert refused(error)
+        else:
+            assert [each for each in found if each.severity == ERROR] == []
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("bits", [None, *range(MAX_FRACTIONAL_BITS + 1)])
+def test_a_coordinate_is_written_up_to_the_last_but_one_code(bits: int | None, method: str, tmp_path: Path) -> None:
+    """The last code is what writers clamp to, which is what a coordinate that has it is taken for."""
+    step = 2.0 ** -(bits or 0)
+    for code, sign in itertools.product((-1, 0, 1), (1, -1)):
+        splats = random_splats(5)
+        splats.center[:] = 0
+        splats.center[3, 1] = sign * (spz.LAST_CODE + code) * step
+        source = file_of(tmp_path, splats)
+        recipe = Recipe(method=method, spz=spz.Options(fractional_bits=bits))
+        if code < 1:
+            assert [each.code for each in findings_of(source, recipe) if each.severity == ERROR] == []
+        else:
+            with pytest.raises(SparklodError, match=r"does not fit|SPZ holds at most 8388606: scale the scene"):
+                findings_of(source, recipe)
+
+
+@given(scenes(), st.sampled_from(METHODS), st.sampled_from(ENCODINGS))
+@settings(max_examples=100, deadline=None)
+def test_every_encoding_and_every_report_of_an_extreme_scene_is_made_without_a_warning(
+    splats: Splats, method: str, encoding: str
+) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        source, output = file_of(folder, splats), Path(folder, "out")
+        try:
+            bake(source, lambda pieces: write(output, pieces), Recipe(method=method, encoding=encoding))
+        except InvalidSplatsError as error:  # of which none can be seen
+            assert refused(error)
+        reported(source)
+
+
+SPECIAL = np.array([0, -0.0, 1, -1, 1e-45, 1e-38, 1e30, -1e30, 65_519, 65_520, 3.4e38, -3.4e38, np.inf, np.nan])
+
+
+def any_floats(rng: np.random.Generator, count: int, width: int) -> np.ndarray:
+    """(count, width) float32 as damaged files have them: ordinary ones, special ones, and any bits at all."""
+    kinds = rng.choice(3, (count, width), p=[0.9, 0.06, 0.04])
+    bits = rng.integers(0, 2**32, (count, width), np.uint32).view(np.float32)
+    ordinary = rng.normal(size=(count, width)) * 0.1
+    return np.choose(kinds, [ordinary, rng.choice(SPECIAL, (count, width)), bits.astype(np.float64)])
+
+
+def raw_file(rng: np.random.Generator, kind: str) -> bytes:
+    """A file of 40 splats of any numbers."""
+    columns = splat_columns(40, sh_degree=1)
+    if kind == ".ply":
+        for name in columns:
+            columns[name] = any_floats(rng, 40, 1)[:, 0].astype(np.float32)
+        return by_hand.ply(columns)
+    splats = random_splats(40)
+    plain = {"center": splats.center, "scale": any_floats(rng, 40, 3), "quat_wxyz": splats.quat_xyzw}
+    plain |= {"opacity": splats.opacity, "rgb": splats.rgb, "sh": any_floats(rng, 40, 24).reshape(40, 8, 3)}
+    if kind == ".splat":
+        return by_hand_splat.splat(**plain | {"center": any_floats(rng, 40, 3)})
+    return by_hand_ksplat.ksplat(**plain | {"center": any_floats(rng, 40, 3)}, level=0)
+
+
+@given(
+    st.integers(0, 2**32 - 1),
+    st.sampled_from([".ply", ".splat", ".ksplat"]),
+    st.sampled_from(METHODS),
+    st.sampled_from([None, *ENCODINGS]),
+    st.booleans(),
+)
+@settings(max_examples=150, deadline=None)
+def test_any_numbers_are_baked_refused_and_reported_without_a_warning(
+    seed: int, kind: str, method: str, encoding: str | None, drop: bool
+) -> None:
+    with np.errstate(all="ignore"):
+        data = raw_file(np.random.default_rng(seed), kind)
+    with tempfile.TemporaryDirectory() as folder:
+        source, output = Path(folder, f"scene{kind}"), Path(folder, "out.spz")
+        source.write_bytes(data)
+        recipe = Recipe(method=method, encoding=encoding, selection=Selection(drop_invalid=drop))
+        try:
+            bake(source, lambda pieces: write(output, pieces), recipe)
+        except SparklodError as error:
+            assert refused(error)
+        else:
+            if encoding is None:
+                assert [each for each in checked(output, source) if each.severity == ERROR] == []
+        reported(source)
+
+
+#: Scenes that SPZ does not hold, or hardly: how large or how far the splats themselves are is said, of their trees too.
+ODD = {"huge.ply": {"values.center-far", "values.scale-clamped"}}
+SCENES = ("sh0.ply", "sh3.ply", "flat.ply", "needle.ply", "coincident.ply", "one.ply", "demo.ply", *ODD)
+REAL = ("biker.ply", "biker.spz", "playbot-125k.ply", "meadow.sog", "playbot.sog")
+
+
+def passes(source: Path, method: str) -> None:
+    """The law of docs/ci.md: `--check --fail-on warning`."""
+    found = findings_of(source, Recipe(method=method, spz=spz.Options(threads=2)))
+    assert {each.code for each in found if each.severity != NOTE} == ODD.get(source.name, set()), found
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("name", [*SCENES, *REAL])
+def test_bakes_pass_the_recipe_for_ci(name: str, method: str) -> None:
+    passes(real_scene(name) if name in REAL else FIXTURES / name, method)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_bake_of_the_town_passes_the_recipe_for_ci(method: str, tmp_path: Path) -> None:
+    town = read_scene(FIXTURES / "traverse" / "town.spz")
+    assert town.tree is not None
+    passes(file_of(tmp_path, town.splats.take(town.tree.is_leaf)), method)
+
+
+@given(st.integers(2, 300), st.integers(0, 2**32 - 1), st.sampled_from([0.01, 1.0, 30.0]), st.sampled_from(METHODS))
+@settings(max_examples=100, deadline=None)
+def test_bakes_of_random_scenes_pass_the_recipe_for_ci(count: int, seed: int, extent: float, method: str) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        passes(file_of(folder, random_splats(count, seed=seed, extent=extent)), method)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_line_without_width_is_not_what_a_node_stands_for(method: str, tmp_path: Path) -> None:
+    """SPZ gives it a width, after the tree is built."""
+    splats = random_splats(3)
+    splats.scale[:] = [[8e-5, 1e-5, 1e-6], [3e-7, 7e-4, 1e-13], [1e-24, 1e-19, 11]]
+    splats.center[:] = 0
+    passes(file_of(tmp_path, splats), method)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_small_splats_far_apart_are_no_reason_for_a_warning(method: str, tmp_path: Path) -> None:
+    """What is merged of them is larger than SPZ holds, and clamped."""
+    splats = random_splats(4)
+    splats.scale[:] = 0.02
+    splats.center[:] = [[2047.9999, 0, 0], [-2047.9999, 2048, 5], [0, 0, 0], [1, 1, 1]]
+    passes(file_of(tmp_path, splats), method)
+
+
+def faint_and_large(seed: int) -> Splats:
+    """Small opaque splats, and among them needles and balls that are a hundred times as large and hardly seen."""
+    splats = random_splats(400, seed=seed)
+    few = np.arange(400) % 10 == 0
+    splats.scale[few] *= np.float32(100)
+    splats.scale[few[::2].nonzero()[0] * 2, 1:] = 1e-3
+    splats.opacity[few] = 0.004
+    splats.opacity[~few] = 1
+    return splats
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("seed", range(10))
+def test_a_large_splat_that_is_hardly_seen_is_no_reason_for_a_warning(seed: int, method: str, tmp_path: Path) -> None:
+    passes(file_of(tmp_path, faint_and_large(seed)), method)

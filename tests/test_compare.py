@@ -1,0 +1,233 @@
+"""Comparisons of cuts with full detail: laws over their rows, and what becomes of them."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import json
+import math
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sparklod_cli import bake
+from sparklod_cli import io as files
+from sparklod_cli.cameras.camera import Camera
+from sparklod_cli.cameras.path import CameraPath
+from sparklod_cli.cameras.pose import look_at
+from sparklod_cli.commands import render_compare
+from sparklod_cli.commands.console import Console
+from sparklod_cli.compare import (
+    COLUMNS,
+    Comparison,
+    ComparisonSettings,
+    on_background,
+    parse_budgets,
+    rows_of,
+    summarize,
+)
+from sparklod_cli.images.metrics import MOST_PSNR
+from sparklod_cli.lod.traversal import Cones
+from sparklod_cli.model.splats import COLUMNS as ALL
+from sparklod_cli.render.backends import BACKENDS
+from sparklod_cli.render.settings import RasterSettings
+from sparklod_cli.simulation.frames import LodSettings
+from sparklod_cli.support.errors import SparklodError
+from sparklod_cli.tables.columns import Row
+from sparklod_cli.world import Placement, World, read_world
+from tests.conftest import FIXTURES
+
+VIEWER = LodSettings(1, Cones(), pixel_scale_limit=0.0)
+HOW = ComparisonSettings(BACKENDS["numba"].draw, RasterSettings())
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory) -> World:
+    """A few hundred splats with SH, as a tree, twice."""
+    baked = tmp_path_factory.mktemp("compare") / "sh3.spz"
+    bake.bake(FIXTURES / "sh3.ply", lambda pieces: files.write_whole(baked, pieces, overwrite=True), bake.Recipe())
+    there = np.eye(4)
+    there[:3, 3] = 3, 0, 1
+    return read_world([Placement(baked, "here"), Placement(baked, "there", there)], columns=ALL)
+
+
+def path_of(count: int, size: tuple[int, int] = (96, 70)) -> CameraPath:
+    cameras = []
+    for at in range(count):
+        eye = (6 * math.sin(at), -1.0, -6 * math.cos(at))
+        pose = look_at(eye, (1.5, 0, 0.5), (0.0, -1.0, 0.0))
+        cameras.append(Camera(pose, *size, (80.0, 80.0), (size[0] / 2, size[1] / 2), at / 10, f"view, {at}"))
+    return CameraPath(tuple(cameras), "a test", (), tuple(range(5, 5 + count)))
+
+
+def rows(world: World, budgets: str, *, count: int = 3, how: ComparisonSettings = HOW, threads: int = 1) -> list[Row]:
+    return list(Comparison(world, VIEWER, parse_budgets(budgets), how).run(path_of(count), threads=threads))
+
+
+def column(table: list[Row], name: str) -> list[Any]:
+    return [row[name] for row in table]
+
+
+def test_budgets_are_shares_or_counts() -> None:
+    some = parse_budgets("2%, 12.5 %,500k,1000,.5%")
+    assert [budget.text for budget in some] == ["2%", "12.5 %", "500k", "1000", ".5%"]
+    assert [budget.of(8000) for budget in some] == [160, 1000, 500_000, 1000, 40]
+    assert parse_budgets("0.001%")[0].of(10) == 1  # there is always something to draw
+    assert parse_budgets("29%")[0].share == Fraction(29, 100)  # and not 28.999 %
+
+
+@pytest.mark.parametrize("text", ["", ",", "0%", "0", "-5%", "5 percent", "1%5%", "nan%", "2.5", "5%,lots"])
+def test_what_is_no_budget(text: str) -> None:
+    with pytest.raises(ValueError, match=r"budget|neither|nothing"):
+        parse_budgets(text)
+
+
+def test_all_splats_are_full_detail(world: World) -> None:
+    for row in rows(world, "100%,150%,1M"):
+        assert row["psnr_black"] == row["psnr_white"] == row["psnr"] == row["worst_tile_psnr"] == MOST_PSNR
+        assert row["ssim_black"] == row["ssim_white"] == row["ssim"] == 1
+    for row in rows(world, "100%", how=dataclasses.replace(HOW, width=1.25)):
+        assert (row["psnr"], row["ssim"]) == (MOST_PSNR, 1)
+
+
+def test_more_splats_come_nearer_to_it(world: World) -> None:
+    table = rows(world, "5%,15%,40%,80%")
+    for name in ("psnr", "ssim"):
+        means = [np.mean(column(group, name)) for group in rows_of(table, parse_budgets("1%,1%,1%,1%"))]
+        assert means == sorted(means)
+        assert means[0] < means[-1]
+    assert 5 < min(column(table, "psnr")) < max(column(table, "psnr")) < MOST_PSNR
+
+
+@pytest.mark.parametrize("width", [None, 1.25])
+def test_rows_tell_what_was_drawn(world: World, width: float | None) -> None:
+    table = rows(world, "10%,50%", how=dataclasses.replace(HOW, width=width))
+    leaves = Comparison(world, VIEWER, parse_budgets("10%"), HOW).leaves
+    assert column(table, "frame") == [5, 5, 6, 6, 7, 7]
+    assert column(table, "name")[::2] == ["view, 0", "view, 1", "view, 2"]
+    assert column(table, "budget") == [leaves // 10, leaves // 2] * 3
+    for row in table:
+        assert list(row) == [each.name for each in COLUMNS]
+        budget, selected, psnr = (row[name] for name in ("budget", "selected", "psnr"))
+        assert isinstance(budget, int) and isinstance(selected, int) and isinstance(psnr, float)
+        assert selected <= budget if width is None else budget <= selected <= 4 * budget
+        assert psnr == pytest.approx(np.mean([row["psnr_black"], row["psnr_white"]]), abs=1e-3)
+        assert row["ssim"] == pytest.approx(np.mean([row["ssim_black"], row["ssim_white"]]), abs=1e-5)
+        assert row["worst_tile_psnr"] <= min(row["psnr_black"], row["psnr_white"]) + 1e-3
+        assert row["worst_tile_x"] in (0, 64) and row["worst_tile_y"] in (0, 64)
+
+
+def test_the_same_for_any_number_of_threads(world: World) -> None:
+    assert rows(world, "10%,50%", threads=1) == rows(world, "10%,50%", threads=3)
+
+
+def test_spherical_harmonics_can_be_left_out(world: World) -> None:
+    plain = dataclasses.replace(HOW, max_sh=0)
+    assert rows(world, "100%", count=1, how=plain)[0]["psnr"] == MOST_PSNR
+    assert rows(world, "10%", count=1, how=plain) != rows(world, "10%", count=1)
+
+
+def test_a_pixel_limit_ends_cuts_early(world: World) -> None:
+    coarse = Comparison(world, dataclasses.replace(VIEWER, pixel_scale_limit=0.3), parse_budgets("100%"), HOW)
+    (row,) = coarse.run(path_of(1))
+    assert row["selected"] < row["budget"]  # type: ignore[operator]
+    assert row["psnr"] < 60  # type: ignore[operator]
+
+
+def test_a_budget_holds_the_roots(world: World) -> None:
+    with pytest.raises(SparklodError, match="a budget of 1 is less than one splat for each of 2 instances"):
+        Comparison(world, VIEWER, parse_budgets("50%,1"), HOW)
+
+
+def test_a_picture_lies_over_its_background_and_is_clamped() -> None:
+    image = np.array([[[0.2, 0.1, 0.0, 0.5], [0.0, 0.0, 0.0, 0.0], [1.2, 0.5, 0.5, 1.0]]], np.float32)
+    np.testing.assert_allclose(on_background(image, 0.0), [[[0.2, 0.1, 0], [0, 0, 0], [1, 0.5, 0.5]]], atol=1e-7)
+    np.testing.assert_allclose(on_background(image, 1.0), [[[0.7, 0.6, 0.5], [1, 1, 1], [1, 0.5, 0.5]]], atol=1e-7)
+
+
+def test_summaries_are_by_budget(world: World) -> None:
+    budgets = parse_budgets("10%,50%")
+    table = rows(world, "10%,50%")
+    for at, each in enumerate(summarize(table, budgets)):
+        mine = table[at::2]
+        assert (each.text, each.frames, each.budget) == (budgets[at].text, 3, mine[0]["budget"])
+        assert each.psnr == pytest.approx(np.mean(column(mine, "psnr")))
+        assert (each.psnr_min, each.psnr_max) == (min(column(mine, "psnr")), max(column(mine, "psnr")))
+        assert each.ssim_min == min(column(mine, "ssim"))
+        (worst,) = [row for row in mine if row["worst_tile_psnr"] == each.worst_tile_psnr]
+        assert (each.worst_frame, each.worst_tile_x) == (worst["frame"], worst["worst_tile_x"])
+
+
+def run(
+    world: World, capsys: pytest.CaptureFixture[str], budgets: str = "10%,50%", **given: Any
+) -> tuple[int, str, str]:
+    settings = {"asserts": (), "plot": None, "overwrite": False, "output": None, "as_json": False} | given
+    wanted = render_compare.wanted_from(
+        settings, parse_budgets(budgets), output=settings["output"], as_json=settings["as_json"]
+    )
+    with Console(quiet=False, verbose=False) as console:
+        status = render_compare.run(console, world, LodSettings(1, Cones()), path_of(2), HOW, wanted, threads=1)
+    said = capsys.readouterr()
+    return status, said.out, said.err
+
+
+def test_the_table_goes_to_standard_output(world: World, capsys: pytest.CaptureFixture[str]) -> None:
+    status, out, err = run(world, capsys)
+    lines = out.splitlines()
+    assert status == 0
+    assert lines[0] == ",".join(column.name for column in COLUMNS)
+    assert len(lines) == 1 + 2 * 2
+    assert [line.split()[0] for line in err.splitlines()] == ["2", "budget", "10%", "50%"]
+    assert max(map(len, err.splitlines())) <= 100
+
+
+def test_json_is_the_summary(world: World, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    target = tmp_path / "table.json"
+    status, out, _ = run(world, capsys, as_json=True, output=target, asserts=("psnr_min>1", "50%: ssim_min > 2"))
+    summary = json.loads(out)
+    assert status == 3
+    assert [each["text"] for each in summary["budgets"]] == ["10%", "50%"]
+    assert [each["held"] for each in summary["asserts"]] == [True, False]
+    assert len(json.loads(target.read_text())["data"]) == 4
+
+
+def test_assertions_are_of_all_budgets_or_of_one(world: World, capsys: pytest.CaptureFixture[str]) -> None:
+    table = rows(world, "10%,50%", count=2)
+    coarse, fine = (min(column(group, "psnr")) for group in rows_of(table, parse_budgets("1%,1%")))
+    between = (coarse + fine) / 2
+    assert run(world, capsys, asserts=(f"50%:psnr_min>{between}",))[0] == 0
+    status, _, err = run(world, capsys, asserts=(f"psnr_min>{between}",))
+    assert status == 3
+    assert "psnr_min is" in err and f"at a budget of {table[0]['budget']}" in err
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("7%:psnr>1", "7% is not one of the budgets, 10%, 50%"),
+        ("psnrr>1", "no column 'psnrr', did you mean psnr"),
+        ("churn<1", "no column 'churn'"),
+    ],
+)
+def test_assertions_about_what_is_not_there(
+    world: World, capsys: pytest.CaptureFixture[str], text: str, message: str
+) -> None:
+    import click
+
+    with pytest.raises(click.UsageError, match=message):
+        run(world, capsys, asserts=(text,))
+
+
+def test_a_chart_of_a_comparison_is_a_picture(world: World, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib", reason="charts need the extra `render`")
+    target = tmp_path / "plot.png"
+    assert run(world, capsys, "5%,20%,500k", plot=target)[0] == 0
+    image = Image.open(io.BytesIO(target.read_bytes()))
+    assert image.size[0] == 1600
+    assert len(set(np.asarray(image.convert("RGB")).reshape(-1, 3)[::7].sum(axis=1).tolist())) > 20
+    run(world, capsys, "5%,20%,500k", plot=target, overwrite=True)
+    assert image.tobytes() == Image.open(target).tobytes()

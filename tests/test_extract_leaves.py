@@ -1,0 +1,107 @@
+"""The way back from a tree: its leaves, all of them, with the values of its file."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sparklod_cli.cli import run
+from sparklod_cli.codecs import spz
+from sparklod_cli.codecs.splat import importance_order
+from sparklod_cli.io import read_scene
+from sparklod_cli.lod import quick
+from sparklod_cli.model.scene import Scene
+from sparklod_cli.model.splats import COLUMNS, Splats
+from tests.conftest import FIXTURES
+from tests.scenes import random_splats
+
+
+@pytest.fixture
+def tree_file(tmp_path: Path) -> Path:
+    path = tmp_path / "scene-lod.spz"
+    scene = Scene(*quick.build(random_splats(3000, sh_degree=2)), antialiased=True)
+    path.write_bytes(b"".join(spz.encode(scene, spz.Options(version=2, fractional_bits=9))))
+    return path
+
+
+def unlod(*arguments: object) -> int:
+    return run(["build-lod", "--unlod", *map(str, arguments)])
+
+
+def leaves(path: Path) -> Splats:
+    scene = read_scene(path)
+    assert scene.tree is not None
+    return scene.splats.take(scene.tree.is_leaf)
+
+
+def test_spz_keeps_every_value_of_the_tree(tree_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert unlod(tree_file, "--json") == 0
+    record = json.loads(capsys.readouterr().out)
+    back = read_scene(tree_file.with_name("scene-unlod.spz"))
+    expected = leaves(tree_file)
+    assert (back.format, back.antialiased, back.tree) == ("SPZ 2", True, None)
+    assert (record["splats"], record["nodes"]) == (3000, len(read_scene(tree_file).splats))
+    assert back.header["fractional_bits"] == 9
+    for column in ("center", "scale", "rgb", "sh"):
+        np.testing.assert_array_equal(getattr(back.splats, column), getattr(expected, column), column)
+    # 127 steps of opacity become 255, and a rotation may fall on the other side of a rounding.
+    np.testing.assert_allclose(back.splats.opacity, expected.opacity, atol=1.001 / 510)
+    assert np.abs(np.einsum("ij,ij->i", back.splats.quat_xyzw, expected.quat_xyzw)).min() > 1 - 1e-4
+
+
+def test_ply_keeps_them_as_floats(tree_file: Path, tmp_path: Path) -> None:
+    assert unlod(tree_file, "-o", tmp_path / "back.ply") == 0
+    back, expected = read_scene(tmp_path / "back.ply"), leaves(tree_file)
+    assert back.format == "PLY"
+    for column in COLUMNS:
+        np.testing.assert_allclose(getattr(back.splats, column), getattr(expected, column), rtol=1e-5, atol=1e-6)
+
+
+def test_splat_is_sorted_by_importance(tree_file: Path, tmp_path: Path) -> None:
+    assert unlod(tree_file, "-o", tmp_path / "back.splat") == 0
+    expected = leaves(tree_file)
+    expected = expected.take(importance_order(expected))
+    np.testing.assert_array_equal(read_scene(tmp_path / "back.splat").splats.center, expected.center)
+
+
+def test_other_bits_and_versions_can_be_had(tree_file: Path, tmp_path: Path) -> None:
+    assert unlod(tree_file, "-o", tmp_path / "back.spz", "--spz-version", 3, "--fractional-bits", 8) == 0
+    back = read_scene(tmp_path / "back.spz")
+    assert (back.header["version"], back.header["fractional_bits"]) == (3, 8)
+
+
+def test_leaves_that_cannot_be_drawn_are_written_too(tmp_path: Path) -> None:
+    splats = random_splats(50)
+    splats.opacity[:10] = 1e-4  # becomes 0 in the file
+    scene = Scene(*quick.build(splats))
+    (tmp_path / "scene-lod.spz").write_bytes(b"".join(spz.encode(scene, spz.Options())))
+    assert unlod(tmp_path / "scene-lod.spz") == 0
+    assert len(read_scene(tmp_path / "scene-unlod.spz").splats) == 50
+
+
+def test_what_is_no_tree_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert unlod(FIXTURES / "one.ply", "--output-dir", tmp_path) == 1
+    assert "it has no Level-of-Detail tree that could be undone" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--base", "1.2"], "--base is of no use with --unlod"),
+        (["--method", "quick"], "--method is of no use with --unlod"),
+        (["--growth", "1.2"], "--growth is of no use with --unlod"),
+        (["--rgba", "c.npy"], "--rgba is of no use with --unlod"),
+        (["--encoding", "ext"], "--encoding is of no use with --unlod"),
+        (["-o", "x.sog"], "--unlod writes .spz, .ply, .splat, not .sog"),
+        (["-o", "x.ply", "--spz-version", "2"], "--spz-version is of SPZ, not of .ply"),
+    ],
+)
+def test_options_that_do_not_suit_unlod_are_refused(
+    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert unlod("scene-lod.spz", *arguments) == 2
+    assert message in capsys.readouterr().err
