@@ -18,6 +18,7 @@ from scenes import load, tiled, write_ply
 
 from sparklod_cli.bake import BUILDERS
 from sparklod_cli.codecs import spz
+from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.support import jit
 from sparklod_cli.support.defaults import METHODS
@@ -88,8 +89,8 @@ def whole_command(path: Path, output: Path, method: str) -> dict[str, float]:
 
 def plain_bytes(path: Path, bits: int) -> int:
     """Size of the plain SPZ of the same splats, of the same version, level and fractional bits, in their own order."""
-    options = spz.Options(fractional_bits=bits, threads=processors())
-    return sum(len(piece) for piece in spz.encode(Scene(load(path)), options))
+    pieces = spz.encode(Scene(load(path)), WriteOptions(fractional_bits=bits), threads=processors())
+    return sum(map(len, pieces))
 
 
 def spark(path: Path, runs: int) -> list[float]:

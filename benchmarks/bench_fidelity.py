@@ -205,7 +205,7 @@ def ours(splats: Splats, method: str, arguments: argparse.Namespace) -> Built:
 
 def as_written(scene: Scene) -> tuple[Splats, LodTree]:
     """A tree after its coding as SPZ, with the options of `build-lod`."""
-    data = b"".join(spz.encode(scene, spz.Options(threads=processors())))
+    data = b"".join(spz.encode(scene, threads=processors()))
     held = spz.decode(io.BytesIO(data), threads=processors())
     assert held.tree is not None
     return held.splats, held.tree

@@ -79,7 +79,7 @@ def bake(source: Splats, nodes: int, path: Path) -> tuple[int, int]:
     growth = len(quick.build(tiled(source.with_max_sh(0), sample))[1]) / sample
     leaves = round(nodes / growth)
     splats, tree = quick.build(tiled(source, leaves))
-    write_whole(path, spz.encode(Scene(splats, tree), spz.Options(threads=processors())), overwrite=True)
+    write_whole(path, spz.encode(Scene(splats, tree), threads=processors()), overwrite=True)
     return leaves, len(tree)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from .codecs import clamps, spz
 from .codecs.gpu import dump
+from .codecs.options import WriteOptions
 from .io import Sink, read_rgba, read_scene
 from .lod import quality, quick
 from .model.scene import Scene
@@ -35,9 +36,10 @@ class Recipe:
         max_sh: SH degrees above this are left out.
         selection: which splats to keep.
         rgba: a file of colours and opacities that take the place of the splats' own, see `io.read_rgba`.
-        encoding: one of `defaults.ENCODINGS`, to write the arrays of that instead of SPZ.
+        encoding: one of `codecs.gpu.table.ENCODINGS`, to write the arrays of that instead of SPZ.
         raw: write their words alone, rather than as .npz.
-        spz: how to write SPZ, and on how many threads to work.
+        spz: how to write SPZ.
+        threads: to work on.
     """
 
     method: str = METHODS[0]
@@ -48,7 +50,8 @@ class Recipe:
     rgba: Path | None = None
     encoding: str | None = None
     raw: bool = False
-    spz: spz.Options = field(default_factory=spz.Options)
+    spz: WriteOptions = field(default_factory=WriteOptions)
+    threads: int = 1
 
 
 @dataclass(frozen=True)
@@ -100,7 +103,7 @@ def bake(source: Path, write: Sink, recipe: Recipe, *, progress: Progress = sile
 
 
 def _bake(source: Path, write: Sink, recipe: Recipe, progress: Progress) -> Baked:
-    threads = recipe.spz.threads
+    threads = recipe.threads
     start = time.perf_counter()
     scene = read_scene(source, threads=threads, progress=progress)
     if scene.tree is not None:
@@ -111,24 +114,23 @@ def _bake(source: Path, write: Sink, recipe: Recipe, progress: Progress) -> Bake
     antialiased, name, notes = scene.antialiased, scene.format, scene.notes
     count, degree = len(kept), kept.sh_degree
     # Before building, so that what does not fit is said at once.
-    bits = None if recipe.encoding else spz.fractional_bits(kept, recipe.spz)
+    if not recipe.encoding:
+        spz.settled(Scene(kept), recipe.spz)
     # The builder frees its input as it goes, if nobody else holds it: a third of the peak.
     handed_over = [kept]
     del scene, kept
     builder, setting = BUILDERS[recipe.method]
     nodes, tree = builder.build(handed_over.pop(), getattr(recipe, setting), progress=progress)
-    if bits is not None and recipe.spz.fractional_bits is None:
-        # The quality builder's nodes may lie a little outside of the box of the splats.
-        bits = min(bits, spz.largest_fractional_bits(nodes.center))
     levels = int(tree.depths().max()) + 1
     build_done = time.perf_counter()
     output = Scene(nodes, tree, antialiased)
     arrays = dump.pack(output, recipe.encoding, threads) if recipe.encoding else {}
-    if arrays:
+    options = None if arrays else spz.settled(output, recipe.spz)
+    if options is None:
         size = write(dump.encode_raw(arrays) if recipe.raw else dump.encode_npz(arrays))
     else:
-        size = write(spz.encode(output, dataclasses.replace(recipe.spz, fractional_bits=bits), progress=progress))
-    clamped = {} if arrays else spz.clamped(nodes, threads)
+        size = write(spz.encode(output, options, threads=threads, progress=progress))
+    clamped = {} if arrays else clamps.clamped(nodes, threads)
     ends = tuple(clamps.clamps(nodes, clamped))
     seconds = {
         "read": read_done - start,
@@ -145,8 +147,8 @@ def _bake(source: Path, write: Sink, recipe: Recipe, progress: Progress) -> Bake
         nodes=len(nodes),
         levels=levels,
         bytes=size,
-        version=None if arrays else recipe.spz.version,
-        fractional_bits=bits,
+        version=None if options is None else options.spz_version,
+        fractional_bits=None if options is None else options.fractional_bits,
         arrays={array: words.shape for array, words in arrays.items()},
         clamped=clamped,
         clamps=ends,

@@ -25,6 +25,7 @@ COMMANDS = {
     "traverse": "Simulate what a viewer draws along a camera path.",
     "render": "Draw pictures of splat files, and compare them.",
     "warmup": "Compile all kernels ahead of the first run.",
+    "doctor": "Check the installation, and say what to do.",
     "help": "Print the help of a command.",
 }
 

@@ -5,15 +5,16 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from .codecs import ply, splat, spz
+from .codecs.formats import WRITABLE
+from .codecs.options import WriteOptions
+from .codecs.spz_options import like
 from .io import Sink, read_scene
 from .model.scene import Scene
-from .support.defaults import DEFAULT_COMPRESSION, PLAIN_SUFFIXES, SPZ_VERSIONS
 from .support.errors import FormatError, memory_told
 from .support.progress import Progress, silent
 
@@ -23,16 +24,13 @@ class Target:
     """How to write.
 
     Attributes:
-        suffix: one of `defaults.PLAIN_SUFFIXES`.
-        version, fractional_bits: of SPZ; None takes those of the input, which keeps its values as they are.
-        compression_level: of SPZ.
+        suffix: one of `formats.WRITABLE`.
+        options: of the file; what is None is taken from the input, which keeps its values as they are.
         threads: to work on.
     """
 
     suffix: str = ".spz"
-    version: int | None = None
-    fractional_bits: int | None = None
-    compression_level: int = DEFAULT_COMPRESSION
+    options: WriteOptions = field(default_factory=WriteOptions)
     threads: int = 1
 
 
@@ -90,16 +88,8 @@ def _unlod(source: Path, write: Sink, target: Target, progress: Progress) -> Unb
 
 
 def _encode(scene: Scene, target: Target, progress: Progress) -> Iterator[bytes]:
-    if target.suffix not in PLAIN_SUFFIXES:
-        raise ValueError(f"{target.suffix} is not one of {PLAIN_SUFFIXES}")
-    if target.suffix != ".spz":
-        codec = {".ply": ply, ".splat": splat}[target.suffix]
-        return codec.encode(scene, threads=target.threads, progress=progress)
-    version = target.version or scene.header["version"]
-    options = spz.Options(
-        version=version if version in SPZ_VERSIONS else max(SPZ_VERSIONS),
-        fractional_bits=scene.header["fractional_bits"] if target.fractional_bits is None else target.fractional_bits,
-        compression_level=target.compression_level,
-        threads=target.threads,
-    )
-    return spz.encode(scene, options, progress=progress)
+    if target.suffix not in WRITABLE:
+        raise ValueError(f"{target.suffix} is not one of {', '.join(WRITABLE)}")
+    codec, options = WRITABLE[target.suffix].codec(), like(scene, target.options)
+    pieces: Iterator[bytes] = codec.encode(scene, options, threads=target.threads, progress=progress)
+    return pieces

@@ -82,7 +82,7 @@ JOBS = {
     ),
     "render": Job(
         (
-            *("bands.count_fragments", "bands.draw_discs", "cut.find_cut", "cut_statistics.measure", "project.arrange"),
+            *("bands.count_fragments", "bands.draw_discs", "cut.find_cut", "project.arrange"),
             *("project.project", "raster.draw_tiles", "raster.sort_into_tiles"),
         ),
         (
@@ -199,4 +199,4 @@ def _write_inputs(folder: Path) -> None:
     children[0], starts[0] = count, 1
     tree = Scene(root, LodTree(children, starts))
     write_whole(folder / "scene.ply", ply.encode(Scene(leaves)), overwrite=True)
-    write_whole(folder / "tree.spz", spz.encode(tree, spz.Options()), overwrite=True)
+    write_whole(folder / "tree.spz", spz.encode(tree), overwrite=True)

@@ -18,7 +18,9 @@ from hypothesis import strategies as st
 
 from fixtures import by_hand, by_hand_ksplat, by_hand_splat
 from sparklod_cli.bake import Recipe, bake
-from sparklod_cli.codecs import ply, spz
+from sparklod_cli.codecs import ply, spz_options
+from sparklod_cli.codecs.gpu.table import ENCODINGS
+from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.inspection import leaves, values
 from sparklod_cli.inspection.findings import ERROR, NOTE, Finding
 from sparklod_cli.inspection.report import Wanted, inspect
@@ -28,7 +30,7 @@ from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.selection import Selection
 from sparklod_cli.model.sh import COEFFICIENTS
 from sparklod_cli.model.splats import Splats
-from sparklod_cli.support.defaults import ENCODINGS, MAX_FRACTIONAL_BITS, METHODS, SPZ_VERSIONS
+from sparklod_cli.support.defaults import MAX_FRACTIONAL_BITS, METHODS, SPZ_VERSIONS
 from sparklod_cli.support.errors import InvalidSplatsError, SparklodError
 from sparklod_cli.tables import histograms
 from tests.conftest import FIXTURES, real_scene
@@ -105,7 +107,7 @@ def reported(source: Path) -> None:
     json.dumps(report.as_dict(), allow_nan=False)
     assert scene is not None
     for name in values.names_of(scene.splats):
-        histograms.as_text(histograms.of_quantity(scene.splats, name))
+        histograms.as_text(values.histogram_of(scene.splats, name))
 
 
 def checked(output: Path, source: Path) -> list[Finding]:
@@ -138,7 +140,7 @@ def refused(error: SparklodError) -> bool:
 @settings(max_examples=300, deadline=None)
 def test_what_is_written_passes_our_own_check(splats: Splats, method: str, version: int, bits: int | None) -> None:
     with tempfile.TemporaryDirectory() as folder:
-        recipe = Recipe(method=method, spz=spz.Options(version=version, fractional_bits=bits))
+        recipe = Recipe(method=method, spz=WriteOptions(spz_version=version, fractional_bits=bits))
         try:
             found = findings_of(file_of(folder, splats), recipe)
         except SparklodError as error:
@@ -155,9 +157,9 @@ def test_a_coordinate_is_written_up_to_the_last_but_one_code(bits: int | None, m
     for code, sign in itertools.product((-1, 0, 1), (1, -1)):
         splats = random_splats(5)
         splats.center[:] = 0
-        splats.center[3, 1] = sign * (spz.LAST_CODE + code) * step
+        splats.center[3, 1] = sign * (spz_options.LAST_CODE + code) * step
         source = file_of(tmp_path, splats)
-        recipe = Recipe(method=method, spz=spz.Options(fractional_bits=bits))
+        recipe = Recipe(method=method, spz=WriteOptions(fractional_bits=bits))
         if code < 1:
             assert [each.code for each in findings_of(source, recipe) if each.severity == ERROR] == []
         else:
@@ -165,7 +167,7 @@ def test_a_coordinate_is_written_up_to_the_last_but_one_code(bits: int | None, m
                 findings_of(source, recipe)
 
 
-@given(scenes(), st.sampled_from(METHODS), st.sampled_from(ENCODINGS))
+@given(scenes(), st.sampled_from(METHODS), st.sampled_from(list(ENCODINGS)))
 @settings(max_examples=100, deadline=None)
 def test_every_encoding_and_every_report_of_an_extreme_scene_is_made_without_a_warning(
     splats: Splats, method: str, encoding: str
@@ -240,7 +242,7 @@ REAL = ("biker.ply", "biker.spz", "playbot-125k.ply", "meadow.sog", "playbot.sog
 
 def passes(source: Path, method: str) -> None:
     """The law of docs/ci.md: `--check --fail-on warning`."""
-    found = findings_of(source, Recipe(method=method, spz=spz.Options(threads=2)))
+    found = findings_of(source, Recipe(method=method, threads=2))
     assert {each.code for each in found if each.severity != NOTE} == ODD.get(source.name, set()), found
 
 

@@ -10,6 +10,7 @@ import pytest
 
 from sparklod_cli.cli import run
 from sparklod_cli.codecs import spz
+from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.codecs.splat import importance_order
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod import quick
@@ -23,7 +24,7 @@ from tests.scenes import random_splats
 def tree_file(tmp_path: Path) -> Path:
     path = tmp_path / "scene-lod.spz"
     scene = Scene(*quick.build(random_splats(3000, sh_degree=2)), antialiased=True)
-    path.write_bytes(b"".join(spz.encode(scene, spz.Options(version=2, fractional_bits=9))))
+    path.write_bytes(b"".join(spz.encode(scene, WriteOptions(spz_version=2, fractional_bits=9))))
     return path
 
 
@@ -77,7 +78,7 @@ def test_leaves_that_cannot_be_drawn_are_written_too(tmp_path: Path) -> None:
     splats = random_splats(50)
     splats.opacity[:10] = 1e-4  # becomes 0 in the file
     scene = Scene(*quick.build(splats))
-    (tmp_path / "scene-lod.spz").write_bytes(b"".join(spz.encode(scene, spz.Options())))
+    (tmp_path / "scene-lod.spz").write_bytes(b"".join(spz.encode(scene)))
     assert unlod(tmp_path / "scene-lod.spz") == 0
     assert len(read_scene(tmp_path / "scene-unlod.spz").splats) == 50
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from sparklod_cli.support.defaults import ENCODINGS, MAX_BASE, MAX_GROWTH, METHODS, MIN_BASE, MIN_GROWTH
+from sparklod_cli.codecs.gpu.table import ENCODINGS
+from sparklod_cli.support.defaults import MAX_BASE, MAX_GROWTH, METHODS, MIN_BASE, MIN_GROWTH
 
 from .. import laws, scenes
 from ..case import Case, LawError, Rng
@@ -27,7 +28,7 @@ def make(rng: Rng) -> Case:
     output = "baked.spz"
     if rng.integers(4) == 0:
         output = pick(rng, ("baked.npz", "baked.bin"))
-        options += ["--encoding", pick(rng, ENCODINGS)]
+        options += ["--encoding", pick(rng, tuple(ENCODINGS))]
     else:
         options += ["--spz-version", pick(rng, ("2", "3"))]
         if rng.integers(3) == 0:

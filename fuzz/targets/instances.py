@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sparklod_cli.world_file import read_placements
+from sparklod_cli.scenes.instances_file import read_instances
 
 from ..case import Case, LawError, Rng
 from ..command import command
@@ -41,6 +41,6 @@ def check(case: Case, folder: Path) -> None:
     if arguments:
         command([arguments[0], "--scene", "scene.json", *arguments[1:]])
         return
-    for place in read_placements(Path("scene.json")):
+    for place in read_instances(Path("scene.json")):
         if not np.isfinite(place.object_to_world).all():
             raise LawError(f"an instance that cannot be drawn: {place!r:.200}")

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from typing import Any, TypeVar
+from collections.abc import Sequence
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..model.splats import Splats
-from ..render.settings import RasterSettings
+from ..model.balls import Balls
 from ..support.defaults import FARTHEST
 from ..support.errors import InvalidSplatsError
 from .camera import Camera, Matrix
@@ -30,9 +28,6 @@ OUTSIDE = 3.0
 #: So many splats are looked at; more make no difference that could be seen.
 SAMPLE = 1 << 18
 
-#: How far out a splat is seen, in standard deviations: there it has an eighth of its opacity left.
-SEEN = 2.0
-
 #: The share of the picture's width, or height, that is filled.
 FILLED = 0.92
 
@@ -46,45 +41,6 @@ STEPS = 1e-6
 CAMERAS = 64
 
 Item = TypeVar("Item")
-
-
-@dataclass(frozen=True)
-class Balls:
-    """What splats cover, a ball each; N of them.
-
-    Attributes:
-        center: (N, 3) float64 world units.
-        radius: (N,) float64 world units.
-    """
-
-    center: Matrix
-    radius: Matrix
-
-    def take(self, index: NDArray[np.bool_]) -> Balls:
-        """Some of them, of a mask (N,)."""
-        return Balls(self.center[index], self.radius[index])
-
-
-def balls_of(splats: Splats, index: NDArray[Any] | slice, object_to_world: Matrix) -> Balls:
-    """What some splats cover where they stand; those without finite numbers are left out.
-
-    Args:
-        splats: that they are of.
-        index: which of them.
-        object_to_world: (4, 4) a rotation, a uniform scale and a translation.
-    """
-    with np.errstate(all="ignore"):
-        center = splats.center[index].astype(np.float64) @ object_to_world[:3, :3].T + object_to_world[:3, 3]
-        times = SEEN * float(np.cbrt(np.linalg.det(object_to_world[:3, :3])))
-        radius = times * splats.scale[index].max(axis=1, initial=0).astype(np.float64)
-        finite = np.isfinite(center).all(axis=1) & np.isfinite(radius)
-    return Balls(center[finite], radius[finite])
-
-
-def together(parts: Iterable[Balls]) -> Balls:
-    """All balls of several."""
-    every = list(parts)
-    return Balls(np.concatenate([part.center for part in every]), np.concatenate([part.radius for part in every]))
 
 
 def framing(center: NDArray[np.floating]) -> tuple[NDArray[np.float64], float]:
@@ -191,9 +147,14 @@ def some(cameras: Sequence[Item]) -> Sequence[Item]:
     return cameras[:: -(-len(cameras) // CAMERAS)]
 
 
-def with_reach(look: RasterSettings, cameras: Sequence[Camera], scene: Balls) -> RasterSettings:
-    """A look that leaves nothing out of a scene, however small or large it is, because of near and far."""
-    near, far = look.near, look.far
+def reach(near: float, far: float, cameras: Sequence[Camera], scene: Balls) -> tuple[float, float]:
+    """Near and far distances, moved apart where they would leave out a part of a scene that cameras look at.
+
+    Args:
+        near, far: along the axis of a camera, world units.
+        cameras: that look at the scene.
+        scene: all that its splats cover.
+    """
     sample = scene.center[:: max(len(scene.center) // SAMPLE, 1)]
     corners = np.stack([scene.center.min(axis=0), scene.center.max(axis=0)])
     largest = float(scene.radius.max())
@@ -201,4 +162,4 @@ def with_reach(look: RasterSettings, cameras: Sequence[Camera], scene: Balls) ->
         away = np.linalg.norm(sample - camera.position, axis=1)
         farthest = float(np.linalg.norm(np.abs(corners - camera.position).max(axis=0)))
         near, far = min(near, float(np.median(away)) / 100), max(far, 2 * (farthest + largest))
-    return dataclasses.replace(look, near=near, far=min(far, FARTHEST))
+    return near, min(far, FARTHEST)

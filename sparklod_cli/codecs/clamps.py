@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..model.splats import Splats
+from ..model.splats import FloatArray, Splats
+from ..support.parallel import chunks_of, ordered_map
 from . import quantize
 
 
@@ -30,12 +31,26 @@ class Clamp:
     farthest: float
 
 
+def clamped(splats: Splats, threads: int = 1) -> dict[str, int]:
+    """How many splats have a value that its code cannot hold, by the column (scale, rgb, sh) where there are any."""
+    counts = {}
+    for name, (low, high) in quantize.CLAMPS.items():
+        column = getattr(splats, name).reshape(len(splats), -1)
+
+        def outside(part: slice, column: FloatArray = column, low: float = low, high: float = high) -> int:
+            values = column[part]
+            return int(np.count_nonzero(((values < low) | (values > high)).any(axis=1)))
+
+        counts[name] = sum(ordered_map(outside, chunks_of(len(splats)), threads))
+    return {name: count for name, count in counts.items() if count}
+
+
 def clamps(splats: Splats, columns: Iterable[str]) -> list[Clamp]:
     """Which ends of their codes values lie beyond.
 
     Args:
         splats: as they are written.
-        columns: of `Splats`, those that `spz.clamped` found some in.
+        columns: of `Splats`, those that `clamped` found some in.
     """
     found = []
     for name in columns:

@@ -78,7 +78,7 @@ def _within(bounds: FloatArray | None, part: slice, unit: FloatArray) -> FloatAr
     # A run of rows begins with a chunk: it has 16,384 of them, as the four words of a splat alone are 16 bytes.
     of_chunks = bounds[part.start // CHUNK_SPLATS : -(-part.stop // CHUNK_SPLATS)]
     low, high = np.split(np.repeat(of_chunks, CHUNK_SPLATS, axis=0)[: len(unit)], 2, axis=1)
-    return low * (1 - unit) + high * unit
+    return quantize.between(unit, low, high)
 
 
 def _rows(file: BinaryIO, header: Header, name: str) -> Iterator[tuple[slice, NDArray[Any]]]:

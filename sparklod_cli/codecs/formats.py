@@ -18,6 +18,9 @@ class Format:
     Attributes:
         name: for people.
         module: in this package; has `decode(file, *, threads, progress) -> Scene`.
+        writable: its module also has `encode(scene, options, *, threads, progress) -> Iterator[bytes]`, and
+            `settled(scene, options) -> WriteOptions`, the options with nothing left open, which raises `FormatError`
+            where the scene cannot be written.
         suffixes: lower case, with the dot.
         beginning: a regular expression that the first bytes of its files match; None where they can be anything, and
             only the suffix tells.
@@ -30,6 +33,7 @@ class Format:
     module: str
     suffixes: tuple[str, ...]
     beginning: bytes | None
+    writable: bool = False
     companions: bool = False
     selective: bool = False
 
@@ -51,14 +55,17 @@ FORMATS = (
         (".ply",),
         rb"ply\s(?:(?!end_header).)*[\r\n]\s*property\s+\w+\s+packed_position\s",
     ),
-    Format("PLY", "ply", (".ply",), rb"ply[\r\n]"),
-    Format("SPZ", "spz", (".spz",), rb"\x1f\x8b\x08[\0-\x1f]|NGSP", selective=True),  # gzipped up to version 3
-    Format(
-        "SOG", "sog", (".sog", ".json"), rb"PK\x03\x04|\s*\{\s*\"\w+\"\s*:", companions=True
-    ),  # a zip, or its meta.json unpacked
+    Format("PLY", "ply", (".ply",), rb"ply[\r\n]", writable=True),
+    # Gzipped up to version 3.
+    Format("SPZ", "spz", (".spz",), rb"\x1f\x8b\x08[\0-\x1f]|NGSP", writable=True, selective=True),
+    # A zip, or its meta.json unpacked.
+    Format("SOG", "sog", (".sog", ".json"), rb"PK\x03\x04|\s*\{\s*\"\w+\"\s*:", companions=True),
     Format("KSPLAT", "ksplat", (".ksplat",), rb"\0[\x01-\xff]\0\0"),  # version 0.1 and up; a float would be denormal
-    Format("SPLAT", "splat", (".splat",), None),
+    Format("SPLAT", "splat", (".splat",), None, writable=True),
 )
+
+#: The formats that can be written, by the suffix of the file.
+WRITABLE = {suffix: form for form in FORMATS if form.writable for suffix in form.suffixes}
 
 
 def sniff(head: bytes, suffix: str) -> Format | None:

@@ -134,7 +134,7 @@ def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> 
         splats.opacity[part] = quantize.decode_unorm8(some["opacity"])
         values = some["sh"][:, SH_PLACES[: some["sh"].shape[1]]].astype(np.float32)
         if level == 2:
-            values = low + values / np.float32(255) * (high - low)
+            values = quantize.of_range(values / np.float32(255), low, high)
         coefficients = values.shape[1] // 3
         splats.sh[part, :coefficients] = values.reshape(len(some), coefficients, 3)
         splats.sh[part, coefficients:] = 0  # other sections have more

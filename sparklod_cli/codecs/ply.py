@@ -25,6 +25,7 @@ from ..support.parallel import chunks_of, ordered_map
 from ..support.progress import Progress, silent
 from ..support.untrusted import quoted
 from . import quantize
+from .options import DEFAULTS, WriteOptions
 from .ply_header import Header, read_header
 from .stream import Rows, decode_rows, rows_of, size_of
 
@@ -151,7 +152,20 @@ def _text_rows(file: BinaryIO, header: Header) -> Iterator[Rows]:
         yield part, rows
 
 
-def encode(scene: Scene, *, threads: int = 1, progress: Progress = silent) -> Iterator[bytes]:
+def settled(scene: Scene, options: WriteOptions) -> WriteOptions:
+    """These options, of which PLY leaves none open.
+
+    Raises:
+        FormatError: the scene is a tree, which PLY cannot hold.
+    """
+    if scene.tree is not None:
+        raise FormatError("PLY holds no Level-of-Detail tree")
+    return options
+
+
+def encode(
+    scene: Scene, options: WriteOptions = DEFAULTS, *, threads: int = 1, progress: Progress = silent
+) -> Iterator[bytes]:
     """The bytes of a binary PLY file in the layout of Inria's trainer, piece by piece.
 
     Numbers are finite: opacities 0 and 1 and scales 0, whose logarithms are not, get ones that read as them.
@@ -159,8 +173,7 @@ def encode(scene: Scene, *, threads: int = 1, progress: Progress = silent) -> It
     Raises:
         FormatError: the scene is a tree, which PLY cannot hold.
     """
-    if scene.tree is not None:
-        raise FormatError("PLY holds no Level-of-Detail tree")
+    settled(scene, options)
     splats = scene.splats
     row_type = np.dtype([(name, "<f4") for name in _inria_properties(splats.sh.shape[1])])
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(splats)}"]

@@ -222,6 +222,21 @@ def decode_quat_bytes(codes: Bytes) -> FloatArray:
     return normalized_quat((codes.astype(np.float32) - 128) / 128)
 
 
+def of_range(unit: FloatArray, low: Any, high: Any) -> FloatArray:
+    """0..1 to low..high: low + unit * (high - low), as KSPLAT's and Spark's readers round it."""
+    return low + unit * (high - low)
+
+
+def between(unit: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
+    """0..1 to low..high: low * (1 - unit) + high * unit, as PlayCanvas's readers round it, exact at both ends."""
+    return low * (1 - unit) + high * unit
+
+
+def range_table(low: Any, high: Any, codes: int) -> NDArray[np.float64]:
+    """(..., codes) what the codes 0..codes - 1 mean in equal steps from low to high, (...,), in float64."""
+    return np.linspace(low, high, codes, axis=-1)
+
+
 def _unorm(code: NDArray[np.uint32], low: int, bits: int) -> FloatArray:
     """Bits `low` up of codes, all ones for 1."""
     most = (1 << bits) - 1

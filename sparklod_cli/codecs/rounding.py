@@ -1,42 +1,66 @@
-"""Splats as they are after an encoding of Spark's, or of a file: to see what its rounding does."""
+"""Splats after a round trip through an encoding of Spark's or of a file: shows what its rounding does.
+
+Imports nothing heavy: `--help` names the encodings.
+"""
 
 from __future__ import annotations
 
 import io
-from pathlib import Path
+from collections.abc import Callable
+from typing import TYPE_CHECKING
 
-from ..model.scene import Scene
-from ..model.splats import Splats
 from ..support.errors import FormatError
-from . import spz
-from .gpu import ext_splats, packed_splats
+from .options import WriteOptions
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from ..model.scene import Scene
+    from ..model.splats import Splats
+
+
+def _packed(scene: Scene, threads: int) -> Splats:
+    from .gpu import packed_splats
+
+    encoding = packed_splats.of_scene(scene)
+    arrays = packed_splats.pack(scene.splats, encoding, threads=threads)
+    return packed_splats.unpack(arrays, encoding, threads=threads)
+
+
+def _ext(scene: Scene, threads: int) -> Splats:
+    from .gpu import ext_splats
+
+    return ext_splats.unpack(ext_splats.pack(scene.splats, threads=threads), threads=threads)
+
+
+def _spz(scene: Scene, threads: int) -> Splats:
+    from . import spz
+
+    options = WriteOptions(compression_level=1)  # the bytes live for a moment only, so they need not be small
+    data = b"".join(spz.encode(scene, options, threads=threads))
+    return spz.decode(io.BytesIO(data), threads=threads).splats
+
+
+#: Round trips by the name that `--through` knows: PackedSplats as Spark has them for such a scene, ExtSplats, and SPZ
+#: as build-lod writes it.
+ROUND_TRIPS: dict[str, Callable[[Scene, int], Splats]] = {"packed": _packed, "ext": _ext, "spz": _spz}
 
 
 def after(through: str | None, file: Path, scene: Scene, threads: int = 1) -> Splats:
     """The splats of a scene, encoded and decoded.
 
     Args:
-        through: one of `defaults.THROUGH`: PackedSplats as Spark has them for such a scene, ExtSplats, or SPZ as
-            build-lod writes it; None leaves them as they are.
-        file: that the scene is of, for errors.
+        through: one of `ROUND_TRIPS`; None leaves the splats as they are.
+        file: that the scene was read from, for errors.
         scene: with a tree or without.
         threads: to work on.
 
     Raises:
-        FormatError: SPZ cannot hold them; names the file.
+        FormatError: SPZ cannot hold the splats; names the file.
     """
-    if through == "packed":
-        encoding = packed_splats.Encoding(lod_opacity=scene.tree is not None)
-        return packed_splats.unpack(
-            packed_splats.pack(scene.splats, encoding, threads=threads), encoding, threads=threads
-        )
-    if through == "ext":
-        return ext_splats.unpack(ext_splats.pack(scene.splats, threads=threads), threads=threads)
-    if through == "spz":
-        try:
-            # The bytes live for a moment only, so they need not be small.
-            data = b"".join(spz.encode(scene, spz.Options(compression_level=1, threads=threads)))
-        except FormatError as error:
-            raise FormatError(f"{file}: {error}") from None
-        return spz.decode(io.BytesIO(data), threads=threads).splats
-    return scene.splats
+    if through is None:
+        return scene.splats
+    try:
+        return ROUND_TRIPS[through](scene, threads)
+    except FormatError as error:
+        raise FormatError(f"{file}: {error}") from None

@@ -104,7 +104,7 @@ def _tables(meta: Meta, name: str, version: int, channels: int) -> FloatArray:
     if version == 2:
         return np.tile(_codebook(meta, name), (channels, 1))
     low, high = meta.numbers(channels, name, "mins"), meta.numbers(channels, name, "maxs")
-    return np.linspace(low, high, 256, axis=1).astype(np.float32)
+    return quantize.range_table(low, high, 256).astype(np.float32)
 
 
 def _codebook(meta: Meta, name: str) -> FloatArray:
@@ -113,7 +113,7 @@ def _codebook(meta: Meta, name: str) -> FloatArray:
 
 def _centers(splats: Splats, low: Texels, high: Texels, meta: Meta) -> Pass:
     """16 bits a coordinate, over two images, between the bounds of sign(x) * log(1 + abs(x))."""
-    logs = np.linspace(meta.numbers(3, "means", "mins"), meta.numbers(3, "means", "maxs"), 1 << 16, axis=1)
+    logs = quantize.range_table(meta.numbers(3, "means", "mins"), meta.numbers(3, "means", "maxs"), 1 << 16)
     with np.errstate(over="ignore"):
         tables = np.copysign(np.expm1(np.abs(logs)), logs).astype(np.float32)
 
@@ -150,7 +150,7 @@ def _read_palette(files: Files, version: int) -> FloatArray:
     entries = image[:, :, :3].reshape(-1, coefficients, 3)
     if version == 1:
         low, high = files.meta.number("shN", "mins"), files.meta.number("shN", "maxs")
-        return np.linspace(low, high, 256).astype(np.float32)[entries]
+        return quantize.range_table(low, high, 256).astype(np.float32)[entries]
     bands, count = files.meta.integer("shN", "bands"), files.meta.integer("shN", "count")
     if bands not in (1, 2, 3) or COEFFICIENTS[bands] != coefficients:
         raise FormatError(f"its image of SH centroids has {coefficients} coefficients, not those of {bands} bands")

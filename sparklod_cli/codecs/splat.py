@@ -14,6 +14,7 @@ from ..support.errors import FormatError, TruncatedError
 from ..support.parallel import chunks_of, ordered_map
 from ..support.progress import Progress, silent
 from . import quantize
+from .options import DEFAULTS, WriteOptions
 from .stream import decode_rows, rows_of, size_of
 
 ROW = np.dtype(
@@ -57,14 +58,26 @@ def importance_order(splats: Splats) -> NDArray[np.intp]:
     return np.argsort(-importance, kind="stable")
 
 
-def encode(scene: Scene, *, threads: int = 1, progress: Progress = silent) -> Iterator[bytes]:
-    """The bytes of a .splat file, piece by piece, in order of importance. It holds no SH above degree 0.
+def settled(scene: Scene, options: WriteOptions) -> WriteOptions:
+    """These options, of which .splat leaves none open.
 
     Raises:
         FormatError: the scene is a tree, which .splat cannot hold.
     """
     if scene.tree is not None:
         raise FormatError("SPLAT holds no Level-of-Detail tree")
+    return options
+
+
+def encode(
+    scene: Scene, options: WriteOptions = DEFAULTS, *, threads: int = 1, progress: Progress = silent
+) -> Iterator[bytes]:
+    """The bytes of a .splat file, piece by piece, in order of importance. It holds no SH above degree 0.
+
+    Raises:
+        FormatError: the scene is a tree, which .splat cannot hold.
+    """
+    settled(scene, options)
     order = importance_order(scene.splats)
 
     def rows(part: slice) -> bytes:

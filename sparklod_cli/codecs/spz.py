@@ -6,10 +6,8 @@ versions 2 and 3. `docs/formats.md` lays the extension out byte by byte.
 
 from __future__ import annotations
 
-import math
 import struct
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -18,19 +16,15 @@ from numpy.typing import NDArray
 from ..model.lod_tree import LodTree
 from ..model.scene import Scene
 from ..model.sh import notes_on_degree
-from ..model.splats import COLUMNS, FloatArray, Splats
-from ..support.defaults import (
-    DEFAULT_COMPRESSION,
-    DEFAULT_SPZ_VERSION,
-    MAX_FRACTIONAL_BITS,
-    MAX_SH_DEGREE,
-    SPZ_VERSIONS,
-)
+from ..model.splats import COLUMNS, Splats
+from ..support.defaults import MAX_SH_DEGREE
 from ..support.errors import FormatError, MembersError, NotSplatsError, TreeError, TruncatedError, VersionError
-from ..support.parallel import chunks_of, for_chunks, ordered_map
+from ..support.parallel import for_chunks, ordered_map
 from ..support.progress import Progress, silent
-from . import compression, quantize
+from . import compression
+from .options import DEFAULTS, WriteOptions
 from .spz_layout import ANTIALIASED, EXTENSIONS, LOD, Layout, Stream, StreamRows
+from .spz_options import settled as settled
 from .stream import Read, rows_of, size_of
 
 MAGIC = 0x5053474E  # "NGSP"
@@ -39,88 +33,6 @@ HEADER_V4 = struct.Struct("<IIIBBBBI12s")  # ..., streams, offset of the table o
 STREAM_SIZES = struct.Struct("<QQ")  # of a version 4 stream: compressed, uncompressed
 
 READABLE = (1, 2, 3, 4)
-
-#: What "far below the smallest splats" means for the step of a position: see `fractional_bits`.
-STEPS_A_SPLAT, SMALL_QUANTILE = 16, 0.01
-
-
-#: The largest code that a coordinate is given. The one after it, with either sign, is what writers clamp to: `inspect`
-#: takes a coordinate that has it for one that did not fit.
-LAST_CODE = quantize.FIXED24_MAX - 1
-
-
-@dataclass(frozen=True)
-class Options:
-    """How to write.
-
-    Attributes:
-        version: 2 (rotations in 3 bytes) or 3 (in 4, ten times as exact).
-        fractional_bits: of positions, 0 to 24; None takes what suits the scene, see `fractional_bits`.
-        compression_level: 1 (fast) to 9 (small).
-        threads: to encode and compress with.
-    """
-
-    version: int = DEFAULT_SPZ_VERSION
-    fractional_bits: int | None = None
-    compression_level: int = DEFAULT_COMPRESSION
-    threads: int = 1
-
-
-def largest_fractional_bits(center: NDArray[np.float32]) -> int:
-    """The most fractional bits, 0 to 24, with which every coordinate fits 24-bit fixed point.
-
-    Raises:
-        FormatError: not even whole units fit.
-    """
-    largest = float(np.abs(center).max(initial=0))
-    if np.rint(largest) > LAST_CODE:
-        reach = f"{largest:.0f}" if largest < 1e7 else f"{largest:.3g}"
-        raise FormatError(f"coordinates reach {reach}, SPZ holds at most {LAST_CODE}: scale the scene")
-    bits = MAX_FRACTIONAL_BITS
-    while bits and np.rint(largest * 2.0**bits) > LAST_CODE:
-        bits -= 1
-    return bits
-
-
-def fractional_bits(splats: Splats, options: Options) -> int:
-    """The fractional bits that these splats get with these options.
-
-    Raises:
-        FormatError: a coordinate does not fit the fractional bits; the text names the most that would.
-    """
-    if options.version not in SPZ_VERSIONS:
-        raise ValueError(f"SPZ version {options.version} is not one of {SPZ_VERSIONS}")
-    most = largest_fractional_bits(splats.center)
-    if options.fractional_bits is None:
-        return _enough_bits(splats, most)
-    if options.fractional_bits > most:
-        raise FormatError(
-            f"a coordinate does not fit {options.fractional_bits} fractional bits, at most {most} would do"
-        )
-    return options.fractional_bits
-
-
-def _enough_bits(splats: Splats, most: int) -> int:
-    """As many bits as the extent allows, up to where a step is far below the smallest splats.
-
-    Small splats are measured by the 1 % quantile of their largest scales; a step is at most 1/16 of that.
-    """
-    small = float(np.quantile(splats.scale.max(axis=1), SMALL_QUANTILE))
-    return max(0, min(most, math.ceil(math.log2(STEPS_A_SPLAT / small))))
-
-
-def clamped(splats: Splats, threads: int = 1) -> dict[str, int]:
-    """How many splats have a value that its code cannot hold, by the column (scale, rgb, sh) where there are any."""
-    counts = {}
-    for name, (low, high) in quantize.CLAMPS.items():
-        column = getattr(splats, name).reshape(len(splats), -1)
-
-        def outside(part: slice, column: FloatArray = column, low: float = low, high: float = high) -> int:
-            values = column[part]
-            return int(np.count_nonzero(((values < low) | (values > high)).any(axis=1)))
-
-        counts[name] = sum(ordered_map(outside, chunks_of(len(splats)), threads))
-    return {name: count for name, count in counts.items() if count}
 
 
 def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> Scene:
@@ -186,7 +98,9 @@ def _column(splats: Splats, tree: LodTree | None, stream: Stream) -> NDArray[Any
     return column
 
 
-def encode(scene: Scene, options: Options, *, progress: Progress = silent) -> Iterator[bytes]:
+def encode(
+    scene: Scene, options: WriteOptions = DEFAULTS, *, threads: int = 1, progress: Progress = silent
+) -> Iterator[bytes]:
     """The bytes of a file, piece by piece: an LoD file where the scene has a tree, else a plain one.
 
     The same scene and options give the same bytes for any number of threads.
@@ -195,9 +109,11 @@ def encode(scene: Scene, options: Options, *, progress: Progress = silent) -> It
         FormatError: a coordinate does not fit the fractional bits; the text names the most that would.
     """
     splats, tree = scene.splats, scene.tree
-    bits = fractional_bits(splats, options)
+    options = settled(scene, options)
+    assert options.spz_version is not None and options.fractional_bits is not None
+    bits = options.fractional_bits
     flags = (ANTIALIASED if scene.antialiased else 0) | (LOD if tree is not None else 0)
-    layout = Layout(options.version, len(splats), splats.sh_degree, bits, flags)
+    layout = Layout(options.spz_version, len(splats), splats.sh_degree, bits, flags)
     data = np.empty(HEADER.size + layout.total, np.uint8)
     data[: HEADER.size] = np.frombuffer(
         HEADER.pack(MAGIC, layout.version, layout.count, layout.sh_degree, bits, flags, 0), np.uint8
@@ -212,8 +128,8 @@ def encode(scene: Scene, options: Options, *, progress: Progress = silent) -> It
             values = np.ascontiguousarray(stream.encode(_column(splats, tree, stream)[part]))
             out[part] = values.view(np.uint8).reshape(-1, stream.size)
 
-    for_chunks(fill, layout.count, options.threads, lambda done: progress("encoding", done, layout.count, "splat"))
-    yield from compression.gzip_member(data, options.compression_level, options.threads, progress)
+    for_chunks(fill, layout.count, threads, lambda done: progress("encoding", done, layout.count, "splat"))
+    yield from compression.gzip_member(data, options.compression_level, threads, progress)
 
 
 def _checked(layout: Layout, file_size: int) -> Layout:

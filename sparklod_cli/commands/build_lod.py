@@ -11,6 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from ..codecs.formats import WRITABLE
+from ..codecs.gpu.table import ENCODINGS, RAW_SUFFIXES
+from ..codecs.options import WriteOptions
 from ..support import defaults
 from ..support.printable import MOST, shortened
 from .command import Command
@@ -121,7 +124,7 @@ Examples:
 )
 @click.option(
     "--encoding",
-    type=click.Choice(defaults.ENCODINGS),
+    type=click.Choice(list(ENCODINGS)),
     help="Write the tree as arrays in a viewer's memory layout: .npz, or the words alone if FILE is .bin or .raw.",
 )
 @click.option(
@@ -205,18 +208,18 @@ def _check_usage(ctx: click.Context, inputs: tuple[Path, ...], output: Path | No
     suffix = output.suffix.lower() if output is not None and output != DASH else ""
     if settings["unlod"]:
         refuse(ctx, OF_BAKING, "is of no use with --unlod, which writes what there is")
-        if suffix and suffix not in defaults.PLAIN_SUFFIXES:
-            raise click.UsageError(f"--unlod writes {', '.join(defaults.PLAIN_SUFFIXES)}, not {suffix}")
+        if suffix and suffix not in WRITABLE:
+            raise click.UsageError(f"--unlod writes {', '.join(WRITABLE)}, not {suffix}")
         if suffix not in ("", ".spz"):
             refuse(ctx, OF_SPZ, f"is of SPZ, not of {suffix}")
     elif settings["encoding"]:
         refuse(ctx, OF_SPZ, "is of SPZ, not of --encoding")
-        if suffix not in ("", ".npz", *defaults.RAW_SUFFIXES):
-            known = ", ".join((".npz", *defaults.RAW_SUFFIXES))
+        if suffix not in ("", ".npz", *RAW_SUFFIXES):
+            known = ", ".join((".npz", *RAW_SUFFIXES))
             raise click.UsageError(f"--encoding writes {known}, not {suffix}")
     elif suffix in OTHER_SUFFIXES:
         raise click.UsageError(f"{suffix} holds no tree, which is written as SPZ; name the output .spz")
-    elif suffix in (".npz", *defaults.RAW_SUFFIXES):
+    elif suffix in (".npz", *RAW_SUFFIXES):
         raise click.UsageError(f"a {suffix} output needs --encoding")
     elif suffix not in ("", ".spz"):
         raise click.UsageError(f"a tree is written as SPZ, not as {suffix}; name the output .spz")
@@ -253,7 +256,6 @@ def _output_name(source: Path, settings: dict[str, Any]) -> str:
 def _bake(settings: dict[str, Any], output: Path | None, console: Console) -> Work:
     """What bakes a file and reports it; the point where numpy and numba are loaded."""
     from ..bake import Recipe, bake
-    from ..codecs import spz
     from ..model.selection import Selection
     from ..support import jit
 
@@ -274,12 +276,12 @@ def _bake(settings: dict[str, Any], output: Path | None, console: Console) -> Wo
         rgba=settings["rgba"],
         encoding=settings["encoding"],
         raw=output is not None and output.suffix.lower() != ".npz",
-        spz=spz.Options(
-            version=int(settings["spz_version"]),
+        spz=WriteOptions(
+            spz_version=int(settings["spz_version"]),
             fractional_bits=settings["fractional_bits"],
             compression_level=settings["compression_level"],
-            threads=settings["threads"],
         ),
+        threads=settings["threads"],
     )
 
     def work(source: Path, target: Path, write: Sink) -> Baked:
@@ -299,9 +301,11 @@ def _unlod(ctx: click.Context, settings: dict[str, Any], console: Console) -> Wo
     def work(source: Path, target: Path, write: Sink) -> Unbaked:
         how = Target(
             suffix=".spz" if target == DASH else target.suffix.lower() or ".spz",
-            version=int(settings["spz_version"]) if chosen else None,
-            fractional_bits=settings["fractional_bits"],
-            compression_level=settings["compression_level"],
+            options=WriteOptions(
+                spz_version=int(settings["spz_version"]) if chosen else None,
+                fractional_bits=settings["fractional_bits"],
+                compression_level=settings["compression_level"],
+            ),
             threads=settings["threads"],
         )
         unbaked = unlod(source, write, how, progress=console.progress)

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from ..cameras.camera import Matrix
     from ..cameras.formats.source import Parsed
     from ..cameras.frame import Frame, Settings
-    from ..cameras.framing import Balls
     from ..cameras.path import CameraPath
+    from ..model.balls import Balls
 
     #: Gives what the splats cover.
     Scene = Callable[[], Balls]

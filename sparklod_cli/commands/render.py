@@ -24,9 +24,9 @@ from .usage import exclude, given, require
 from .world_options import cut_options, files_meant, placements_from, viewer_from, world_options
 
 if TYPE_CHECKING:
-    from ..scenery import Scenery
-    from ..simulation.frames import LodSettings
-    from ..world import Placement
+    from ..lod.settings import LodSettings
+    from ..model.instances import Instance
+    from ..scenes.finder import CutFinder
     from .render_output import Output
 
 #: Options of cuts, of which --full and files without a tree have none.
@@ -151,11 +151,11 @@ def render(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, **s
         _use_threads(settings["threads"])
 
         @functools.cache
-        def scenery() -> Scenery:
+        def finder() -> CutFinder:
             return _read(placements, None if settings["full"] else viewer, settings, console)
 
-        path, look = framed(ctx, settings, manner.look, lambda: scenery().balls())
-        manner = dataclasses.replace(manner, look=look)
+        path, look = framed(ctx, settings, manner.raster, lambda: finder().scenes.balls())
+        manner = dataclasses.replace(manner, raster=look)
         sheet = _is_sheet(settings)
         output = _output(settings, placements, len(path.cameras))
         if output.form == "npy":
@@ -173,19 +173,19 @@ def render(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, **s
         output.check(path.numbers, overwrite=settings["overwrite"])
         if output.kind == "animation":
             animation.check(output.form, frame_rate(path))
-        notes = [*path.notes, *scenery().notes]
+        notes = [*path.notes, *finder().scenes.notes]
         cuts = given(ctx, CUTS)
-        if cuts and all(source.level is None for source in scenery().sources):
+        if cuts and not finder().scenes.trees:
             say = f"{' and '.join(cuts)} say{'s' * (len(cuts) == 1)}"
             notes.append(f"no file is a Level-of-Detail tree, so all splats are drawn, whatever {say}")
         for note in notes:
             console.say(note)
         console.detail(f"  read in {time.perf_counter() - start:.2f} s")
-        painter, other = Renderer(scenery(), manner, path.cameras), None
+        painter, other = Renderer(finder(), manner, path.cameras), None
         if settings["diff"] is not None:
-            from ..world import Placement
+            from ..model.instances import Instance
 
-            compared = [Placement(settings["diff"], settings["diff"].stem)]
+            compared = [Instance(settings["diff"], settings["diff"].stem)]
             plain = settings | {"through": None}
             other = Renderer(
                 _read(compared, None if settings["full"] else viewer, plain, console), manner, path.cameras
@@ -225,10 +225,7 @@ def _compare(ctx: click.Context, settings: dict[str, Any], console: Console, *, 
     viewer = viewer_from(ctx, settings | {"budget": None})
     manner = manner_from(ctx, settings)
     with console:
-        from ..compare import ComparisonSettings
-        from ..model.splats import COLUMNS
-        from ..render.backends import BACKENDS
-        from ..world import read_world
+        from ..scenes.reading import read_scenes
         from .render_compare import run, wanted_from
 
         wanted = wanted_from(settings, settings["budget"], output=settings["output"], as_json=as_json)
@@ -236,18 +233,18 @@ def _compare(ctx: click.Context, settings: dict[str, Any], console: Console, *, 
         keep_apart(ctx, files_meant(settings, placements))
         console.announce_compiling("render")
         _use_threads(settings["threads"])
-        world = read_world(
+        world = read_scenes(
             placements,
-            columns=COLUMNS,
+            trees_only=True,
             precision=settings["precision"],
             threads=settings["threads"],
             progress=console.progress,
         )
-        path, look = framed(ctx, settings, manner.look, world.balls)
+        path, look = framed(ctx, settings, manner.raster, world.balls)
         for note in path.notes:
             console.say(note)
-        draw = functools.partial(BACKENDS[settings["backend"]].draw, **manner.options)
-        how = ComparisonSettings(draw, look, settings["max_sh"], blend_from(settings))
+        how = dataclasses.replace(manner, raster=look, max_sh=settings["max_sh"])
+        viewer = dataclasses.replace(viewer, continuous=blend_from(settings))
         return run(console, world, viewer, path, how, wanted, threads=settings["threads"])
 
 
@@ -265,28 +262,30 @@ def _is_sheet(settings: Mapping[str, Any]) -> bool:
     return settings["sheet"] or len(settings["views"]) > 1
 
 
-def _output(settings: Mapping[str, Any], placements: list[Placement], cameras: int) -> Output:
+def _output(settings: Mapping[str, Any], placements: list[Instance], cameras: int) -> Output:
     from .render_output import output_for
 
     name = settings["scene"] or placements[0].file
+    assert name is not None
     return output_for(settings["output"], name.stem or name.name, cameras, sheet=_is_sheet(settings))
 
 
 def _read(
-    placements: list[Placement], viewer: LodSettings | None, settings: Mapping[str, Any], console: Console
-) -> Scenery:
-    from ..scenery import read_scenery
+    placements: list[Instance], viewer: LodSettings | None, settings: Mapping[str, Any], console: Console
+) -> CutFinder:
+    from ..scenes.finder import CutFinder
+    from ..scenes.reading import read_scenes
 
     try:
-        return read_scenery(
+        scenes = read_scenes(
             placements,
-            viewer,
             through=settings["through"],
-            blend=blend_from(settings),
             precision=settings["precision"],
             threads=settings["threads"],
             progress=console.progress,
         )
+        blended = None if viewer is None else dataclasses.replace(viewer, continuous=blend_from(settings))
+        return CutFinder(scenes, blended)
     except ValueError as error:
         raise click.UsageError(str(error)) from None
 

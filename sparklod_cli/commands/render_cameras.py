@@ -13,8 +13,8 @@ from .camera_options import SOURCES, cameras_from
 from .usage import exclude, is_given
 
 if TYPE_CHECKING:
-    from ..cameras.framing import Balls
     from ..cameras.path import CameraPath
+    from ..model.balls import Balls
     from ..render.settings import RasterSettings
 
 #: Sources of cameras that are chosen for the scene, where nobody says how far away they are.
@@ -58,13 +58,14 @@ def framed(
         look: that they ask for.
         scene: gives what the splats cover; called only where cameras are chosen by it.
     """
-    from ..cameras.framing import with_reach
+    from ..cameras.framing import reach
 
     scene = functools.cache(scene)
     path = _cameras(settings, scene)
     chosen = not settings["views"] and all(name in CHOSEN for name in SOURCES if settings[name])
     if chosen and not settings["distance"] and not is_given(ctx, "near") and not is_given(ctx, "far"):
-        look = with_reach(look, path.cameras, scene())
+        near, far = reach(look.near, look.far, path.cameras, scene())
+        look = dataclasses.replace(look, near=near, far=far)
     return path, look
 
 

@@ -21,12 +21,14 @@ from .paths import OutputPath
 
 if TYPE_CHECKING:
     from ..cameras.path import CameraPath
-    from ..compare import Comparison, ComparisonSettings, OfBudget
+    from ..compare import Comparison
     from ..lod.budget import Budget
-    from ..simulation.frames import LodSettings
+    from ..lod.settings import LodSettings
+    from ..render.settings import RenderSettings
+    from ..scenes.loaded import Scenes
     from ..tables.assertions import Assertion
     from ..tables.columns import Row
-    from ..world import World
+    from ..tables.comparison import BudgetSummary
 
 #: What is compared unless told otherwise.
 DEFAULT_BUDGETS = "2%,5%,10%,25%,50%"
@@ -135,8 +137,8 @@ def wanted_from(
 
 
 def _assertion(text: str, budgets: Sequence[Budget]) -> tuple[int | None, Assertion]:
-    from ..compare import COLUMNS
     from ..tables import assertions
+    from ..tables.comparison import COLUMNS
 
     name, found, rest = text.rpartition(ABOUT)
     at, texts = None, [budget.text for budget in budgets]
@@ -152,10 +154,10 @@ def _assertion(text: str, budgets: Sequence[Budget]) -> tuple[int | None, Assert
 
 def run(
     console: Console,
-    world: World,
+    world: Scenes,
     viewer: LodSettings,
     path: CameraPath,
-    how: ComparisonSettings,
+    how: RenderSettings,
     wanted: Wanted,
     *,
     threads: int,
@@ -164,8 +166,9 @@ def run(
 
     Cuts go down to the budget, not to the size of a pixel, unless the viewer has a limit of its own.
     """
-    from ..compare import COLUMNS, Comparison, rows_of
+    from ..compare import Comparison
     from ..io import write_stdout, write_whole
+    from ..tables.comparison import COLUMNS, rows_by_budget
     from ..tables.files import encode
 
     wanted.check()
@@ -194,24 +197,23 @@ def run(
     if wanted.plot is not None:
         from ..figures.comparison_chart import plot
 
-        title = ", ".join(dict.fromkeys(tree.file.name for tree in world.trees))
         texts = (budget.text for budget in wanted.budgets)
-        series = list(zip(texts, rows_of(rows, wanted.budgets), strict=True))
-        write_whole(wanted.plot, [plot(series, title)], overwrite=wanted.overwrite)
+        series = list(zip(texts, rows_by_budget(rows, len(wanted.budgets)), strict=True))
+        write_whole(wanted.plot, [plot(series, world.title)], overwrite=wanted.overwrite)
     return _report(console, wanted, comparison, path, rows)
 
 
 def _report(console: Console, wanted: Wanted, comparison: Comparison, path: CameraPath, rows: Sequence[Row]) -> int:
-    from ..compare import rows_of, summarize
     from ..tables.assertions import check
+    from ..tables.comparison import rows_by_budget, summarize
 
-    groups = rows_of(rows, wanted.budgets)
+    groups = rows_by_budget(rows, len(wanted.budgets))
     outcomes = [
         outcome
         for at, assertion in wanted.asserts
         for outcome in check([assertion], rows if at is None else groups[at])
     ]
-    summary = summarize(rows, wanted.budgets)
+    summary = summarize(rows, [budget.text for budget in wanted.budgets])
     if wanted.as_json:
         asserts = [{"assert": each.assertion.text, "held": each.held, "value": each.value} for each in outcomes]
         budgets = [each.as_dict() for each in summary]
@@ -228,7 +230,7 @@ def _report(console: Console, wanted: Wanted, comparison: Comparison, path: Came
     return 0 if all(outcome.held for outcome in outcomes) else 3
 
 
-def lines(summary: Sequence[OfBudget], path: CameraPath, leaves: int) -> Iterator[str]:
+def lines(summary: Sequence[BudgetSummary], path: CameraPath, leaves: int) -> Iterator[str]:
     """The summary as a person reads it."""
     sizes = list(dict.fromkeys((camera.width, camera.height) for camera in path.cameras))
     size = f"{sizes[0][0]} x {sizes[0][1]}" + (" and others" if len(sizes) > 1 else "")

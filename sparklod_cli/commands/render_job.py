@@ -190,7 +190,7 @@ class Job:
 
     def _floats(self, drawn: Drawn, image: NDArray[np.float32]) -> NDArray[np.float32]:
         """What a .npy holds: the numbers behind the colours where those are of pixels, else the colours."""
-        by = self.painter.manner.color_by
+        by = self.painter.settings.color_by
         return drawn.values if by in OF_PIXELS and drawn.values is not None else image
 
     def _write(self, target: Path | None, data: bytes) -> None:
@@ -227,10 +227,10 @@ class Job:
             said.append(f"PSNR {worst:.2f} dB" + (" or more" if len(frames) > 1 else ""))
             said.append(f"differences {self._gain:g} times as strong" if self._gain != 1 else "differences as they are")
         self.console.say(f"{name}  {', '.join(said)}, {self.seconds:.2f} s")
-        manner = self.painter.manner
+        manner = self.painter.settings
         self.console.detail(
             f"  {self.path.format}, {size_of(self.written)} of {output.form}; {manner.style} by {manner.backend},"
-            f" from {manner.look.near:g} to {manner.look.far:g} units away"
+            f" from {manner.raster.near:g} to {manner.raster.far:g} units away"
         )
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from ..codecs.rounding import ROUND_TRIPS
 from ..render.settings import PROFILES, SORTS, RasterSettings
 from ..support import defaults
 from ..support.defaults import OF_PIXELS
@@ -17,7 +18,7 @@ from .usage import exclude, is_given
 
 if TYPE_CHECKING:
     from ..images.pixels import Color
-    from ..render.renderer import RenderSettings
+    from ..render.settings import RenderSettings
 
 COLORS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "transparent": None}
 
@@ -124,7 +125,7 @@ def look_options(command: Command) -> Command:
             click.option("--no-bar", is_flag=True, help="Leave that bar out."),
             click.option(
                 "--through",
-                type=click.Choice(defaults.THROUGH),
+                type=click.Choice(list(ROUND_TRIPS)),
                 help="Draw splats as they are after Spark's PackedSplats or ExtSplats, or SPZ, in the file's own cuts.",
             ),
             click.option(
@@ -166,7 +167,7 @@ def look_options(command: Command) -> Command:
 
 def manner_from(ctx: click.Context, settings: Mapping[str, Any]) -> RenderSettings:
     """The manner that the options of `look_options` ask for."""
-    from ..render.renderer import RenderSettings
+    from ..render.settings import RenderSettings
 
     style, by = settings["style"], settings["color_by"]
     if not settings["near"] < settings["far"]:
@@ -189,7 +190,7 @@ def manner_from(ctx: click.Context, settings: Mapping[str, Any]) -> RenderSettin
     if options and settings["backend"] != "osmesa":
         raise click.UsageError("--sorting and --sort-throttle only mean something with --backend osmesa")
     return RenderSettings(
-        look=RasterSettings(settings["near"], settings["far"], settings["profile"], settings["sort"]),
+        raster=RasterSettings(settings["near"], settings["far"], settings["profile"], settings["sort"]),
         style=style,
         backend=settings["backend"],
         color_by=by,

@@ -7,14 +7,14 @@ from typing import Any
 
 import click
 
-from ..support import defaults
+from ..tables.files import FORMS
 from .camera_options import camera_options, cameras_from
 from .command import Command
 from .console import Console
 from .options.common import common_options, overwrite_option, table_form
 from .paths import OutputPath, claim_stdout, keep_apart
 from .usage import exclude
-from .world_options import files_meant, placements_from, viewer_from, viewer_options, world_options
+from .world_options import files_meant, placements_from, streaming_from, viewer_from, viewer_options, world_options
 
 #: Below this share of splats in front of the cameras, path and scene probably do not share their axes.
 LEAST_IN_FRONT = 0.05
@@ -43,7 +43,7 @@ Examples:
 @click.option(
     "--format",
     "form",
-    type=click.Choice(defaults.TABLES),
+    type=click.Choice(list(FORMS)),
     help="Of the table.  [default: by the name of --output, or csv]",
 )
 @click.option("--per-instance", is_flag=True, help="A row for each instance, too.")
@@ -83,10 +83,10 @@ def traverse(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, *
 
     Coordinates are those of the files; --up, --world-transform and --camera-axes bring cameras into them.
     """
+    from ..scenes.reading import TRAVERSED, read_scenes
     from ..simulation import columns
     from ..simulation.frames import Simulation
     from ..tables import assertions
-    from ..world import TRAVERSED, read_world
     from .traverse_job import Job, Wanted
 
     viewer = viewer_from(ctx, settings)
@@ -119,8 +119,9 @@ def traverse(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, *
 
         console.announce_compiling("traverse")
         wanted.check()
-        world = read_world(
+        world = read_scenes(
             placements,
+            trees_only=True,
             columns=TRAVERSED if wanted.plot is None else COLUMNS,
             precision=settings["precision"],
             threads=settings["threads"],
@@ -128,7 +129,7 @@ def traverse(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, *
         )
         path = cameras_from(settings, world.balls)
         try:
-            simulation = Simulation(world, viewer, by_instance=settings["per_instance"])
+            simulation = Simulation(world, viewer, streaming_from(settings), by_instance=settings["per_instance"])
         except ValueError as error:
             raise click.UsageError(str(error)) from None
         for note in path.notes:

@@ -157,7 +157,7 @@ class Job:
         """The files of --indices-out, all that will be written."""
         if self.wanted.indices is not None:
             for number in self.path.numbers:
-                yield from _index_files(self.wanted.indices, number, len(self.simulation.world.instances))
+                yield from _index_files(self.wanted.indices, number, len(self.simulation.scenes.instances))
 
     def _keep(self, frame: Frame) -> None:
         """Keeps what may be drawn in the end: the frames that are most worth looking at until now, and the first."""
@@ -177,25 +177,20 @@ class Job:
     def _plot(self, target: Path) -> None:
         """Draws the charts, and the path over what the frame that is most worth looking at had: its cut, as drawn."""
         from ..figures.traversal_chart import Scenery, plot
-        from ..model.splats import Splats
 
-        world = self.simulation.world
+        scenes = self.simulation.scenes
         worth = [self._kept[what] for what in (*(moment.what for moment in self._lookout.moments()), "first")]
         frame = next((each for each in worth if len(each.cut)), worth[0])  # before anything arrived, nothing is drawn
         at = self.path.numbers.index(frame.number)
-        nodes = frame.cut.indices()
-        splats = [world.splats_of(number, part) for number, part in enumerate(nodes)]
-        level = [world.trees[place.tree].level[part] for place, part in zip(world.instances, nodes, strict=True)]
-        degree = min(part.sh_degree for part in splats)
+        cut = scenes.cut_of(frame.cut)
         scenery = Scenery(
             self.path.cameras,
-            Splats.concat([part.with_max_sh(degree) for part in splats]),
-            np.concatenate(level),
+            cut.splats,
+            np.concatenate([part.depth for part in cut.parts]),
             at,
         )
-        title = ", ".join(dict.fromkeys(tree.file.name for tree in world.trees))
         marked = {moment.what: moment.frame for moment in self._lookout.moments()}
-        drawn = plot(self.rows, marked, title, scenery)
+        drawn = plot(self.rows, marked, scenes.title, scenery)
         if drawn.note:
             self.console.say(f"{target}: {drawn.note}")
         write_whole(target, [drawn.png], overwrite=self.wanted.overwrite)

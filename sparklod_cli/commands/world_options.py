@@ -16,8 +16,9 @@ from .paths import InputPath, file_of
 from .usage import exclude, is_given
 
 if TYPE_CHECKING:
-    from ..simulation.frames import LodSettings
-    from ..world import Placement
+    from ..lod.settings import LodSettings
+    from ..model.instances import Instance
+    from ..simulation.streaming import StreamingSettings
 
 #: Options of the cones, which --outside-foveate leaves no room for.
 CONES = ("cone_fov0", "cone_fov", "cone_foveate")
@@ -55,10 +56,10 @@ def world_options(command: Command) -> Command:
     return command
 
 
-def placements_from(settings: Mapping[str, Any]) -> list[Placement]:
+def placements_from(settings: Mapping[str, Any]) -> list[Instance]:
     """What stands where: each FILE once, as it is, and all that --scene says."""
-    from ..world import Placement, names_of
-    from ..world_file import read_placements
+    from ..model.instances import instances_of
+    from ..scenes.instances_file import read_instances
 
     files, scene = settings["files"], settings["scene"]
     if not files and scene is None:
@@ -66,14 +67,14 @@ def placements_from(settings: Mapping[str, Any]) -> list[Placement]:
     if files and scene is not None:
         raise click.UsageError("--scene names the files; leave out FILE")
     if scene is not None:
-        return read_placements(scene)
-    return [Placement(file, name) for file, name in zip(files, names_of(files), strict=True)]
+        return read_instances(scene)
+    return instances_of(files)
 
 
-def files_meant(settings: Mapping[str, Any], placements: Sequence[Placement]) -> dict[str, list[Path]]:
+def files_meant(settings: Mapping[str, Any], placements: Sequence[Instance]) -> dict[str, list[Path]]:
     """For `paths.keep_apart`, files that are read without being parameters themselves."""
     matrix = settings["world_transform"] and file_of(settings["world_transform"])
-    return {"scene": [place.file for place in placements], "world_transform": [matrix] if matrix else []}
+    return {"scene": [place.file for place in placements if place.file], "world_transform": [matrix] if matrix else []}
 
 
 def viewer_options(command: Command) -> Command:
@@ -191,9 +192,8 @@ def _streaming_options(command: Command) -> Command:
 
 def viewer_from(ctx: click.Context, settings: Mapping[str, Any]) -> LodSettings:
     """The viewer that the options of `viewer_options`, or of `cut_options`, ask for."""
-    from ..lod.traversal import Cones, Frustum
-    from ..simulation.frames import LodSettings
-    from ..simulation.streaming import Network
+    from ..lod.settings import LodSettings
+    from ..model.foveation import Cones, Frustum
 
     behind, outside = settings["behind_foveate"], settings["outside_foveate"]
     if outside is not None:
@@ -214,9 +214,6 @@ def viewer_from(ctx: click.Context, settings: Mapping[str, Any]) -> LodSettings:
     else:
         behind = defaults.BEHIND_FOVEATE if behind is None else behind
         foveation = Cones(settings["cone_fov0"], settings["cone_fov"], settings["cone_foveate"], behind)
-    network = Network()
-    if settings.get("bandwidth") is not None:
-        network = Network(settings["bandwidth"], settings["latency"] or 0.0, settings["fetchers"] or defaults.FETCHERS)
     budget = defaults.PRESETS[settings["preset"]] if settings["budget"] is None else settings["budget"]
     if not 0 < budget * settings["lod_splat_scale"] < BUDGETS:
         raise click.UsageError("the budget is to be more than 0, and no more than people can count")
@@ -225,6 +222,14 @@ def viewer_from(ctx: click.Context, settings: Mapping[str, Any]) -> LodSettings:
         foveation=foveation,
         pixel_scale_limit=settings["pixel_scale_limit"],
         render_scale=settings["lod_render_scale"],
-        network=network,
-        chunk_cache=settings.get("chunk_cache"),
     )
+
+
+def streaming_from(settings: Mapping[str, Any]) -> StreamingSettings:
+    """How chunks get to the viewer that the options of `viewer_options` ask for."""
+    from ..simulation.streaming import Network, StreamingSettings
+
+    network = Network()
+    if settings["bandwidth"] is not None:
+        network = Network(settings["bandwidth"], settings["latency"] or 0.0, settings["fetchers"] or defaults.FETCHERS)
+    return StreamingSettings(network, settings["chunk_cache"])

@@ -22,10 +22,8 @@ continuous and falls with T; so there is such a T, and it moves by no more than 
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,17 +31,13 @@ from numpy.typing import NDArray
 
 from ..model.gaussian import linear_opacity, lod_opacity
 from ..model.lod_tree import LodTree
-from ..model.splats import FloatArray, Splats
+from ..model.splats import FloatArray
 from ..support.defaults import BLEND
-from ..world import World
-from .kernels.pixel_scale import FRUSTUM, NEAREST, NO_FOVEATION
-from .traversal import Matrix, Traversal, View, views_of
+from .foveation import pixel_scales
+from .traversal import Traversal, View, views_of
 
 #: Halvings of the interval in which the threshold is, which is no longer than the width.
 HALVINGS = 40
-
-#: Numbers of a `VIEW` that say how pixel scales count by direction.
-FOVEATION = ("side", "behind", "inner", "outer")
 
 Shares = NDArray[np.float64]
 
@@ -87,7 +81,7 @@ class ContinuousCuts:
             view: where the camera is.
             budget: what the weights sum to, all instances together, unless `smallest` or the leaves come first; at
                 least as many as there are instances. More nodes are drawn, for those that fade are, too.
-            smallest: nodes of this pixel scale are not divided; see `pixel_limit`.
+            smallest: nodes of this pixel scale are not divided; see `settings.pixel_limit`.
             width: nodes of so many times the threshold are divided wholly; above 1.
         """
         views = views_of(self._forest, self._instances, view)
@@ -204,39 +198,6 @@ def _ranges(start: NDArray[np.int64], count: NDArray[np.int64]) -> NDArray[np.in
     return np.repeat(start - first, count) + np.arange(count.sum())
 
 
-def pixel_scales(values: Sequence[NDArray[np.float32]], view: np.void) -> NDArray[np.float32]:
-    """(N,) pixel scales, the very numbers of the traversal's; infinite where those are not numbers.
-
-    Args:
-        values: x, y, z and sizes, (N,) each.
-        view: a `kernels.sight.VIEW`.
-    """
-    one = np.float32(1)
-    with np.errstate(all="ignore"):
-        delta = [value - view[f"origin_{axis}"] for axis, value in zip("xyz", values, strict=False)]
-
-        def along(way: str) -> NDArray[np.float32]:
-            x, y, z = (part * view[f"{way}_{axis}"] for axis, part in zip("xyz", delta, strict=True))
-            return (x + y) + z
-
-        x, y, z = delta
-        distance = np.sqrt((x * x + y * y) + z * z)
-        inverse = one / np.where(distance > NEAREST, distance, NEAREST)
-        scale: NDArray[np.float32] = values[3] * inverse * view["lod_scale"]
-        if view["kind"] != NO_FOVEATION:
-            ahead, side, behind, inner, outer = along("forward"), *(view[name] for name in FOVEATION)
-            if view["kind"] == FRUSTUM:
-                seen = (abs(along("right")) <= inner * ahead) & (abs(along("up")) <= outer * ahead)
-                weight = np.where(seen, one, side)
-            else:
-                cosine = ahead * inverse
-                within = side + (one - side) * ((cosine - outer) / (inner - outer))
-                beyond = behind + (side - behind) * (cosine / outer)
-                weight = np.where(cosine >= inner, one, np.where(cosine >= outer, within, beyond))
-            scale = np.where(ahead <= 0, behind, weight) * scale
-        return np.where(np.isnan(scale), np.float32(np.inf), abs(scale))
-
-
 def faded(opacity: FloatArray, weight: Shares) -> FloatArray:
     """(N,) linear opacities of splats that are drawn with a weight: that of D times the weight, Spark's parameter.
 
@@ -246,14 +207,3 @@ def faded(opacity: FloatArray, weight: Shares) -> FloatArray:
     """
     fading: FloatArray = np.where(weight < 1, linear_opacity(lod_opacity(opacity) * weight), opacity)
     return fading.astype(np.float32)
-
-
-def parts_of(world: World, cut: BlendedCut) -> list[tuple[Splats, Matrix]]:
-    """For `render.shown.show`: the splats of each instance, as opaque as they are drawn, and where it stands."""
-    parts = []
-    for number, instance in enumerate(world.instances):
-        mine = cut.instance == number
-        splats = world.trees[instance.tree].scene.splats.take(cut.node[mine])
-        splats = dataclasses.replace(splats, opacity=faded(splats.opacity, cut.weight[mine]))
-        parts.append((splats, instance.object_to_world))
-    return parts

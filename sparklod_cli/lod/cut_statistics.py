@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .kernels import cut_statistics as kernels
-from .traversal import Cut, Forest, Instance, View, pixel_limit
+from .settings import pixel_limit
+from .traversal import Forest, TreeCut, TreeInstance, View
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,7 @@ class Measured:
 def measure(
     forest: Forest,
     level: NDArray[np.int32],
-    cut: Cut,
+    cut: TreeCut,
     view: View,
     *,
     size: tuple[int, int],
@@ -125,7 +126,7 @@ class Changes:
         instances: of them.
     """
 
-    def __init__(self, forest: Forest, instances: Sequence[Instance]) -> None:
+    def __init__(self, forest: Forest, instances: Sequence[TreeInstance]) -> None:
         sizes = np.diff(forest.node_base)
         bits = [int(sizes[instance.tree]) for instance in instances]
         # Each instance begins a word of its own.
@@ -135,7 +136,7 @@ class Changes:
         self._last: tuple[NDArray[np.uint32], NDArray[np.uint16]] | None = None
         self._counts = np.zeros(len(bits), np.int64)
 
-    def next(self, cut: Cut) -> list[tuple[int, int | None, int]]:
+    def next(self, cut: TreeCut) -> list[tuple[int, int | None, int]]:
         """For each instance how many nodes it has, how many of them the last cut had, and how many that had.
 
         The second is None for the first cut, which nothing can be compared with.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -10,7 +9,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from ..codecs.gpu.lod_tree import Nodes
+from ..model.foveation import Cones, Foveation
+from ..model.nodes import Nodes
+from .foveation import set_foveation
 from .kernels import cut as kernels
 from .kernels import pixel_scale
 
@@ -19,9 +20,9 @@ Matrix = NDArray[np.float64]
 #: Nodes of a chunk, as Spark streams them.
 CHUNK_NODES = 1 << kernels.CHUNK_BITS
 
-#: How many nodes are looked at for a cut of so many, at most where every node that is divided has two children or more;
-#: in others the buffers grow.
-LOOKS = 2
+#: Nodes that are visited for each node of a cut, at most, where every node that is refined has two children or more; in
+#: other trees the buffers grow.
+VISITS = 2
 
 #: The first threshold for a cut, of the last one of the cut before it: a little lower, for looking at a few nodes in
 #: vain costs less than another round.
@@ -37,38 +38,8 @@ REASONS = {
 
 
 @dataclass(frozen=True)
-class Cones:
-    """Foveation by the angle to the optical axis, Spark 2's.
-
-    Attributes:
-        fov0: full angle in degrees of the cone inside of which everything counts 1; 0 for none.
-        fov: of the outer cone; between them the weight falls linearly in the cosine.
-        foveate: weight at the outer cone; it goes on to `behind` at 90 degrees.
-        behind: weight behind the camera.
-    """
-
-    fov0: float = 0.0
-    fov: float = 0.0
-    foveate: float = 1.0
-    behind: float = 1.0
-
-
-@dataclass(frozen=True)
-class Frustum:
-    """Foveation by the picture's own edges, as Spark's LoD design has it.
-
-    Attributes:
-        outside: weight in front of the camera but beside the picture.
-        behind: weight behind the camera.
-    """
-
-    outside: float = 1.0
-    behind: float = 1.0
-
-
-@dataclass(frozen=True)
-class Instance:
-    """One appearance of a tree in the world.
+class TreeInstance:
+    """A tree of a forest and where it stands.
 
     Attributes:
         tree: which tree of its `Forest`.
@@ -80,7 +51,7 @@ class Instance:
     tree: int = 0
     object_to_world: Matrix = field(default_factory=lambda: np.eye(4))
     lod_scale: float = 1.0
-    foveation: Cones | Frustum = field(default_factory=Cones)
+    foveation: Foveation = field(default_factory=Cones)
 
 
 @dataclass(frozen=True)
@@ -101,7 +72,7 @@ class Forest:
     """Trees ready to be traversed.
 
     Attributes:
-        nodes: `sight.NODE` of all trees, one after the other.
+        nodes: `pixel_scale.NODE` of all trees, one after the other.
         node_base: (trees + 1,) int64, where the nodes of each begin.
         chunk_base: (trees + 1,) int64, where the chunks of each begin.
     """
@@ -129,11 +100,11 @@ class Forest:
 
 
 @dataclass(frozen=True)
-class Cut:
+class TreeCut:
     """The nodes that are drawn; S of them, of all instances.
 
     Attributes:
-        views: (instances,) `sight.VIEW`.
+        views: (instances,) `pixel_scale.VIEW`.
         node: (S,) uint32 index in its tree.
         instance: (S,) uint16.
         limit: (S,) float32, the least pixel scale from the root to it; negative for one that the queue took out, since
@@ -178,25 +149,27 @@ class Traversal:
         instances: of them, at most 65,535.
     """
 
-    def __init__(self, forest: Forest, instances: Sequence[Instance]) -> None:
+    def __init__(self, forest: Forest, instances: Sequence[TreeInstance]) -> None:
         self.forest, self.instances = forest, list(instances)
         self._all = np.ones(forest.chunks, np.bool_)
         self._local = threading.local()
         sizes = np.diff(forest.node_base)
         self._most = sum(int(sizes[instance.tree]) for instance in self.instances)
 
-    def cut(self, view: View, *, budget: int, smallest: float = 0.0, resident: NDArray[np.bool_] | None = None) -> Cut:
+    def cut(
+        self, view: View, *, budget: int, smallest: float = 0.0, resident: NDArray[np.bool_] | None = None
+    ) -> TreeCut:
         """The cut that a viewer draws.
 
         Args:
             view: where the camera is.
             budget: how many splats may be drawn, all instances together; one for each instance at least.
-            smallest: nodes of this pixel scale are not divided; see `pixel_limit`.
+            smallest: nodes of this pixel scale or less are not refined; see `settings.pixel_limit`.
             resident: (chunks,) which chunks of all trees are there; all unless given.
         """
         views = views_of(self.forest, self.instances, view)
         present = self._all if resident is None else resident
-        work = self._work(LOOKS * budget + CHUNK_NODES)
+        work = self._work(VISITS * budget + CHUNK_NODES)
         wanted = np.empty(self.forest.chunks, np.float32)
         length = min(budget, self._most) + 1
         cut = np.empty(length, np.uint32), np.empty(length, np.int32), np.empty(length, np.uint16)
@@ -218,7 +191,7 @@ class Traversal:
             work = self._work(2 * len(work.slots[0]))
         # The next cut will be much like this one.
         work.guess = GUESS * least if reason == kernels.BUDGET else smallest
-        return Cut(
+        return TreeCut(
             views=views,
             node=cut[0][:selected],
             instance=cut[2][:selected],
@@ -260,19 +233,8 @@ class _Work:
         return float(limit.view(np.float32)[at]), int(instance[at]), int(node[at])
 
 
-def pixel_limit(fov_y: float, height: int, scale: float = 1.0) -> float:
-    """The pixel scale of a pixel, Spark's `pixelScaleLimit`: 2 * tan(fov_y / 2) / height * scale.
-
-    Args:
-        fov_y: radians.
-        height: pixels.
-        scale: Spark's `lodRenderScale`.
-    """
-    return 2 * math.tan(fov_y / 2) / height * scale
-
-
-def views_of(forest: Forest, instances: Sequence[Instance], view: View) -> NDArray[np.void]:
-    """(instances,) `sight.VIEW`: the camera in the space of each instance, in the precision that Spark has."""
+def views_of(forest: Forest, instances: Sequence[TreeInstance], view: View) -> NDArray[np.void]:
+    """(instances,) `pixel_scale.VIEW`: the camera in the space of each instance, in the precision that Spark has."""
     views = np.zeros(len(instances), pixel_scale.VIEW)
     for row, instance in zip(views, instances, strict=True):
         view_to_object = (np.linalg.inv(instance.object_to_world) @ view.camera_to_world).astype(np.float32)
@@ -287,19 +249,7 @@ def views_of(forest: Forest, instances: Sequence[Instance], view: View) -> NDArr
         row["lod_scale"] = instance.lod_scale
         row["node_base"] = forest.node_base[instance.tree]
         row["chunk_base"] = forest.chunk_base[instance.tree]
-        foveation = instance.foveation
-        row["behind"] = foveation.behind
-        if isinstance(foveation, Frustum):
-            row["kind"] = pixel_scale.FRUSTUM
-            row["side"] = foveation.outside
-            row["inner"], row["outer"] = math.tan(view.fov_x / 2), math.tan(view.fov_y / 2)
-        else:
-            row["kind"] = pixel_scale.CONE
-            row["side"] = foveation.foveate
-            row["inner"] = _half_angle_cosine(foveation.fov0)
-            row["outer"] = min(row["inner"], _half_angle_cosine(foveation.fov))
-        if row["behind"] == row["side"] == 1:
-            row["kind"] = pixel_scale.NO_FOVEATION
+        set_foveation(row, instance.foveation, view.fov_x, view.fov_y)
     return views
 
 
@@ -308,11 +258,3 @@ def _unit(vector: NDArray[np.float32]) -> NDArray[np.float32]:
     x, y, z = vector
     unit: NDArray[np.float32] = vector / np.sqrt((x * x + y * y) + z * z)
     return unit
-
-
-def _half_angle_cosine(degrees: float) -> np.float32:
-    """The cosine of half an angle, 1 for none, that of 180 degrees for more; rounded to float32 where Spark rounds."""
-    if degrees <= 0:
-        return np.float32(1)
-    radians = np.float32(0.5) * np.float32(min(degrees, 180)) * np.float32(math.pi / 180)
-    return np.float32(math.cos(float(radians)))

@@ -45,13 +45,19 @@ def covariance(scale: FloatArray, quat_xyzw: FloatArray) -> NDArray[np.float64]:
 
     In float64, because what is left of the elements of a thin splat are small differences of large numbers.
     """
+    axes = rotation_matrices(quat_xyzw)
+    axes *= scale.T
+    return np.einsum("kin,kin->nk", axes[_ROW], axes[_COLUMN])
+
+
+def rotation_matrices(quat_xyzw: FloatArray) -> NDArray[np.float64]:
+    """(3, 3, N) rotations, world axis by local axis, of (N, 4) unit quaternions, local to world."""
     x, y, z, w = quat_xyzw.T.astype(np.float64)
-    axes = np.empty((3, 3, len(scale)))  # world axis, local axis
+    axes = np.empty((3, 3, len(quat_xyzw)))
     axes[0] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
     axes[1] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
     axes[2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
-    axes *= scale.T
-    return np.einsum("kin,kin->nk", axes[_ROW], axes[_COLUMN])
+    return axes
 
 
 def moved(points: FloatArray, matrix: NDArray[np.float64]) -> FloatArray:
@@ -63,7 +69,7 @@ def moved(points: FloatArray, matrix: NDArray[np.float64]) -> FloatArray:
 def placed(splats: Splats, matrix: NDArray[np.float64]) -> Splats:
     """Splats under a (4, 4) rotation, uniform scale and translation; their SH are not turned."""
     size = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
-    turn = _quat_of(matrix[:3, :3] / size)
+    turn = quat_of_rotation(matrix[:3, :3] / size)
     x, y, z, w = splats.quat_xyzw.T
     a, b, c, d = turn
     quat = [d * x + a * w + b * z - c * y, d * y - a * z + b * w + c * x, d * z + a * y - b * x + c * w]
@@ -75,8 +81,11 @@ def placed(splats: Splats, matrix: NDArray[np.float64]) -> Splats:
     )
 
 
-def _quat_of(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(4,) x y z w of a (3, 3) rotation: the eigenvector of Bar-Itzhack's matrix, which needs no special cases."""
+def quat_of_rotation(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(4,) unit x y z w, of either sign, of a (3, 3) rotation.
+
+    The eigenvector of Bar-Itzhack's matrix, which needs no special cases.
+    """
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation
     symmetric = np.array(
         [

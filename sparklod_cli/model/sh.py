@@ -8,6 +8,20 @@ from ..support.errors import FormatError
 #: Y_00, the constant term of the real spherical harmonics: 1 / (2 * sqrt(pi)).
 SH_C0 = 0.28209479177387814
 
+#: Normalisations of the real spherical harmonics of degree 1 to 3, in the order and with the signs of 3D Gaussian
+#: Splatting; `transforms.sh_basis` has the polynomials that they go with.
+SH_C1 = 0.4886025119029199
+SH_C2 = (1.0925484305920792, -1.0925484305920792, 0.31539156525252005, -1.0925484305920792, 0.5462742152960396)
+SH_C3 = (
+    -0.5900435899266435,
+    2.890611442640554,
+    -0.4570457994644658,
+    0.3731763325901154,
+    -0.4570457994644658,
+    1.445305721320277,
+    -0.5900435899266435,
+)
+
 #: Coefficients a colour channel above the constant term, by degree: (degree + 1) ** 2 - 1.
 COEFFICIENTS = (0, 3, 8, 15, 24)
 

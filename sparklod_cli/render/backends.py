@@ -27,7 +27,7 @@ class Draw(Protocol):
         BackendError: it cannot draw here.
     """
 
-    def __call__(self, shown: ShadedSplats, camera: Camera, look: RasterSettings, **options: Any) -> Image: ...
+    def __call__(self, splats: ShadedSplats, camera: Camera, settings: RasterSettings, **options: Any) -> Image: ...
 
 
 @dataclass(frozen=True)
@@ -37,9 +37,9 @@ class Backend:
     name: str
     module: str
 
-    def draw(self, shown: ShadedSplats, camera: Camera, look: RasterSettings, **options: Any) -> Image:
+    def draw(self, splats: ShadedSplats, camera: Camera, settings: RasterSettings, **options: Any) -> Image:
         """What a camera sees; see `Draw`. Options are those of the module's function."""
-        return cast(Draw, import_module(self.module, __package__).draw)(shown, camera, look, **options)
+        return cast(Draw, import_module(self.module, __package__).draw)(splats, camera, settings, **options)
 
 
 BACKENDS = {

@@ -13,7 +13,8 @@ from ..cameras.camera import Camera
 from ..lod.traversal import CHUNK_NODES
 from ..model.gaussian import lod_opacity, moved, spark_size
 from ..model.splats import FloatArray
-from ..scenery import Index, Piece, Scenery, Source
+from ..scenes.finder import CutSource
+from ..scenes.loaded import Index, LoadedScene, Part
 from ..support.errors import SparklodError
 from ..support.ticks import ticks
 from .color_scales import (
@@ -66,50 +67,50 @@ class Scale:
         return colors
 
 
-def values_of(by: str, piece: Piece) -> FloatArray:
+def values_of(by: str, part: Part) -> FloatArray:
     """(M,) the numbers that some splats are coloured by: "level", "lod-opacity", "size" or "chunk".
 
     Sizes are in world units; splats of files without a tree are of level 0.
     """
     if by in ("level", "chunk"):
-        return numbers_of(by, piece.source, piece.index).astype(np.float64)
+        return numbers_of(by, part.scene, part.index).astype(np.float64)
     if by == "lod-opacity":
-        return lod_opacity(np.maximum(piece.splats.opacity, 0))
-    return spark_size(piece.splats) * np.float32(np.cbrt(np.linalg.det(piece.object_to_world[:3, :3])))
+        return lod_opacity(np.maximum(part.splats.opacity, 0))
+    return spark_size(part.splats) * np.float32(np.cbrt(np.linalg.det(part.object_to_world[:3, :3])))
 
 
-def scale_of_splats(by: str, scenery: Scenery, cameras: Sequence[Camera]) -> Scale:
+def scale_of_splats(by: str, source: CutSource, cameras: Sequence[Camera]) -> Scale:
     """The scale of a colour that is of splats, for all that cameras may see; of whole numbers, for what they do see.
 
     Raises:
         SparklodError: by level, where no file is a tree.
     """
-    if by == "level" and all(source.level is None for source in scenery.sources):
+    candidates = source.candidates().parts
+    if by == "level" and not any(part.scene.is_tree for part in candidates):
         raise SparklodError("there are no levels to colour by: no file is a Level-of-Detail tree")
     if by in ("chunk", "level"):
-        return _whole(by, scenery, cameras)
-    pieces = scenery.candidates()
-    every = max(1, sum(len(piece.index) for piece in pieces) // SAMPLE)
-    values = np.concatenate([values_of(by, piece)[::every] for piece in pieces])
+        return _whole(by, source, cameras)
+    every = max(1, sum(len(part.index) for part in candidates) // SAMPLE)
+    values = np.concatenate([values_of(by, part)[::every] for part in candidates])
     return _opacities(values) if by == "lod-opacity" else _sizes(values)
 
 
-def scale_of_depth(scenery: Scenery, cameras: Sequence[Camera], look: RasterSettings) -> Scale:
+def scale_of_depth(source: CutSource, cameras: Sequence[Camera], settings: RasterSettings) -> Scale:
     """From the nearest splats to the farthest that cameras see, but for a few."""
-    pieces = scenery.candidates()
-    every = max(1, sum(len(piece.index) for piece in pieces) // SAMPLE)
-    centers = np.concatenate([moved(piece.splats.center[::every], piece.object_to_world) for piece in pieces])
+    parts = source.candidates().parts
+    every = max(1, sum(len(part.index) for part in parts) // SAMPLE)
+    centers = np.concatenate([moved(part.splats.center[::every], part.object_to_world) for part in parts])
     seen = [np.empty(0)]
     for camera in cameras[:: max(1, len(cameras) // CAMERAS)]:
         local = (centers - camera.position) @ camera.camera_to_world[:3, :3]
         depth = -local[:, 2]
         with np.errstate(all="ignore"):
-            inside = (depth > look.near) & (depth < look.far)
+            inside = (depth > settings.near) & (depth < settings.far)
             inside &= abs(camera.focal[0] * local[:, 0] / depth) <= camera.width / 2
             inside &= abs(camera.focal[1] * local[:, 1] / depth) <= camera.height / 2
         seen.append(depth[inside])
     depths = np.concatenate(seen)
-    low, high = np.percentile(depths, [CLIPPED, 100 - CLIPPED]) if len(depths) else (look.near, look.near + 1)
+    low, high = np.percentile(depths, [CLIPPED, 100 - CLIPPED]) if len(depths) else (settings.near, settings.near + 1)
     # A scene that is as good as flat gets no more contrast than there is.
     high = max(high, low + 1e-3 * abs(low))
     return _linear("depth", float(low), float(high), tuple(reversed(PLASMA)), ends=True)
@@ -121,21 +122,22 @@ def scale_of_overdraw(counts: Sequence[FloatArray]) -> Scale:
     return _linear("overdraw", 0.0, max(1.0, float(math.ceil(most))), MAGMA, ends=True)
 
 
-def _whole(by: str, scenery: Scenery, cameras: Sequence[Camera]) -> Scale:
+def _whole(by: str, source: CutSource, cameras: Sequence[Camera]) -> Scale:
     """From the least to the most that some cameras see; others may see less, or more."""
     every = -(-len(cameras) // CUTS)
-    seen = [numbers_of(by, source, index) for camera in cameras[::every] for source, index in scenery.drawn(camera)]
+    parts = [part for camera in cameras[::every] for part in source.cut(camera).parts]
+    seen = [numbers_of(by, part.scene, part.index) for part in parts]
     ends = [(int(numbers.min()), int(numbers.max())) for numbers in seen if len(numbers)] or [(0, 0)]
     low, high = min(low for low, _ in ends), max(high for _, high in ends)
     beyond = int(every > 1)
     return Scale(whole_numbers(by, np.arange(low - beyond, high + 1 + beyond), low, high), low, high)
 
 
-def numbers_of(by: str, source: Source, index: Index) -> NDArray[np.int64]:
+def numbers_of(by: str, scene: LoadedScene, index: Index) -> NDArray[np.int64]:
     """(M,) the "level" or the "chunk" of some splats of a file; without a tree, all are of level 0."""
     if by == "chunk":
-        return source.first_chunk + index // CHUNK_NODES
-    return np.zeros(len(index), np.int64) if source.level is None else source.level[index].astype(np.int64)
+        return scene.first_chunk + index // CHUNK_NODES
+    return np.zeros(len(index), np.int64) if scene.depth is None else scene.depth[index].astype(np.int64)
 
 
 def _linear(title: str, low: float, high: float, stops: tuple[str, ...], *, ends: bool) -> Scale:

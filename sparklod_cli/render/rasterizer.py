@@ -22,32 +22,35 @@ _kept = threading.local()
 CHUNKS = 2
 
 
-def draw(shown: ShadedSplats, camera: Camera, look: RasterSettings) -> Image:
+def draw(splats: ShadedSplats, camera: Camera, settings: RasterSettings) -> Image:
     """What a camera sees: (height, width, 4) float32, red, green, blue, multiplied by alpha, and alpha; 0..1.
 
     The image is the same for any number of threads.
     """
-    screen = seen(shown, camera, look)
+    screen = seen(splats, camera, settings)
     across, down = -(-camera.width // raster.TILE), -(-camera.height // raster.TILE)
-    start, splats = raster.sort_into_tiles(screen, across, down, CHUNKS * threads_in_use())
+    start, order = raster.sort_into_tiles(screen, across, down, CHUNKS * threads_in_use())
     image = np.empty((camera.height, camera.width, 4), np.float32)
-    raster.draw_tiles(screen, start, splats, across, down, look.profile == "shifted", np.float32(MIN_ALPHA), image)
+    raster.draw_tiles(screen, start, order, across, down, settings.profile == "shifted", np.float32(MIN_ALPHA), image)
     return image
 
 
-def seen(shown: ShadedSplats, camera: Camera, look: RasterSettings) -> NDArray[np.float32]:
+def seen(splats: ShadedSplats, camera: Camera, settings: RasterSettings) -> NDArray[np.float32]:
     """The splats on the screen, (M, `project.COLUMNS`) from near to far; a buffer, which the next call overwrites."""
-    screen, arranged, keys = _buffers(len(shown))
+    screen, arranged, keys = _buffers(len(splats))
     project.project(
-        shown.center,
-        shown.scale,
-        shown.quat_xyzw,
-        shown.lod_opacity,
-        shown.rgb,
+        splats.center,
+        splats.scale,
+        splats.quat_xyzw,
+        splats.lod_opacity,
+        splats.rgb,
         world_to_camera(camera),
         np.array([*camera.focal, *camera.principal, camera.width, camera.height], np.float32),
-        np.array([look.near, look.far, CLIP, BLUR, MIN_ALPHA, MAX_STD_DEV, STD_DEV_PER_D, look.max_radius], np.float32),
-        look.sort == "radial",
+        np.array(
+            [settings.near, settings.far, CLIP, BLUR, MIN_ALPHA, MAX_STD_DEV, STD_DEV_PER_D, settings.max_radius],
+            np.float32,
+        ),
+        settings.sort == "radial",
         screen,
         keys,
     )

@@ -1,47 +1,26 @@
-"""Draws what a camera sees of a scenery: `Renderer`."""
+"""`Renderer`: draws what a camera sees of scenes."""
 
 from __future__ import annotations
 
 import dataclasses
 import threading
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..cameras.camera import Camera
-from ..scenery import Piece, Scenery
+from ..scenes.finder import CutSource
+from ..scenes.loaded import Cut
 from . import color_by, styles
 from .color_by import Scale
 from .rasterizer import Image
-from .settings import RasterSettings
-from .shading import ShadedSplats, show
+from .settings import RasterSettings, RenderSettings
+from .shading import ShadedSplats, shade
 
 #: Held while kernels run on all threads: they do not share them, and not every layer of threads survives their trying.
 _KERNELS = threading.Lock()
-
-
-@dataclass(frozen=True)
-class RenderSettings:
-    """How pictures are drawn.
-
-    Attributes:
-        look: how splats become pixels.
-        style: one of `defaults.STYLES`.
-        backend: one of `defaults.BACKENDS`.
-        color_by: one of `defaults.COLOR_BY`; None for the colours of the splats.
-        supersample: each pixel is the mean of so many, squared.
-        options: of the backend.
-    """
-
-    look: RasterSettings = field(default_factory=RasterSettings)
-    style: str = "splats"
-    backend: str = "numba"
-    color_by: str | None = None
-    supersample: int = 1
-    options: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -60,12 +39,12 @@ class Drawn:
 
 
 class Renderer:
-    """Draws pictures of a scenery, all in one manner, from several threads if they want to.
+    """Draws pictures with the same settings; several threads may ask it.
 
     Args:
-        scenery: what is drawn.
-        manner: how.
-        cameras: that it will be seen by; colours mean the same in the pictures of all.
+        source: what is drawn.
+        settings: how.
+        cameras: that will see it; colours that mean something mean the same in the pictures of all of them.
 
     Attributes:
         scale: what the colours mean; None where they are those of the splats.
@@ -74,20 +53,20 @@ class Renderer:
         SparklodError: there is nothing to colour by.
     """
 
-    def __init__(self, scenery: Scenery, manner: RenderSettings, cameras: Sequence[Camera]) -> None:
-        self.scenery, self.manner = scenery, manner
+    def __init__(self, source: CutSource, settings: RenderSettings, cameras: Sequence[Camera]) -> None:
+        self.source, self.settings = source, settings
         self.scale = self._scale(cameras)
 
     def _scale(self, cameras: Sequence[Camera]) -> Scale | None:
-        by = self.manner.color_by
+        by = self.settings.color_by
         if by is None:
             return None
         if by == "depth":
-            return color_by.scale_of_depth(self.scenery, cameras, self.manner.look)
+            return color_by.scale_of_depth(self.source, cameras, self.settings.raster)
         if by == "overdraw":
             some = {number: cameras[number] for number in (0, len(cameras) // 2, len(cameras) - 1)}
-            return color_by.scale_of_overdraw([self._overdraw(self.scenery.pieces(at), at) for at in some.values()])
-        return color_by.scale_of_splats(by, self.scenery, cameras)
+            return color_by.scale_of_overdraw([self._overdraw(self.source.cut(at), at) for at in some.values()])
+        return color_by.scale_of_splats(by, self.source, cameras)
 
     def draw(self, camera: Camera) -> Drawn:
         """The picture of a camera.
@@ -95,59 +74,58 @@ class Renderer:
         Raises:
             BackendError: the backend cannot draw here.
         """
-        pieces = self.scenery.pieces(camera)
-        count = sum(len(piece.index) for piece in pieces)
-        by = self.manner.color_by
+        cut = self.source.cut(camera)
+        by = self.settings.color_by
         if by == "overdraw":
-            values = self._overdraw(pieces, camera)
-            return Drawn(self._colored(values, (values > 0).astype(np.float32)), values, count)
+            values = self._overdraw(cut, camera)
+            return Drawn(self._colored(values, (values > 0).astype(np.float32)), values, len(cut))
         if by == "depth":
-            values, alpha = self._depth(pieces, camera)
-            return Drawn(self._colored(values, alpha), values, count)
-        fine = finer(camera, self.manner.supersample)
+            values, alpha = self._depth(cut, camera)
+            return Drawn(self._colored(values, alpha), values, len(cut))
+        fine = finer(camera, self.settings.supersample)
         with _KERNELS:
-            shown = self._show(pieces, fine)
+            shaded = self._shaded(cut, fine)
             if self.scale is not None and by is not None:
-                rgb = [self.scale.rgb(color_by.values_of(by, piece)) for piece in pieces]
-                shown = dataclasses.replace(shown, rgb=np.concatenate(rgb))
-            image = self._image(shown, fine)
-        return Drawn(averaged(image, self.manner.supersample), None, count)
+                rgb = [self.scale.rgb(color_by.values_of(by, part)) for part in cut.parts]
+                shaded = dataclasses.replace(shaded, rgb=np.concatenate(rgb))
+            image = self._image(shaded, fine)
+        return Drawn(averaged(image, self.settings.supersample), None, len(cut))
 
-    def _show(self, pieces: Sequence[Piece], camera: Camera) -> ShadedSplats:
+    def _shaded(self, cut: Cut, camera: Camera) -> ShadedSplats:
         """Colours that are not the splats' own are not lit either."""
-        degree = 3 if self.manner.color_by is None else 0
-        return show([(piece.splats.with_max_sh(degree), piece.object_to_world) for piece in pieces], camera)
+        degree = self.settings.max_sh if self.settings.color_by is None else 0
+        return shade([(part.splats.with_max_sh(degree), part.object_to_world) for part in cut.parts], camera)
 
-    def _image(self, shown: ShadedSplats, camera: Camera) -> Image:
-        look = self._look
-        return styles.draw(self.manner.style, self.manner.backend, shown, camera, look, self.manner.options)
+    def _image(self, shaded: ShadedSplats, camera: Camera) -> Image:
+        settings = self.settings
+        return styles.draw(settings.style, settings.backend, shaded, camera, self._raster, settings.options)
 
     @property
-    def _look(self) -> RasterSettings:
-        """That of finer pictures: the largest radius counts in pixels of those that are shown."""
-        look = self.manner.look
-        return dataclasses.replace(look, max_radius=look.max_radius * self.manner.supersample)
+    def _raster(self) -> RasterSettings:
+        """Raster settings of the finer picture: the largest radius counts in pixels of the one that is shaded."""
+        raster = self.settings.raster
+        return dataclasses.replace(raster, max_radius=raster.max_radius * self.settings.supersample)
 
-    def _overdraw(self, pieces: Sequence[Piece], camera: Camera) -> NDArray[np.float32]:
-        fine = finer(camera, self.manner.supersample)
+    def _overdraw(self, cut: Cut, camera: Camera) -> NDArray[np.float32]:
+        fine = finer(camera, self.settings.supersample)
         with _KERNELS:
-            counts = styles.overdraw(self._show(pieces, fine), fine, self._look)
-        return averaged(counts[..., None], self.manner.supersample)[..., 0]
+            counts = styles.overdraw(self._shaded(cut, fine), fine, self._raster)
+        return averaged(counts[..., None], self.settings.supersample)[..., 0]
 
-    def _depth(self, pieces: Sequence[Piece], camera: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def _depth(self, cut: Cut, camera: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """(H, W) the mean depth of what is seen, world units, NaN where that is nothing; and alpha."""
-        look, fine = self.manner.look, finer(camera, self.manner.supersample)
+        raster, fine = self.settings.raster, finer(camera, self.settings.supersample)
         with _KERNELS:
-            shown = self._show(pieces, fine)
-            depth = (shown.center - camera.position.astype(np.float32)) @ camera.forward.astype(np.float32)
-            drawn = (depth > look.near) & (depth < look.far)
+            shaded = self._shaded(cut, fine)
+            depth = (shaded.center - camera.position.astype(np.float32)) @ camera.forward.astype(np.float32)
+            drawn = (depth > raster.near) & (depth < raster.far)
             # Backends draw colours of 0..1.
-            top = float(depth[drawn].max(initial=look.near))
+            top = float(depth[drawn].max(initial=raster.near))
             rgb = np.clip(np.nan_to_num(depth) / np.float32(top), 0, 1)
             image = self._image(
-                dataclasses.replace(shown, rgb=np.repeat(rgb[:, None], 3, axis=1).astype(np.float32)), fine
+                dataclasses.replace(shaded, rgb=np.repeat(rgb[:, None], 3, axis=1).astype(np.float32)), fine
             )
-        image = averaged(image, self.manner.supersample)
+        image = averaged(image, self.settings.supersample)
         alpha = image[..., 3]
         with np.errstate(divide="ignore", invalid="ignore"):
             mean = np.where(alpha > 0, image[..., 0] / alpha * np.float32(top), np.float32(np.nan))

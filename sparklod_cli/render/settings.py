@@ -1,8 +1,12 @@
-"""`RasterSettings`: how splats become pixels; the defaults are Spark 2's."""
+"""How splats become pixels, and how pictures are drawn; the defaults are Spark 2's. Imports nothing heavy."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from ..support.defaults import MAX_SH_DEGREE
 
 #: How far out a splat is drawn, in standard deviations: Spark's `maxStdDev`, sqrt(8); a merged one farther, by this for
 #: each that its D is above 1.
@@ -44,3 +48,26 @@ class RasterSettings:
     profile: str = PROFILES[0]
     sort: str = SORTS[0]
     max_radius: float = MAX_PIXEL_RADIUS
+
+
+@dataclass(frozen=True)
+class RenderSettings:
+    """How pictures are drawn.
+
+    Attributes:
+        raster: how splats become pixels.
+        style: one of `defaults.STYLES`.
+        backend: a name in `backends.BACKENDS`.
+        color_by: one of `defaults.COLOR_BY`; None for the colours of the splats.
+        supersample: samples along each side of a pixel, which is their mean.
+        max_sh: degrees of spherical harmonics above this are left out.
+        options: of the backend.
+    """
+
+    raster: RasterSettings = field(default_factory=RasterSettings)
+    style: str = "splats"
+    backend: str = "numba"
+    color_by: str | None = None
+    supersample: int = 1
+    max_sh: int = MAX_SH_DEGREE
+    options: Mapping[str, Any] = field(default_factory=dict)

@@ -36,18 +36,18 @@ class ShadedSplats:
         return len(self.center)
 
 
-def show(parts: Sequence[tuple[Splats, Matrix]], camera: Camera) -> ShadedSplats:
+def shade(parts: Sequence[tuple[Splats, Matrix]], camera: Camera) -> ShadedSplats:
     """Splats with their places, (4, 4) object to world, as a camera sees them.
 
     Spherical harmonics are those of the direction from the camera to a splat's centre, in the space of its object.
     """
-    shown = [_show(splats, matrix, camera) for splats, matrix in parts]
+    shaded = [_shade(splats, matrix, camera) for splats, matrix in parts]
     return ShadedSplats(
-        **{field.name: np.concatenate([getattr(part, field.name) for part in shown]) for field in fields(ShadedSplats)}
+        **{field.name: np.concatenate([getattr(part, field.name) for part in shaded]) for field in fields(ShadedSplats)}
     )
 
 
-def _show(splats: Splats, matrix: Matrix, camera: Camera) -> ShadedSplats:
+def _shade(splats: Splats, matrix: Matrix, camera: Camera) -> ShadedSplats:
     rgb = splats.rgb.copy()
     if splats.sh.shape[1]:
         eye = np.linalg.solve(matrix, np.append(camera.position, 1))[:3].astype(np.float32)

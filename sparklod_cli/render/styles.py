@@ -29,7 +29,7 @@ class OnScreen:
     """Splats whose centres a camera sees; M of them.
 
     Attributes:
-        index: (M,) which of those that are shown.
+        index: (M,) which of those that are shaded.
         x, y: (M,) float32 pixels from the upper left corner.
         depth: (M,) float32 along the axis.
         distance: (M,) float32 from the camera.
@@ -45,9 +45,9 @@ class OnScreen:
 def draw(
     style: str,
     backend: str,
-    shown: ShadedSplats,
+    splats: ShadedSplats,
     camera: Camera,
-    look: RasterSettings,
+    settings: RasterSettings,
     options: Mapping[str, Any] | None = None,
 ) -> Image:
     """What a camera sees; the image is that of `rasterizer.draw`.
@@ -57,31 +57,31 @@ def draw(
             as the splats; both are drawn in the order of the file. "sorted-billboards" are drawn from far to near, as
             "splats" are.
         backend: one of `BACKENDS`, which draws splats.
-        shown: what is drawn.
+        splats: what is drawn.
         camera: that sees it.
-        look: how.
+        settings: how splats become pixels.
         options: of the backend.
 
     Raises:
         BackendError: the backend cannot draw here.
     """
     if style == "splats":
-        return BACKENDS[backend].draw(shown, camera, look, **(options or {}))
-    seen = on_screen(shown, camera, look)
+        return BACKENDS[backend].draw(splats, camera, settings, **(options or {}))
+    seen = on_screen(splats, camera, settings)
     image: Image = np.zeros((camera.height, camera.width, 4), np.float32)
     if style == "points":
         inside = (seen.x >= 0) & (seen.x < camera.width) & (seen.y >= 0) & (seen.y < camera.height)
         row, column = seen.y[inside].astype(np.intp), seen.x[inside].astype(np.intp)
-        image[row, column, :3] = np.minimum(shown.rgb[seen.index[inside]], 1)  # of several, the last one stays
+        image[row, column, :3] = np.minimum(splats.rgb[seen.index[inside]], 1)  # of several, the last one stays
         image[row, column, 3] = 1
         return image
     order = np.arange(len(seen.index))
     if style == "sorted-billboards":
-        order = np.argsort(-(seen.distance if look.sort == "radial" else seen.depth), kind="stable")
+        order = np.argsort(-(seen.distance if settings.sort == "radial" else seen.depth), kind="stable")
     index, depth = seen.index[order], seen.depth[order]
-    width = shown.scale[index].mean(axis=1) * (1 + SIZE_PER_D * np.maximum(shown.lod_opacity[index] - 1, 0))
-    radius = np.clip(width * np.float32(camera.focal[1]) / depth, 0.5, look.max_radius)
-    rgb = np.minimum(shown.rgb[index], 1)
+    width = splats.scale[index].mean(axis=1) * (1 + SIZE_PER_D * np.maximum(splats.lod_opacity[index] - 1, 0))
+    radius = np.clip(width * np.float32(camera.focal[1]) / depth, 0.5, settings.max_radius)
+    rgb = np.minimum(splats.rgb[index], 1)
     bands.draw_discs(
         np.ascontiguousarray(seen.x[order]),
         np.ascontiguousarray(seen.y[order]),
@@ -93,13 +93,13 @@ def draw(
     return image
 
 
-def on_screen(shown: ShadedSplats, camera: Camera, look: RasterSettings) -> OnScreen:
+def on_screen(splats: ShadedSplats, camera: Camera, settings: RasterSettings) -> OnScreen:
     """The splats between near and far whose centres are in the picture, or as far beside it as splats are drawn."""
-    local = (shown.center - camera.position.astype(np.float32)) @ camera.camera_to_world[:3, :3].astype(np.float32)
+    local = (splats.center - camera.position.astype(np.float32)) @ camera.camera_to_world[:3, :3].astype(np.float32)
     depth = -local[:, 2]
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         dx, dy = camera.focal[0] * local[:, 0] / depth, -camera.focal[1] * local[:, 1] / depth
-        seen = (depth > look.near) & (depth < look.far) & (shown.lod_opacity >= MIN_ALPHA)
+        seen = (depth > settings.near) & (depth < settings.far) & (splats.lod_opacity >= MIN_ALPHA)
         seen &= (abs(dx) <= CLIP * camera.width / 2) & (abs(dy) <= CLIP * camera.height / 2)
     index = np.flatnonzero(seen)
     return OnScreen(
@@ -111,13 +111,13 @@ def on_screen(shown: ShadedSplats, camera: Camera, look: RasterSettings) -> OnSc
     )
 
 
-def overdraw(shown: ShadedSplats, camera: Camera, look: RasterSettings) -> NDArray[np.float32]:
+def overdraw(splats: ShadedSplats, camera: Camera, settings: RasterSettings) -> NDArray[np.float32]:
     """(height, width) how many splats are blended into each pixel, those too that others hide.
 
     Splats are those that the backend numba draws.
     """
     counts = np.zeros((camera.height, camera.width), np.int32)
     bands.count_fragments(
-        rasterizer.seen(shown, camera, look), look.profile == "shifted", np.float32(MIN_ALPHA), counts
+        rasterizer.seen(splats, camera, settings), settings.profile == "shifted", np.float32(MIN_ALPHA), counts
     )
     return counts.astype(np.float32)

@@ -1,10 +1,10 @@
-"""Goes along a camera path and tells, frame by frame, what a viewer would draw."""
+"""`Simulation`: what a viewer draws along a camera path, frame by frame, and what it has to fetch for that."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,45 +12,17 @@ from numpy.typing import NDArray
 from ..cameras.camera import Camera
 from ..cameras.path import CameraPath
 from ..lod.cut_statistics import Changes, Measured, measure
-from ..lod.traversal import Cones, Cut, Frustum, Traversal, View, pixel_limit
+from ..lod.settings import LodSettings
+from ..lod.traversal import TreeCut
+from ..model.instances import TOTAL
+from ..scenes.finder import view_of
+from ..scenes.loaded import Scenes
 from ..support.parallel import ordered_map
 from ..support.progress import Progress, silent
-from ..support.units import count_of
 from ..tables.columns import Row
-from ..world import TOTAL, World
 from .chunk_cache import Chunks
 from .columns import COLUMNS
-from .streaming import Network, Stream
-
-#: A cut has the number of an instance as a uint16.
-MOST_INSTANCES = 65_535
-
-
-@dataclass(frozen=True)
-class LodSettings:
-    """How a viewer is set.
-
-    Attributes:
-        budget: how many splats it draws at most, all instances together.
-        foveation: how pixel scales count by direction, where an instance does not have its own.
-        pixel_scale_limit: nodes of this pixel scale are not divided; None for the size of a pixel.
-        render_scale: what the size of a pixel is multiplied by, Spark's `lodRenderScale`.
-        network: what brings chunks.
-        chunk_cache: how many chunks it holds; None for all.
-    """
-
-    budget: int
-    foveation: Cones | Frustum = field(default_factory=Cones)
-    pixel_scale_limit: float | None = None
-    render_scale: float = 1.0
-    network: Network = field(default_factory=Network)
-    chunk_cache: int | None = None
-
-    def smallest(self, camera: Camera) -> float:
-        """The pixel scale at or under which it divides nothing."""
-        if self.pixel_scale_limit is not None:
-            return self.pixel_scale_limit
-        return pixel_limit(camera.fov_y, camera.height, self.render_scale)
+from .streaming import Stream, StreamingSettings
 
 
 @dataclass(frozen=True)
@@ -67,7 +39,7 @@ class Frame:
 
     number: int
     camera: Camera
-    cut: Cut
+    cut: TreeCut
     rows: list[Row]
     in_front: float
 
@@ -76,42 +48,45 @@ class Frame:
 class _Found:
     """A cut, what it is like, as a whole and by instance, and how long it took."""
 
-    cut: Cut
+    cut: TreeCut
     whole: Measured
     parts: list[Measured]
     seconds: float
 
 
-def view_of(camera: Camera) -> View:
-    """A camera, as far as the traversal cares."""
-    return View(camera.camera_to_world, camera.fov_x, camera.fov_y)
-
-
 class Simulation:
-    """A viewer in a world.
+    """A viewer that goes along a camera path through trees.
 
     Args:
-        world: the trees.
-        viewer: how it is set.
-        by_instance: rows of single instances are wanted, too.
+        scenes: trees alone.
+        settings: what the viewer draws; its cuts are ordinary ones.
+        streaming: how chunks get to it; everything is there unless given.
+        by_instance: make rows of single instances, too.
 
     Raises:
-        ValueError: the budget, or the cache, is too small for even the roots; or there are too many instances.
+        ValueError: the budget, or the cache, is too small for the roots; or there are too many instances.
     """
 
-    def __init__(self, world: World, viewer: LodSettings, *, by_instance: bool = False) -> None:
-        instances = world.foveated(viewer.foveation)
-        if viewer.budget < len(instances):
-            budget = count_of(viewer.budget, "splat")
-            raise ValueError(f"a budget of {budget} is less than one for each of {len(instances)} instances")
-        if len(instances) > MOST_INSTANCES:
-            raise ValueError(f"{len(instances):,} instances are more than {MOST_INSTANCES:,}")
-        self.world, self.viewer, self._by_instance = world, viewer, by_instance
-        self._traversal = Traversal(world.forest, instances)
-        self._level = np.concatenate([tree.level for tree in world.trees])
-        self._chunks = Chunks(world.chunk_bytes())
-        self._names = [place.name for place in world.placements]
-        Stream(self._chunks, viewer.network, capacity=viewer.chunk_cache)  # refuses what would fail at the first frame
+    def __init__(
+        self,
+        scenes: Scenes,
+        settings: LodSettings,
+        streaming: StreamingSettings | None = None,
+        *,
+        by_instance: bool = False,
+    ) -> None:
+        self.scenes, self.settings, self._by_instance = scenes, settings, by_instance
+        self._streaming = streaming or StreamingSettings()
+        self._traversal = scenes.traversal(settings)
+        depths = [tree.depth for tree in scenes.trees]
+        self._depth = np.concatenate([depth for depth in depths if depth is not None])
+        self._chunks = Chunks([tree.chunk_bytes() for tree in scenes.trees])
+        self._names = [instance.name for instance in scenes.instances]
+        self._stream()  # refuses what would fail at the first frame
+
+    def _stream(self, start: float = 0.0) -> Stream:
+        """A viewer's chunks, from a time in seconds on."""
+        return Stream(self._chunks, self._streaming.network, capacity=self._streaming.chunk_cache, start=start)
 
     def run(self, path: CameraPath, *, threads: int = 1, progress: Progress = silent) -> Iterator[Frame]:
         """The frames of a path, in order.
@@ -119,8 +94,8 @@ class Simulation:
         Cuts are found on several threads, some frames ahead; what depends on the frame before is done in order. Where
         chunks are missing, the cut is found once more with what is there.
         """
-        stream = Stream(self._chunks, self.viewer.network, capacity=self.viewer.chunk_cache, start=path.cameras[0].time)
-        changes = Changes(self.world.forest, self._traversal.instances)
+        stream = self._stream(path.cameras[0].time)
+        changes = Changes(self.scenes.forest, self._traversal.instances)
         self._warm_up(path.cameras[0])
         found = ordered_map(self._find, path.cameras, threads)
         for at, (number, camera, ideal) in enumerate(zip(path.numbers, path.cameras, found, strict=True)):
@@ -138,24 +113,15 @@ class Simulation:
         view = view_of(camera)
         self._traversal.cut(view, budget=len(self._traversal.instances))
 
-    @property
-    def traversal(self) -> Traversal:
-        """What finds its cuts."""
-        return self._traversal
-
-    def cut(self, camera: Camera) -> Cut:
-        """What a camera would see if all chunks were there."""
-        return self._find(camera).cut
-
     def _find(self, camera: Camera, resident: NDArray[np.bool_] | None = None) -> _Found:
         view = view_of(camera)
-        smallest = self.viewer.smallest(camera)
+        limit = self.settings.limit(camera.fov_y, camera.height)
         start = time.perf_counter()
-        cut = self._traversal.cut(view, budget=self.viewer.budget, smallest=smallest, resident=resident)
+        cut = self._traversal.cut(view, budget=self.settings.budget, smallest=limit, resident=resident)
         seconds = time.perf_counter() - start
         whole, parts = measure(
-            self.world.forest,
-            self._level,
+            self.scenes.forest,
+            self._depth,
             cut,
             view,
             size=(camera.width, camera.height),
@@ -166,7 +132,7 @@ class Simulation:
     def _fetched(self, camera: Camera, ideal: _Found, stream: Stream) -> tuple[_Found, Row]:
         """What is drawn with the chunks that are there, and the cells that tell of them."""
         wanted = ideal.cut.chunks()
-        instant = self.viewer.network.instant
+        instant = self._streaming.network.instant
         if instant:
             stream.want(wanted)
         drawn = ideal
@@ -187,7 +153,7 @@ class Simulation:
         self, number: int, camera: Camera, drawn: _Found, changes: Sequence[tuple[int, int | None, int]]
     ) -> list[Row]:
         """The row of all instances, but for its chunks, and those of each, if they are wanted."""
-        cut, viewer = drawn.cut, self.viewer
+        cut, settings = drawn.cut, self.settings
         where: Row = {"frame": number, "time_s": camera.time, "name": camera.name}
         for name, vector in (("position", camera.position), ("forward", camera.forward)):
             where |= {f"{name}_{axis}": float(value) for axis, value in zip("xyz", vector, strict=True)}
@@ -195,12 +161,12 @@ class Simulation:
             "fov_y_deg": float(np.degrees(camera.fov_y)),
             "width": camera.width,
             "height": camera.height,
-            "budget": viewer.budget,
-            "pixel_scale_limit": viewer.smallest(camera),
+            "budget": settings.budget,
+            "pixel_scale_limit": settings.limit(camera.fov_y, camera.height),
         }
         selected, kept, before = (None if None in column else sum(column) for column in zip(*changes, strict=True))
         assert selected is not None and before is not None
-        total = where | {"instance": TOTAL} | _shape(drawn.whole, viewer.budget) | _change(selected, kept, before)
+        total = where | {"instance": TOTAL} | _shape(drawn.whole, settings.budget) | _change(selected, kept, before)
         total |= {
             "stop_reason": cut.reason,
             "pixel_scale_min": cut.least if np.isfinite(cut.least) else None,
@@ -212,7 +178,7 @@ class Simulation:
         return [
             total,
             *(
-                where | {"instance": name} | _shape(part, viewer.budget) | _change(*change)
+                where | {"instance": name} | _shape(part, settings.budget) | _change(*change)
                 for name, part, change in zip(self._names, drawn.parts, changes, strict=True)
             ),
         ]

@@ -6,7 +6,7 @@ import copy
 import math
 from collections import deque
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from heapq import heappop, heappush
 
 from ..support.defaults import FETCHERS
@@ -42,6 +42,19 @@ class Network:
     def instant(self) -> bool:
         """Whether everything comes at once."""
         return self.bandwidth == math.inf and self.latency == 0
+
+
+@dataclass(frozen=True)
+class StreamingSettings:
+    """How chunks get to a viewer and stay with it.
+
+    Attributes:
+        network: that brings them; by default everything comes at once.
+        chunk_cache: the most chunks of 65,536 nodes that the viewer holds; None for all.
+    """
+
+    network: Network = field(default_factory=Network)
+    chunk_cache: int | None = None
 
 
 class Stream:

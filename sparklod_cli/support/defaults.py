@@ -79,3 +79,6 @@ SORTINGS = ("exact", "counting16")
 
 #: No far plane is farther away, world units, so that it is a float32.
 FARTHEST = 1e37
+
+#: Axes of a file that can point up, for splats that are turned to have y up.
+UP_AXES = ("y", "-y", "z", "-z")

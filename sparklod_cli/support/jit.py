@@ -190,3 +190,16 @@ def threads_in_use() -> int:
     """How many threads kernels run on."""
     threads: int = numba.get_num_threads()
     return threads
+
+
+def threading_layer() -> str:
+    """What runs the loops of parallel kernels: omp, tbb or workqueue; starts their threads.
+
+    Raises:
+        ValueError: none of them loads.
+    """
+    from numba.np.ufunc.parallel import _launch_threads
+
+    _launch_threads()
+    layer: str = numba.threading_layer()
+    return layer

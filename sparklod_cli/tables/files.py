@@ -6,14 +6,12 @@ import difflib
 import io
 import json
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from types import ModuleType
 from typing import Any
 
 from ..support.errors import SparklodError
 from .columns import Cell, Column, Row
-
-FORMS = ("csv", "json", "parquet")
 
 #: Counts up when a column changes its meaning or goes away; new ones may come without that.
 SCHEMA_VERSION = 1
@@ -49,13 +47,9 @@ def encode(rows: Iterable[Row], columns: Sequence[Column], form: str) -> Iterato
         SparklodError: pyarrow is not installed, for Parquet; at once, before the first row is asked for.
         ValueError: a number is not finite; while the pieces are taken.
     """
-    if form == "csv":
-        return _csv(rows, columns)
-    if form == "json":
-        return _json(rows, columns)
-    if form == "parquet":
-        return _parquet(rows, columns, load_pyarrow())
-    raise ValueError(f"form is {form}, not one of {', '.join(FORMS)}")
+    if form not in FORMS:
+        raise ValueError(f"form is {form}, not one of {', '.join(FORMS)}")
+    return FORMS[form](rows, columns)
 
 
 def load_pyarrow() -> ModuleType:
@@ -118,7 +112,11 @@ def _dumped(value: dict[str, Any]) -> str:
     return json.dumps(value, ensure_ascii=False, allow_nan=False)
 
 
-def _parquet(rows: Iterable[Row], columns: Sequence[Column], pyarrow: ModuleType) -> Iterator[bytes]:
+def _parquet(rows: Iterable[Row], columns: Sequence[Column]) -> Iterator[bytes]:
+    return _parquet_pieces(rows, columns, load_pyarrow())  # which is missed at once, not at the first row
+
+
+def _parquet_pieces(rows: Iterable[Row], columns: Sequence[Column], pyarrow: ModuleType) -> Iterator[bytes]:
     types = {int: pyarrow.int64(), float: pyarrow.float64(), str: pyarrow.string()}
     fields = [
         pyarrow.field(column.name, types[column.kind], metadata={"unit": column.unit, "description": column.meaning})
@@ -135,3 +133,11 @@ def _parquet(rows: Iterable[Row], columns: Sequence[Column], pyarrow: ModuleType
     file = io.BytesIO()
     pyarrow.parquet.write_table(table, file)
     yield file.getvalue()
+
+
+#: How rows become the pieces of a file, by the name that `--format` knows, and the suffix; the first is the default.
+FORMS: dict[str, Callable[[Iterable[Row], Sequence[Column]], Iterator[bytes]]] = {
+    "csv": _csv,
+    "json": _json,
+    "parquet": _parquet,
+}

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 
-from ..world import TOTAL
+from ..model.instances import TOTAL
 from .columns import Row
 
 Number = int | float

@@ -11,6 +11,7 @@ import pytest
 
 from sparklod_cli.codecs import spz
 from sparklod_cli.codecs.formats import FORMATS
+from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.io import read_scene
 from sparklod_cli.model.gaussian import linear_opacity, lod_opacity
 from sparklod_cli.model.lod_tree import LodTree
@@ -84,8 +85,7 @@ def assert_close(back: Splats, source: Splats, allowed: Precision) -> None:
 @pytest.mark.parametrize("lod", [False, True])
 def test_writing_again_changes_nothing(name: str, version: int, lod: bool) -> None:
     """SPZ of SPZ: whatever was rounded once stays where it is (rotations beyond half a turn excepted)."""
-    bits = spz.fractional_bits(scene(name).splats, spz.Options())
-    options = spz.Options(version=version, fractional_bits=bits)
+    options = spz.settled(scene(name), WriteOptions(spz_version=version))
     once = spz.decode(io.BytesIO(b"".join(spz.encode(scene(name, lod=lod), options))))
     twice = spz.decode(io.BytesIO(b"".join(spz.encode(once, options))))
     for column in COLUMNS:
@@ -95,7 +95,7 @@ def test_writing_again_changes_nothing(name: str, version: int, lod: bool) -> No
 
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_spz_keeps_whether_a_scene_is_antialiased(antialiased: bool) -> None:
-    data = b"".join(spz.encode(Scene(scene("sh0").splats, antialiased=antialiased), spz.Options()))
+    data = b"".join(spz.encode(Scene(scene("sh0").splats, antialiased=antialiased)))
     assert spz.decode(io.BytesIO(data)).antialiased is antialiased
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import gzip
 import io
 import math
@@ -14,7 +15,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fixtures import by_hand
-from sparklod_cli.codecs import clamps, quantize, spz
+from sparklod_cli.codecs import clamps, quantize, spz, spz_options
+from sparklod_cli.codecs.options import WriteOptions
+from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.support.errors import FormatError
@@ -119,7 +122,9 @@ def test_a_tree_is_read() -> None:
 @pytest.mark.parametrize("threads", [2, 5])
 def test_threads_do_not_change_a_file(version: int, threads: int) -> None:
     scene = Scene(random_splats(40_000, sh_degree=1))  # more than two chunks of rows and five gzip blocks
-    one, many = (b"".join(spz.encode(scene, spz.Options(version=version, threads=count))) for count in (1, threads))
+    one, many = (
+        b"".join(spz.encode(scene, WriteOptions(spz_version=version), threads=count)) for count in (1, threads)
+    )
     assert one == many
     decoded = [spz.decode(io.BytesIO(one), threads=count).splats for count in (1, threads)]
     for column in COLUMNS:
@@ -137,16 +142,16 @@ def splats_with(*, reach: float = 1.0, scale: float = 0.01, count: int = 200) ->
 
 
 def bits_of(splats: Splats, fractional_bits: int | None = None) -> int | None:
-    return spz.fractional_bits(splats, spz.Options(fractional_bits=fractional_bits))
+    return spz.settled(Scene(splats), WriteOptions(fractional_bits=fractional_bits)).fractional_bits
 
 
-@given(reach=st.floats(2.0**-10, spz.LAST_CODE, width=32))
+@given(reach=st.floats(2.0**-10, spz_options.LAST_CODE, width=32))
 def test_the_most_bits_are_the_most_that_fit(reach: float) -> None:
     splats = splats_with(reach=reach, count=2)
-    bits = spz.largest_fractional_bits(splats.center)
-    assert round(reach * 2.0**bits) <= spz.LAST_CODE == 2**23 - 2
-    assert bits == 24 or round(reach * 2.0 ** (bits + 1)) > spz.LAST_CODE
-    back = spz.decode(io.BytesIO(b"".join(spz.encode(Scene(splats), spz.Options(fractional_bits=bits)))))
+    bits = spz_options.largest_fractional_bits(splats.center)
+    assert round(reach * 2.0**bits) <= spz_options.LAST_CODE == 2**23 - 2
+    assert bits == 24 or round(reach * 2.0 ** (bits + 1)) > spz_options.LAST_CODE
+    back = spz.decode(io.BytesIO(b"".join(spz.encode(Scene(splats), WriteOptions(fractional_bits=bits)))))
     assert np.abs(back.splats.center.astype(np.float64) - splats.center).max() <= 0.5 * 2.0**-bits
 
 
@@ -190,7 +195,40 @@ def test_what_no_bits_hold_is_refused() -> None:
 def test_only_versions_2_and_3_are_written() -> None:
     for version in (1, 4):
         with pytest.raises(ValueError, match="is not one of"):
-            spz.fractional_bits(random_splats(1), spz.Options(version=version))
+            spz.settled(Scene(random_splats(1)), WriteOptions(spz_version=version))
+
+
+def test_merged_splats_have_no_say_in_the_bits() -> None:
+    """A tree gets those of its leaves: its inner nodes are larger, and may lie farther out only by the extent."""
+    leaves = splats_with(scale=0.01, count=20)
+    root = leaves.take(np.zeros(400, np.int64))
+    root.scale[:] = 1e-5
+    count = np.zeros(420, np.uint16)
+    count[:400], start = 1, np.arange(1, 421, dtype=np.uint32)
+    count[399], start[400:] = 20, 0
+    tree = Scene(Splats.concat([root, leaves]), LodTree(count, start))
+    assert spz.settled(tree, WriteOptions()).fractional_bits == bits_of(leaves) == 11
+    root.center[0] = 4000
+    assert spz.settled(Scene(Splats.concat([root, leaves]), tree.tree), WriteOptions()).fractional_bits == 11
+    root.center[0] = 5000
+    assert spz.settled(Scene(Splats.concat([root, leaves]), tree.tree), WriteOptions()).fractional_bits == 10
+
+
+def test_settled_options_are_settled_and_write_the_same_bytes() -> None:
+    scene = Scene(random_splats(50))
+    once = spz.settled(scene, WriteOptions())
+    assert None not in (once.spz_version, once.fractional_bits)
+    assert spz.settled(scene, once) == once
+    assert b"".join(spz.encode(scene, once)) == b"".join(spz.encode(scene))
+
+
+def test_options_like_those_of_a_file_are_its_own_where_nobody_chose() -> None:
+    scene = spz.decode(io.BytesIO(b"".join(spz.encode(Scene(random_splats(9)), WriteOptions(2, 9)))))
+    assert spz_options.like(scene, WriteOptions()) == WriteOptions(2, 9)
+    assert spz_options.like(scene, WriteOptions(3, 0, 7)) == WriteOptions(3, 0, 7)
+    newer = dataclasses.replace(scene, header={"version": 4, "fractional_bits": 12})
+    assert spz_options.like(newer, WriteOptions()) == WriteOptions(3, 12)
+    assert spz_options.like(Scene(scene.splats), WriteOptions()) == WriteOptions()
 
 
 def test_what_is_clamped_is_counted_by_splat() -> None:
@@ -199,13 +237,13 @@ def test_what_is_clamped_is_counted_by_splat() -> None:
     low, high = math.exp(-10 - 1 / 32), math.exp(255.5 / 16 - 10)
     splats.scale[0] = low * 1.001  # rounds to the last code that is in
     splats.scale[1] = high * 0.999
-    assert spz.clamped(splats) == {}
+    assert clamps.clamped(splats) == {}
     splats.scale[2, 1] = low * 0.999
     splats.scale[3, 2] = high * 1.001
     splats.scale[4] = 0  # a splat counts once, however many of its axes are out
     splats.rgb[5] = -0.5
     splats.sh[6:, 2] = 1.1
-    assert spz.clamped(splats, threads=2) == {"scale": 3, "rgb": 1, "sh": 2}
+    assert clamps.clamped(splats, threads=2) == {"scale": 3, "rgb": 1, "sh": 2}
     found = {(at.column, at.above): (at.splats, at.farthest) for at in clamps.clamps(splats, ["scale", "rgb", "sh"])}
     assert found == {
         ("scale", False): (2, 0.0),

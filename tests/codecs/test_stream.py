@@ -13,6 +13,7 @@ import pytest
 from fixtures import by_hand
 from sparklod_cli.codecs import ply, splat, spz
 from sparklod_cli.codecs.formats import HEAD, sniff
+from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.codecs.stream import rows_of
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
@@ -25,7 +26,7 @@ COUNT = 12 * CHUNK
 
 def spz4(splats: Splats) -> bytes:
     """Version 4 of what version 3 has: the same streams, a zstd frame each."""
-    gzipped = b"".join(spz.encode(Scene(splats), spz.Options(version=3)))
+    gzipped = b"".join(spz.encode(Scene(splats), WriteOptions(spz_version=3)))
     raw = by_hand.unpacked(gzipped)
     streams, at = [], 16
     for size in (9, 1, 3, 3, 4, 3 * splats.sh.shape[1]):
@@ -39,7 +40,7 @@ def spz4(splats: Splats) -> bytes:
 WRITERS: dict[str, Callable[[Splats], bytes]] = {
     "ply": lambda splats: b"".join(ply.encode(Scene(splats))),
     "splat": lambda splats: b"".join(splat.encode(Scene(splats))),
-    "spz 3": lambda splats: b"".join(spz.encode(Scene(splats), spz.Options(version=3))),
+    "spz 3": lambda splats: b"".join(spz.encode(Scene(splats), WriteOptions(spz_version=3))),
     "spz 4": spz4,
 }
 

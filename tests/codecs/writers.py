@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from fixtures import by_hand, by_hand_compressed_ply, by_hand_ksplat, by_hand_sog, by_hand_splat
 from sparklod_cli.codecs import ply, splat, spz
+from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.sh import SH_C0
 from sparklod_cli.model.splats import Splats
@@ -158,11 +159,11 @@ COMPRESSED_PLY = {
 
 
 def as_spz(source: Scene, version: int) -> bytes:
-    return b"".join(spz.encode(source, spz.Options(version=version)))
+    return b"".join(spz.encode(source, WriteOptions(spz_version=version)))
 
 
 def spz_precision(source: Scene, version: int) -> Precision:
-    bits = spz.fractional_bits(source.splats, spz.Options(version=version))
+    bits = spz.settled(source, WriteOptions(spz_version=version)).fractional_bits
     assert bits is not None
     coding = spz.quantize.decode_quat_smallest_three if version == 3 else spz.quantize.decode_quat_first_three
     return Precision(

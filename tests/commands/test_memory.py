@@ -12,6 +12,7 @@ import pytest
 
 from sparklod_cli.cli import run
 from sparklod_cli.codecs import spz
+from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
@@ -54,7 +55,7 @@ def large(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     inner = np.arange(-(-(COUNT - 1) // fan))
     count[inner] = np.minimum(fan, COUNT - 1 - inner * fan)
     start[inner] = 1 + inner * fan
-    pieces = spz.encode(Scene(splats, LodTree(count, start)), spz.Options(compression_level=1))
+    pieces = spz.encode(Scene(splats, LodTree(count, start)), WriteOptions(compression_level=1))
     tree.write_bytes(b"".join(pieces))
     return plain, tree
 

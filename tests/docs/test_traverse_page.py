@@ -33,7 +33,7 @@ def with_columns(text: str) -> str:
 
 @pytest.mark.parametrize("text", re.findall(r"--assert '(.*?)'", PAGE.read_text()))
 def test_assertions_on_the_page_are_understood(text: str) -> None:
-    assert check([parse(text)], flight(20))
+    assert check([parse(text, COLUMNS)], flight(20))
 
 
 def test_the_page_names_what_is_in_the_summary() -> None:

@@ -9,7 +9,10 @@ import numpy as np
 from PIL import Image
 
 from sparklod_cli.cameras.camera import Camera
-from sparklod_cli.figures.traversal_chart import Scenery
+from sparklod_cli.figures.traversal_chart import Plot, Scenery, plot
+from sparklod_cli.simulation.summary import look_at
+from sparklod_cli.tables.columns import Row
+from sparklod_cli.tables.statistics import totals
 from tests.scenes import random_splats
 
 SIZE = (400, 250)
@@ -35,6 +38,16 @@ def circle(count: int = 20, radius: float = 6) -> list[Camera]:
 def scenery(frame: int | None = 3) -> Scenery:
     splats = random_splats(500)
     return Scenery(circle(), splats, np.arange(500) // 100, frame)
+
+
+def marked(rows: list[Row]) -> dict[str, int]:
+    """The frames worth a look, as `traverse --plot` marks them."""
+    return {moment.what: moment.frame for moment in look_at(totals(rows))}
+
+
+def plotted(rows: list[Row], title: str = "scene.spz", scenery: Scenery | None = None) -> Plot:
+    """The plot of `traverse --plot`."""
+    return plot(rows, marked(rows), title, scenery)
 
 
 def pixels(png: bytes) -> np.ndarray:

@@ -7,9 +7,8 @@ import pytest
 
 from sparklod_cli.figures import charts
 from sparklod_cli.figures.camera_path import FRAME, _above, frustum_lines, picture_of_path
-from sparklod_cli.figures.traversal_chart import plot
 from sparklod_cli.support.errors import SparklodError
-from tests.figures.flights import SIZE, circle, count_of, looking, pixels, scenery
+from tests.figures.flights import SIZE, circle, count_of, looking, pixels, plotted, scenery
 from tests.scenes import random_splats
 from tests.tables.rows import flight
 
@@ -54,10 +53,10 @@ class TestPictureOfPath:
 
     @pytest.mark.usefixtures("charting")
     def test_it_stands_below_the_charts(self) -> None:
-        plotted = plot(flight(5), "scene.spz", scenery())
-        alone = pixels(plot(flight(5), "scene.spz").png)
-        both = pixels(plotted.png)
-        assert plotted.note is None
+        whole = plotted(flight(5), scenery=scenery())
+        alone = pixels(plotted(flight(5)).png)
+        both = pixels(whole.png)
+        assert whole.note is None
         assert both.shape == (len(alone) + 1000, charts.WIDTH, 3)
         assert (both[: len(alone)] == alone).all()
 

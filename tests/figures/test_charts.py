@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from sparklod_cli.figures import charts
-from sparklod_cli.figures.traversal_chart import plot
 from sparklod_cli.tables.columns import Row
-from tests.figures.flights import count_of, pixels
+from tests.figures.flights import count_of, marked, pixels, plotted
 from tests.tables.rows import flight, row
 
 
@@ -32,10 +31,10 @@ def test_axes_count_in_whole_numbers(most: int, charting: None) -> None:
 @pytest.mark.usefixtures("charting")
 class TestCharts:
     def test_the_same_rows_give_the_same_picture(self) -> None:
-        assert plot(flight(60), "scene.spz") == plot(flight(60), "scene.spz")
+        assert plotted(flight(60)) == plotted(flight(60))
 
     def test_it_is_as_wide_as_it_should_be(self) -> None:
-        image = pixels(plot(flight(60), "scene.spz").png)
+        image = pixels(plotted(flight(60)).png)
         assert image.shape[1] == charts.WIDTH
         assert image.shape[0] > charts.ROW * len(charts.PANELS) / 2
 
@@ -44,28 +43,28 @@ class TestCharts:
         for each in quiet:
             each |= dict.fromkeys(("churn", "bytes_new", "missing", "complete_in_s", "overdraw_estimate"), 0)
             each["pixel_scale_min"] = each["pixel_scale_limit"]
-        assert count_of(pixels(plot(flight(60), "scene.spz").png), charts.PINK) > 500
-        assert count_of(pixels(plot(quiet, "scene.spz").png), charts.PINK) == 0
+        assert count_of(pixels(plotted(flight(60)).png), charts.PINK) > 500
+        assert count_of(pixels(plotted(quiet).png), charts.PINK) == 0
 
     def test_empty_columns_leave_their_panel_out(self) -> None:
         rows = flight(60)
-        every = charts.draw(rows).shape[0]
+        every = charts.draw(rows, marked(rows)).shape[0]
         assert every == charts.ROW * 5
-        fewer = charts.draw([each | dict.fromkeys(("traverse_ms", "complete_in_s"), None) for each in rows])
+        fewer = charts.draw([each | dict.fromkeys(("traverse_ms", "complete_in_s"), None) for each in rows], {})
         assert fewer.shape[0] == charts.ROW * 4
 
     @pytest.mark.parametrize("panel", charts.PANELS, ids=lambda panel: panel.title)
     def test_each_panel_shows_its_columns(self, panel: charts.Panel, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(charts, "PANELS", (panel,))
         rows = flight(60)
-        before = charts.draw(rows)
+        before = charts.draw(rows, marked(rows))
         for name in panel.columns:
             other = [each | {name: (each[name] or 0) * (1.1 + at % 7)} for at, each in enumerate(rows)]  # type: ignore[operator]
-            assert not np.array_equal(charts.draw(other), before), name
+            assert not np.array_equal(charts.draw(other, marked(other)), before), name
 
     @pytest.mark.parametrize("count", [1, 2, 3])
     def test_a_path_of_few_frames_has_a_chart_of_full_width(self, count: int) -> None:
-        assert pixels(plot(flight(count), "scene.spz").png).shape[1] == charts.WIDTH
+        assert pixels(plotted(flight(count)).png).shape[1] == charts.WIDTH
 
     @pytest.mark.parametrize(
         "cells",
@@ -80,27 +79,27 @@ class TestCharts:
     @pytest.mark.filterwarnings("error")
     def test_rows_with_nothing_in_them(self, cells: dict[str, int | float]) -> None:
         rows: list[Row] = [row(frame, **cells) for frame in range(4)]
-        assert plot(rows, "scene.spz").note is None
+        assert plotted(rows).note is None
 
     @pytest.mark.parametrize("title", ["$x", "a\nb", "", "城.spz", "w" * 1000])
     def test_any_name_is_a_title(self, title: str) -> None:
-        assert plot(flight(3), title).png
+        assert plotted(flight(3), title).png
 
     def test_a_chart_leaves_single_instances_out(self) -> None:
         rows = flight(20)
-        assert plot([*rows, *(each | {"instance": "tree"} for each in rows)], "a") == plot(rows, "a")
+        assert plotted([*rows, *(each | {"instance": "tree"} for each in rows)], "a") == plotted(rows, "a")
 
     def test_a_matplotlibrc_changes_nothing(self) -> None:
         import matplotlib
 
-        before = charts.draw(flight(5))
+        before = charts.draw(flight(5), {})
         with matplotlib.rc_context({"lines.linewidth": 9, "font.size": 30, "axes.grid": False}):
-            assert np.array_equal(charts.draw(flight(5)), before)
+            assert np.array_equal(charts.draw(flight(5), {}), before)
 
     def test_pyplot_is_left_alone(self) -> None:
         """It would keep every figure, and ask for a display."""
         program = (
             "import sys; from tests.tables.rows import flight; from sparklod_cli.figures import charts\n"
-            "charts.draw(flight(3)); assert 'matplotlib.pyplot' not in sys.modules"
+            "charts.draw(flight(3), {}); assert 'matplotlib.pyplot' not in sys.modules"
         )
         subprocess.run([sys.executable, "-c", program], check=True)

@@ -15,8 +15,8 @@ from sparklod_cli.figures.svg import children_groups
 from sparklod_cli.figures.tree_plot import Picture
 from sparklod_cli.inspection.html import Section, page
 from sparklod_cli.inspection.report import Wanted, inspect
-from sparklod_cli.inspection.values import names_of
-from sparklod_cli.tables.histograms import histogram, of_quantity
+from sparklod_cli.inspection.values import histogram_of, names_of
+from sparklod_cli.tables.histograms import histogram
 from tests.conftest import FIXTURES
 from tests.scenes import random_splats
 
@@ -217,7 +217,7 @@ def test_a_picture_is_inside_the_page() -> None:
 def test_a_page_draws_every_histogram_that_has_bins() -> None:
     splats = random_splats(300, sh_degree=1)
     values = np.array([np.nan, 1, 2, 3, 1e9, -1e9] + [2] * 2000, np.float32)
-    counted = {name: of_quantity(splats, name) for name in names_of(splats)}
+    counted = {name: histogram_of(splats, name) for name in names_of(splats)}
     counted |= {"odd": histogram(values), "none": histogram(values[:1]), "same": histogram(values[8:])}
     reader = read(page([Section(REPORT, histograms=counted)]))
     assert len(reader.all("svg")) == len(counted) - 1
@@ -238,7 +238,7 @@ def test_many_files_are_listed() -> None:
 @pytest.mark.parametrize("name", ["golden/tree-v3.spz", "golden/sh3-v2.sog", "sh1.ply", "points.ply"])
 def test_a_page_of_a_real_file_says_what_its_report_says(name: str) -> None:
     report, scene = inspect(FIXTURES / name, Wanted(values=True, all_quantities=True, check=True))
-    counted = {} if scene is None else {name: of_quantity(scene.splats, name) for name in names_of(scene.splats)}
+    counted = {} if scene is None else {name: histogram_of(scene.splats, name) for name in names_of(scene.splats)}
     text = said(Section(report.as_dict(), histograms=counted))
     assert name in text
     assert ("Levels of the tree" in text) == (report.tree is not None)

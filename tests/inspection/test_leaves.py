@@ -13,7 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sparklod_cli.cli import run
-from sparklod_cli.codecs import spz
+from sparklod_cli.codecs import spz, spz_options
+from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.inspection import leaves
 from sparklod_cli.inspection.findings import Finding
 from sparklod_cli.inspection.leaves import check
@@ -82,14 +83,14 @@ def tree_of(splats: Splats, **options: int) -> Scene:
 
 
 def coded(scene: Scene, **options: int) -> Scene:
-    return spz.decode(BytesIO(b"".join(spz.encode(scene, spz.Options(**options)))))
+    return spz.decode(BytesIO(b"".join(spz.encode(scene, WriteOptions(**options)))))
 
 
 @given(st.integers(1, 60), st.integers(0, 24), st.integers(0, 3), st.integers(0, 2**32 - 1))
 @settings(max_examples=60)
 def test_any_coding_has_the_same_leaves(count: int, bits: int, degree: int, seed: int) -> None:
     splats = random_splats(count, sh_degree=degree, seed=seed, extent=0.02)
-    bits = min(bits, spz.largest_fractional_bits(splats.center))
+    bits = min(bits, spz_options.largest_fractional_bits(splats.center))
     for version in (2, 3):
         assert check(tree_of(splats, version=version, fractional_bits=bits), Scene(splats)) == []
 

@@ -18,6 +18,7 @@ from jsonschema import Draft202012Validator
 from sparklod_cli.cli import run
 from sparklod_cli.codecs import spz
 from sparklod_cli.codecs.formats import FORMATS
+from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.inspection import values
 from sparklod_cli.inspection.expectations import value_at
 from sparklod_cli.inspection.findings import CODES
@@ -64,7 +65,7 @@ def faults(report: Report) -> list[str]:
 @cache
 def tree_bytes(sh_degree: int) -> bytes:
     scene = Scene(*quick.build(random_splats(300, sh_degree=sh_degree)))
-    return b"".join(spz.encode(scene, spz.Options()))
+    return b"".join(spz.encode(scene))
 
 
 @pytest.fixture
@@ -126,7 +127,7 @@ def test_reports_of_broken_trees(tmp_path: Path, count: int, most: int) -> None:
             rng.integers(0, most + 1, count).astype(np.uint16), rng.integers(0, count + 2, count).astype(np.uint32)
         )
         path = tmp_path / "tree.spz"
-        path.write_bytes(b"".join(spz.encode(Scene(splats, tree), spz.Options(fractional_bits=12))))
+        path.write_bytes(b"".join(spz.encode(Scene(splats, tree), WriteOptions(fractional_bits=12))))
         for name, wanted in WAYS.items():
             assert faults(report_of(path, wanted)) == [], (seed, name)
 

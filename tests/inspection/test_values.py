@@ -14,7 +14,16 @@ from sparklod_cli.cli import run
 from sparklod_cli.codecs import ply, splat, spz
 from sparklod_cli.inspection import values
 from sparklod_cli.inspection.report import Wanted, inspect
-from sparklod_cli.inspection.values import MAIN, PERCENTILES, QUANTITIES, check, examine, names_of, quantity
+from sparklod_cli.inspection.values import (
+    MAIN,
+    PERCENTILES,
+    QUANTITIES,
+    check,
+    examine,
+    histogram_of,
+    names_of,
+    quantity,
+)
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.sh import COEFFICIENTS
@@ -250,7 +259,7 @@ def test_the_bounds_are_said_of_scenes_as_they_are_written(tmp_path: Path) -> No
     splats = random_splats(50)
     splats.scale[:10] = 1e-6
     path = tmp_path / "scene.spz"
-    path.write_bytes(b"".join(spz.encode(Scene(splats), spz.Options())))
+    path.write_bytes(b"".join(spz.encode(Scene(splats))))
     report, _ = inspect(path, Wanted(check=True))
     assert [(found.code, found.count) for found in report.findings or []] == [("values.scale-clamped", 10)]
     path.write_bytes(b"".join(ply.encode(Scene(splats))))
@@ -278,3 +287,10 @@ def test_names_are_what_the_command_line_takes(tmp_path: Path, capsys: pytest.Ca
     for name in values.names_of(random_splats(1, sh_degree=2)):
         assert run(["inspect", str(path), "--field", f"values.quantities.{name}.p50"]) == 0
         assert math.isfinite(float(capsys.readouterr().out))
+
+
+def test_a_histogram_of_a_quantity_counts_every_splat() -> None:
+    splats = random_splats(200)
+    splats.opacity[0] = 1e-3
+    assert not histogram_of(splats, "opacity").log
+    assert histogram_of(splats, "scale", bins=10).counts.sum() == 200

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sparklod_cli.codecs import spz
+from sparklod_cli.codecs.options import DEFAULTS, WriteOptions
 from sparklod_cli.model.gaussian import lod_opacity
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
@@ -127,11 +128,11 @@ def check_sh(spark: Spark, data: bytes, splats: Splats) -> None:
     within(got, sh, spz_step / 2 + 1 / 256 + packed_step / 2 + TINY)
 
 
-def check(spark: Spark, scene: Scene, options: spz.Options) -> ExtSplats:
+def check(spark: Spark, scene: Scene, options: WriteOptions = DEFAULTS, *, threads: int = 1) -> ExtSplats:
     """All of the above, for the file that `spz.encode` makes of a scene."""
-    data = b"".join(spz.encode(scene, options))
+    data = b"".join(spz.encode(scene, options, threads=threads))
     raw = gzip.decompress(data)
-    assert raw[4] == options.version
+    assert raw[4] == (options.spz_version or 3)
     got = spark.load(data)
     decoded = check_decoded(got, data)
     assert (decoded.tree is None) == (scene.tree is None)

@@ -22,6 +22,7 @@ from fixtures import by_hand
 from sparklod_cli.codecs import spz
 from sparklod_cli.codecs.gpu import ext_splats, lod_tree, packed_splats
 from sparklod_cli.codecs.gpu.packed_splats import Encoding
+from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod import quick
 from sparklod_cli.model import gaussian
@@ -104,7 +105,7 @@ def ply(path: Path, splats: Splats) -> Path:
 
 
 def baked(path: Path, splats: Splats, version: int) -> Path:
-    path.write_bytes(b"".join(spz.encode(Scene(*quick.build(splats)), spz.Options(version=version, threads=2))))
+    path.write_bytes(b"".join(spz.encode(Scene(*quick.build(splats)), WriteOptions(spz_version=version), threads=2)))
     return path
 
 

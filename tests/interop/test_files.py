@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from sparklod_cli.bake import BUILDERS
-from sparklod_cli.codecs import spz
+from sparklod_cli.codecs import spz, spz_options
+from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.model.lod_tree import MAX_CHILDREN
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
@@ -23,7 +24,7 @@ def baked(splats: Splats, method: str = "quick") -> Scene:
 
 
 def encoded(scene: Scene) -> bytes:
-    return b"".join(spz.encode(scene, spz.Options()))
+    return b"".join(spz.encode(scene))
 
 
 @pytest.mark.parametrize("sh_degree", range(4))
@@ -31,7 +32,7 @@ def encoded(scene: Scene) -> bytes:
 @pytest.mark.parametrize("method", METHODS)
 def test_spark_reads_a_tree_as_it_was_baked(spark: Spark, method: str, version: int, sh_degree: int) -> None:
     scene = baked(random_splats(2000, sh_degree=sh_degree), method)
-    got = laws.check(spark, scene, spz.Options(version=version))
+    got = laws.check(spark, scene, WriteOptions(spz_version=version))
     assert got.sh.shape == scene.splats.sh.shape
     assert got.lod_opacity.max() > 1  # merged splats that are more than opaque were among them
 
@@ -39,31 +40,31 @@ def test_spark_reads_a_tree_as_it_was_baked(spark: Spark, method: str, version: 
 @pytest.mark.parametrize("sh_degree", range(4))
 @pytest.mark.parametrize("version", [2, 3])
 def test_spark_reads_plain_splats_as_they_were_written(spark: Spark, version: int, sh_degree: int) -> None:
-    laws.check(spark, Scene(random_splats(2000, sh_degree=sh_degree)), spz.Options(version=version))
+    laws.check(spark, Scene(random_splats(2000, sh_degree=sh_degree)), WriteOptions(spz_version=version))
 
 
 @pytest.mark.parametrize("extent, bits", [(5e3, 0), (1, 12), (0.05, 24), (0.05, None), (1, None), (5e3, None)])
 def test_spark_reads_any_number_of_fractional_bits(spark: Spark, extent: float, bits: int | None) -> None:
     scene = baked(random_splats(2000, extent=extent))
-    laws.check(spark, scene, spz.Options(fractional_bits=bits))
+    laws.check(spark, scene, WriteOptions(fractional_bits=bits))
 
 
 def test_coordinates_at_the_limit(spark: Spark) -> None:
     splats = random_splats(2)
-    limit = spz.LAST_CODE
+    limit = spz_options.LAST_CODE
     splats.center[:] = [[limit, -limit, 0.4], [-limit, limit, -0.6]]
-    laws.check(spark, Scene(splats), spz.Options(fractional_bits=0))
+    laws.check(spark, Scene(splats), WriteOptions(fractional_bits=0))
 
 
 def test_spark_reads_a_tree_of_one_node(spark: Spark) -> None:
-    got = laws.check(spark, baked(random_splats(1, sh_degree=3)), spz.Options())
+    got = laws.check(spark, baked(random_splats(1, sh_degree=3)))
     assert len(got.center) == 1
 
 
 def test_more_children_in_one_place_than_a_node_may_have(spark: Spark) -> None:
     count = MAX_CHILDREN + 5000
     scene = baked(random_splats(1).take(np.zeros(count, np.intp)))
-    got = laws.check(spark, scene, spz.Options())
+    got = laws.check(spark, scene)
     assert got.nodes is not None
     assert np.count_nonzero(got.nodes["child_count"] == 0) == count
     assert got.nodes["child_count"].sum() == len(got.nodes) - 1
@@ -73,7 +74,7 @@ def test_antialiased_changes_only_the_flag(spark: Spark) -> None:
     scene = baked(random_splats(500))
     flagged = dataclasses.replace(scene, antialiased=True)
     assert encoded(flagged) != encoded(scene)
-    a, b = laws.check(spark, flagged, spz.Options()), laws.check(spark, scene, spz.Options())
+    a, b = laws.check(spark, flagged), laws.check(spark, scene)
     np.testing.assert_array_equal(a.nodes, b.nodes)
     np.testing.assert_array_equal(a.center, b.center)
     np.testing.assert_array_equal(a.alpha, b.alpha)

@@ -181,7 +181,7 @@ def test_judged_as_what_it_is(
     spark: Spark, tmp_path: Path, capsys: pytest.CaptureFixture[str], source: Path, builder: str
 ) -> None:
     path = tmp_path / "tree.spz"
-    path.write_bytes(b"".join(spz.encode(spark_tree(spark, source, builder), spz.Options(threads=2))))
+    path.write_bytes(b"".join(spz.encode(spark_tree(spark, source, builder), threads=2)))
     code, report = inspected(path, capsys, "--fail-on", "warning")
     tree = Tree.read(path)
     tree.check_facts(report)
@@ -203,7 +203,7 @@ def test_leaves_are_the_splats(spark: Spark, tmp_path: Path, capsys: pytest.Capt
     """But for turns below 2.5 degrees: Spark's builders hold the w of a rotation as a float16, which makes 1 of it."""
     source, path = FIXTURES / "demo.ply", tmp_path / "tree.spz"
     scene = spark_tree(spark, source, builder)
-    path.write_bytes(b"".join(spz.encode(scene, spz.Options())))
+    path.write_bytes(b"".join(spz.encode(scene)))
     code, report = inspected(path, capsys, "--leaves-of", str(source))
     original = read_scene(source).splats
     by_center = {tuple(center): quat for center, quat in zip(original.center.tolist(), original.quat_xyzw, strict=True)}
@@ -217,6 +217,6 @@ def test_leaves_are_the_splats(spark: Spark, tmp_path: Path, capsys: pytest.Capt
     assert turned.max() < 2.6
     # Where there are no such turns, they are the splats.
     needle = tmp_path / "needle.spz"
-    needle.write_bytes(b"".join(spz.encode(spark_tree(spark, FIXTURES / "needle.ply", builder), spz.Options())))
+    needle.write_bytes(b"".join(spz.encode(spark_tree(spark, FIXTURES / "needle.ply", builder))))
     code, report = inspected(needle, capsys, "--leaves-of", str(FIXTURES / "needle.ply"))
     assert (code, report["tree"]["leaves"]) == (0, 60)

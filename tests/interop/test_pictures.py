@@ -42,7 +42,7 @@ def demo() -> Splats:
 
 def written(folder: Path, scene: Scene) -> Path:
     path = folder / "scene.spz"
-    path.write_bytes(b"".join(spz.encode(scene, spz.Options())))
+    path.write_bytes(b"".join(spz.encode(scene)))
     return path
 
 

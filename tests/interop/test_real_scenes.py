@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sparklod_cli.bake import BUILDERS
-from sparklod_cli.codecs import spz
+from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.io import read_scene
 from sparklod_cli.model.scene import Scene
 from tests.conftest import real_scene
@@ -29,7 +29,7 @@ def baked(name: str, method: str = "quick") -> Scene:
 def test_spark_reads_the_tree_of_a_real_scene_as_it_was_baked(
     spark: Spark, name: str, method: str, version: int
 ) -> None:
-    laws.check(spark, baked(name, method), spz.Options(version=version, threads=2))
+    laws.check(spark, baked(name, method), WriteOptions(spz_version=version), threads=2)
 
 
 @pytest.mark.parametrize("name", ["biker.ply", "playbot-125k.ply"])

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from sparklod_cli.simulation.columns import COLUMNS
+from sparklod_cli.simulation.columns import COLUMNS, EMPTY
 from sparklod_cli.tables.assertions import COMPARISONS, BadAssertionError, Outcome, check, parse
 from sparklod_cli.tables.columns import Row
 from sparklod_cli.tables.statistics import STATISTICS
@@ -20,7 +20,7 @@ NAMED = st.sampled_from(sorted(STATISTICS)) | st.integers(0, 100).map(lambda per
 
 
 def asked(text: str, rows: list[Row]) -> Outcome:
-    (outcome,) = check([parse(text)], rows)
+    (outcome,) = check([parse(text, COLUMNS)], rows, empty=EMPTY)
     return outcome
 
 
@@ -32,7 +32,7 @@ def churns(*values: float | None) -> list[Row]:
 def test_every_assertion_is_understood(name: str, statistic: str | None, sign: str, bound: float) -> None:
     left = name if statistic is None else f"{name}_{statistic}"
     for text in (f"{left}{sign}{bound!r}", f" {left} {sign}  {bound!r} "):
-        assertion = parse(text)
+        assertion = parse(text, COLUMNS)
         # A column of that name is meant, where there is one, and not a statistic of a shorter one.
         assert (assertion.column.name, assertion.statistic) == (
             (left, "") if left in NUMERIC else (name, statistic or "")
@@ -43,7 +43,7 @@ def test_every_assertion_is_understood(name: str, statistic: str | None, sign: s
 @given(st.text(max_size=30))
 def test_any_other_text_is_refused_in_a_line(text: str) -> None:
     try:
-        parse(text)
+        parse(text, COLUMNS)
     except BadAssertionError as error:
         assert "\n" not in str(error)
     else:
@@ -90,7 +90,7 @@ def test_without_a_statistic_every_frame_must_hold(values: list[float | None], s
     ],
 )  # fmt: skip
 def test_bounds_may_have_units_and_shares(text: str, bound: float) -> None:
-    assert parse(text).bound == bound
+    assert parse(text, COLUMNS).bound == bound
 
 
 @pytest.mark.parametrize(
@@ -108,7 +108,7 @@ def test_bounds_may_have_units_and_shares(text: str, bound: float) -> None:
     ],
 )
 def test_the_longest_name_wins(text: str, column: str, statistic: str) -> None:
-    assertion = parse(text)
+    assertion = parse(text, COLUMNS)
     assert (assertion.column.name, assertion.statistic) == (column, statistic)
 
 
@@ -139,7 +139,7 @@ def test_the_longest_name_wins(text: str, column: str, statistic: str) -> None:
 )
 def test_what_is_not_understood(text: str, message: str) -> None:
     with pytest.raises(BadAssertionError, match=message) as caught:
-        parse(text)
+        parse(text, COLUMNS)
     assert "\n" not in str(caught.value)
 
 

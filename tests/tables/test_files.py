@@ -14,10 +14,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sparklod_cli.simulation.columns import COLUMNS
+from sparklod_cli.simulation.columns import COLUMNS, select
 from sparklod_cli.support.errors import SparklodError
 from sparklod_cli.tables.columns import Cell, Column, Row
-from sparklod_cli.tables.files import FORMS, TYPES, UnknownColumnError, encode, select
+from sparklod_cli.tables.files import FORMS, TYPES, encode
 from tests.tables.rows import flight, row
 
 NAMES = st.none() | st.text(min_size=1, max_size=20)
@@ -189,18 +189,3 @@ def test_the_extra_that_brings_pyarrow_is_named(monkeypatch: pytest.MonkeyPatch)
 def test_an_unknown_format_of_tables_is_an_error() -> None:
     with pytest.raises(ValueError, match="not one of csv, json, parquet"):
         encode([], COLUMNS, "xlsx")
-
-
-class TestSelect:
-    def test_no_selection_is_all_columns(self) -> None:
-        assert select() == COLUMNS
-        assert select(timing=False) == COLUMNS[:-1]
-
-    def test_the_order_is_that_of_the_names(self) -> None:
-        assert [column.name for column in select(["churn", "frame", "churn"])] == ["churn", "frame"]
-
-    def test_an_unknown_column_is_an_error_with_a_suggestion(self) -> None:
-        with pytest.raises(UnknownColumnError, match=r"^there is no column 'chrun', did you mean churn\?$"):
-            select(["frame", "chrun"])
-        with pytest.raises(UnknownColumnError, match=r"^there is no column 'zzz'$"):
-            select(["zzz"])

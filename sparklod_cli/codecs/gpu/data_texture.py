@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...model.gaussian import covariance
+from ...model.scene import Scene
 from ...model.splats import FloatArray, Splats
 from ...support.errors import FormatError
 from ...support.parallel import for_chunks
@@ -58,6 +59,11 @@ def pack(splats: Splats, *, threads: int = 1) -> dict[str, Words]:
 
     for_chunks(encode, len(splats), threads, lambda _: None)
     return {"texture": texture}
+
+
+def dump(scene: Scene, *, threads: int = 1) -> dict[str, Words]:
+    """The texture of a scene; it holds no links of a tree."""
+    return pack(scene.splats, threads=threads)
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...model.scene import Scene
 from ...model.splats import FloatArray, Splats
 from ...support.parallel import for_chunks
 from .. import octahedral
@@ -69,6 +70,11 @@ def pack(splats: Splats, *, threads: int = 1) -> dict[str, Words]:
 
     for_chunks(encode, len(splats), threads, lambda _: None)
     return arrays
+
+
+def dump(scene: Scene, *, threads: int = 1) -> dict[str, Words]:
+    """The arrays of a scene; those of a tree are no different."""
+    return pack(scene.splats, threads=threads)
 
 
 def unpack(arrays: Mapping[str, NDArray[Any]], *, threads: int = 1) -> Splats:

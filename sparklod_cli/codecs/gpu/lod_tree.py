@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,6 +10,8 @@ from numpy.typing import NDArray
 
 from ...model.gaussian import spark_size
 from ...model.lod_tree import MAX_CHILDREN, LodTree
+from ...model.nodes import Nodes
+from ...model.scene import Scene
 from ...model.splats import FloatArray, Splats
 from ...support.errors import FormatError
 from ...support.parallel import for_chunks
@@ -59,19 +60,15 @@ def pack(
     return {"lod_tree": words}
 
 
-@dataclass(frozen=True)
-class Nodes:
-    """What a packed tree holds.
+def dump(scene: Scene, *, threads: int = 1) -> dict[str, Words]:
+    """The words of a scene that is a tree.
 
-    Attributes:
-        center: (N, 3) float32 world units.
-        size: (N,) float32 world units.
-        tree: (N,) links; not validated.
+    Raises:
+        ValueError: it is none.
     """
-
-    center: FloatArray
-    size: FloatArray
-    tree: LodTree
+    if scene.tree is None:
+        raise ValueError("the scene has no tree")
+    return pack(scene.splats, scene.tree, threads=threads)
 
 
 def unpack(arrays: Mapping[str, NDArray[Any]]) -> Nodes:

@@ -13,11 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...model.scene import Scene
 from ...model.sh import COEFFICIENTS
 from ...model.splats import FloatArray, Splats
 from ...support.errors import FormatError
 from ...support.parallel import for_chunks
-from .. import octahedral
+from .. import octahedral, quantize
 from ..octahedral import STEPS_8_8_8, Words, to_code
 
 SPLAT = np.dtype(
@@ -80,6 +81,11 @@ class Encoding:
 DEFAULT = Encoding()
 
 
+def of_scene(scene: Scene) -> Encoding:
+    """The encoding that Spark sets up for a scene: an LoD tree has LoD opacities."""
+    return Encoding(lod_opacity=scene.tree is not None)
+
+
 def pack(splats: Splats, encoding: Encoding = DEFAULT, *, threads: int = 1) -> dict[str, Words]:
     """Splats as Spark holds them: "packed" (N, 4) uint32, and by degree "sh1" (N, 2), "sh2" (N, 4) and "sh3" (N, 4).
 
@@ -107,6 +113,11 @@ def pack(splats: Splats, encoding: Encoding = DEFAULT, *, threads: int = 1) -> d
 
     for_chunks(encode, len(splats), threads, lambda _: None)
     return arrays
+
+
+def dump(scene: Scene, *, threads: int = 1) -> dict[str, Words]:
+    """The arrays of a scene, in the encoding of `of_scene`."""
+    return pack(scene.splats, of_scene(scene), threads=threads)
 
 
 def unpack(arrays: Mapping[str, NDArray[Any]], encoding: Encoding = DEFAULT, *, threads: int = 1) -> Splats:
@@ -154,8 +165,7 @@ def _encode_linear(values: FloatArray, low: float, high: float) -> Words:
 
 
 def _decode_linear(codes: NDArray[np.uint8], low: float, high: float) -> FloatArray:
-    first, width = np.float32(low), np.float32(high) - np.float32(low)
-    return first + codes.astype(np.float32) / np.float32(255) * width
+    return quantize.of_range(codes.astype(np.float32) / np.float32(255), np.float32(low), np.float32(high))
 
 
 def encode_log_scale(scale: FloatArray, encoding: Encoding = DEFAULT) -> Words:

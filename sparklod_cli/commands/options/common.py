@@ -10,7 +10,8 @@ from typing import Any, TypeVar
 import click
 
 from ... import __version__
-from ...support.defaults import MAX_THREADS, TABLES
+from ...support.defaults import MAX_THREADS
+from ...tables.files import FORMS
 from ..command import COMMON, GENERAL, option
 from ..console import Console, Verbosity
 
@@ -48,13 +49,13 @@ def table_form(flag: str, output: Path | None, form: str | None = None) -> str:
     """
     suffix = output.suffix.lower() if output is not None else ""
     if not suffix:
-        return form or TABLES[0]
+        return form or next(iter(FORMS))
     if form is not None:
-        if suffix[1:] != form and suffix[1:] in (*TABLES, *NO_TABLES):
+        if suffix[1:] != form and suffix[1:] in (*FORMS, *NO_TABLES):
             raise click.UsageError(f"{flag} {output} does not end in .{form}, which --format asks for")
         return form
-    if suffix[1:] not in TABLES:
-        raise click.UsageError(f"{flag} {output}: tables are written as {', '.join(f'.{form}' for form in TABLES)}")
+    if suffix[1:] not in FORMS:
+        raise click.UsageError(f"{flag} {output}: tables are written as {', '.join(f'.{form}' for form in FORMS)}")
     return suffix[1:]
 
 

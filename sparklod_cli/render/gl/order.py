@@ -24,8 +24,8 @@ class Order:
         sorting: one of `SORTINGS`.
         throttle: splats are not sorted again while the cosine between where the camera looked when they were and where
             it looks now is above 1 - throttle; antimatter15's viewer has 0.01, an angle of 8.1 degrees. 0 sorts for
-            each camera. With `RasterSettings.sort` "radial", where what counts is the camera's place, they are also sorted when
-            it has moved so far that the middle one of the splats appears turned by that angle.
+            each camera. With `RasterSettings.sort` "radial", where what counts is the camera's place, they are also
+            sorted when it has moved so far that the middle one of the splats appears turned by that angle.
     """
 
     def __init__(self, sorting: str, throttle: float = 0.0) -> None:

@@ -17,7 +17,8 @@ from ..shading import ShadedSplats
 #: How exactly splats are held: as they are, or as antimatter15's viewer holds them.
 PRECISIONS = ("float", "half")
 
-#: Columns of `ShadedSplats` that stay as they are while a camera moves; colours do not, where there are spherical harmonics.
+#: Columns of `ShadedSplats` that stay as they are while a camera moves; colours do not, where there are spherical
+#: harmonics.
 GEOMETRY = ("center", "scale", "quat_xyzw", "lod_opacity")
 
 Words = NDArray[np.uint32]

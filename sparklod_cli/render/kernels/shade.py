@@ -5,29 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numba import prange
 
+from ...model.sh import SH_C1, SH_C2, SH_C3
 from ...support.jit import kernel
 
 f32 = np.float32
 
-#: Normalisations of the real spherical harmonics of degree 1 to 3, in the order of 3D Gaussian Splatting.
-C1 = f32(0.4886025119029199)
-C2 = tuple(
-    map(f32, (1.0925484305920792, -1.0925484305920792, 0.31539156525252005, -1.0925484305920792, 0.5462742152960396))
-)
-C3 = tuple(
-    map(
-        f32,
-        (
-            -0.5900435899266435,
-            2.890611442640554,
-            -0.4570457994644658,
-            0.3731763325901154,
-            -0.4570457994644658,
-            1.445305721320277,
-            -0.5900435899266435,
-        ),
-    )
-)
+C1, C2, C3 = f32(SH_C1), tuple(map(f32, SH_C2)), tuple(map(f32, SH_C3))
 
 
 @kernel(parallel=True)

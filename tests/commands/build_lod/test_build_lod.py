@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from sparklod_cli.cli import run
-from sparklod_cli.codecs import spz
+from sparklod_cli.codecs import spz, spz_options
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod import quality, quick
 from sparklod_cli.model.lod_tree import LodTree
@@ -83,8 +83,8 @@ def test_merged_splats_outside_of_the_box_of_the_leaves(
     splats = read_scene(scene).splats
     splats.center[:] *= 1e5  # so that it is the extent that bounds the bits
     far = tmp_path / "far.spz"
-    far.write_bytes(b"".join(spz.encode(Scene(splats), spz.Options())))
-    most = spz.largest_fractional_bits(read_scene(far).splats.center)
+    far.write_bytes(b"".join(spz.encode(Scene(splats))))
+    most = spz_options.largest_fractional_bits(read_scene(far).splats.center)
     assert build(far, "-o", tmp_path / "out.spz", "--method", "quality", "--json") == 0
     assert json.loads(capsys.readouterr().out)["fractional_bits"] < most
 

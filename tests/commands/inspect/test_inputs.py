@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from sparklod_cli.codecs import spz
+from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.inspection import report as reports
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
@@ -77,7 +78,7 @@ def chain(nodes: int) -> bytes:
         getattr(splats, name)[:] = value
     count, start = np.ones(nodes, np.uint16), np.arange(1, nodes + 1, dtype=np.uint32)
     count[-1] = start[-1] = 0
-    return b"".join(spz.encode(Scene(splats, LodTree(count, start)), spz.Options(compression_level=1)))
+    return b"".join(spz.encode(Scene(splats, LodTree(count, start)), WriteOptions(compression_level=1)))
 
 
 @pytest.mark.parametrize("nodes", [999, 1000, 1001, 50_000])

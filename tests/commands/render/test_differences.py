@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sparklod_cli.codecs.rounding import ROUND_TRIPS
 from sparklod_cli.images.metrics import psnr
-from sparklod_cli.support import defaults
 from tests.commands.render.runs import AT, DEMO, PLAIN, SIZE, Said, floats, pixels, render
 
 
@@ -46,7 +46,7 @@ def test_a_difference_says_what_it_shows(built: Path, tmp_path: Path, capsys: Sa
 
 def test_an_encoding_is_seen_in_the_difference_to_the_file_itself(tmp_path: Path, capsys: Said) -> None:
     values = {}
-    for through in defaults.THROUGH:
+    for through in ROUND_TRIPS:
         settings = (PLAIN, *SIZE, "--through", through, "--diff", PLAIN, "--json", "-q")
         assert render(*settings, "-o", tmp_path / f"{through}.png") == 0
         values[through] = json.loads(capsys.readouterr().out)["frames"][0]["psnr_db"]

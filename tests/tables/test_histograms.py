@@ -8,8 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from sparklod_cli.tables.histograms import Histogram, as_text, histogram, of_quantity
-from tests.scenes import random_splats
+from sparklod_cli.tables.histograms import Histogram, as_text, histogram
 
 FLOATS = arrays.arrays(np.float32, st.integers(0, 300), elements=st.floats(width=32))
 
@@ -110,10 +109,3 @@ def test_text_puts_bins_together() -> None:
     lines = as_text(counted, rows=10).splitlines()
     assert len(lines) == 10
     assert sum(int(line.split()[1]) for line in lines) == 100
-
-
-def test_a_histogram_of_a_quantity_counts_every_splat() -> None:
-    splats = random_splats(200)
-    splats.opacity[0] = 1e-3
-    assert not of_quantity(splats, "opacity").log
-    assert of_quantity(splats, "scale", bins=10).counts.sum() == 200

@@ -1,4 +1,4 @@
-"""Reads what stands where: the file that --scene names."""
+"""The instances file: JSON that names splat files and says where they stand."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from .cameras.pose import rotation_of
-from .io import is_file_name, read_text
-from .lod.traversal import Cones, Frustum, Matrix
-from .support.errors import SparklodError
-from .support.untrusted import parse_json, shown, well_formed
-from .world import TOTAL, Placement, names_of
+from ..cameras.pose import rotation_of
+from ..io import is_file_name, read_text
+from ..model.foveation import Cones, Foveation, Frustum
+from ..model.instances import TOTAL, Instance, Matrix, names_of
+from ..support.errors import SparklodError
+from ..support.untrusted import parse_json, shown, well_formed
 
 #: What an instance may say, and how many numbers that is; 0 for something else.
 KEYS = {"file": 0, "name": 0, "matrix": 16, "translation": 3, "rotation": 4, "scale": 1, "lod_scale": 1, "foveation": 0}
@@ -31,38 +31,38 @@ LARGEST = 1e12
 WIDEST = 180
 
 
-class WorldFileError(SparklodError):
-    """A file of instances cannot be understood."""
+class InstancesFileError(SparklodError):
+    """An instances file cannot be understood."""
 
 
-def read_placements(path: Path) -> list[Placement]:
+def read_instances(path: Path) -> list[Instance]:
     """The instances of a file; the trees that it names lie beside it.
 
     Raises:
-        WorldFileError: it says something that is not an instance; names the file and the instance.
+        InstancesFileError: it says something that is not an instance; names the file and the instance.
         FormatError: it cannot be read.
     """
     try:
         data = parse_json(read_text(path), keep_surrogates=True)  # files may be called so
     except ValueError as error:
-        raise WorldFileError(f"{path} is not JSON: {error}") from None
+        raise InstancesFileError(f"{path} is not JSON: {error}") from None
     instances = data.get("instances") if isinstance(data, dict) else None
     if not isinstance(instances, list) or not instances:
-        raise WorldFileError(f'{path} has no list of instances: {{"instances": [{{"file": ...}}, ...]}}')
-    placements: list[Placement] = []
+        raise InstancesFileError(f'{path} has no list of instances: {{"instances": [{{"file": ...}}, ...]}}')
+    found: list[Instance] = []
     try:
-        placements.extend(_placement(instance, path.parent) for instance in instances)
+        found.extend(_instance(instance, path.parent) for instance in instances)
     except ValueError as error:
-        raise WorldFileError(f"{path}: instance {len(placements)} {error}") from None
-    given = Counter(place.name for place in placements if place.name)
+        raise InstancesFileError(f"{path}: instance {len(found)} {error}") from None
+    given = Counter(each.name for each in found if each.name)
     twice = next((name for name, count in given.items() if count > 1), None)
     if twice is not None:
-        raise WorldFileError(f"{path}: two instances are called {twice!r}")
-    automatic = iter(names_of([place.file for place in placements if not place.name], given))
-    return [place if place.name else replace(place, name=next(automatic)) for place in placements]
+        raise InstancesFileError(f"{path}: two instances are called {twice!r}")
+    automatic = iter(names_of([each.file for each in found if each.file and not each.name], given))
+    return [each if each.name else replace(each, name=next(automatic)) for each in found]
 
 
-def _placement(data: Any, folder: Path) -> Placement:
+def _instance(data: Any, folder: Path) -> Instance:
     """One instance, its name empty where it has none; `ValueError` where it is none."""
     if not isinstance(data, dict):
         raise ValueError(f"is {shown(data)}, not an object")
@@ -79,7 +79,7 @@ def _placement(data: Any, folder: Path) -> Placement:
     lod_scale = _numbers(data, "lod_scale", [1.0])[0]
     if lod_scale < 0:
         raise ValueError(f"has a lod_scale of {lod_scale:g}")
-    return Placement(folder / file, well_formed(name), _matrix(data), lod_scale, _foveation(data.get("foveation")))
+    return Instance(folder / file, well_formed(name), _matrix(data), lod_scale, _foveation(data.get("foveation")))
 
 
 def _matrix(data: Mapping[str, Any]) -> Matrix:
@@ -105,7 +105,7 @@ def _matrix(data: Mapping[str, Any]) -> Matrix:
     return matrix
 
 
-def _foveation(data: Any) -> Cones | Frustum | None:
+def _foveation(data: Any) -> Foveation | None:
     if data is None:
         return None
     if not isinstance(data, dict):

@@ -1,0 +1,13 @@
+"""The table of layouts in memory that a tree can be dumped in: adding one is a module and a row.
+
+Imports nothing heavy: `--help` names them.
+"""
+
+from __future__ import annotations
+
+#: By the name that `--encoding` knows: the module in this package, which has `dump(scene, *, threads)`, the arrays of
+#: words of a scene by their names; docs/formats.md has their layout.
+ENCODINGS = {"packed": "packed_splats", "ext": "ext_splats", "lodtree": "lod_tree", "texture": "data_texture"}
+
+#: Suffixes of dumps without a header: nothing but the words of all arrays, one after the other.
+RAW_SUFFIXES = (".bin", ".raw")

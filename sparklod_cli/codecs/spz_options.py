@@ -1,0 +1,78 @@
+"""Which version and how many fractional bits an SPZ file is written with."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..model.scene import Scene
+from ..support.defaults import DEFAULT_SPZ_VERSION, MAX_FRACTIONAL_BITS, SPZ_VERSIONS
+from ..support.errors import FormatError
+from . import quantize
+from .options import WriteOptions
+
+#: The largest code that a coordinate is given, 2 ** 23 - 2. Writers clamp what does not fit to the code after it, of
+#: either sign, so `inspect` takes a coordinate that has that one for clamped.
+LAST_CODE = quantize.FIXED24_MAX - 1
+
+#: A step of the positions is at most a 16th of the standard deviation of a small splat, so that rounding shifts it by
+#: at most a 32nd; small are the splats at this quantile of the largest scales. See docs/decisions.
+STEPS_A_SPLAT, SMALL_QUANTILE = 16, 0.01
+
+
+def largest_fractional_bits(center: NDArray[np.float32]) -> int:
+    """The most fractional bits, 0 to 24, with which every coordinate fits 24-bit fixed point.
+
+    Raises:
+        FormatError: not even whole units fit.
+    """
+    largest = float(np.abs(center).max(initial=0))
+    if np.rint(largest) > LAST_CODE:
+        reach = f"{largest:.0f}" if largest < 1e7 else f"{largest:.3g}"
+        raise FormatError(f"coordinates reach {reach}, SPZ holds at most {LAST_CODE}: scale the scene")
+    bits = MAX_FRACTIONAL_BITS
+    while bits and np.rint(largest * 2.0**bits) > LAST_CODE:
+        bits -= 1
+    return bits
+
+
+def settled(scene: Scene, options: WriteOptions) -> WriteOptions:
+    """These options with nothing left open: `encode` writes the scene with them.
+
+    Positions get as many fractional bits as all nodes allow, up to where a step is far below the smallest splats of
+    full detail (`STEPS_A_SPLAT`): merged splats are larger.
+
+    Raises:
+        FormatError: a coordinate does not fit the fractional bits; the text names the most that would.
+        ValueError: the version is not one that is written.
+    """
+    version = DEFAULT_SPZ_VERSION if options.spz_version is None else options.spz_version
+    if version not in SPZ_VERSIONS:
+        raise ValueError(f"SPZ version {version} is not one of {SPZ_VERSIONS}")
+    bits, most = options.fractional_bits, largest_fractional_bits(scene.splats.center)
+    if bits is None:
+        scale = scene.splats.scale if scene.tree is None else scene.splats.scale[scene.tree.is_leaf]
+        small = float(np.quantile(scale.max(axis=1), SMALL_QUANTILE))
+        bits = max(0, min(most, math.ceil(math.log2(STEPS_A_SPLAT / small))))
+    if bits > most:
+        raise FormatError(f"a coordinate does not fit {bits} fractional bits, at most {most} would do")
+    return dataclasses.replace(options, spz_version=version, fractional_bits=bits)
+
+
+def like(scene: Scene, options: WriteOptions) -> WriteOptions:
+    """These options, and where they leave a choice open, that of the SPZ file which the scene was read from.
+
+    Its values then stay as they are. A version that is not written becomes the newest one that is; a scene from
+    another format leaves the choice open.
+    """
+    version, bits = options.spz_version, options.fractional_bits
+    if "fractional_bits" not in scene.header:
+        return options
+    if version is None:
+        version = int(scene.header["version"])
+        version = version if version in SPZ_VERSIONS else max(SPZ_VERSIONS)
+    bits = int(scene.header["fractional_bits"]) if bits is None else bits
+    return dataclasses.replace(options, spz_version=version, fractional_bits=bits)

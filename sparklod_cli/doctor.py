@@ -1,0 +1,308 @@
+"""What sparklod needs, and whether it is here: what `sparklod doctor` calls, and a program can call.
+
+It must work where nothing else does: packages are looked up by their metadata and tried in processes of their own, as a
+broken one may end its process instead of raising.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import platform
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any, Literal
+
+from . import __version__
+from .support import machine
+from .support.parallel import processors
+from .support.requirements import required_by
+
+#: ok: works. note: something optional is missing, or could be better. problem: baking does not work.
+State = Literal["ok", "note", "problem"]
+
+DISTRIBUTION = "sparklod"
+
+#: Extras for people who work on sparklod, which nobody else need install.
+INTERNAL_EXTRAS = ("dev", "docs", "test")
+
+#: What the other extras bring, for people.
+PURPOSES = {
+    "parquet": "Parquet tables",
+    "render": "figures, charts, and the backends osmesa and open3d of render",
+    "video": ".mp4 animations",
+}
+
+#: Seconds that a process which tries something is given; Open3D alone may load for a minute.
+PATIENCE = 120
+
+#: Below so many bytes of available memory, little can be baked.
+LITTLE_MEMORY = 1 << 30
+
+#: What `_print_kernels` is called by, in a process of its own.
+KERNELS = f"import {__name__} as doctor; doctor._print_kernels()"
+
+#: Prints the encoder of videos.
+FFMPEG = "import imageio_ffmpeg; print(imageio_ffmpeg.get_ffmpeg_exe())"
+
+
+@dataclass(frozen=True)
+class Check:
+    """One thing that was looked at.
+
+    Attributes:
+        name: what it is.
+        state: see `State`.
+        value: what was found.
+        advice: what to do about it; empty where nothing need be done.
+    """
+
+    name: str
+    state: State
+    value: str
+    advice: str = ""
+
+
+def check_all(begun: Callable[[str], None] = lambda name: None) -> list[Check]:
+    """Looks at everything, in the order in which a person would; takes some seconds.
+
+    Args:
+        begun: is told what is about to be looked at.
+    """
+    found: list[Check] = []
+    parts: list[tuple[str, Callable[[], Iterator[Check]]]] = [
+        ("versions", _versions),
+        ("packages", _packages),
+        ("kernels", _kernels),
+        ("processors", _processors),
+        ("memory", _memory),
+        ("extras", _extras),
+        ("OpenGL", _opengl),
+        ("Open3D", _open3d),
+        ("ffmpeg", _ffmpeg),
+        ("Node and Chromium", _programs),
+    ]
+    for name, look in parts:
+        begun(name)
+        try:
+            found.extend(look())
+        except Exception as error:  # this is where people turn when things are broken in ways that nobody foresaw
+            value = f"cannot be looked at ({type(error).__name__}: {error})"
+            found.append(Check(name, "note", value, "please report this, with what sparklod doctor --json prints"))
+    return found
+
+
+def _versions() -> Iterator[Check]:
+    yield Check("sparklod", "ok", f"{__version__} in {Path(__file__).parent}")
+    system = f"{platform.system()} {platform.release()} on {platform.machine()}"
+    yield Check("Python", "ok", f"{platform.python_version()}, {sys.executable}; {system}")
+
+
+# Packages
+
+
+def _packages() -> Iterator[Check]:
+    try:
+        for one in required_by(DISTRIBUTION):
+            advice = f"pip install --upgrade '{one.name}>={one.least}'" if one.missing else ""
+            yield Check(one.name, "problem" if one.missing else "ok", one.found, advice)
+    except metadata.PackageNotFoundError:
+        yield Check("packages", "note", "sparklod itself is not installed, so nothing tells what it requires", _INSTALL)
+
+
+_INSTALL = "pip install sparklod"
+
+
+def _extras() -> Iterator[Check]:
+    try:
+        extras = metadata.metadata(DISTRIBUTION).get_all("Provides-Extra") or []
+    except metadata.PackageNotFoundError:
+        return
+    for extra in sorted(set(extras) - set(INTERNAL_EXTRAS)):
+        packages = list(required_by(DISTRIBUTION, extra))
+        missing = any(package.missing for package in packages)
+        purpose = f"   # {PURPOSES[extra]}" if extra in PURPOSES else ""
+        advice = f"pip install --upgrade 'sparklod[{extra}]'{purpose}" if missing else ""
+        yield Check(
+            f"extra {extra}",
+            "note" if missing else "ok",
+            ", ".join(f"{package.name} {package.found}" for package in packages),
+            advice,
+        )
+
+
+# What is compiled, and what it runs on
+
+
+def _print_kernels() -> None:
+    """Loads all that a bake takes, starts the threads of kernels, and prints what there is of kernels, as JSON."""
+    from . import bake, warmup  # noqa: F401
+    from .support import jit
+
+    about = {
+        "folder": None if jit.CACHE_FOLDER is None else str(jit.CACHE_FOLDER.resolve()),
+        "wanted": len({name for job in warmup.JOBS.values() for name in job.kernels}),
+        "missing": len(warmup.missing(warmup.JOBS)),
+        "layer": jit.threading_layer(),
+        "threads": jit.threads_in_use(),
+    }
+    print(json.dumps(about))
+
+
+def _kernels() -> Iterator[Check]:
+    code, out, err = _run([sys.executable, "-c", KERNELS])
+    try:
+        about = json.loads(out.splitlines()[-1])
+    except (IndexError, ValueError):
+        advice = "pip install --force-reinstall sparklod   # in a new virtual environment, if that does not help"
+        yield Check("kernels", "problem", f"what bakes does not load: {_last_line(err, code)}", advice)
+        return
+    wanted, folder = about["wanted"], about["folder"]
+    if folder is None:
+        advice = "set NUMBA_CACHE_DIR to a folder that can be written to"
+        yield Check("kernel cache", "note", "no folder can be written to, so every run compiles its kernels", advice)
+    else:
+        compiled = wanted - about["missing"]
+        value = f"{compiled} of {wanted} kernels are compiled, {_megabytes(_size_of(Path(folder)))} in {folder}"
+        advice = "sparklod warmup   # compiles the others now, instead of when they are first used"
+        yield Check("kernel cache", "note" if about["missing"] else "ok", value, advice if about["missing"] else "")
+        old = [path for path in Path(folder).parent.glob("kernels-*") if path != Path(folder)]
+        if old:
+            value = f"{len(old)} of other versions of sparklod, {_megabytes(sum(map(_size_of, old)))}"
+            advice = f"delete the other kernels-* in {Path(folder).parent}, unless those versions are still used"
+            yield Check("old caches", "note", value, advice)
+    layer = about["layer"]
+    advice = "install OpenMP (on Debian and Ubuntu: apt install libgomp1), or pip install tbb"
+    slow = layer == "workqueue"  # numba's own, which ends a process that calls kernels from two threads at once
+    value = f"{about['threads']}, run by {layer}"
+    yield Check("threads", "note" if slow else "ok", value, f"{advice}: programs with threads need it" if slow else "")
+
+
+def _processors() -> Iterator[Check]:
+    usable, quota = processors(), machine.processor_quota()
+    value = f"{usable} of {os.cpu_count() or usable} can be used"
+    if quota is None or quota >= usable:
+        yield Check("processors", "ok", value)
+    else:
+        advice = f"--threads {max(1, round(quota))}, since more threads get no more time"
+        yield Check("processors", "note", f"{value}, for the time of {quota:g}: a limit of the container", advice)
+
+
+def _memory() -> Iterator[Check]:
+    total, available = machine.total_memory(), machine.available_memory()
+    if total is None or available is None:
+        yield Check("memory", "ok", "this system does not say" if total is None else f"{total / 1e9:.1f} GB")
+        return
+    little = available < LITTLE_MEMORY
+    advice = "free some: a bake takes about three times the size of its PLY file" if little else ""
+    value = f"{available / 1e9:.1f} of {total / 1e9:.1f} GB are available"
+    yield Check("memory", "note" if little else "ok", value, advice)
+
+
+# What draws
+
+
+def _opengl() -> Iterator[Check]:
+    if not _is_installed("moderngl"):
+        yield Check("OpenGL", "note", "not tried without moderngl", "pip install 'sparklod[render]'")
+        return
+    from .render.gl.context import PACKAGES, probe
+
+    reasons = {kind: probe(kind) for kind in PACKAGES}
+    value = ", ".join(f"{kind} draws" if not reason else f"{kind}: {reason}" for kind, reason in reasons.items())
+    if all(reasons.values()):
+        packages = " or ".join(PACKAGES.values())
+        advice = f"on Debian and Ubuntu: apt install {packages}   # render --backend osmesa draws with it"
+        yield Check("OpenGL", "note", value, advice)
+    else:
+        yield Check("OpenGL", "ok", value)
+
+
+def _open3d() -> Iterator[Check]:
+    if not _is_installed("open3d"):
+        yield Check("Open3D", "note", "not tried, since it is not installed", "pip install 'sparklod[render]'")
+        return
+    try:
+        from .render.open3d.child import PACKAGES
+        from .render.open3d.process import COMMAND
+    except ImportError as error:  # numpy
+        yield Check("Open3D", "note", f"not tried ({error})", _INSTALL)
+        return
+    code, out, err = _run(COMMAND)  # it draws a splat before it looks for requests, of which there are none
+    try:
+        reason = json.loads(out.splitlines()[0]).get("error", "")
+    except (IndexError, ValueError):
+        reason = f"it has crashed: {_last_line(err, code)}"
+    advice = f"on Debian and Ubuntu: apt install {PACKAGES}   # render --backend open3d draws with it" if reason else ""
+    yield Check("Open3D", "note" if reason else "ok", reason or "draws", advice)
+
+
+def _ffmpeg() -> Iterator[Check]:
+    if _is_installed("imageio-ffmpeg"):
+        code, out, err = _run([sys.executable, "-c", FFMPEG])
+        value = _last_line(err, code) if code else out.strip()
+        advice = "install ffmpeg, or set IMAGEIO_FFMPEG_EXE to it   # .mp4 animations take it" if code else ""
+        yield Check("ffmpeg", "note" if code else "ok", value, advice)
+
+
+# What only the tests take
+
+
+def _programs() -> Iterator[Check]:
+    for name, command, packages in (("Node", "node", "nodejs npm"), ("Chromium", "chromium", "chromium")):
+        advice = f"on Debian and Ubuntu: apt install {packages}   # only sparklod's own tests take it"
+        program = shutil.which(command)
+        if program is None:
+            yield Check(name, "note", "is not installed", advice)
+            continue
+        code, out, err = _run([program, "--version"])
+        if code:
+            yield Check(name, "note", f"{program} does not run: {_last_line(err, code)}", advice)
+        else:
+            yield Check(name, "ok", f"{_last_line(out, code)}, {program}")
+
+
+def _is_installed(package: str) -> bool:
+    try:
+        metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return False
+    return True
+
+
+def _run(command: list[str]) -> tuple[int, str, str]:
+    """Exit code, output and errors of a program that has nothing to read, and finds the modules that this one finds."""
+    here = [str(Path(__file__).parents[1]), *(path or str(Path.cwd()) for path in sys.path)]
+    how: dict[str, Any] = {"env": {**os.environ, "PYTHONPATH": os.pathsep.join(here)}, "timeout": PATIENCE}
+    try:
+        done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, check=False, **how)
+    except subprocess.TimeoutExpired:
+        return 1, "", f"no answer within {PATIENCE} seconds"
+    except OSError as error:
+        return 1, "", str(error)
+    return done.returncode, done.stdout.decode("utf-8", "replace"), done.stderr.decode("utf-8", "replace")
+
+
+def _last_line(text: str, code: int) -> str:
+    lines = text.strip().splitlines()
+    if lines:
+        return lines[-1].strip()
+    return f"ended by signal {-code}" if code < 0 else f"exit status {code}"
+
+
+def _size_of(folder: Path) -> int:
+    total = 0
+    for path in folder.glob("*"):
+        with contextlib.suppress(OSError):  # another process has just replaced it
+            total += path.stat().st_size
+    return total
+
+
+def _megabytes(size: int) -> str:
+    return f"{size / 1e6:.1f} MB"

@@ -1,0 +1,45 @@
+"""`LodSettings`: what a viewer draws of Level-of-Detail trees."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+from ..model.foveation import Cones, Foveation
+
+
+@dataclass(frozen=True)
+class LodSettings:
+    """How a viewer finds its cuts.
+
+    Attributes:
+        budget: the most splats that are drawn, all instances together.
+        foveation: how much nodes count by direction, where an instance has no foveation of its own.
+        pixel_scale_limit: nodes of this pixel scale or less are not refined; None for the pixel scale of a pixel.
+        render_scale: multiplies the pixel scale of a pixel, Spark's `lodRenderScale`.
+        continuous: width of continuous cuts, the ratio of the pixel scales between which a node fades into its
+            children, above 1 (see `continuous`); None for ordinary cuts.
+    """
+
+    budget: int
+    foveation: Foveation = field(default_factory=Cones)
+    pixel_scale_limit: float | None = None
+    render_scale: float = 1.0
+    continuous: float | None = None
+
+    def limit(self, fov_y: float, height: int) -> float:
+        """Pixel scale at or below which no node is refined; by vertical field of view (radians) and height (pixels)."""
+        if self.pixel_scale_limit is not None:
+            return self.pixel_scale_limit
+        return pixel_limit(fov_y, height, self.render_scale)
+
+
+def pixel_limit(fov_y: float, height: int, scale: float = 1.0) -> float:
+    """The pixel scale of a pixel, Spark's `pixelScaleLimit`: 2 * tan(fov_y / 2) / height * scale.
+
+    Args:
+        fov_y: radians.
+        height: pixels.
+        scale: Spark's `lodRenderScale`.
+    """
+    return 2 * math.tan(fov_y / 2) / height * scale

@@ -1,0 +1,56 @@
+"""`Balls`: what splats cover, a ball each, by which cameras are framed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .splats import Splats
+
+Matrix = NDArray[np.float64]
+
+#: Standard deviations out to which a splat counts: there an eighth of its opacity is left, exp(-2).
+SEEN = 2.0
+
+
+@dataclass(frozen=True)
+class Balls:
+    """What splats cover; N of them.
+
+    Attributes:
+        center: (N, 3) float64 world units.
+        radius: (N,) float64 world units.
+    """
+
+    center: Matrix
+    radius: Matrix
+
+    def take(self, index: NDArray[np.bool_]) -> Balls:
+        """Those of a mask (N,)."""
+        return Balls(self.center[index], self.radius[index])
+
+    @classmethod
+    def concat(cls, parts: Iterable[Balls]) -> Balls:
+        """All balls of several parts; at least one part."""
+        every = list(parts)
+        return cls(np.concatenate([part.center for part in every]), np.concatenate([part.radius for part in every]))
+
+
+def balls_of(splats: Splats, index: NDArray[Any] | slice, object_to_world: Matrix) -> Balls:
+    """What some splats cover where they stand; those without finite numbers are left out.
+
+    Args:
+        splats: all of an object.
+        index: which of them.
+        object_to_world: (4, 4) a rotation, a uniform scale and a translation.
+    """
+    with np.errstate(all="ignore"):
+        center = splats.center[index].astype(np.float64) @ object_to_world[:3, :3].T + object_to_world[:3, 3]
+        times = SEEN * float(np.cbrt(np.linalg.det(object_to_world[:3, :3])))
+        radius = times * splats.scale[index].max(axis=1, initial=0).astype(np.float64)
+        finite = np.isfinite(center).all(axis=1) & np.isfinite(radius)
+    return Balls(center[finite], radius[finite])

@@ -1,0 +1,65 @@
+"""`Instance`: a scene and where it stands."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .foveation import Foveation
+from .scene import Scene
+
+Matrix = NDArray[np.float64]
+
+#: What all instances together are called in tables.
+TOTAL = "total"
+
+
+@dataclass(frozen=True, eq=False)
+class Instance:
+    """A scene and where it stands.
+
+    Attributes:
+        source: a splat file, or a scene in memory.
+        name: for people and tables; unique among the instances of a run.
+        object_to_world: (4, 4) rotation, uniform scale and translation.
+        lod_scale: multiplies the pixel scales of its nodes; above 1 it gets more of the budget than others.
+        foveation: its own; None for that of the viewer.
+    """
+
+    source: Path | Scene
+    name: str = ""
+    object_to_world: Matrix = field(default_factory=lambda: np.eye(4))
+    lod_scale: float = 1.0
+    foveation: Foveation | None = None
+
+    @property
+    def file(self) -> Path | None:
+        """The splat file; None for a scene in memory."""
+        return self.source if isinstance(self.source, Path) else None
+
+
+def names_of(files: Sequence[Path], taken: Collection[str] = ()) -> list[str]:
+    """A name for each file, numbered where several have the same; none is `TOTAL` or in `taken`."""
+    seen = {TOTAL, *taken}
+    counts: dict[str, int] = {}
+    names = []
+    for file in files:
+        stem = file.name if file.stem == TOTAL else file.stem
+        for count in itertools.count(counts.get(stem, 0) + 1):
+            name = stem if count == 1 else f"{stem} {count}"
+            if name not in seen:
+                break
+        counts[stem] = count
+        seen.add(name)
+        names.append(name)
+    return names
+
+
+def instances_of(files: Sequence[Path]) -> list[Instance]:
+    """One instance of each file, where the file has it."""
+    return [Instance(file, name) for file, name in zip(files, names_of(files), strict=True)]

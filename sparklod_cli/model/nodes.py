@@ -1,0 +1,29 @@
+"""`Nodes`: a tree as a traversal reads it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from .gaussian import spark_size
+from .lod_tree import LodTree
+from .splats import FloatArray, Splats
+
+
+@dataclass(frozen=True)
+class Nodes:
+    """What the traversal needs of N nodes.
+
+    Attributes:
+        center: (N, 3) float32 world units.
+        size: (N,) float32 feature sizes, world units.
+        tree: (N,) children; not validated.
+    """
+
+    center: FloatArray
+    size: FloatArray
+    tree: LodTree
+
+    @classmethod
+    def of(cls, splats: Splats, tree: LodTree) -> Nodes:
+        """The nodes of a tree in full precision, with Spark's feature sizes."""
+        return cls(splats.center, spark_size(splats), tree)

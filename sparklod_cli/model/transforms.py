@@ -1,0 +1,324 @@
+"""Turn, scale and move splats, with all that they consist of: centres, axes, sizes and spherical harmonics.
+
+Conventions:
+    A point p becomes scale * rotation @ p + translation: rotated first, then scaled, then moved, about the origin of
+    the file; three.js (`Object3D.matrix`) and splat-transform (its TRS matrix) have the same order. Rotations are
+    active and right-handed: a positive angle turns counterclockwise, seen from the tip of the axis.
+
+    Euler angles are degrees about the axes x, y, z of the file, which stay where they are: first about x, then y, then
+    z, so that rotation = Rz @ Ry @ Rx. That is `Quat.setFromEulerAngles` of PlayCanvas, and so splat-transform's
+    `--rotate x,y,z`, and three.js's Euler order "ZYX" (not its default, "XYZ"). Coordinates here are those of the file.
+    Since its version 2, splat-transform's are those of an engine that turns PLY files by 180 degrees about z when it
+    loads them: for the same effect on a file, change the signs of its angles about x and y and of its moves along them.
+
+    `up` names the axis of the file that points up; it becomes +y, as in three.js, by a turn about x, so that right
+    stays right. "-y" is half a turn: from the axes in which training leaves scenes (y down, z forward) to those of
+    three.js (y up, z back). "z" is a quarter turn, as from Blender to glTF: +y, forward there, becomes -z.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..support.defaults import UP_AXES
+from ..support.parallel import chunks_of
+from .gaussian import quat_of_rotation, rotation_matrices
+from .sh import COEFFICIENTS, SH_C1, SH_C2, SH_C3
+from .splats import FloatArray, Splats
+
+Matrix = NDArray[np.float64]
+
+#: How far R^T R may be from the identity: float32 leaves 1e-7 of rotation matrices.
+SKEW = 1e-6
+
+#: No scale or translation is larger, and no scale smaller than the inverse: their squares must fit into a float32.
+LARGEST = 1e12
+
+#: Numbers of an SH rotation this near to 0, 1 or -1 are those, so that half turns round nothing; least squares leave
+#: some 1e-15.
+SNAP = 1e-12
+
+#: Directions that SH are sampled in to find their rotations: a few times the 7 coefficients of degree 3.
+SAMPLES = 64
+
+#: Splats that are worked on at a time: their float64 copies stay in a processor's cache.
+ROWS = 1 << 12
+
+#: Degrees about x that turn the axis of a file that points up to +y.
+_DEGREES_OF_UP = dict(zip(UP_AXES, (0.0, 180.0, -90.0, 90.0), strict=True))
+
+
+@dataclass(frozen=True, eq=False)
+class Transform:
+    """A rotation, a uniform scale and a translation, in this order.
+
+    Attributes:
+        rotation: (3, 3) float64, orthonormal, determinant 1; read-only.
+        scale: more than 0.
+        translation: (3,) float64, world units; read-only.
+
+    Raises:
+        ValueError: the matrix is not a rotation, or a number is not finite or out of range.
+    """
+
+    rotation: Matrix = field(default_factory=lambda: np.eye(3))
+    scale: float = 1.0
+    translation: Matrix = field(default_factory=lambda: np.zeros(3))
+
+    def __post_init__(self) -> None:
+        rotation, translation = (np.array(value, np.float64) for value in (self.rotation, self.translation))
+        if rotation.shape != (3, 3) or translation.shape != (3,):
+            raise ValueError(
+                f"a rotation of shape {rotation.shape} and a translation of shape {translation.shape};"
+                " they must be (3, 3) and (3,)"
+            )
+        with np.errstate(all="ignore"):
+            right = np.abs(rotation.T @ rotation - np.eye(3)).max() <= SKEW and np.linalg.det(rotation) > 0
+        if not right:
+            raise ValueError("the matrix is not a rotation: its columns must be a right-handed orthonormal basis")
+        if not 1 / LARGEST <= self.scale <= LARGEST:
+            raise ValueError(f"the scale {self.scale:g} is out of range; give {1 / LARGEST:g} to {LARGEST:g}")
+        if not np.abs(translation).max() <= LARGEST:
+            raise ValueError(
+                f"the translation {','.join(f'{part:g}' for part in translation)} is out of range;"
+                f" give {-LARGEST:g} to {LARGEST:g} for each axis"
+            )
+        for name, array in (("rotation", rotation), ("translation", translation)):
+            array.flags.writeable = False
+            object.__setattr__(self, name, array)
+        object.__setattr__(self, "scale", float(self.scale))
+
+    @classmethod
+    def from_euler(cls, x: float, y: float, z: float) -> Transform:
+        """A rotation by x, then y, then z degrees about the fixed axes; multiples of 90 are exact.
+
+        Raises:
+            ValueError: an angle is not finite.
+        """
+        if not all(map(math.isfinite, (x, y, z))):
+            raise ValueError(f"the angles {x:g},{y:g},{z:g} are not all finite; give three in degrees")
+        rotation = np.eye(3)
+        for axis, angle in enumerate((x, y, z)):
+            cosine, sine = _cosine_and_sine(angle)
+            turn = np.eye(3)
+            first, second = (axis + 1) % 3, (axis + 2) % 3
+            turn[first, first] = turn[second, second] = cosine
+            turn[second, first], turn[first, second] = sine, -sine
+            rotation = turn @ rotation
+        return cls(rotation + 0.0)  # no -0
+
+    @classmethod
+    def from_quat(cls, quat_xyzw: ArrayLike) -> Transform:
+        """A rotation by a (4,) quaternion x y z w of any length but 0.
+
+        Raises:
+            ValueError: it has another shape, or a length of 0 or not finite.
+        """
+        quat = np.asarray(quat_xyzw, np.float64)
+        if quat.shape != (4,):
+            raise ValueError(f"a quaternion of shape {quat.shape}; it must be (4,), x y z w")
+        largest = np.abs(quat).max()
+        if not 0 < largest < math.inf:
+            raise ValueError("the quaternion has a length of 0, or not finite; give x y z w of a rotation")
+        quat = quat / largest  # so that no square overflows or vanishes
+        quat /= math.hypot(*quat)
+        return cls(rotation_matrices(quat[None])[:, :, 0])
+
+    @classmethod
+    def from_up(cls, axis: str) -> Transform:
+        """The rotation after which `axis`, one of `UP_AXES`, is +y; see the conventions of this module.
+
+        Raises:
+            ValueError: there is no such axis.
+        """
+        if axis not in _DEGREES_OF_UP:
+            raise ValueError(f"{axis!r} is not an axis that can point up; use one of {', '.join(UP_AXES)}")
+        return cls.from_euler(_DEGREES_OF_UP[axis], 0, 0)
+
+    @classmethod
+    def from_parts(
+        cls,
+        *,
+        up: str = "y",
+        rotate: Sequence[float] = (0, 0, 0),
+        scale: float = 1.0,
+        translate: Sequence[float] = (0, 0, 0),
+    ) -> Transform:
+        """What the options --up, --rotate, --scale and --translate mean together: one after another, in this order.
+
+        Args:
+            up: one of `UP_AXES`.
+            rotate: degrees about x, y, z, after `up` has turned the file.
+            scale: a factor, more than 0.
+            translate: x, y, z in world units, after scaling.
+
+        Raises:
+            ValueError: one of them is out of range; its text says which and what to give.
+        """
+        turned = cls.from_up(up).then(cls.from_euler(*rotate))
+        return cls(turned.rotation, scale, np.asarray(translate, np.float64))
+
+    @property
+    def is_identity(self) -> bool:
+        """Whether it leaves everything exactly where and as it is."""
+        return self._keeps_axes and self.scale == 1 and not self.translation.any()
+
+    @property
+    def _keeps_axes(self) -> bool:
+        return np.array_equal(self.rotation, np.eye(3))
+
+    @property
+    def matrix(self) -> Matrix:
+        """(4, 4) float64 that multiplies column vectors x y z 1."""
+        matrix = np.eye(4)
+        matrix[:3, :3] = self.scale * self.rotation
+        matrix[:3, 3] = self.translation
+        return matrix
+
+    def then(self, after: Transform) -> Transform:
+        """This transform followed by another, as one."""
+        translation = after.scale * (after.rotation @ self.translation) + after.translation
+        return Transform(after.rotation @ self.rotation, after.scale * self.scale, translation)
+
+    def inverse(self) -> Transform:
+        """The transform that undoes this one."""
+        back = self.rotation.T
+        return Transform(back, 1 / self.scale, -(back @ self.translation) / self.scale)
+
+    def apply(self, splats: Splats) -> Splats:
+        """Splats rotated, scaled and moved: computed in float64, rounded once to float32.
+
+        The identity returns `splats` itself, and columns that a transform leaves alone are shared, not copied.
+        Quaternions keep their length, so that invalid ones stay invalid, and are not brought to one hemisphere:
+        q becomes r * q, where w of r is not negative. A splat that leaves the range of float32 becomes infinite, and
+        so invalid.
+        """
+        if self.is_identity:
+            return splats
+        columns = {"center": np.empty_like(splats.center)}
+        if not self._keeps_axes:
+            columns["quat_xyzw"] = np.empty_like(splats.quat_xyzw)
+            if splats.sh.shape[1]:
+                columns["sh"] = np.empty_like(splats.sh)
+        if self.scale != 1:
+            columns["scale"] = np.empty_like(splats.scale)
+        result = dataclasses.replace(splats, **columns)
+        quat, of_degrees = _quat_product(self.rotation), sh_rotations(self.rotation, splats.sh_degree)
+        matrix = self.scale * self.rotation
+        with np.errstate(over="ignore", under="ignore", invalid="ignore"):
+            for part in chunks_of(len(splats), ROWS):
+                result.center[part] = _multiplied(matrix, splats.center[part]) + self.translation
+                if "scale" in columns:
+                    result.scale[part] = splats.scale[part].astype(np.float64) * self.scale
+                if "quat_xyzw" in columns:
+                    result.quat_xyzw[part] = _multiplied(quat, splats.quat_xyzw[part])
+                if "sh" in columns:
+                    _turn_sh(of_degrees, splats.sh[part], result.sh[part])
+        return result
+
+
+def sh_rotations(rotation: Matrix, degree: int) -> list[Matrix]:
+    """For each degree from 1 to `degree`, what multiplies its SH coefficients where splats are turned by `rotation`.
+
+    A colour f(d) = Y(d) c becomes f(R^-1 d), so Y(d) c' = Y(R^-1 d) c for all d: c' = X c, where X is the solution of
+    Y(d) X = Y(R^-1 d). It is exact, as the functions of a degree turn among themselves; least squares over more
+    directions than coefficients find it to float64.
+
+    Args:
+        rotation: (3, 3).
+        degree: 0 to 3.
+
+    Returns:
+        (3, 3), (5, 5) and (7, 7) orthogonal float64, as far as `degree` goes.
+    """
+    directions = _directions()
+    before, after = sh_basis(directions, degree), sh_basis(directions @ rotation, degree)
+    found = []
+    for l in range(1, degree + 1):  # noqa: E741 - as books call the degree
+        part = slice(COEFFICIENTS[l - 1], COEFFICIENTS[l])
+        turn = np.linalg.lstsq(before[:, part], after[:, part], rcond=None)[0]
+        nearest = np.rint(turn)
+        found.append(np.where(np.abs(turn - nearest) < SNAP, nearest + 0.0, turn))
+    return found
+
+
+def sh_basis(directions: Matrix, degree: int) -> Matrix:
+    """(N, K) real spherical harmonics of degree 1 to `degree` in (N, 3) unit directions, ordered as `Splats.sh` is.
+
+    The polynomials and signs are those of the code that trained 3D Gaussian Splatting (`eval_sh` there); the rasterizer
+    has them in `kernels/shade.py`.
+    """
+    x, y, z = directions.T
+    columns = [SH_C1 * -y, SH_C1 * z, SH_C1 * -x] if degree else []
+    if degree > 1:
+        columns += [c * p for c, p in zip(SH_C2, _second(x, y, z), strict=True)]
+    if degree > 2:
+        columns += [c * p for c, p in zip(SH_C3, _third(x, y, z), strict=True)]
+    return np.stack(columns, axis=1) if columns else np.empty((len(directions), 0))
+
+
+def _second(x: Matrix, y: Matrix, z: Matrix) -> list[Matrix]:
+    return [x * y, y * z, 2 * z * z - x * x - y * y, x * z, x * x - y * y]
+
+
+def _third(x: Matrix, y: Matrix, z: Matrix) -> list[Matrix]:
+    return [
+        y * (3 * x * x - y * y),
+        x * y * z,
+        y * (4 * z * z - x * x - y * y),
+        z * (2 * z * z - 3 * x * x - 3 * y * y),
+        x * (4 * z * z - x * x - y * y),
+        z * (x * x - y * y),
+        x * (x * x - 3 * y * y),
+    ]
+
+
+def _directions() -> Matrix:
+    """(SAMPLES, 3) unit vectors, spread evenly: a spiral from pole to pole by the golden angle."""
+    index = np.arange(SAMPLES)
+    z = 1 - (2 * index + 1) / SAMPLES
+    angle = index * (math.pi * (3 - math.sqrt(5)))
+    radius = np.sqrt(1 - z * z)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
+
+
+def _cosine_and_sine(degrees: float) -> tuple[float, float]:
+    quarters, rest = divmod(math.fmod(degrees, 360), 90)
+    if rest == 0:
+        return ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))[int(quarters) % 4]
+    return math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+
+
+def _quat_product(rotation: Matrix) -> Matrix:
+    """(4, 4) that multiplies quaternions x y z w from the left by that of a rotation, of w >= 0."""
+    quat = quat_of_rotation(rotation)
+    quat[np.abs(quat) < SNAP] = 0
+    first = quat[3] or quat[np.argmax(np.abs(quat))]  # half turns have no w: then the largest part is positive
+    x, y, z, w = quat if first > 0 else -quat
+    return np.array([[w, -z, y, x], [z, w, -x, y], [-y, x, w, z], [-x, -y, -z, w]])
+
+
+def _multiplied(matrix: Matrix, rows: FloatArray) -> Matrix:
+    """(N, K) rows times a (K, K) matrix, as (N, K) float64.
+
+    Sums are in a fixed order, which BLAS would choose by processor and threads; columns are what einsum is fast with.
+    """
+    columns: Matrix = np.einsum("ij,jn->in", matrix, rows.T.astype(np.float64, order="C"))
+    return columns.T
+
+
+def _turn_sh(of_degrees: list[Matrix], sh: FloatArray, out: FloatArray) -> None:
+    """Fills (N, K, 3) coefficients with those of turned splats, degree by degree; as `_multiplied`."""
+    count, start = len(sh), 0
+    for turn in of_degrees:
+        part = slice(start, start + len(turn))
+        columns = sh[:, part].transpose(1, 2, 0).astype(np.float64, order="C").reshape(len(turn), 3 * count)
+        turned = np.einsum("kj,jn->kn", turn, columns).reshape(len(turn), 3, count)
+        out[:, part] = turned.transpose(2, 0, 1)
+        start = part.stop

@@ -1,0 +1,264 @@
+"""`Scenes`: scenes in memory where they stand, and `Cut`: what is drawn of them, with its splats."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..codecs.gpu import lod_tree
+from ..lod.continuous import faded
+from ..lod.settings import LodSettings
+from ..lod.traversal import CHUNK_NODES, Forest, Traversal, TreeCut, TreeInstance
+from ..model.balls import Balls, balls_of
+from ..model.foveation import Foveation
+from ..model.gaussian import placed
+from ..model.instances import Instance, Matrix
+from ..model.nodes import Nodes
+from ..model.scene import Scene
+from ..model.splats import Splats
+from ..support.defaults import PRECISIONS
+from ..support.units import count_of
+
+Index = NDArray[np.signedinteger]
+Weights = NDArray[np.float64]
+
+#: A cut holds the number of an instance as a uint16.
+MAX_INSTANCES = 65_535
+
+#: What a scene without a file is called in messages and titles.
+UNNAMED = "scene"
+
+
+@dataclass(frozen=True, eq=False)
+class LoadedScene:
+    """A scene that instances are of, read once however often it stands.
+
+    Attributes:
+        file: that it was read from; None for a scene that was in memory.
+        bytes: of the file; of a scene that was in memory, of its columns.
+        scene: as the file has it; columns that were not asked for are 0.
+        splats: N, as they are drawn: those of the scene, or what a coding makes of them.
+        first_chunk: number of its first chunk, where the chunks of all scenes are counted.
+    """
+
+    file: Path | None
+    bytes: int
+    scene: Scene
+    splats: Splats
+    first_chunk: int
+
+    @property
+    def name(self) -> str:
+        """For messages and titles: that of the file."""
+        return self.file.name if self.file is not None else UNNAMED
+
+    @property
+    def is_tree(self) -> bool:
+        """Whether it has a Level-of-Detail tree, so that cuts of it can be drawn."""
+        return self.scene.tree is not None
+
+    @functools.cached_property
+    def depth(self) -> NDArray[np.int32] | None:
+        """(N,) edges from the root to each node; None without a tree."""
+        return None if self.scene.tree is None else self.scene.tree.depths()
+
+    @functools.cached_property
+    def every(self) -> Index:
+        """(N,) indices of all splats."""
+        return np.arange(len(self.splats))
+
+    @functools.cached_property
+    def leaves(self) -> Index:
+        """(M,) indices of full detail: the leaves of a tree, or all splats."""
+        return self.every if self.scene.tree is None else np.flatnonzero(self.scene.tree.is_leaf)
+
+    @functools.cached_property
+    def full(self) -> Splats:
+        """M splats of full detail, in the space of the scene."""
+        return self.splats if self.leaves is self.every else self.splats.take(self.leaves)
+
+    @property
+    def chunks(self) -> int:
+        """How many chunks it has, of 65,536 splats each."""
+        return -(-len(self.splats) // CHUNK_NODES)
+
+    def chunk_bytes(self) -> NDArray[np.int64]:
+        """(chunks,) bytes of each, as if the file were cut evenly: SPZ has no chunks of its own."""
+        nodes = len(self.splats)
+        ends = np.minimum(np.arange(1, self.chunks + 1) * CHUNK_NODES, nodes)
+        return np.diff(ends * self.bytes // nodes, prepend=0)
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """What is drawn of one instance.
+
+    Attributes:
+        scene: that it is of.
+        index: (M,) which of its splats are drawn, ascending.
+        weight: (M,) float64 by how much, 0..1, in a continuous cut; None for wholly.
+        object_to_world: (4, 4) where they stand.
+    """
+
+    scene: LoadedScene
+    index: Index
+    weight: Weights | None
+    object_to_world: Matrix
+
+    @functools.cached_property
+    def splats(self) -> Splats:
+        """M splats in the space of the scene, as opaque as they are drawn."""
+        if self.index is self.scene.leaves:
+            return self.scene.full
+        if self.index is self.scene.every:
+            return self.scene.splats
+        splats = self.scene.splats.take(self.index)
+        return splats if self.weight is None else replace(splats, opacity=faded(splats.opacity, self.weight))
+
+    @property
+    def depth(self) -> NDArray[np.int32]:
+        """(M,) edges from the root to each; 0 without a tree."""
+        depth = self.scene.depth
+        return np.zeros(len(self.index), np.int32) if depth is None else depth[self.index]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Cut:
+    """What is drawn of some instances.
+
+    Attributes:
+        parts: one for each instance.
+        pixel_scale: nodes above it are refined; None where no tree was cut, or nothing refined.
+        reason: why the cut has no more nodes: "budget", "pixel" (the limit), "missing" (chunks) or "exhausted" (full
+            detail); None where no tree was cut, or the cut is continuous.
+    """
+
+    parts: tuple[Part, ...]
+    pixel_scale: float | None = None
+    reason: str | None = None
+
+    def __len__(self) -> int:
+        return sum(len(part.index) for part in self.parts)
+
+    def __repr__(self) -> str:
+        instances = f" of {len(self.parts):,} instances" if len(self.parts) > 1 else ""
+        scale = "" if self.pixel_scale is None else f", pixel scale {self.pixel_scale:.4g}"
+        return f"Cut({len(self):,} splats{instances}{scale}{f', stopped by {self.reason}' if self.reason else ''})"
+
+    @property
+    def nodes(self) -> tuple[Index, ...]:
+        """For each instance (M,) which of its splats, or nodes, are drawn, ascending."""
+        return tuple(part.index for part in self.parts)
+
+    @functools.cached_property
+    def splats(self) -> Splats:
+        """All splats in the world; SH of the lowest degree of the scenes, in the directions of their own spaces."""
+        parts = []
+        degree = min(part.splats.sh_degree for part in self.parts)
+        for part in self.parts:
+            still = np.array_equal(part.object_to_world, np.eye(4))
+            splats = part.splats.with_max_sh(degree)
+            parts.append(splats if still else placed(splats, part.object_to_world))
+        return parts[0] if len(parts) == 1 else Splats.concat(parts)
+
+
+@dataclass(frozen=True, eq=False)
+class Scenes:
+    """Instances and the scenes that they are of; made by `read_scenes`.
+
+    Attributes:
+        instances: at least one.
+        loaded: each scene once.
+        of_instance: of each instance, its scene.
+        notes: what a person should know of the files.
+        precision: one of `PRECISIONS`, of the nodes that cuts are found with.
+        threads: to prepare nodes on.
+    """
+
+    instances: Sequence[Instance]
+    loaded: Sequence[LoadedScene]
+    of_instance: Sequence[LoadedScene]
+    notes: Sequence[str] = ()
+    precision: str = PRECISIONS[0]
+    threads: int = 1
+
+    @property
+    def title(self) -> str:
+        """The names of the scenes."""
+        return ", ".join(dict.fromkeys(loaded.name for loaded in self.loaded))
+
+    @functools.cached_property
+    def trees(self) -> list[LoadedScene]:
+        """The scenes that have trees, in the order of `forest`."""
+        return [loaded for loaded in self.loaded if loaded.is_tree]
+
+    @functools.cached_property
+    def forest(self) -> Forest:
+        """The trees as the traversal reads them."""
+        return Forest([self._nodes(loaded.scene) for loaded in self.trees])
+
+    def _nodes(self, scene: Scene) -> Nodes:
+        assert scene.tree is not None
+        if self.precision == "float16":
+            return lod_tree.unpack(lod_tree.pack(scene.splats, scene.tree, threads=self.threads))
+        return Nodes.of(scene.splats, scene.tree)
+
+    def tree_instances(self, foveation: Foveation) -> list[TreeInstance]:
+        """The instances of trees; those without a foveation of their own have this one."""
+        numbers = {id(loaded): number for number, loaded in enumerate(self.trees)}
+        return [
+            TreeInstance(numbers[id(loaded)], at.object_to_world, at.lod_scale, at.foveation or foveation)
+            for at, loaded in zip(self.instances, self.of_instance, strict=True)
+            if loaded.is_tree
+        ]
+
+    def traversal(self, settings: LodSettings) -> Traversal:
+        """Finds the cuts of the instances of trees.
+
+        Raises:
+            ValueError: the budget is too small for the roots, or there are too many instances.
+        """
+        instances = self.tree_instances(settings.foveation)
+        if settings.budget < len(instances):
+            budget = count_of(settings.budget, "splat")
+            raise ValueError(f"a budget of {budget} is less than one for each of {len(instances)} instances")
+        if len(instances) > MAX_INSTANCES:
+            raise ValueError(f"{len(instances):,} instances are more than {MAX_INSTANCES:,}")
+        return Traversal(self.forest, instances)
+
+    def full(self) -> Cut:
+        """Full detail: all leaves, and all splats of scenes without trees."""
+        return Cut(tuple(map(self._whole, range(len(self.instances)))))
+
+    def cut_of(self, found: TreeCut) -> Cut:
+        """What a traversal of these scenes found, with its splats."""
+        least = found.least if np.isfinite(found.least) else None
+        return Cut(self.parts_of([(nodes, None) for nodes in found.indices()]), least, found.reason)
+
+    def parts_of(self, of_trees: Sequence[tuple[NDArray[np.uint32], Weights | None]]) -> tuple[Part, ...]:
+        """What is drawn of each instance: of trees, in order, these nodes by these weights; of others all splats."""
+        found = iter(of_trees)
+        parts = []
+        for number, (at, loaded) in enumerate(zip(self.instances, self.of_instance, strict=True)):
+            if loaded.is_tree:
+                nodes, weight = next(found)
+                parts.append(Part(loaded, nodes.astype(np.int64), weight, at.object_to_world))
+            else:
+                parts.append(self._whole(number))
+        return tuple(parts)
+
+    def _whole(self, number: int) -> Part:
+        loaded = self.of_instance[number]
+        return Part(loaded, loaded.leaves, None, self.instances[number].object_to_world)
+
+    def balls(self) -> Balls:
+        """What the splats cover in the world: full detail of every instance."""
+        return Balls.concat(
+            balls_of(loaded.splats, loaded.leaves, at.object_to_world)
+            for at, loaded in zip(self.instances, self.of_instance, strict=True)
+        )

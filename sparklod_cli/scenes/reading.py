@@ -1,0 +1,109 @@
+"""Reads the scenes of instances, each once."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from ..codecs.rounding import after
+from ..io import examine_scene, size_on_disk
+from ..model.instances import Instance
+from ..model.scene import Scene
+from ..model.selection import Selection, describe
+from ..model.splats import COLUMNS, Splats
+from ..support.defaults import PRECISIONS
+from ..support.errors import FormatError, InvalidSplatsError, SparklodError, TreeError, memory_told
+from ..support.progress import Progress, silent
+from .loaded import UNNAMED, LoadedScene, Scenes
+
+#: What a traversal reads of splats.
+TRAVERSED = ("center", "scale", "opacity")
+
+
+def read_scenes(
+    instances: Sequence[Instance],
+    *,
+    columns: Collection[str] = COLUMNS,
+    trees_only: bool = False,
+    through: str | None = None,
+    precision: str = PRECISIONS[0],
+    threads: int = 1,
+    progress: Progress = silent,
+) -> Scenes:
+    """Reads the scenes of instances, each once.
+
+    Splats that cannot be drawn are left out of scenes without trees; `Scenes.notes` tells how many.
+
+    Args:
+        instances: at least one.
+        columns: of `Splats` that are read; with `trees_only` only, for all are looked at where there is no tree.
+        trees_only: refuse scenes without trees.
+        through: one of `rounding.ROUND_TRIPS`, a coding after which splats are drawn; cuts are those of the scene.
+        precision: one of `PRECISIONS`, of the nodes that cuts are found with.
+        threads: to decode on.
+        progress: is told how much is done.
+
+    Raises:
+        FormatError: a file cannot be read, is no tree but has to be, or does not fit the coding; names the file.
+        TreeError: a tree is broken; names the file.
+        InvalidSplatsError: a scene has nothing to draw; names it.
+        OutOfMemoryError: a file does not fit into memory; names it.
+    """
+    loaded: dict[Path | int, LoadedScene] = {}
+    notes: list[str] = []
+    chunks = 0
+    for source in (instance.source for instance in instances):
+        if _key(source) in loaded:
+            continue
+        scene = _read(source, columns if trees_only else COLUMNS, threads, progress)
+        file = source if isinstance(source, Path) else None
+        name = file if file is not None else UNNAMED
+        if scene.tree is None and trees_only:
+            raise FormatError(f"{name}: it is not a Level-of-Detail tree; bake it first with sparklod build-lod")
+        notes += (f"{name}: {note}" for note in scene.notes)
+        if scene.tree is None:
+            scene = _drawable(str(name), scene, notes)
+        size = (size_on_disk(file) or 0) if file is not None else _size_of(scene.splats)
+        drawn = after(through, file or Path(UNNAMED), scene, threads)
+        loaded[_key(source)] = entry = LoadedScene(file, size, scene, drawn, chunks)
+        chunks += entry.chunks
+    of_instance = [loaded[_key(instance.source)] for instance in instances]
+    return Scenes(instances, list(loaded.values()), of_instance, notes, precision, threads)
+
+
+def _key(source: Path | Scene) -> Path | int:
+    return source if isinstance(source, Path) else id(source)
+
+
+def _size_of(splats: Splats) -> int:
+    return sum(getattr(splats, name).nbytes for name in COLUMNS)
+
+
+def _read(source: Path | Scene, columns: Collection[str], threads: int, progress: Progress) -> Scene:
+    """The scene of a source; its tree, if it has one, is sound."""
+    name = UNNAMED if isinstance(source, Scene) else source
+    try:
+        if isinstance(source, Scene):
+            scene = source
+        else:
+            with memory_told():
+                scene = examine_scene(source, columns=columns, threads=threads, progress=progress)
+        if scene.tree is not None:
+            scene.tree.validate()
+    except TreeError as error:
+        raise TreeError(f"{name}: its tree is broken: {error}") from None
+    except SparklodError as error:
+        raise type(error)(f"{name}: {error}") from None
+    return scene
+
+
+def _drawable(name: str, scene: Scene, notes: list[str]) -> Scene:
+    """A scene without the splats that cannot be drawn."""
+    try:
+        splats, dropped = Selection(drop_invalid=True).apply(scene.splats)
+    except InvalidSplatsError as error:
+        raise InvalidSplatsError(f"{name}: {error}") from None
+    if dropped:
+        notes.append(f"{name}: left out {describe(dropped)}")
+    return replace(scene, splats=splats)

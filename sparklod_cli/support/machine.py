@@ -1,0 +1,85 @@
+"""What this process may use of its machine: memory and processors, and the limits that a container sets on both.
+
+Each function returns None where the system does not say; none of them raises.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+#: Limits of version 1 that are none: the kernel writes the largest multiple of a page.
+UNLIMITED = 1 << 60
+
+
+def total_memory() -> int | None:
+    """Bytes of memory that this process could have at most: the machine's, or the limit of its container."""
+    physical = _meminfo("MemTotal")
+    if physical is None:
+        try:
+            physical = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+        except (AttributeError, OSError, ValueError):  # Windows has no sysconf
+            return None
+    return min([physical, *(limit for limit, _ in _memory_limits())])
+
+
+def available_memory() -> int | None:
+    """Bytes that can be allocated before the system swaps, or the container ends the process."""
+    available = _meminfo("MemAvailable")
+    if available is None:
+        return None
+    return max(0, min([available, *(limit - used for limit, used in _memory_limits())]))
+
+
+def processor_quota() -> float | None:
+    """How many processors' time a container grants, such as 1.5; None where there is no such limit."""
+    found = []
+    for folder in _groups("cpu"):
+        words = (_text(folder / "cpu.max") or "").split()  # version 2
+        if not words:
+            words = [_text(folder / f"cpu.cfs_{name}_us") or "" for name in ("quota", "period")]
+        if len(words) == 2 and all(word.isdigit() for word in words) and int(words[1]):
+            found.append(int(words[0]) / int(words[1]))
+    return min(found, default=None)
+
+
+def _meminfo(name: str) -> int | None:
+    for line in (_text(Path("/proc/meminfo")) or "").splitlines():
+        words = line.split()
+        if words[:1] == [f"{name}:"] and words[1].isdigit():
+            return int(words[1]) * 1024
+    return None
+
+
+def _memory_limits() -> Iterator[tuple[int, int]]:
+    """Limit and use in bytes of each group of processes that this one is in."""
+    for folder in _groups("memory"):
+        for limit_name, used_name in (
+            ("memory.max", "memory.current"),  # version 2
+            ("memory.limit_in_bytes", "memory.usage_in_bytes"),
+        ):
+            limit, used = _text(folder / limit_name) or "", _text(folder / used_name) or ""
+            if limit.isdigit() and int(limit) < UNLIMITED:
+                yield int(limit), int(used) if used.isdigit() else 0
+
+
+def _groups(controller: str) -> list[Path]:
+    """The folders of cgroups, versions 1 and 2, that limit this process, with all above them."""
+    root = Path("/sys/fs/cgroup")
+    folders = {root, root / controller}  # in a container, its own group is the root
+    for line in (_text(Path("/proc/self/cgroup")) or "").splitlines():
+        number, _, rest = line.partition(":")
+        names, _, path = rest.partition(":")
+        if number == "0" or controller in names.split(","):
+            base = root if number == "0" else root / controller
+            own = base / path.lstrip("/")
+            folders |= {own, *(parent for parent in own.parents if parent.is_relative_to(base))}
+    return sorted(folders)
+
+
+def _text(path: Path) -> str | None:
+    try:
+        return path.read_text("utf-8", "replace").strip()
+    except OSError:
+        return None

@@ -1,0 +1,105 @@
+"""The table of a comparison: its columns, and what its rows come to for each budget."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from .columns import FRAME, Column, Row
+from .statistics import numbers, statistic
+
+COLUMNS = (
+    *FRAME,
+    Column("budget", int, "", "splats", "the most that may be drawn, all instances together"),
+    Column("share", float, ".6g", "share", "budget over the splats of full detail"),
+    Column("selected", int, "", "splats", "what is drawn; with `--continuous` more than the budget, as some fade"),
+    Column("psnr_black", float, ".3f", "dB", "PSNR against full detail, both on black; 100 if they are the same"),
+    Column("psnr_white", float, ".3f", "dB", "the same on white"),
+    Column("psnr", float, ".3f", "dB", "mean of the two"),
+    Column("ssim_black", float, ".5f", "", "SSIM against full detail, both on black; 1 if they are the same"),
+    Column("ssim_white", float, ".5f", "", "the same on white"),
+    Column("ssim", float, ".5f", "", "mean of the two"),
+    Column("worst_tile_psnr", float, ".3f", "dB", "PSNR of the tile of 64 x 64 pixels that is farthest off, on either"),
+    Column("worst_tile_x", int, "", "px", "its left side"),
+    Column("worst_tile_y", int, "", "px", "its upper side"),
+)
+
+
+@dataclass(frozen=True)
+class BudgetSummary:
+    """What the frames of a budget come to.
+
+    Attributes:
+        text: the budget, as it was given.
+        budget, share: see `COLUMNS`.
+        frames: how many.
+        selected: mean.
+        psnr, psnr_min, psnr_max, psnr_black, psnr_white: dB; means but for the least and the most.
+        ssim, ssim_min: mean and least.
+        worst_tile_psnr: the least, dB.
+        worst_frame, worst_tile_x, worst_tile_y: where that is.
+    """
+
+    text: str
+    budget: int
+    share: float
+    frames: int
+    selected: float
+    psnr: float
+    psnr_min: float
+    psnr_max: float
+    psnr_black: float
+    psnr_white: float
+    ssim: float
+    ssim_min: float
+    worst_tile_psnr: float
+    worst_frame: int
+    worst_tile_x: int
+    worst_tile_y: int
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return asdict(self)
+
+
+def rows_by_budget(rows: Iterable[Row], budgets: int) -> list[list[Row]]:
+    """The rows of each of some budgets, in the order of the frames."""
+    every = list(rows)
+    return [every[at::budgets] for at in range(budgets)]
+
+
+def summarize(rows: Iterable[Row], budgets: Sequence[str]) -> list[BudgetSummary]:
+    """What the rows of a comparison come to, for each budget, named as it was given."""
+    return [_summary(budget, mine) for budget, mine in zip(budgets, rows_by_budget(rows, len(budgets)), strict=True)]
+
+
+def _summary(text: str, rows: Sequence[Row]) -> BudgetSummary:
+    def of(name: str, which: str = "mean") -> float:
+        return float(f"{statistic(which, numbers(rows, name)):.9g}")
+
+    worst = min(rows, key=lambda row: numbers([row], "worst_tile_psnr")[0])
+    first = rows[0]
+    return BudgetSummary(
+        text=text,
+        budget=int(numbers([first], "budget")[0]),
+        share=float(numbers([first], "share")[0]),
+        frames=len(rows),
+        selected=of("selected"),
+        psnr=of("psnr"),
+        psnr_min=of("psnr", "min"),
+        psnr_max=of("psnr", "max"),
+        psnr_black=of("psnr_black"),
+        psnr_white=of("psnr_white"),
+        ssim=of("ssim"),
+        ssim_min=of("ssim", "min"),
+        worst_tile_psnr=of("worst_tile_psnr", "min"),
+        **{
+            name: int(numbers([worst], column)[0])
+            for name, column in (
+                ("worst_frame", "frame"),
+                ("worst_tile_x", "worst_tile_x"),
+                ("worst_tile_y", "worst_tile_y"),
+            )
+        },
+    )
