@@ -1,1 +1,1 @@
-"""Inputs that nobody would make on purpose, and laws that hold for whatever comes of them; see docs/fuzzing.md."""
+"""Fuzzers: they make hostile and damaged inputs, and check laws that hold for every input; see docs/fuzzing.md."""

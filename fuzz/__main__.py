@@ -1,4 +1,4 @@
-"""`python -m fuzz`: runs the fuzzers; exit status 1 if something was found."""
+"""`python -m fuzz`: runs the fuzzers. The exit status is 1 if they found something."""
 
 from __future__ import annotations
 
@@ -12,16 +12,18 @@ from .runner import run, table
 
 
 def main() -> int:
-    """Parses the command line, runs what it asks for, and says what was found."""
+    """Parses the command line, runs the cases it asks for and prints the findings; returns the exit status."""
     parser = argparse.ArgumentParser(prog="python -m fuzz", description=__doc__)
-    parser.add_argument("--minutes", type=float, metavar="M", help="for all targets together")
-    parser.add_argument("--cases", type=int, metavar="N", help="of each target; 100 unless --minutes says otherwise")
-    parser.add_argument("--seed", type=int, default=SEED, metavar="S", help=f"of the cases; {SEED} unless given")
-    parser.add_argument("--first", type=int, default=0, metavar="I", help="number of the first case; 0 unless given")
-    parser.add_argument("--target", action="append", metavar="NAME", help="only this one; may be given more than once")
-    parser.add_argument("--keep", type=Path, metavar="DIR", help="where to put the cases in which something is found")
-    parser.add_argument("--list", action="store_true", help="name the targets")
-    parser.add_argument("--replay", type=Path, metavar="FILE", help="run a case of --keep again")
+    parser.add_argument("--minutes", type=float, metavar="M", help="stop after M minutes, for all targets together")
+    parser.add_argument(
+        "--cases", type=int, metavar="N", help="cases of each target (default: 100, or as many as --minutes allows)"
+    )
+    parser.add_argument("--seed", type=int, default=SEED, metavar="S", help=f"seed of the cases (default: {SEED})")
+    parser.add_argument("--first", type=int, default=0, metavar="I", help="number of the first case (default: 0)")
+    parser.add_argument("--target", action="append", metavar="NAME", help="run this target only; repeatable")
+    parser.add_argument("--keep", type=Path, metavar="DIR", help="save the cases that have findings in DIR")
+    parser.add_argument("--list", action="store_true", help="list the targets")
+    parser.add_argument("--replay", type=Path, metavar="FILE", help="run a case again that --keep saved")
     given = parser.parse_args()
     if given.list:
         print("\n".join(TARGETS))
@@ -33,14 +35,15 @@ def main() -> int:
         parser.error(f"{unknown[0]} is not one of {', '.join(TARGETS)}")
     cases = given.cases if given.cases or given.minutes else 100
     seconds = given.minutes and 60 * given.minutes
-    how = {"seed": given.seed, "first": given.first, "keep": given.keep}
-    tallies = run(given.target or TARGETS, cases=cases, seconds=seconds, **how)
+    tallies = run(
+        given.target or TARGETS, cases=cases, seconds=seconds, seed=given.seed, first=given.first, keep=given.keep
+    )
     print(table(tallies))
     return int(any(tally.found for tally in tallies))
 
 
 def replay(path: Path) -> int:
-    """Runs a case that was kept."""
+    """Runs a case that `--keep` saved; returns the exit status."""
     target, case = unpacked(path)
     print(f"{target}: {case.what}")
     with Child() as child:

@@ -1,10 +1,10 @@
-"""The decoders under atheris, which follows the branches that an input takes.
+"""Fuzzes the decoders with atheris, which is guided by the branches that an input takes.
 
     python -m fuzz.atheris_decoders -max_total_time=600 corpus
 
-`pip install atheris` first, which is there for Linux. The first byte of an input chooses the format, so that sniffing
-is no obstacle; `--seeds DIR` writes the seeds of the other fuzzers in this form and ends. Kernels are compiled, and not
-followed.
+Run `pip install atheris` first; it exists for Linux only. The first byte of an input chooses the format, so that
+sniffing does not stand in the way. `--seeds DIR` writes the seeds of the other fuzzers in this form and exits. Compiled
+kernels are not instrumented.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from typing import BinaryIO
 from sparklod_cli.codecs.formats import FORMATS, HEAD, sniff
 from sparklod_cli.support.errors import FormatError, SparklodError
 
-from .containers import good, opened, seeds
+from .containers import seeds, split_file, valid_seeds
 
 
 def decode(data: bytes) -> None:
-    """Runs the decoder that the first byte names; anything but a scene or an error of ours is raised."""
+    """Runs the decoder that the first byte names; lets through every exception but sparklod's own."""
     if not data:
         return
     form = FORMATS[data[0] % len(FORMATS)]
@@ -31,7 +31,7 @@ def decode(data: bytes) -> None:
     files: Mapping[str, bytes] = {}
     if form.companions:
         with contextlib.suppress(Exception):
-            files = opened(body)[0]
+            files = split_file(body)[0]
 
     def beside(name: str) -> BinaryIO:
         if name not in files:
@@ -46,16 +46,16 @@ def decode(data: bytes) -> None:
 
 
 def write_seeds(folder: Path) -> None:
-    """The seeds of the other fuzzers, with the byte before them that chooses their format."""
+    """Writes the seeds of the other fuzzers, each behind the byte that chooses its format."""
     folder.mkdir(parents=True, exist_ok=True)
-    for name in good():
+    for name in valid_seeds():
         form = sniff(seeds()[name][:HEAD], Path(name).suffix)
         if form is not None:
             (folder / name.replace("/", "-")).write_bytes(bytes([FORMATS.index(form)]) + seeds()[name])
 
 
 def main() -> None:
-    """Hands over to libFuzzer, whose options those of the command line are."""
+    """Runs libFuzzer, which reads its own options from the command line."""
     if "--seeds" in sys.argv:
         write_seeds(Path(sys.argv[sys.argv.index("--seeds") + 1]))
         return
@@ -73,7 +73,7 @@ def main() -> None:
 
 
 def _instrument(atheris: object, module: object) -> None:
-    """Lets atheris follow the functions of a module that is loaded already; not those of others, as of numba."""
+    """Instruments the functions that a loaded module defines, but not those it imports, such as numba's."""
     for name, value in vars(module).copy().items():
         if callable(value) and hasattr(value, "__code__") and value.__module__ == module.__name__:  # type: ignore[attr-defined]
             with contextlib.suppress(Exception):

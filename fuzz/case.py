@@ -1,4 +1,4 @@
-"""A case: files and what to do with them, all of which follows from a target, a seed and a number."""
+"""A case: files and what to do with them, determined by a target, a seed and a number."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ import numpy as np
 
 Rng = np.random.Generator
 
-#: The seed of a run that names none.
+#: Default of `--seed`.
 SEED = 1
 
-#: Targets, each a module of `fuzz.targets`.
+#: Names of the targets; each is a module in `fuzz/targets/`.
 TARGETS = ("decoders", "trees", "builds", "cameras", "instances", "expectations", "assertions", "rgba", "options")
 
 
 class LawError(Exception):
-    """What the project promises was not kept.
+    """A law that docs/fuzzing.md states did not hold.
 
     Args:
-        text: what came instead; its first line for the table.
-        fault: tells this fault from others; by the text unless given.
+        text: what happened instead; its first line goes into the table of findings.
+        fault: findings with the same `fault` count as one fault; without it, those with the same text do.
     """
 
     def __init__(self, text: str, fault: str = "") -> None:
@@ -38,13 +38,13 @@ class LawError(Exception):
 
 @dataclass(frozen=True)
 class Case:
-    """What a target tries.
+    """One input of a target.
 
     Attributes:
-        what: how it was made, for people.
-        files: bytes by the name in the case's folder, with / between folders.
-        run: what else the target's `check` must know; plain values, as JSON has them. `replaced` names files that a
-            command may replace; all others keep their bytes.
+        what: a description of how it was made, for people.
+        files: the content of each file by its path in the case's folder, with / as the separator.
+        run: what else the target's `check` needs; values that JSON can hold. `replaced` lists the files that a command
+            may replace; all others must keep their bytes.
     """
 
     what: str
@@ -53,18 +53,18 @@ class Case:
 
     @property
     def size(self) -> int:
-        """Bytes of all files."""
+        """Total size of the files, in bytes."""
         return sum(map(len, self.files.values()))
 
     def write(self, folder: Path) -> None:
-        """Puts the files into a folder."""
+        """Writes the files into a folder."""
         for name, data in self.files.items():
             path = folder / name
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(data)
 
     def packed(self, target: str, finding: str) -> bytes:
-        """A zip file that `unpacked` reads, with what was found for people."""
+        """Packs the case and the text of a finding into a zip file, which `unpacked` reads."""
         file = io.BytesIO()
         with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
             about = {"target": target, "what": self.what, "run": dict(self.run)}
@@ -76,7 +76,7 @@ class Case:
 
 
 def unpacked(path: Path) -> tuple[str, Case]:
-    """The target and the case of a file that `Case.packed` made."""
+    """Reads the target's name and the case from a zip file that `Case.packed` made."""
     with zipfile.ZipFile(path) as archive:
         about = json.loads(archive.read("case.json"))
         names = [name for name in archive.namelist() if name.startswith("files/")]
@@ -85,26 +85,26 @@ def unpacked(path: Path) -> tuple[str, Case]:
 
 
 class Target(Protocol):
-    """What a target's module has."""
+    """The two functions that the module of a target defines."""
 
     def make(self, rng: Rng) -> Case:
-        """A case, from nothing but the generator."""
+        """Makes a case from the random generator alone."""
 
     def check(self, case: Case, folder: Path) -> None:
         """Runs a case whose files are in `folder`, the current directory.
 
         Raises:
-            SparklodError: an input was refused, which is as good as a result.
-            LawError: a law does not hold.
+            SparklodError: the input was refused, which is as good an outcome as a result.
+            LawError: a law did not hold.
         """
 
 
 def target_of(name: str) -> Target:
-    """A target's module; a name with a dot is that of any module, for one that is only tried out."""
+    """Imports the module of a target; a name with a dot is a full module name, of a target that is not in `TARGETS`."""
     module: Any = import_module(name if "." in name else f"fuzz.targets.{name}")
     return module
 
 
 def case_of(name: str, seed: int, number: int) -> Case:
-    """Case `number` of a target: the same bytes, whenever it is asked for."""
+    """Makes case `number` of a target; the same arguments always give the same bytes."""
     return target_of(name).make(np.random.default_rng([seed, number, zlib.crc32(name.encode())]))

@@ -1,4 +1,4 @@
-"""The parent's side of the process that runs cases: starts it, waits no longer than is right, buries it."""
+"""Starts the worker process that runs cases, sends it requests, and kills it when a case takes too long."""
 
 from __future__ import annotations
 
@@ -20,16 +20,19 @@ from .oracle import Finding
 
 ROOT = Path(__file__).resolve().parents[1]
 
-#: Seconds that a case may take; and the first of a process, or one that is tried again: these may compile kernels.
-LIMIT, PATIENCE = 10.0, 300.0
+#: Seconds that a case may take.
+LIMIT = 10.0
+
+#: Seconds that a case may take if it may have to compile kernels: the first of a process, and one that is repeated.
+PATIENCE = 300.0
 
 
 class Child:
-    """A process that runs cases, started when it is needed.
+    """A worker process that runs cases; it is started by the first request, and again after it died.
 
     Args:
-        limit: seconds of a case.
-        patience: seconds of one that may compile.
+        limit: seconds that a case may take.
+        patience: seconds that a case may take if it may compile kernels.
     """
 
     def __init__(self, limit: float = LIMIT, patience: float = PATIENCE) -> None:
@@ -45,7 +48,7 @@ class Child:
         shutil.rmtree(self.scratch, ignore_errors=True)
 
     def run(self, request: dict[str, Any], *, patient: bool = False) -> dict[str, Any]:
-        """What came of a request, as the process answers it; a crash or a hang is a finding, too."""
+        """Runs a request in the worker and returns its answer; a crash or a hang of the worker becomes a finding."""
         if self._process is None:
             self._start()
             patient = True
@@ -75,7 +78,7 @@ class Child:
         return {"finding": finding.plain(), "outcome": "", "seconds": time.perf_counter() - started, "what": ""}
 
     def stop(self) -> None:
-        """Ends the process."""
+        """Kills the worker, if it runs."""
         if self._process is None:
             return
         self._process.kill()
@@ -115,12 +118,12 @@ class Child:
 
 
 def _cache() -> str:
-    """Where kernels are kept when NUMBA_CACHE_DIR does not say: as without a home of its own."""
+    """The user's cache folder: the worker has another HOME, but should find the kernels that are compiled already."""
     return os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
 
 
 def _place(log: str) -> str:
-    """The innermost place of sparklod, or else of anything, in what faulthandler wrote last."""
+    """The innermost frame in sparklod, or else the innermost frame at all, of the last trace by faulthandler."""
     threads = log.rpartition("Current thread")[2] or log
     frames = re.findall(r'File "([^"]*)", line \d+ in (\S+)', threads)
     ours = [frame for frame in frames if "sparklod_cli" in frame[0]] or frames

@@ -1,4 +1,4 @@
-"""Runs the command line inside this process, and holds it to what holds for every command."""
+"""Runs the command line inside this process and checks the laws that hold for every command."""
 
 from __future__ import annotations
 
@@ -14,31 +14,32 @@ from sparklod_cli import cli
 from sparklod_cli.support.errors import SparklodError
 
 from .case import LawError
-from .oracle import lines_fault, where_of
+from .oracle import innermost_frame, stderr_fault
 from .streams import STREAMS
 
+#: Exit codes of sparklod: done, a failure, wrong usage, a check that did not hold.
 CODES = (0, 1, 2, 3)
 
 
 @dataclass(frozen=True)
-class Done:
-    """What a command did."""
+class CommandResult:
+    """Exit code and output of a command."""
 
     code: int
     out: bytes
     err: str
 
 
-def command(arguments: Sequence[str]) -> Done:
+def command(arguments: Sequence[str]) -> CommandResult:
     """Runs `sparklod` with these arguments.
 
     Raises:
-        LawError: of its exit code, or of what it says on standard error.
+        LawError: the exit code or the text on standard error breaks a law, or an exception reached the last guard.
     """
     with _unforeseen() as caught:
         code = cli.run(list(arguments))
     out, err = STREAMS.take()
-    done = Done(code, out, err.decode("utf-8", "backslashreplace"))
+    done = CommandResult(code, out, err.decode("utf-8", "backslashreplace"))
     if caught:
         kind, where = caught[0]
         raise LawError(
@@ -51,19 +52,19 @@ def command(arguments: Sequence[str]) -> Done:
     return done
 
 
-def _faults(done: Done) -> Iterator[tuple[str, str]]:
-    fault, text = lines_fault(done.err)
+def _faults(done: CommandResult) -> Iterator[tuple[str, str]]:
+    fault, text = stderr_fault(done.err)
     if fault:
         yield fault, text
     if done.code == 1 and not done.err.strip():
         yield "silence", "exit code 1 without a word"
-    if done.code == 2 and "Error:" not in done.err:
+    if done.code == 2 and "error: " not in done.err:
         yield "silence", f"exit code 2 without an error: {done.err[:100]!r}"
 
 
 @contextmanager
 def _unforeseen() -> Iterator[list[tuple[str, str]]]:
-    """Notes what is raised below the one place where errors become exit codes, and is none of those that are meant."""
+    """Records the unexpected exceptions that `cli.run` would turn into exit codes."""
     caught: list[tuple[str, str]] = []
     original = cli.cli.main
 
@@ -73,7 +74,9 @@ def _unforeseen() -> Iterator[list[tuple[str, str]]]:
         except (SparklodError, click.ClickException, click.exceptions.Exit):
             raise
         except BaseException as error:
-            caught.append((f"{type(error).__name__}: {error}".splitlines()[0][:200], where_of(sys.exc_info()[2])))
+            caught.append(
+                (f"{type(error).__name__}: {error}".splitlines()[0][:200], innermost_frame(sys.exc_info()[2]))
+            )
             raise
 
     cli.cli.main = main  # type: ignore[method-assign]

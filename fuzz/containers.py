@@ -1,4 +1,4 @@
-"""What lies under the compression of splat files, part by part, and the way back: faults that no checksum finds."""
+"""Unpacks compressed splat files into parts and packs them again: changes to the parts get past checksums."""
 
 from __future__ import annotations
 
@@ -22,14 +22,16 @@ from .mutate import INTEGERS, json_mutated, mutated, pick, text_mutated
 
 FIXTURES = Path(__file__).resolve().parents[1] / "fixtures"
 
-#: Small files of every format: good ones, and some that are broken already, whose changes lead elsewhere.
+#: Small files of every format. Those in faults/ are broken already; changed further, they reach other code.
 PATTERNS = ("one.ply", "sh[0-3]*.ply", "flat.ply", "golden/*.*", "faults/*.*")
+
+#: Seeds are at most this long, in bytes, so that a case takes milliseconds.
 LARGEST = 32_000
 
-#: Bytes that say what the others mean, at most.
+#: Number of leading bytes that are changed more often than others, since they say what the others mean.
 HEADER = 120
 
-#: What reading a broken container raises.
+#: Exceptions that reading a broken container raises.
 BROKEN = (EOFError, OSError, ValueError, struct.error, zipfile.BadZipFile, zlib.error, zstandard.ZstdError)
 
 Parts = Mapping[str, bytes]
@@ -37,25 +39,25 @@ Parts = Mapping[str, bytes]
 
 @functools.cache
 def seeds() -> Mapping[str, bytes]:
-    """Files to begin with, by name."""
+    """The files that cases start from, by their path in fixtures/."""
     paths = sorted({path for pattern in PATTERNS for path in FIXTURES.glob(pattern) if path.is_file()})
     files = {str(path.relative_to(FIXTURES)): path.read_bytes() for path in paths}
     return {name: data for name, data in files.items() if len(data) <= LARGEST}
 
 
 @functools.cache
-def good() -> tuple[str, ...]:
-    """Names of the seeds that nothing is wrong with."""
+def valid_seeds() -> tuple[str, ...]:
+    """Names of the seeds that are valid files."""
     return tuple(name for name in seeds() if not name.startswith("faults/"))
 
 
 def folder_seed() -> dict[str, bytes]:
-    """The files of an unpacked SOG."""
+    """The files of an unpacked SOG, by name."""
     return {path.name: path.read_bytes() for path in sorted((FIXTURES / "golden" / "sh1-sog").iterdir())}
 
 
-def opened(data: bytes) -> tuple[Parts, Callable[[Parts], bytes]]:
-    """The parts of a file, and what puts it together again around others."""
+def split_file(data: bytes) -> tuple[Parts, Callable[[Parts], bytes]]:
+    """Splits a file into named parts, and returns a function that makes a file of parts again."""
     try:
         if data[:2] == b"\x1f\x8b":
             raw = gzip.decompress(data)
@@ -66,7 +68,7 @@ def opened(data: bytes) -> tuple[Parts, Callable[[Parts], bytes]]:
             with zipfile.ZipFile(io.BytesIO(data)) as archive:
                 return {name: archive.read(name) for name in archive.namelist()}, by_hand_sog.zipped
     except BROKEN:
-        return {"file": data}, _joined  # it is broken already
+        return {"file": data}, _joined  # the seed itself is broken
     end = data.find(b"end_header\n") + 11 if data[:3] == b"ply" else 0
     return ({"text": data[:end], "payload": data[end:]} if end > 11 else {"file": data}), _joined
 
@@ -100,8 +102,8 @@ def _spz_4(data: bytes) -> tuple[Parts, Callable[[Parts], bytes]]:
 
 
 def mutated_scene(rng: Rng, data: bytes, other: bytes) -> tuple[str, bytes]:
-    """A splat file after changes to its bytes, or to what lies under its compression; and which of the two."""
-    parts, joined = opened(data)
+    """Changes the bytes of a splat file, or those under its compression; returns "bytes" or "inside", and the file."""
+    parts, joined = split_file(data)
     if len(parts) == 1 or rng.integers(3) == 0:
         return "bytes", mutated(rng, data, other=other, header=HEADER)
     changed = dict(parts)
@@ -113,7 +115,7 @@ def mutated_scene(rng: Rng, data: bytes, other: bytes) -> tuple[str, bytes]:
 
 
 def mutated_part(rng: Rng, name: str, data: bytes) -> bytes:
-    """A part of a splat file after changes that suit it: a header's text, a JSON's structure, an image's pixels."""
+    """Changes a part of a splat file by its kind: the structure of JSON, the pixels of an image, a header's text."""
     if name.endswith(".json") and rng.integers(4):
         return json_mutated(rng, data)
     if name.endswith(".webp") and rng.integers(3):

@@ -1,4 +1,4 @@
-"""Laws about what sparklod gives, whatever it was given."""
+"""Laws about what sparklod makes of any input: scenes, reports and files."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from sparklod_cli.model.splats import COLUMNS
 from sparklod_cli.support.errors import FormatError, InvalidSplatsError
 
 from .case import LawError
-from .oracle import lines_fault
+from .oracle import stderr_fault
 
 
-def scene_holds(scene: Scene) -> None:
-    """What was read can be drawn, after what cannot is left out; `Splats` itself checks shapes and types."""
+def check_scene(scene: Scene) -> None:
+    """Checks that a scene can be drawn once invalid splats are dropped; `Splats` itself checks shapes and types."""
     if scene.tree is not None:
         scene.tree.validate()
         if len(scene.tree) != len(scene.splats):
-            raise LawError("the tree has other nodes than there are splats")
+            raise LawError(f"the tree has {len(scene.tree):,} nodes, but there are {len(scene.splats):,} splats")
     try:
         kept, _ = Selection(drop_invalid=True).apply(scene.splats)
     except InvalidSplatsError:
@@ -40,25 +40,25 @@ def scene_holds(scene: Scene) -> None:
         raise LawError("negative opacities are left after --on-invalid drop")
 
 
-def report_holds(path: Path) -> None:
-    """Whatever a file is, there is a report of it, which is JSON, and its findings are lines that can be shown."""
+def check_report(path: Path) -> None:
+    """Checks that any file has a report, which is valid JSON and whose findings are printable lines."""
     found, _ = report.inspect(path, report.Wanted(True, True, True), threads=2)
     try:
         json.dumps(found.as_dict(), allow_nan=False)
     except ValueError as error:
         raise LawError(f"the report is not JSON: {error}") from None
     for finding in found.findings or []:
-        fault, text = lines_fault(finding_line(str(path), finding, "text"))
+        fault, text = stderr_fault(finding_line(str(path), finding, "text"))
         if fault:
             raise LawError(f"of a finding, {text}", f"{fault}, of {finding.code}")
 
 
-def output_holds(path: Path) -> None:
-    """A file that a command wrote is whole, as its name says what it is."""
+def check_output(path: Path) -> None:
+    """Checks that a file which a command wrote is a whole file of the kind that its suffix names."""
     data = path.read_bytes()
     try:
         if path.suffix in (".spz", ".ply", ".splat"):
-            scene_holds(read_scene(path))
+            check_scene(read_scene(path))
         elif path.suffix in (".png", ".webp", ".gif"):
             Image.open(io.BytesIO(data)).load()
         elif path.suffix in (".npy", ".npz"):
@@ -72,4 +72,4 @@ def output_holds(path: Path) -> None:
         elif path.suffix == ".csv" and not data.endswith(b"\n"):
             raise LawError("the table ends in the middle of a line")
     except (FormatError, OSError, ValueError, EOFError) as error:
-        raise LawError(f"what was written is not whole: {path.name!r:.60}: {error}", f"output {path.suffix}") from None
+        raise LawError(f"an output is not a whole file: {path.name!r:.60}: {error}", f"output {path.suffix}") from None

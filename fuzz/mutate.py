@@ -1,4 +1,4 @@
-"""Changes to bytes, texts and JSON, from a flipped bit to what no writer would write."""
+"""Random changes to bytes, texts and JSON, from a flipped bit to values that no writer would write."""
 
 from __future__ import annotations
 
@@ -14,17 +14,23 @@ from .case import Rng
 
 T = TypeVar("T")
 
-#: How many changes, most often one: what is changed a lot is refused for the first of them.
+#: Numbers of changes to pick from. One is the most likely: a file with many is refused for the first of them.
 CHANGES = (1, 1, 1, 1, 2, 2, 3, 4)
+
+#: Integers at the edges of number types and near powers of two.
 INTEGERS = (
     *(0, 1, 2, 3, 4, 5, 7, 8, 15, 16, 24, 31, 32, 64, 127, 128, 255, 256, 1000, 4095, 4096, 32767, 32768, 65535, 65536),
     *(65537, 1 << 20, (1 << 24) - 1, 1 << 24, (1 << 31) - 1, 1 << 31, (1 << 32) - 2, (1 << 32) - 1, 1 << 32, 1 << 40),
     *((1 << 63) - 1, (1 << 64) - 1),
 )
+
+#: Floats that are special, or at the edges of float16, float32 and SPZ's fixed point.
 FLOATS = (
     *(math.nan, math.inf, -math.inf, 0.0, -0.0, -1.0, 1.0, 0.5, 1e-45, 1e-30, 1e30, 1e38, -1e38, 3.4e38, -3.4e38),
     *(-0.02, 65504.0, 8388607.0, -8388607.0, 8388608.0, 1e7),
 )
+
+#: Texts that parsers, terminals, spreadsheets or CI runs treat in a special path.
 WORDS = (
     *("0", "-1", "1", "2", "nan", "NaN", "inf", "-Infinity", "1e38", "-1e38", "1e308", "1e999", "1e-320", "0.0", "-0"),
     *(
@@ -43,8 +49,11 @@ WORDS = (
     *("null", "true", "{", "}", "[", "]", ",", ":", ";", '"', "'", "#", "//", "a" * 8000, "../../x", "/dev/zero", "%s"),
     *("element vertex 3\n", "property float x\n", "property list uchar int v\n", "format ascii 1.0\n", "end_header\n"),
 )
-#: Takes the place of what `json.dumps` cannot write.
+
+#: Placeholders for JSON that `json.dumps` cannot write; `json_text` replaces them.
 DEEP, DIGITS, LONE = "@deep@", "@digits@", "@lone@"
+
+#: Values to put into JSON.
 VALUES: tuple[Any, ...] = (
     *(None, True, False, 0, 1, -1, 2, 0.5, -0.02, 1e-300, 1e12, 1e38, -1e38, 1e300, 1e308, -1e308, math.nan, math.inf),
     *(1 << 31, 1 << 32, 1 << 53, 1 << 64, 10**400, 65536, 255, 256, 1000, 1e7),
@@ -55,28 +64,28 @@ VALUES: tuple[Any, ...] = (
 
 
 def pick(rng: Rng, options: Sequence[T]) -> T:
-    """One of them."""
+    """Picks one option at random."""
     return options[int(rng.integers(len(options)))]
 
 
-def place(rng: Rng, length: int, header: int) -> int:
-    """Somewhere in a file, half of the time in its header."""
+def random_offset(rng: Rng, length: int, header: int) -> int:
+    """Picks an offset in a file; half of the time in its header, if it has one."""
     reach = min(header, length) if header and rng.integers(2) else length
     return int(rng.integers(reach + 1))
 
 
 def mutated(rng: Rng, data: bytes, *, other: bytes = b"", header: int = 0) -> bytes:
-    """The bytes after one to four changes.
+    """Makes one to four changes to bytes.
 
     Args:
-        rng: of the case.
-        data: what to change.
-        other: what to splice in.
-        header: how many of the first bytes say what the others mean.
+        rng: the case's random generator.
+        data: the bytes to change.
+        other: bytes to splice in.
+        header: number of leading bytes that are changed more often than the others.
     """
     changed = bytearray(data)
     for _ in range(int(pick(rng, CHANGES))):
-        pick(rng, BYTES)(rng, changed, other or data, place(rng, len(changed), header))
+        pick(rng, BYTE_CHANGES)(rng, changed, other or data, random_offset(rng, len(changed), header))
     return bytes(changed)
 
 
@@ -139,14 +148,14 @@ def _splice(rng: Rng, data: bytearray, other: bytes, at: int) -> None:
         data[at : at + 64] = other[start : start + 64]
 
 
-BYTES: tuple[Callable[[Rng, bytearray, bytes, int], None], ...] = (
+BYTE_CHANGES: tuple[Callable[[Rng, bytearray, bytes, int], None], ...] = (
     *(_flip, _flip, _byte, _byte, _integer, _integer, _integer, _float, _float),
     *(_delete, _truncate, _extend, _insert, _copy, _splice),
 )
 
 
 def text_mutated(rng: Rng, text: str) -> str:
-    """A text after one to four changes to its words, numbers and lines."""
+    """Makes one to four changes to the words, numbers and lines of a text."""
     for _ in range(int(pick(rng, CHANGES))):
         words = [(found.start(), found.end()) for found in re.finditer(r"[\w.+-]+|[^\w\s]", text)]
         start, end = pick(rng, words) if words else (0, 0)
@@ -167,23 +176,23 @@ def text_mutated(rng: Rng, text: str) -> str:
 
 
 def json_mutated(rng: Rng, data: bytes) -> bytes:
-    """JSON after one to four changes of its structure; now and then of its text, too."""
+    """Makes one to four changes to the structure of JSON, and in one case of twelve to its text as well."""
     root = {"": json.loads(data)}
     for _ in range(int(pick(rng, CHANGES))):
-        # Not all of a long list alike: what is near the root is rarer and matters more.
-        way = [(root, "")]
+        # Walk down from the root: a uniform choice would nearly always hit a number in a long list.
+        path = [(root, "")]
         while True:
-            holder, key = way[-1]
+            holder, key = path[-1]
             below = list(_below(holder[key]))
             if not below or rng.integers(5) == 0:
                 break
-            way.append(pick(rng, below))
-        _change(rng, *pick(rng, way[-2:]))
+            path.append(pick(rng, below))
+        _change(rng, *pick(rng, path[-2:]))
     return json_text(rng, root.get(""))
 
 
 def json_text(rng: Rng, value: Any) -> bytes:
-    """JSON of a value, with what `json.dumps` cannot write in the place of `DEEP` and the like."""
+    """Writes a value as JSON, and replaces `DEEP`, `DIGITS` and `LONE` by what `json.dumps` cannot write."""
     text = json.dumps(value)
     deep = int(pick(rng, (100, 900, 3000, 100_000)))
     text = text.replace(f'"{DEEP}"', "[" * deep + "]" * deep).replace(f'"{DIGITS}"', "9" * 5000)
@@ -197,7 +206,7 @@ def _below(value: Any) -> Iterator[tuple[Any, Any]]:
 
 
 def _value(rng: Rng) -> Any:
-    """A copy: what a case changes must not be there for the next."""
+    """Picks a value, as a copy: a case must not change what the next one starts from."""
     return copy.deepcopy(pick(rng, VALUES))
 
 

@@ -1,4 +1,4 @@
-"""What holds for every case, whatever it is: runs one in this process and says what was broken."""
+"""Runs a case in this process and checks the laws that hold for every case."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from sparklod_cli.support.errors import OutOfMemoryError, SparklodError
 from .case import Case, LawError, Target
 from .streams import STREAMS
 
-#: Bytes that a case may take beyond what the process has, and for each byte of its files.
-MEMORY, MEMORY_A_BYTE = 400 << 20, 64
+#: Peak memory that a case may add to the process, in bytes: a fixed part, and a part for each byte of its files.
+MEMORY, MEMORY_PER_BYTE = 400 << 20, 64
 
-#: Characters of an error.
+#: Length of an error message at most, in characters; `support.printable` shortens longer texts to it.
 LONGEST = 500
 
-#: Bytes of a file that a case writes, and for each byte of its files: small files make no gigabytes.
-OUTPUT, OUTPUT_A_BYTE = 8 << 20, 200
+#: Size of an output at most, in bytes: a fixed part, and a part for each byte of the case's files.
+OUTPUT, OUTPUT_PER_BYTE = 8 << 20, 200
 
 #: Names of temporary files.
 TEMPORARY = re.compile(r".*\.part|\.sparklod-.*|.*\.tmp")
@@ -36,13 +36,13 @@ TEMPORARY = re.compile(r".*\.part|\.sparklod-.*|.*\.tmp")
 
 @dataclass(frozen=True)
 class Finding:
-    """What is wrong with a case.
+    """A law that a case broke.
 
     Attributes:
-        kind: exception, warning, law, message, files, stream, memory; of the parent, also crash and hang.
-        text: what came, in a line.
-        where: file and function, or what else tells this fault from others.
-        detail: all that is known, such as a traceback.
+        kind: exception, warning, law, message, files, stream or memory; `fuzz.child` adds crash and hang.
+        text: one line that says what happened.
+        where: file and function, or another text by which this fault is told from others.
+        detail: everything that is known, such as a traceback.
     """
 
     kind: str
@@ -52,22 +52,22 @@ class Finding:
 
     @property
     def signature(self) -> str:
-        """The same for findings that are one fault, as far as one can tell."""
+        """A text that is equal for findings which are probably one fault."""
         return f"{self.kind}: {self.where or re.sub(r'[0-9]+', '#', self.text)[:80]}"
 
     def plain(self) -> dict[str, str]:
-        """As JSON has it."""
+        """The attributes as a dict that JSON can hold."""
         return asdict(self)
 
 
 @dataclass(frozen=True)
 class Result:
-    """What came of a case.
+    """The result of running a case.
 
     Attributes:
-        finding: what is wrong, if anything is.
-        outcome: in a word, of a case with which nothing is wrong: "result" or "refused".
-        seconds: it took.
+        finding: the law that was broken; None if all held.
+        outcome: "refused" if sparklod raised an error of its own, else "result".
+        seconds: time that the case took.
     """
 
     finding: Finding | None
@@ -75,8 +75,8 @@ class Result:
     seconds: float
 
 
-def lines_fault(text: str) -> tuple[str, str]:
-    """What is wrong with what was said on standard error, in general and in full; empty where nothing is."""
+def stderr_fault(text: str) -> tuple[str, str]:
+    """What is wrong with a text on standard error: the kind of fault, and a message; both empty if nothing is."""
     for line in text.split("\n"):
         fault = ""
         if line.startswith("Traceback"):
@@ -85,7 +85,7 @@ def lines_fault(text: str) -> tuple[str, str]:
             fault = "a warning"
         elif line and not line.isprintable():
             fault = "control characters"
-        elif len(re.sub("^[Ee]rror: ", "", line)) > LONGEST:
+        elif len(re.sub("^error: ", "", line)) > LONGEST:
             fault = "a long line"
         elif line.startswith("::"):
             fault = "what a CI takes for a command"
@@ -94,57 +94,57 @@ def lines_fault(text: str) -> tuple[str, str]:
     return "", ""
 
 
-def error_fault(error: SparklodError) -> str:
-    """What is wrong with an error as the command line says it; empty where nothing is."""
+def message_fault(error: SparklodError) -> str:
+    """What is wrong with an error as the command line prints it; empty if nothing is."""
     say_error(str(error))
     said = STREAMS.take()[1].decode("utf-8", "backslashreplace").removesuffix("\n")
     if not str(error).strip():
         return "the message is empty"
-    return f"more than a line on standard error: {said!r:.300}" if "\n" in said else lines_fault(said)[1]
+    return f"more than a line on standard error: {said!r:.300}" if "\n" in said else stderr_fault(said)[1]
 
 
-def run(target: Target, case: Case, folder: Path, watched: Watched) -> Result:
-    """Runs a case in `folder`, which is made for it, and holds it to what holds for all."""
+def run(target: Target, case: Case, folder: Path, watch: WriteWatch) -> Result:
+    """Runs a case in `folder`, a fresh folder, and checks the laws that hold for every case."""
     case.write(folder)
     os.chdir(folder)
     STREAMS.begin()
     reset_peak()
     before, start = peak(), time.perf_counter()
-    watched.begin(folder)
+    watch.begin(folder)
     outcome, finding = "result", None
     with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always")
         try:
             target.check(case, folder)
         except SparklodError as error:
-            outcome, fault = "refused", error_fault(error)
+            outcome, fault = "refused", message_fault(error)
             if fault:
-                finding = Finding("message", fault, where_of(error.__traceback__), traceback.format_exc())
+                finding = Finding("message", fault, innermost_frame(error.__traceback__), traceback.format_exc())
             elif isinstance(error, OutOfMemoryError):
-                finding = Finding("memory", str(error), where_of(error.__traceback__), traceback.format_exc())
+                finding = Finding("memory", str(error), innermost_frame(error.__traceback__), traceback.format_exc())
         except LawError as error:
             finding = Finding("law", str(error).splitlines()[0][:300], error.fault, str(error))
         except BaseException as error:
             text = f"{type(error).__name__}: {error}".splitlines()[0][:300]
-            where = f"{type(error).__name__} in {where_of(error.__traceback__)}"
+            where = f"{type(error).__name__} in {innermost_frame(error.__traceback__)}"
             finding = Finding("exception", text, where, traceback.format_exc())
     seconds = time.perf_counter() - start
-    watched.end()
+    watch.end()
     taken = peak() - before
-    finding = finding or next(_all_faults(case, folder, warned, watched), None)
-    allowed = MEMORY + MEMORY_A_BYTE * case.size
+    finding = finding or next(_findings(case, folder, warned, watch), None)
+    allowed = MEMORY + MEMORY_PER_BYTE * case.size
     if finding is None and taken > allowed:
         finding = Finding("memory", f"{taken >> 20:,} MiB for {case.size:,} bytes", case.what.split(",")[0])
     return Result(finding, outcome, seconds)
 
 
-def _all_faults(case: Case, folder: Path, warned: list[warnings.WarningMessage], watched: Watched) -> Iterator[Finding]:
+def _findings(case: Case, folder: Path, warned: list[warnings.WarningMessage], watch: WriteWatch) -> Iterator[Finding]:
     for each in warned:
         text = f"{each.category.__name__}: {each.message}"
         yield Finding("warning", text[:300], f"{text[:60]} at {Path(each.filename).name}:{each.lineno}")
-    for text in STREAMS.unasked():
-        yield Finding("stream", f"said on its own: {text!r:.300}")
-    for text in watched.outside:
+    for text in STREAMS.untaken():
+        yield Finding("stream", f"unexpected output: {text!r:.300}")
+    for text in watch.outside:
         yield Finding("files", text)
     replaced = case.run.get("replaced", ())
     for path in sorted(folder.rglob("*")):
@@ -153,15 +153,17 @@ def _all_faults(case: Case, folder: Path, warned: list[warnings.WarningMessage],
             yield Finding("files", f"a temporary file is left: {name!r}", "a temporary file is left")
         elif path.is_file() and name in case.files and name not in replaced and path.read_bytes() != case.files[name]:
             yield Finding("files", f"an input was changed: {name!r}", "an input was changed")
-        elif path.is_file() and path.stat().st_size > OUTPUT + OUTPUT_A_BYTE * case.size:
-            yield Finding("files", f"{name!r} has {path.stat().st_size:,} bytes, of {case.size:,}", "a large output")
+        elif path.is_file() and path.stat().st_size > OUTPUT + OUTPUT_PER_BYTE * case.size:
+            yield Finding(
+                "files", f"{name!r} has {path.stat().st_size:,} bytes, for inputs of {case.size:,}", "a large output"
+            )
     missing = next((name for name in case.files if not (folder / name).exists()), None)
     if missing is not None:
         yield Finding("files", f"an input was removed: {missing!r}", "an input was removed")
 
 
-def where_of(at: TracebackType | None) -> str:
-    """The innermost place of sparklod in a traceback: "codecs/spz.py decode"."""
+def innermost_frame(at: TracebackType | None) -> str:
+    """The innermost frame of a traceback that is in sparklod, such as "codecs/spz.py decode"."""
     frames = traceback.extract_tb(at)
     ours = [frame for frame in frames if "sparklod_cli" in frame.filename] or frames
     if not ours:
@@ -170,7 +172,7 @@ def where_of(at: TracebackType | None) -> str:
 
 
 def peak() -> int:
-    """The most memory that this process had since `reset_peak`, in bytes; 0 where the system does not say."""
+    """Peak of this process's resident memory since `reset_peak`, in bytes; 0 if the system does not tell."""
     try:
         found = re.search(r"VmHWM:\s*(\d+) kB", Path("/proc/self/status").read_text())
     except OSError:
@@ -179,13 +181,16 @@ def peak() -> int:
 
 
 def reset_peak() -> None:
-    """From now on `peak` is about what is to come, where the system lets it."""
+    """Starts a new measurement of `peak`, if the system allows it."""
     with contextlib.suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5")
 
 
-class Watched:
-    """Tells of what is written, renamed or removed outside of a case's folder. An audit hook stays for good."""
+class WriteWatch:
+    """Records what is written, renamed or removed outside of the case's folder.
+
+    It is an audit hook, which Python cannot remove again: make one of it in a process.
+    """
 
     def __init__(self, allowed: list[Path]) -> None:
         self._always = [os.path.realpath(path) for path in allowed]
@@ -215,7 +220,7 @@ class Watched:
         else:
             return
         if isinstance(path, (str, bytes, os.PathLike)):
-            folder, self._folder = self._folder, None  # what is done here is not the case's
+            folder, self._folder = self._folder, None  # ignore what this hook itself does
             try:
                 place = os.path.realpath(os.fsdecode(path))
             except ValueError:

@@ -1,4 +1,4 @@
-"""Runs targets for a while or for so many cases, and says what was found."""
+"""Runs targets for a given time or number of cases, and reports the findings."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from .case import case_of
 from .child import Child
 from .oracle import Finding
 
-#: Findings of one fault that are tried again; what is found more often is there.
+#: Findings of one fault whose cases are run again to confirm them; further ones need no confirmation.
 CONFIRMED = 2
 
-#: Findings that another process, or a machine that does less, may not have.
-OF_THE_MOMENT = ("hang", "memory")
+#: Kinds of findings that depend on the process or on how busy the machine is: they count only if they occur again.
+LOAD_DEPENDENT = ("hang", "memory")
 
 
 @dataclass(frozen=True)
-class Found:
-    """A finding and the case that has it."""
+class CaseFinding:
+    """A finding, the case that has it, and whether it occurred again when the case was repeated."""
 
     target: str
     seed: int
@@ -31,28 +31,28 @@ class Found:
 
     @property
     def name(self) -> str:
-        """What `--replay` calls its file, without the suffix."""
+        """Name of the file that `--keep` saves, without its suffix."""
         return f"{self.target}-{self.seed}-{self.case}"
 
     def line(self) -> str:
-        """For people."""
-        once = "" if self.again else " (not when it was run again)"
+        """One line about the finding."""
+        once = "" if self.again else " (not when the case was repeated)"
         return f"{self.target}, seed {self.seed}, case {self.case}: {self.finding.kind}: {self.finding.text}{once}"
 
 
 @dataclass
 class Tally:
-    """What came of a target."""
+    """Counts and findings of a target."""
 
     target: str
     cases: int = 0
     refused: int = 0
     seconds: float = 0.0
-    found: list[Found] = field(default_factory=list)
+    found: list[CaseFinding] = field(default_factory=list)
 
-    def by_fault(self) -> dict[str, list[Found]]:
-        """Findings by what is likely to be one fault."""
-        groups: dict[str, list[Found]] = {}
+    def by_fault(self) -> dict[str, list[CaseFinding]]:
+        """The findings, grouped by what is probably one fault."""
+        groups: dict[str, list[CaseFinding]] = {}
         for each in self.found:
             groups.setdefault(each.finding.signature, []).append(each)
         return groups
@@ -72,14 +72,14 @@ def run(
     """Runs targets one after the other.
 
     Args:
-        targets: names.
-        seed: of all.
-        cases: so many of each, or as many as there is time for.
-        seconds: for all of them together.
+        targets: their names.
+        seed: seed of all cases.
+        cases: number of cases of each target; None for as many as `seconds` allows.
+        seconds: time for all targets together; None for no limit.
         first: number of the first case.
-        keep: a folder for the cases in which something was found.
-        say: takes a line for each fault that is new.
-        child: to run them in.
+        keep: a folder for the cases that have findings; None to save none.
+        say: called with a text for each new fault.
+        child: the worker to run the cases in; None for a new one.
     """
     tallies = []
     ends = time.monotonic() + (seconds or 0)
@@ -88,7 +88,7 @@ def run(
             tally = Tally(name)
             tallies.append(tally)
             start = time.monotonic()
-            share = max(0.0, ends - start) / (len(targets) - at)  # what one leaves over is for the others
+            share = max(0.0, ends - start) / (len(targets) - at)  # time that one target leaves goes to the others
             for number in _numbers(first, cases, seconds and start + share):
                 _one(process, tally, seed, number, keep, say)
             tally.seconds = time.monotonic() - start
@@ -111,16 +111,16 @@ def _one(process: Child, tally: Tally, seed: int, number: int, keep: Path | None
         return
     finding, again = Finding(**answer["finding"]), True
     known = len(tally.by_fault().get(finding.signature, ()))
-    if known < CONFIRMED or finding.kind in OF_THE_MOMENT:
-        process.run(request, patient=True)  # it may compile
+    if known < CONFIRMED or finding.kind in LOAD_DEPENDENT:
+        process.run(request, patient=True)  # once to compile kernels
         second = process.run(request)["finding"]
         again = second is not None
-        if not again and finding.kind in OF_THE_MOMENT:
+        if not again and finding.kind in LOAD_DEPENDENT:
             return
         finding = Finding(**second) if second else finding
         known = len(tally.by_fault().get(finding.signature, ()))
     case = case_of(tally.target, seed, number)
-    found = Found(tally.target, seed, number, case.what, finding, again)
+    found = CaseFinding(tally.target, seed, number, case.what, finding, again)
     tally.found.append(found)
     if not known:
         say(f"{found.line()}\n  {finding.where}; {case.what}")
@@ -131,7 +131,7 @@ def _one(process: Child, tally: Tally, seed: int, number: int, keep: Path | None
 
 
 def table(tallies: Sequence[Tally]) -> str:
-    """For people: a line a target, and one for each fault."""
+    """Formats a table with a row for each target, followed by a line for each fault."""
     rows = [["target", "cases", "refused", "findings", "faults", "seconds"]]
     for tally in tallies:
         numbers = (tally.cases, tally.refused, len(tally.found), len(tally.by_fault()))

@@ -1,4 +1,4 @@
-"""Scenes at the edges of what can be, and trees that are odd."""
+"""Scenes of extreme values, and trees of odd shapes."""
 
 from __future__ import annotations
 
@@ -15,14 +15,18 @@ from .mutate import FLOATS, pick
 
 Columns = dict[str, NDArray[Any]]
 
-#: How far apart centres are; SPZ holds up to 8,388,607.
+#: Spread of the centres, in world units; SPZ holds coordinates up to 8,388,607.
 EXTENTS = (0.0, 1e-30, 1e-6, 1e-3, 1.0, 1.0, 1.0, 100.0, 1e4, 1e6, 8.3e6, 8388607.0)
+
+#: Mean of the natural logarithm of the scales; exp(88) is near the largest float32.
 LOG_SCALES = (-100.0, -40.0, -20.0, -10.0, -4.0, -4.0, -4.0, 0.0, 5.0, 10.0, 40.0, 88.0)
+
+#: Standard deviation of log scales and of logits.
 SPREADS = (0.0, 0.5, 0.5, 3.0, 20.0)
 
 
 def extreme(rng: Rng) -> Columns:
-    """Columns of splats as `by_hand.ply_columns` takes them, from one splat to two hundred."""
+    """Makes columns for `by_hand.ply_columns` of 1 to 200 splats with extreme values."""
     count = int(pick(rng, (1, 2, 3, 5, 17, 60, 200)))
     sh = int(pick(rng, (0, 0, 3, 8, 15)))
     center: NDArray[np.float64] = rng.normal(size=(count, 3)) * pick(rng, EXTENTS)
@@ -52,13 +56,13 @@ def extreme(rng: Rng) -> Columns:
 
 
 def ply_of(columns: Columns) -> bytes:
-    """A PLY file of them."""
+    """Writes columns as a PLY file."""
     with np.errstate(all="ignore"):
         return by_hand.ply(by_hand.ply_columns(**columns))
 
 
 def splat_of(columns: Columns) -> bytes:
-    """A .splat file of them, whose linear scales are signed now and then."""
+    """Writes columns as a .splat file, in which some linear scales are negative."""
     rows = np.zeros(len(columns["center"]), [("center", "<f4", 3), ("scale", "<f4", 3), ("bytes", "u1", 8)])
     with np.errstate(all="ignore"):
         rows["center"], rows["scale"] = columns["center"], np.exp(columns["log_scale"].astype(np.float32))
@@ -68,16 +72,18 @@ def splat_of(columns: Columns) -> bytes:
     return rows.tobytes()
 
 
-Links = tuple[NDArray[np.int64], NDArray[np.int64]]
+#: The child columns of a tree: child_count and child_start of each node.
+ChildColumns = tuple[NDArray[np.int64], NDArray[np.int64]]
 
 
-def links(rng: Rng, kind: str, count: int) -> Links:
-    """Child counts and starts of about so many nodes.
+def child_columns(rng: Rng, kind: str, count: int) -> ChildColumns:
+    """Makes a tree of about `count` nodes.
 
     Args:
-        rng: of the case.
-        kind: "chain", "star", "pairs", "broom" (a chain that ends in a star), "shuffled" (runs in any order), "any".
-        count: of nodes.
+        rng: the case's random generator.
+        kind: "chain", "star", "pairs", "broom" (a chain that ends in a star), "shuffled" (children of nodes in any
+            order) or "any".
+        count: number of nodes.
     """
     fan_out = {"chain": [1], "star": [count - 1], "pairs": [2], "broom": [1] * (count // 2) + [count]}.get(
         kind, rng.choice([0, 1, 2, 2, 3, 8, 40], 50).tolist()
@@ -95,8 +101,8 @@ def links(rng: Rng, kind: str, count: int) -> Links:
     return np.array(counts), np.array(starts)
 
 
-def broken(rng: Rng, tree: Links) -> Links:
-    """Links that lead forwards, backwards, in circles, to the children of others, or nowhere."""
+def broken(rng: Rng, tree: ChildColumns) -> ChildColumns:
+    """Breaks a tree: children that are ancestors, shared, past the end, or missing."""
     counts, starts = tree[0].copy(), tree[1].copy()
     for _ in range(int(rng.integers(1, 4))):
         node, other = rng.integers(len(counts), size=2)
@@ -116,13 +122,13 @@ def broken(rng: Rng, tree: Links) -> Links:
     return np.clip(counts, 0, 65535), starts
 
 
-def node_streams(rng: Rng, tree: Links, *, plain: bool) -> list[bytes]:
-    """The streams of an SPZ tree of version 3 or 4.
+def node_streams(rng: Rng, tree: ChildColumns, *, plain: bool) -> list[bytes]:
+    """Makes the streams of an SPZ file of version 3 or 4 with a tree.
 
     Args:
-        rng: of the case.
-        tree: its links.
-        plain: scales fall towards the leaves; else all values are any bytes.
+        rng: the case's random generator.
+        tree: its child columns.
+        plain: True for centres, alphas and scales of a plausible tree, False for random bytes.
     """
     counts, starts = tree
     number = len(counts)

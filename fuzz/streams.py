@@ -1,4 +1,4 @@
-"""Standard output and error of a process that runs cases: kept in files, so that libraries in C cannot slip past."""
+"""Captures standard output and error of this process in files, so that the output of C libraries is captured too."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from collections.abc import Iterator
 
 
 class Streams:
-    """What was written to file descriptors 1 and 2 since it was last taken."""
+    """The output to file descriptors 1 and 2 since it was last taken."""
 
     def __init__(self) -> None:
         self._files: dict[int, int] = {}
 
     def redirect(self) -> None:
-        """From now on they are files; standard input is empty."""
+        """Redirects both descriptors to files, and standard input to an empty one."""
         os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
         for number in (1, 2):
             with tempfile.TemporaryFile() as file:
@@ -23,7 +23,7 @@ class Streams:
         self.begin()
 
     def begin(self) -> None:
-        """Forgets what was written."""
+        """Discards the output so far."""
         for number, descriptor in self._files.items():
             self._flush()
             os.dup2(descriptor, number)  # a command may have pointed it elsewhere
@@ -31,14 +31,14 @@ class Streams:
             os.lseek(descriptor, 0, os.SEEK_SET)
 
     def take(self) -> tuple[bytes, bytes]:
-        """What was written, which is forgotten."""
+        """Returns the output so far, of standard output and of standard error, and discards it."""
         self._flush()
         out, err = (os.pread(descriptor, 1 << 26, 0) for descriptor in (self._files.get(1, -1), self._files.get(2, -1)))
         self.begin()
         return out, err
 
-    def unasked(self) -> Iterator[str]:
-        """What was written and never taken."""
+    def untaken(self) -> Iterator[str]:
+        """Yields the output that was never taken, as texts of up to 2,000 bytes."""
         if self._files:
             for data in self.take():
                 if data:
@@ -51,5 +51,5 @@ class Streams:
                 stream.flush()
 
 
-#: Those of this process.
+#: The streams of this process.
 STREAMS = Streams()

@@ -1,7 +1,7 @@
-"""The process in which cases run; `fuzz.child` starts it, and another one when it dies.
+"""The worker process in which cases run; `fuzz.child` starts it, and starts another when it dies.
 
-It reads requests, a JSON object a line, from one pipe and writes results to another. What kills it, and where it was
-when it was told to say so (SIGUSR1), goes to a log.
+It reads requests from one pipe and writes answers to another, a JSON object a line. Python's fault handler writes its
+traces to a log: of a crash, and of SIGUSR1, which `fuzz.child` sends to a worker that hangs.
 """
 
 from __future__ import annotations
@@ -20,15 +20,16 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-#: Address space beyond what the process has at first: no case takes the whole machine.
+#: Bytes of address space that the process may add to those it has after its first case, so that no case uses up the
+#: machine's memory.
 ADDRESS_SPACE = 4 << 30
 
-#: Packages that are not there for cases: slow to load, and they call into drivers.
+#: Packages that cases cannot import: they take seconds to load and call into graphics drivers.
 BLOCKED = ("pyvista", "open3d")
 
 
 def main() -> None:
-    """Runs cases until there are no more requests."""
+    """Runs cases until the pipe of requests is closed."""
     parser = argparse.ArgumentParser()
     for name in ("requests", "results", "log"):
         parser.add_argument(f"--{name}", type=int)
@@ -42,25 +43,25 @@ def main() -> None:
     temporary.mkdir(parents=True, exist_ok=True)
     tempfile.tempdir = str(temporary)
 
-    from .oracle import Watched
+    from .oracle import WriteWatch
     from .streams import STREAMS
 
     STREAMS.redirect()
     caches = [Path(os.environ["XDG_CACHE_HOME"]) / "sparklod", Path(os.environ.get("NUMBA_CACHE_DIR") or temporary)]
-    watched = Watched([temporary, given.scratch / "matplotlib", Path("/dev"), Path("/proc"), *caches])
+    watch = WriteWatch([temporary, given.scratch / "matplotlib", Path("/dev"), Path("/proc"), *caches])
     limited = False
     with os.fdopen(given.requests) as requests, os.fdopen(given.results, "w") as results:
         for line in requests:
-            answer = attempt(json.loads(line), given.scratch, watched)
+            answer = attempt(json.loads(line), given.scratch, watch)
             results.write(json.dumps(answer) + "\n")
             results.flush()
-            if not limited:  # what is large, such as LLVM, is there after the first
+            if not limited:  # large libraries, such as LLVM, are loaded by the first case
                 limited = True
                 _limit()
 
 
-def attempt(request: dict[str, Any], scratch: Path, watched: Any) -> dict[str, Any]:
-    """What came of one request."""
+def attempt(request: dict[str, Any], scratch: Path, watch: Any) -> dict[str, Any]:
+    """Runs the case of one request and returns the answer."""
     from .case import case_of, target_of, unpacked
     from .oracle import Finding, run
 
@@ -72,7 +73,7 @@ def attempt(request: dict[str, Any], scratch: Path, watched: Any) -> dict[str, A
     else:
         name = request["target"]
         case = case_of(name, request["seed"], request["case"])
-    result = run(target_of(name), case, folder, watched)
+    result = run(target_of(name), case, folder, watch)
     os.chdir(scratch)
     left = [path.name for path in (scratch / "tmp").iterdir()]
     finding = result.finding

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
 from .cameras.path import CameraPath
 from .images.metrics import check_covered, psnr, ssim, worst_tile
+from .io import write_whole
 from .lod.budget import Budget
 from .lod.settings import LodSettings
 from .render.rasterizer import Image
@@ -20,7 +22,7 @@ from .support.errors import SparklodError
 from .support.parallel import ordered_map
 from .support.progress import Progress, silent
 from .tables.columns import Row
-from .tables.comparison import COLUMNS
+from .tables.comparison import COLUMNS, rows_by_budget
 from .tables.statistics import numbers
 
 #: Threads that measure pictures; each has a few that wait, which take memory.
@@ -113,3 +115,23 @@ def _measured(picture: tuple[Row, Image, Image]) -> Row:
     worst = min(tiles, key=lambda tile: tile.psnr)
     row |= {"worst_tile_psnr": worst.psnr, "worst_tile_x": worst.x, "worst_tile_y": worst.y}
     return {column.name: column.rounded(row[column.name]) for column in COLUMNS}
+
+
+def write_charts(target: Path, rows: Sequence[Row], budgets: Sequence[Budget], title: str, *, overwrite: bool) -> None:
+    """Writes the charts of a comparison as a .png.
+
+    Args:
+        target: the file.
+        rows: of `Comparison.run`.
+        budgets: of the comparison.
+        title: the name of the scene.
+        overwrite: replace a file that exists.
+
+    Raises:
+        SparklodError: matplotlib is not installed, or the file cannot be written.
+    """
+    from .figures.comparison_chart import plot
+
+    texts = (budget.text for budget in budgets)
+    series = list(zip(texts, rows_by_budget(rows, len(budgets)), strict=True))
+    write_whole(target, [plot(series, title)], overwrite=overwrite)

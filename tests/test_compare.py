@@ -21,38 +21,32 @@ from sparklod_cli.cameras.path import CameraPath
 from sparklod_cli.cameras.pose import look_at
 from sparklod_cli.commands import render_compare
 from sparklod_cli.commands.console import Console
-from sparklod_cli.compare import (
-    COLUMNS,
-    Comparison,
-    ComparisonSettings,
-    on_background,
-    parse_budgets,
-    rows_of,
-    summarize,
-)
+from sparklod_cli.compare import Comparison, on_background
 from sparklod_cli.images.metrics import MOST_PSNR
-from sparklod_cli.lod.traversal import Cones
-from sparklod_cli.model.splats import COLUMNS as ALL
-from sparklod_cli.render.backends import BACKENDS
-from sparklod_cli.render.settings import RasterSettings
-from sparklod_cli.simulation.frames import LodSettings
+from sparklod_cli.lod.budget import parse_budgets
+from sparklod_cli.lod.settings import LodSettings
+from sparklod_cli.model.foveation import Cones
+from sparklod_cli.model.instances import Instance
+from sparklod_cli.render.settings import RenderSettings
+from sparklod_cli.scenes.loaded import Scenes
+from sparklod_cli.scenes.reading import read_scenes
 from sparklod_cli.support.errors import SparklodError
 from sparklod_cli.tables.columns import Row
-from sparklod_cli.world import Placement, World, read_world
+from sparklod_cli.tables.comparison import COLUMNS, rows_by_budget, summarize
 from tests.conftest import FIXTURES
 
-VIEWER = LodSettings(1, Cones(), pixel_scale_limit=0.0)
-HOW = ComparisonSettings(BACKENDS["numba"].draw, RasterSettings())
+LOD = LodSettings(1, Cones(), pixel_scale_limit=0.0)
+RENDER = RenderSettings()
 
 
 @pytest.fixture(scope="module")
-def world(tmp_path_factory: pytest.TempPathFactory) -> World:
+def twice(tmp_path_factory: pytest.TempPathFactory) -> Scenes:
     """A few hundred splats with SH, as a tree, twice."""
     baked = tmp_path_factory.mktemp("compare") / "sh3.spz"
     bake.bake(FIXTURES / "sh3.ply", lambda pieces: files.write_whole(baked, pieces, overwrite=True), bake.Recipe())
     there = np.eye(4)
     there[:3, 3] = 3, 0, 1
-    return read_world([Placement(baked, "here"), Placement(baked, "there", there)], columns=ALL)
+    return read_scenes([Instance(baked, "here"), Instance(baked, "there", there)])
 
 
 def path_of(count: int, size: tuple[int, int] = (96, 70)) -> CameraPath:
@@ -64,8 +58,16 @@ def path_of(count: int, size: tuple[int, int] = (96, 70)) -> CameraPath:
     return CameraPath(tuple(cameras), "a test", (), tuple(range(5, 5 + count)))
 
 
-def rows(world: World, budgets: str, *, count: int = 3, how: ComparisonSettings = HOW, threads: int = 1) -> list[Row]:
-    return list(Comparison(world, VIEWER, parse_budgets(budgets), how).run(path_of(count), threads=threads))
+def rows(
+    scenes: Scenes,
+    budgets: str,
+    *,
+    count: int = 3,
+    lod: LodSettings = LOD,
+    render: RenderSettings = RENDER,
+    threads: int = 1,
+) -> list[Row]:
+    return list(Comparison(scenes, lod, parse_budgets(budgets), render).run(path_of(count), threads=threads))
 
 
 def column(table: list[Row], name: str) -> list[Any]:
@@ -86,27 +88,27 @@ def test_what_is_no_budget(text: str) -> None:
         parse_budgets(text)
 
 
-def test_all_splats_are_full_detail(world: World) -> None:
-    for row in rows(world, "100%,150%,1M"):
+def test_all_splats_are_full_detail(twice: Scenes) -> None:
+    for row in rows(twice, "100%,150%,1M"):
         assert row["psnr_black"] == row["psnr_white"] == row["psnr"] == row["worst_tile_psnr"] == MOST_PSNR
         assert row["ssim_black"] == row["ssim_white"] == row["ssim"] == 1
-    for row in rows(world, "100%", how=dataclasses.replace(HOW, width=1.25)):
+    for row in rows(twice, "100%", lod=dataclasses.replace(LOD, continuous=1.25)):
         assert (row["psnr"], row["ssim"]) == (MOST_PSNR, 1)
 
 
-def test_more_splats_come_nearer_to_it(world: World) -> None:
-    table = rows(world, "5%,15%,40%,80%")
+def test_more_splats_come_nearer_to_it(twice: Scenes) -> None:
+    table = rows(twice, "5%,15%,40%,80%")
     for name in ("psnr", "ssim"):
-        means = [np.mean(column(group, name)) for group in rows_of(table, parse_budgets("1%,1%,1%,1%"))]
+        means = [np.mean(column(group, name)) for group in rows_by_budget(table, 4)]
         assert means == sorted(means)
         assert means[0] < means[-1]
     assert 5 < min(column(table, "psnr")) < max(column(table, "psnr")) < MOST_PSNR
 
 
 @pytest.mark.parametrize("width", [None, 1.25])
-def test_rows_tell_what_was_drawn(world: World, width: float | None) -> None:
-    table = rows(world, "10%,50%", how=dataclasses.replace(HOW, width=width))
-    leaves = Comparison(world, VIEWER, parse_budgets("10%"), HOW).leaves
+def test_rows_tell_what_was_drawn(twice: Scenes, width: float | None) -> None:
+    table = rows(twice, "10%,50%", lod=dataclasses.replace(LOD, continuous=width))
+    leaves = Comparison(twice, LOD, parse_budgets("10%"), RENDER).leaves
     assert column(table, "frame") == [5, 5, 6, 6, 7, 7]
     assert column(table, "name")[::2] == ["view, 0", "view, 1", "view, 2"]
     assert column(table, "budget") == [leaves // 10, leaves // 2] * 3
@@ -121,26 +123,26 @@ def test_rows_tell_what_was_drawn(world: World, width: float | None) -> None:
         assert row["worst_tile_x"] in (0, 64) and row["worst_tile_y"] in (0, 64)
 
 
-def test_the_same_for_any_number_of_threads(world: World) -> None:
-    assert rows(world, "10%,50%", threads=1) == rows(world, "10%,50%", threads=3)
+def test_the_same_for_any_number_of_threads(twice: Scenes) -> None:
+    assert rows(twice, "10%,50%", threads=1) == rows(twice, "10%,50%", threads=3)
 
 
-def test_spherical_harmonics_can_be_left_out(world: World) -> None:
-    plain = dataclasses.replace(HOW, max_sh=0)
-    assert rows(world, "100%", count=1, how=plain)[0]["psnr"] == MOST_PSNR
-    assert rows(world, "10%", count=1, how=plain) != rows(world, "10%", count=1)
+def test_spherical_harmonics_can_be_left_out(twice: Scenes) -> None:
+    plain = dataclasses.replace(RENDER, max_sh=0)
+    assert rows(twice, "100%", count=1, render=plain)[0]["psnr"] == MOST_PSNR
+    assert rows(twice, "10%", count=1, render=plain) != rows(twice, "10%", count=1)
 
 
-def test_a_pixel_limit_ends_cuts_early(world: World) -> None:
-    coarse = Comparison(world, dataclasses.replace(VIEWER, pixel_scale_limit=0.3), parse_budgets("100%"), HOW)
+def test_a_pixel_limit_ends_cuts_early(twice: Scenes) -> None:
+    coarse = Comparison(twice, dataclasses.replace(LOD, pixel_scale_limit=0.3), parse_budgets("100%"), RENDER)
     (row,) = coarse.run(path_of(1))
     assert row["selected"] < row["budget"]  # type: ignore[operator]
     assert row["psnr"] < 60  # type: ignore[operator]
 
 
-def test_a_budget_holds_the_roots(world: World) -> None:
+def test_a_budget_holds_the_roots(twice: Scenes) -> None:
     with pytest.raises(SparklodError, match="a budget of 1 is less than one splat for each of 2 instances"):
-        Comparison(world, VIEWER, parse_budgets("50%,1"), HOW)
+        Comparison(twice, LOD, parse_budgets("50%,1"), RENDER)
 
 
 def test_a_picture_lies_over_its_background_and_is_clamped() -> None:
@@ -149,10 +151,10 @@ def test_a_picture_lies_over_its_background_and_is_clamped() -> None:
     np.testing.assert_allclose(on_background(image, 1.0), [[[0.7, 0.6, 0.5], [1, 1, 1], [1, 0.5, 0.5]]], atol=1e-7)
 
 
-def test_summaries_are_by_budget(world: World) -> None:
+def test_summaries_are_by_budget(twice: Scenes) -> None:
     budgets = parse_budgets("10%,50%")
-    table = rows(world, "10%,50%")
-    for at, each in enumerate(summarize(table, budgets)):
+    table = rows(twice, "10%,50%")
+    for at, each in enumerate(summarize(table, [budget.text for budget in budgets])):
         mine = table[at::2]
         assert (each.text, each.frames, each.budget) == (budgets[at].text, 3, mine[0]["budget"])
         assert each.psnr == pytest.approx(np.mean(column(mine, "psnr")))
@@ -163,20 +165,20 @@ def test_summaries_are_by_budget(world: World) -> None:
 
 
 def run(
-    world: World, capsys: pytest.CaptureFixture[str], budgets: str = "10%,50%", **given: Any
+    twice: Scenes, capsys: pytest.CaptureFixture[str], budgets: str = "10%,50%", **given: Any
 ) -> tuple[int, str, str]:
     settings = {"asserts": (), "plot": None, "overwrite": False, "output": None, "as_json": False} | given
     wanted = render_compare.wanted_from(
         settings, parse_budgets(budgets), output=settings["output"], as_json=settings["as_json"]
     )
     with Console(quiet=False, verbose=False) as console:
-        status = render_compare.run(console, world, LodSettings(1, Cones()), path_of(2), HOW, wanted, threads=1)
+        status = render_compare.run(console, twice, LodSettings(1, Cones()), path_of(2), RENDER, wanted, threads=1)
     said = capsys.readouterr()
     return status, said.out, said.err
 
 
-def test_the_table_goes_to_standard_output(world: World, capsys: pytest.CaptureFixture[str]) -> None:
-    status, out, err = run(world, capsys)
+def test_the_table_goes_to_standard_output(twice: Scenes, capsys: pytest.CaptureFixture[str]) -> None:
+    status, out, err = run(twice, capsys)
     lines = out.splitlines()
     assert status == 0
     assert lines[0] == ",".join(column.name for column in COLUMNS)
@@ -185,9 +187,9 @@ def test_the_table_goes_to_standard_output(world: World, capsys: pytest.CaptureF
     assert max(map(len, err.splitlines())) <= 100
 
 
-def test_json_is_the_summary(world: World, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_json_is_the_summary(twice: Scenes, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     target = tmp_path / "table.json"
-    status, out, _ = run(world, capsys, as_json=True, output=target, asserts=("psnr_min>1", "50%: ssim_min > 2"))
+    status, out, _ = run(twice, capsys, as_json=True, output=target, asserts=("psnr_min>1", "50%: ssim_min > 2"))
     summary = json.loads(out)
     assert status == 3
     assert [each["text"] for each in summary["budgets"]] == ["10%", "50%"]
@@ -195,12 +197,12 @@ def test_json_is_the_summary(world: World, capsys: pytest.CaptureFixture[str], t
     assert len(json.loads(target.read_text())["data"]) == 4
 
 
-def test_assertions_are_of_all_budgets_or_of_one(world: World, capsys: pytest.CaptureFixture[str]) -> None:
-    table = rows(world, "10%,50%", count=2)
-    coarse, fine = (min(column(group, "psnr")) for group in rows_of(table, parse_budgets("1%,1%")))
+def test_assertions_are_of_all_budgets_or_of_one(twice: Scenes, capsys: pytest.CaptureFixture[str]) -> None:
+    table = rows(twice, "10%,50%", count=2)
+    coarse, fine = (min(column(group, "psnr")) for group in rows_by_budget(table, 2))
     between = (coarse + fine) / 2
-    assert run(world, capsys, asserts=(f"50%:psnr_min>{between}",))[0] == 0
-    status, _, err = run(world, capsys, asserts=(f"psnr_min>{between}",))
+    assert run(twice, capsys, asserts=(f"50%:psnr_min>{between}",))[0] == 0
+    status, _, err = run(twice, capsys, asserts=(f"psnr_min>{between}",))
     assert status == 3
     assert "psnr_min is" in err and f"at a budget of {table[0]['budget']}" in err
 
@@ -214,20 +216,22 @@ def test_assertions_are_of_all_budgets_or_of_one(world: World, capsys: pytest.Ca
     ],
 )
 def test_assertions_about_what_is_not_there(
-    world: World, capsys: pytest.CaptureFixture[str], text: str, message: str
+    twice: Scenes, capsys: pytest.CaptureFixture[str], text: str, message: str
 ) -> None:
     import click
 
     with pytest.raises(click.UsageError, match=message):
-        run(world, capsys, asserts=(text,))
+        run(twice, capsys, asserts=(text,))
 
 
-def test_a_chart_of_a_comparison_is_a_picture(world: World, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_a_chart_of_a_comparison_is_a_picture(
+    twice: Scenes, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
     pytest.importorskip("matplotlib", reason="charts need the extra `render`")
     target = tmp_path / "plot.png"
-    assert run(world, capsys, "5%,20%,500k", plot=target)[0] == 0
+    assert run(twice, capsys, "5%,20%,500k", plot=target)[0] == 0
     image = Image.open(io.BytesIO(target.read_bytes()))
     assert image.size[0] == 1600
     assert len(set(np.asarray(image.convert("RGB")).reshape(-1, 3)[::7].sum(axis=1).tolist())) > 20
-    run(world, capsys, "5%,20%,500k", plot=target, overwrite=True)
+    run(twice, capsys, "5%,20%,500k", plot=target, overwrite=True)
     assert image.tobytes() == Image.open(target).tobytes()

@@ -97,7 +97,7 @@ def test_what_is_no_tree_is_refused(tmp_path: Path, capsys: pytest.CaptureFixtur
         (["--growth", "1.2"], "--growth is of no use with --unlod"),
         (["--rgba", "c.npy"], "--rgba is of no use with --unlod"),
         (["--encoding", "ext"], "--encoding is of no use with --unlod"),
-        (["-o", "x.sog"], "--unlod writes .spz, .ply, .splat, not .sog"),
+        (["-o", "x.sog"], "--unlod writes .ply, .spz, .splat, not .sog"),
         (["-o", "x.ply", "--spz-version", "2"], "--spz-version is of SPZ, not of .ply"),
     ],
 )

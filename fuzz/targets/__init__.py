@@ -1,1 +1,1 @@
-"""What is fuzzed: a module a target, see `fuzz.case.Target`."""
+"""The targets of the fuzzers, a module each; see `fuzz.case.Target`."""

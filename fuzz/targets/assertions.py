@@ -1,4 +1,4 @@
-"""The texts of `--assert`, of tables of traverse and of comparisons."""
+"""Texts of `--assert`, for `traverse` and for `render --compare`."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ COMPARISONS = ("psnr_min>30", "5%:psnr>30", "100: ssim_mean >= 0.9", "worst_tile
 
 
 def make(rng: Rng) -> Case:
-    """A text, after changes; most are only parsed."""
+    """Changes the text of an assertion; most cases only parse it, some run a command with it."""
     compares = rng.integers(20) == 0
     text = text_mutated(rng, pick(rng, COMPARISONS if compares else SEEDS))
     text = text[: int(rng.integers(len(text) + 1))] + pick(rng, WORDS) if rng.integers(8) == 0 else text
@@ -33,7 +33,7 @@ def make(rng: Rng) -> Case:
 
 
 def check(case: Case, folder: Path) -> None:
-    """It is an assertion, or an error."""
+    """The text is parsed as an assertion, or refused with an error."""
     text, arguments = case.run["text"], case.run["arguments"]
     if arguments:
         command([*arguments, f"--assert={text}"])

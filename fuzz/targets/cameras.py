@@ -1,4 +1,4 @@
-"""Camera paths of every format, changed in structure and in text."""
+"""Camera paths of every format, with changes to their structure and text."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from sparklod_cli.cameras.formats.source import Files
 from sparklod_cli.cameras.formats.table import FORMATS, NAMES
 from sparklod_cli.cameras.frame import Settings
 from sparklod_cli.cameras.path import read
-from sparklod_cli.commands.camera_options import LARGEST
+from sparklod_cli.cameras.sources import LARGEST
 from sparklod_cli.io import read_together
 
 from ..case import Case, LawError, Rng
@@ -26,7 +26,7 @@ from ..mutate import json_mutated, mutated, pick, text_mutated
 
 @functools.cache
 def groups() -> Mapping[str, Mapping[str, bytes]]:
-    """Files that belong together, by the file or folder that names them."""
+    """Camera files by the file or folder that a command is given; a folder has several."""
     found: dict[str, dict[str, bytes]] = defaultdict(dict)
     for name, data in camera_files.files().items():
         found[name.partition("/")[0]][name] = data
@@ -35,12 +35,12 @@ def groups() -> Mapping[str, Mapping[str, bytes]]:
 
 @functools.cache
 def tree() -> bytes:
-    """A tree for the cameras to look at."""
+    """A small tree for the cameras to see."""
     return (FIXTURES / "golden" / "tree-v3.spz").read_bytes()
 
 
 def make(rng: Rng) -> Case:
-    """Camera files of a format, one of them changed; and how to read them."""
+    """Changes one of the camera files of a format, and picks options to read them with."""
     path = pick(rng, list(groups()))
     files = dict(groups()[path])
     name = pick(rng, list(files))
@@ -61,7 +61,7 @@ def make(rng: Rng) -> Case:
 
 
 def changed(rng: Rng, name: str, data: bytes) -> bytes:
-    """A camera file after changes that suit it."""
+    """Changes a camera file by its kind: the structure of JSON, the words of a text, bytes."""
     if name.endswith(".json") and rng.integers(5):
         return json_mutated(rng, data)
     if not name.endswith(".bin") and rng.integers(4):
@@ -70,14 +70,14 @@ def changed(rng: Rng, name: str, data: bytes) -> bytes:
 
 
 def check(case: Case, folder: Path) -> None:
-    """They are cameras that can be used, or an error."""
+    """The files are read as cameras with finite poses and focal lengths, or refused with an error."""
     run = case.run
     path = Path(run["path"])
     if run["command"] < 2:
         line = ["--camera-path", str(path), "--every", str(run["every"])]
         line += ["--fov", "60"] if run["fov"] else []
-        how = ["traverse", "tree.spz", "--no-timing"] if run["command"] else ["render", "tree.spz", "--size", "16x12"]
-        command([*how, *line, "-o", "out.csv" if run["command"] else "out.%04d.png"])
+        start = ["traverse", "tree.spz", "--no-timing"] if run["command"] else ["render", "tree.spz", "--size", "16x12"]
+        command([*start, *line, "-o", "out.csv" if run["command"] else "out.%04d.png"])
         return
     settings = Settings(every=run["every"], fov_y=run["fov"], size=run["size"] and tuple(run["size"]), fps=run["fps"])
     cameras = read(Files(path, read_together(path, NAMES, LARGEST)), format=run["format"], settings=settings).cameras

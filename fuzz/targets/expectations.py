@@ -1,4 +1,4 @@
-"""Expectation files of `inspect --expect`, TOML and JSON."""
+"""Expectation files of `inspect --expect`, as TOML and as JSON."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ JSON = (
 
 
 def make(rng: Rng) -> Case:
-    """Expectations of a tree."""
+    """Changes a file of expectations about a small tree."""
     if rng.integers(2):
         name, data = "expect.json", json_mutated(rng, JSON)
     else:
@@ -42,5 +42,5 @@ def make(rng: Rng) -> Case:
 
 
 def check(case: Case, folder: Path) -> None:
-    """They are held or not, or an error."""
+    """The expectations hold or do not, or are refused with an error."""
     command(["inspect", "tree.spz", "--expect", case.run["file"], *case.run["options"]])

@@ -1,4 +1,4 @@
-"""Instances files, changed in structure and in text."""
+"""Instances files, with changes to their structure and text."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SEEDS = tuple(
 
 
 def make(rng: Rng) -> Case:
-    """An instances file and what to do with it."""
+    """Changes an instances file; most cases only read it, some run a command with it."""
     data = pick(rng, SEEDS)
     data = json_mutated(rng, data) if rng.integers(8) else mutated(rng, data)
     line = pick(rng, ("", "", "", "traverse --per-instance --orbit 2 --no-timing", "render --size 16x12 -o out.png"))
@@ -36,11 +36,11 @@ def make(rng: Rng) -> Case:
 
 
 def check(case: Case, folder: Path) -> None:
-    """They are instances that can be drawn, or an error."""
+    """The instances have finite matrices, or the file is refused with an error."""
     arguments = case.run["arguments"]
     if arguments:
         command([arguments[0], "--scene", "scene.json", *arguments[1:]])
         return
-    for place in read_instances(Path("scene.json")):
-        if not np.isfinite(place.object_to_world).all():
-            raise LawError(f"an instance that cannot be drawn: {place!r:.200}")
+    for instance in read_instances(Path("scene.json")):
+        if not np.isfinite(instance.object_to_world).all():
+            raise LawError(f"an instance that cannot be drawn: {instance!r:.200}")

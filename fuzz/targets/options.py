@@ -1,4 +1,4 @@
-"""Any options of any command, with any values: read from the commands themselves, so that new ones are tried, too."""
+"""Random options of every command; the options are read from the commands, so that new ones are tried too."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from ..containers import FIXTURES, seeds
 from ..mutate import pick
 from .cameras import groups, tree
 
-#: Inputs by their name in the case's folder.
+#: The seed of each input, by the name of the input in the case's folder.
 INPUTS = {
     "scene.ply": "one.ply",
     "flat.ply": "flat.ply",
@@ -27,7 +27,11 @@ INPUTS = {
     "broken.spz": "faults/tree-cycle.spz",
     "empty.spz": "faults/empty.spz",
 }
+
+#: Arguments to try as inputs.
 FILES = ("tree.spz", "tree.spz", "tree.spz", *INPUTS, "scene.json", "path.csv", "expect.toml", "absent.ply", ".", "-")
+
+#: Arguments to try as outputs, of pages, of plots, and of folders.
 OUTPUTS = (
     *("out.spz", "out.ply", "out.splat", "out.npz", "out.bin", "out.png", "out.webp", "out.npy", "out.gif", "out.csv"),
     *("out.json", "out.html", "out.%04d.png", "out", "new/out.spz", "-", "", ".", "/dev/null", "tree.spz", "scene.ply"),
@@ -37,7 +41,7 @@ PAGES = ("out.html", "out.html", "-", "", ".", "new/out.html", "/dev/null", "tre
 PLOTS = ("out.png", "out.png", "-", "", ".", "new/out.png", "/dev/null", "tree.spz", "path.csv", "out\x1b[31m.png")
 FOLDERS = ("new", "new/er", ".", "tree.spz", "")
 
-#: Values by the name of an option; sizes and numbers of frames are small, since much work is no fault.
+#: Values to try, by the name of the option. Sizes and numbers of frames are small: taking long is not a fault here.
 VALUES: dict[str, Sequence[str]] = {
     "size": ("16x12", "16x12", "1x1", "33x7", "0x5", "-1x5", "16", "16x12x3", "1e3x4", "\uff19x\uff19"),
     "orbit": ("1", "2", "3", "0", "-1"),
@@ -71,6 +75,8 @@ VALUES: dict[str, Sequence[str]] = {
     "indices_out": FOLDERS,
 }
 VALUES |= {"look_at": VALUES["view"]}
+
+#: Values to try for all other options.
 NUMBERS = (
     *("0", "1", "2", "0.5", "3", "10", "-1", "1e-300", "1e308", "nan", "inf", "1e999", "", "x", "9" * 400, "\x1b[31m"),
     *("1,2,3", "0,0,0", "0,0,0,5", "-1,-1,-1", "1e38,1e38,1e38", "1,2", "nan,0,0", "auto"),
@@ -78,20 +84,21 @@ NUMBERS = (
 SCENE = json.dumps({"instances": [{"file": "tree.spz"}, {"file": "tree.spz", "translation": [3, 0, 0]}]}).encode()
 EXPECT = b'lod = true\nmax_growth = 1.5\n[values]\n"tree.leaves" = 5\n'
 
+#: Options that name an output file.
 OUTPUT_OPTIONS = ("-o", "--output", "--html", "--plot")
 
-#: What ends a run before anything is tried.
+#: Options that end a run before it does anything.
 LEFT_OUT = {"version", "help"}
 
 
 def make(rng: Rng) -> Case:
-    """A command, one or more files, and up to six options."""
+    """Picks a command, up to two inputs, and up to six options with values."""
     name = pick(rng, list(cli.COMMANDS))
-    wanted = cli.cli.get_command(click.Context(cli.cli), name)
-    assert wanted is not None
-    options = [each for each in wanted.params if isinstance(each, click.Option) and each.name not in LEFT_OUT]
+    picked = cli.cli.get_command(click.Context(cli.cli), name)
+    assert picked is not None
+    options = [each for each in picked.params if isinstance(each, click.Option) and each.name not in LEFT_OUT]
     line = [name]
-    for _ in range(int(rng.integers(7))):
+    for _ in range(int(rng.integers(7)) if options else 0):  # `help` has no options
         line += _option(rng, pick(rng, options))
     if rng.integers(3) == 0:
         line.append("--overwrite")
@@ -110,7 +117,7 @@ def make(rng: Rng) -> Case:
 
 
 def _replaced(line: list[str], files: list[str]) -> list[str]:
-    """Files that --overwrite may replace: named as an output, and nothing that is read."""
+    """The files that --overwrite may replace: those named as an output and not also as an input."""
     if "--overwrite" not in line:
         return []
     read = {"tree.spz"} if "scene.json" in line else set()
@@ -129,11 +136,11 @@ def _option(rng: Rng, option: click.Option) -> list[str]:
 
 
 def check(case: Case, folder: Path) -> None:
-    """It is done, or not and said why; what was written is whole, and nothing was with exit code 2."""
+    """The command ends as every command must; its outputs are whole, and exit code 2 leaves none."""
     before = set(folder.rglob("*"))
     done = command(case.run["arguments"])
     for path in sorted(set(folder.rglob("*")) - before):
         if done.code == 2:
             raise LawError(f"exit code 2, but {path.name[:40]!r} was made\n{case.what}\n{done.err}")
         if path.is_file():
-            laws.output_holds(path)
+            laws.check_output(path)

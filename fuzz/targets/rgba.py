@@ -1,4 +1,4 @@
-"""Colour files of `build-lod --rgba`: .npy of all kinds and raw bytes."""
+"""Colour files of `build-lod --rgba`: .npy files of all types, and raw bytes."""
 
 from __future__ import annotations
 
@@ -14,13 +14,15 @@ from ..command import command
 from ..containers import seeds
 from ..mutate import FLOATS, WORDS, mutated, pick, text_mutated
 
-COUNT = 60  # splats of sh0.ply
+COUNT = 60  # number of splats in sh0.ply
+
+#: Types and shapes to try; (COUNT, 4) of bytes or floats is right.
 KINDS = ("u1", "<f4", ">f4", "<f2", "<f8", "<i4", "<c8", "S4", "<U2", "?")
 SHAPES = ((COUNT, 4), (COUNT, 4), (COUNT, 4), (4, COUNT), (COUNT, 3), (COUNT * 4,), (0, 4), (COUNT, 4, 1), ())
 
 
 def make(rng: Rng) -> Case:
-    """Values of any kind, with or without a header, which is changed now and then."""
+    """Makes an array of any type and shape, writes it with or without a header, and changes some of the files."""
     with np.errstate(all="ignore"):
         values = (rng.random(pick(rng, SHAPES)) * 1.2 - 0.1).astype(pick(rng, KINDS))
     if values.dtype.kind == "f" and values.size and rng.integers(3) == 0:
@@ -44,10 +46,10 @@ def make(rng: Rng) -> Case:
 
 
 def check(case: Case, folder: Path) -> None:
-    """They are colours between 0 and 1, or an error."""
+    """The file is read as colours between 0 and 1, or refused with an error."""
     if case.run["command"]:
         command(["build-lod", "scene.ply", "--rgba", "colors.npy", "-o", "out.spz"])
         return
     rgba = read_rgba(Path("colors.npy"), COUNT)
     if rgba.shape != (COUNT, 4) or not ((rgba >= 0) & (rgba <= 1)).all():
-        raise LawError(f"colours that are none: {rgba.dtype}{list(rgba.shape)}")
+        raise LawError(f"values that are not colours: {rgba.dtype}{list(rgba.shape)}")

@@ -1,4 +1,4 @@
-"""Level-of-Detail trees in containers that are whole: odd shapes and broken links, through reports and traversals."""
+"""Level-of-Detail trees of odd shapes or with broken child columns, in valid SPZ files, for all commands."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from ..command import command
 from ..mutate import pick
 
 KINDS = ("chain", "star", "pairs", "broom", "shuffled", "any")
-LOD = 0x80
+LOD = 0x80  # the flag of SPZ's header that says there is a tree
 
-#: What is done with a tree; T stands for it.
+#: Commands to run on a tree; T is replaced by its file.
 INSPECT = (
     *("T --check", "T --json --stats --check", "T --html page.html", "T --stats --histogram size", "T --field tree"),
     *("T --check --fail-on warning --format github", "T --leaves-of T", "T --require-lod --max-growth 1.5"),
@@ -29,11 +29,11 @@ OTHERS = ("build-lod T --unlod -o plain.ply", "build-lod T --unlod", "build-lod 
 
 
 def make(rng: Rng) -> Case:
-    """A tree of any shape, valid or not, and a command; one in forty has more nodes than a chunk."""
+    """Makes a tree of any shape, half of them broken, and picks a command; one tree in forty has several chunks."""
     kind = pick(rng, KINDS)
     large = rng.integers(40) == 0
     count = int(pick(rng, (66_000, 140_000) if large else (1, 2, 3, 4, 10, 50, 200, 1000, 3000)))
-    tree = scenes.links(rng, kind, count)
+    tree = scenes.child_columns(rng, kind, count)
     is_broken = bool(rng.integers(2)) and not large
     if is_broken:
         tree = scenes.broken(rng, tree)
@@ -49,11 +49,11 @@ def make(rng: Rng) -> Case:
 
 
 def check(case: Case, folder: Path) -> None:
-    """The command does what it says, or says why not; what is refused by one reader is not taken by another."""
+    """The command ends as every command must; outputs are whole, and a failure leaves none."""
     arguments = case.run["arguments"]
     done = command(arguments)
     for path in folder.iterdir():
         if path.is_file() and path.name not in case.files:
             if done.code not in (0, 3):
                 raise LawError(f"exit code {done.code}, but {path.name} was written")
-            laws.output_holds(path)
+            laws.check_output(path)

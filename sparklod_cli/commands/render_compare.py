@@ -1,4 +1,4 @@
-"""What `sparklod render --compare` does: how far cuts of several budgets are from full detail."""
+"""What `sparklod render --compare` does: measures how far cuts of several budgets are from full detail."""
 
 from __future__ import annotations
 
@@ -6,222 +6,110 @@ import dataclasses
 import json
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING
 
 import click
 
-from ..support import defaults
 from .console import Console, count_of, for_screen, is_terminal
-from .options.common import Command, table_form
-from .options.types import Quantity
-from .paths import OutputPath
+from .options.common import table_form
+from .paths import DASH, keep_apart
 
 if TYPE_CHECKING:
     from ..cameras.path import CameraPath
     from ..compare import Comparison
     from ..lod.budget import Budget
     from ..lod.settings import LodSettings
-    from ..render.settings import RenderSettings
-    from ..scenes.loaded import Scenes
     from ..tables.assertions import Assertion
     from ..tables.columns import Row
     from ..tables.comparison import BudgetSummary
-
-#: What is compared unless told otherwise.
-DEFAULT_BUDGETS = "2%,5%,10%,25%,50%"
-
-#: Between the budget that an assertion is about and the rest of it.
-ABOUT = ":"
+    from ..tables.output import TableOutput
+    from .render import Asked
 
 
-def _budgets(text: str) -> Any:
-    from ..lod.budget import parse_budgets
+def compare(ctx: click.Context, asked: Asked) -> int:
+    """Compares, writes the table and the charts, and says what they come to; the exit status."""
+    budgets = asked.comparison.budgets(asked.cut.budget)
+    asserts = asked.comparison.assertions(budgets)
+    table = _table(asked)
+    instances = asked.inputs.instances()
+    from ..compare import Comparison, write_charts
+    from .render import read, read_besides, seen
 
-    return parse_budgets(text)
-
-
-#: Type of a --budget of several: texts such as 2%,5%,500k become `Budget`s.
-BUDGETS = Quantity("N|P%,...", _budgets)
-
-
-def compare_options(command: Command) -> Command:
-    """`--compare` and what only it knows; `--budget` is of `BUDGETS`."""
-    for option in reversed(
-        (
-            click.option(
-                "--compare",
-                is_flag=True,
-                help="Tell how far the cuts of each --budget are from full detail, as a table.",
-            ),
-            click.option(
-                "--assert",
-                "asserts",
-                metavar="TEXT",
-                multiple=True,
-                help="With --compare: what must hold, such as 'psnr_min>30', or '5%:psnr>30' for one of the budgets;"
-                " the exit status is 3 if it does not.",
-            ),
-            click.option(
-                "--plot",
-                metavar="FILE",
-                type=OutputPath(suffixes=[".png"]),
-                help="With --compare: draw the table as a .png.",
-            ),
-            click.option(
-                "--max-sh",
-                metavar="N",
-                type=click.IntRange(0, defaults.MAX_SH_DEGREE),
-                default=defaults.MAX_SH_DEGREE,
-                help="Leave out spherical harmonics of higher degrees.",
-            ),
-        )
-    ):
-        command = option(command)
-    return command
-
-
-@dataclass(frozen=True)
-class Wanted:
-    """What is to be made of a comparison.
-
-    Attributes:
-        budgets: at least one.
-        output: of the table; None for standard output.
-        form: of the table.
-        plot: of the charts; None for none.
-        asserts: what must hold, and of which of the budgets; None for all.
-        as_json: print a summary instead of the table.
-        overwrite: replace outputs.
-    """
-
-    budgets: Sequence[Budget]
-    output: Path | None
-    form: str
-    plot: Path | None
-    asserts: Sequence[tuple[int | None, Assertion]]
-    as_json: bool
-    overwrite: bool
-
-    def check(self) -> None:
-        """Raises a `SparklodError` where an output cannot be made, before work goes into it."""
-        from ..io import check_writable
-
-        for target in (self.output, self.plot):
-            if target is not None and str(target) != "-":
-                check_writable(target, overwrite=self.overwrite)
-        if self.form == "parquet":
-            from ..tables.files import load_pyarrow
-
-            load_pyarrow()
-        if self.plot is not None:
+    keep_apart(ctx, read_besides(asked, instances))
+    with asked.general.console() as console:
+        console.announce_compiling("render")
+        scenes = read(asked, instances, console, trees_only=True)
+        path, settings = seen(ctx, asked, lambda: scenes)
+        for note in path.notes:
+            console.say(note)
+        table.check()
+        plot = asked.comparison.plot
+        if plot is not None:
             from ..figures.charts import load_matplotlib
+            from ..io import check_writable
 
+            check_writable(plot, overwrite=asked.pictures.overwrite)
             load_matplotlib()
+        start = time.perf_counter()
+        comparison = Comparison(scenes, _limited(asked), budgets, settings)
+        rows = list(comparison.run(path, threads=asked.general.threads, progress=console.progress))
+        console.clear()  # a bar and a table do not go together on one screen
+        table.write(rows, passed=for_screen if is_terminal(sys.stdout) and table.form != "parquet" else None)
+        console.detail(f"  {len(rows):,} pictures, {time.perf_counter() - start:.2f} s")
+        if plot is not None:
+            write_charts(plot, rows, budgets, scenes.title, overwrite=asked.pictures.overwrite)
+        return _report(console, asked, comparison, path, budgets, asserts, rows)
 
 
-def wanted_from(
-    settings: Mapping[str, Any], budgets: Sequence[Budget] | None, *, output: Path | None, as_json: bool
-) -> Wanted:
-    """What the options of `compare_options`, and `overwrite`, ask for.
-
-    Raises:
-        click.UsageError: an assertion cannot be understood, or a name is not of what is written.
-    """
-    budgets = _budgets(DEFAULT_BUDGETS) if budgets is None else budgets
-    asserts = [_assertion(text, budgets) for text in settings["asserts"]]
-    form = table_form("--output", output)
-    return Wanted(budgets, output, form, settings["plot"], asserts, as_json, settings["overwrite"])
-
-
-def _assertion(text: str, budgets: Sequence[Budget]) -> tuple[int | None, Assertion]:
-    from ..tables import assertions
+def _table(asked: Asked) -> TableOutput:
+    """Where the table goes: nowhere where a terminal, or JSON, gets the summary alone."""
     from ..tables.comparison import COLUMNS
+    from ..tables.output import TableOutput
 
-    name, found, rest = text.rpartition(ABOUT)
-    at, texts = None, [budget.text for budget in budgets]
-    if found:
-        if name.strip() not in texts:
-            raise click.UsageError(f"--assert {text!r}: {name.strip()} is not one of the budgets, {', '.join(texts)}")
-        at = texts.index(name.strip())
-    try:
-        return at, dataclasses.replace(assertions.parse(rest, COLUMNS), text=text.strip())
-    except assertions.BadAssertionError as error:
-        raise click.UsageError(f"--assert {error}") from None
+    output = asked.pictures.output
+    nowhere = output is None and (asked.general.as_json or is_terminal(sys.stdout))
+    return TableOutput(
+        path=None if output == DASH else output,
+        form=None if nowhere else table_form("--output", output),
+        columns=COLUMNS,
+        overwrite=asked.pictures.overwrite,
+    )
 
 
-def run(
+def _limited(asked: Asked) -> LodSettings:
+    """Settings whose cuts go down to the budget, not to the size of a pixel, unless a limit was given."""
+    settings = asked.cut.settings(budget=1)
+    if settings.pixel_scale_limit is None and settings.render_scale == 1:
+        return dataclasses.replace(settings, pixel_scale_limit=0.0)
+    return settings
+
+
+def _report(
     console: Console,
-    world: Scenes,
-    viewer: LodSettings,
+    asked: Asked,
+    comparison: Comparison,
     path: CameraPath,
-    how: RenderSettings,
-    wanted: Wanted,
-    *,
-    threads: int,
+    budgets: Sequence[Budget],
+    asserts: Sequence[tuple[int | None, Assertion]],
+    rows: Sequence[Row],
 ) -> int:
-    """Compares, writes the table and the charts, and says what they come to; the exit status.
-
-    Cuts go down to the budget, not to the size of a pixel, unless the viewer has a limit of its own.
-    """
-    from ..compare import Comparison
-    from ..io import write_stdout, write_whole
-    from ..tables.comparison import COLUMNS, rows_by_budget
-    from ..tables.files import encode
-
-    wanted.check()
-    if viewer.pixel_scale_limit is None and viewer.render_scale == 1:
-        viewer = dataclasses.replace(viewer, pixel_scale_limit=0.0)
-    start = time.perf_counter()
-    comparison = Comparison(world, viewer, wanted.budgets, how)
-    rows: list[Row] = []
-
-    def kept() -> Iterator[Row]:
-        for row in comparison.run(path, threads=threads, progress=console.progress):
-            rows.append(row)
-            yield row
-
-    if wanted.output is not None and str(wanted.output) != "-":
-        write_whole(wanted.output, encode(kept(), COLUMNS, wanted.form), overwrite=wanted.overwrite)
-    elif wanted.as_json:
-        for _ in kept():
-            pass
-    else:  # at once, for a bar and a table do not go together on one screen
-        table = list(encode(kept(), COLUMNS, wanted.form))
-        console.clear()
-        write_stdout(for_screen(table) if is_terminal(sys.stdout) else iter(table))
-    console.clear()
-    console.detail(f"  {len(rows):,} pictures, {time.perf_counter() - start:.2f} s")
-    if wanted.plot is not None:
-        from ..figures.comparison_chart import plot
-
-        texts = (budget.text for budget in wanted.budgets)
-        series = list(zip(texts, rows_by_budget(rows, len(wanted.budgets)), strict=True))
-        write_whole(wanted.plot, [plot(series, world.title)], overwrite=wanted.overwrite)
-    return _report(console, wanted, comparison, path, rows)
-
-
-def _report(console: Console, wanted: Wanted, comparison: Comparison, path: CameraPath, rows: Sequence[Row]) -> int:
     from ..tables.assertions import check
     from ..tables.comparison import rows_by_budget, summarize
 
-    groups = rows_by_budget(rows, len(wanted.budgets))
+    groups = rows_by_budget(rows, len(budgets))
     outcomes = [
-        outcome
-        for at, assertion in wanted.asserts
-        for outcome in check([assertion], rows if at is None else groups[at])
+        outcome for at, assertion in asserts for outcome in check([assertion], rows if at is None else groups[at])
     ]
-    summary = summarize(rows, [budget.text for budget in wanted.budgets])
-    if wanted.as_json:
-        asserts = [{"assert": each.assertion.text, "held": each.held, "value": each.value} for each in outcomes]
-        budgets = [each.as_dict() for each in summary]
-        whole = {"frames": len(path.cameras), "leaves": comparison.leaves, "budgets": budgets, "asserts": asserts}
+    summary = summarize(rows, [budget.text for budget in budgets])
+    if asked.general.as_json:
+        held = [{"assert": each.assertion.text, "held": each.held, "value": each.value} for each in outcomes]
+        figures = [each.as_dict() for each in summary]
+        whole = {"frames": len(path.cameras), "leaves": comparison.leaves, "budgets": figures, "asserts": held}
         click.echo(json.dumps(whole, allow_nan=False))
     for line in lines(summary, path, comparison.leaves):
         console.say(line)
-    for (at, _), outcome in zip(wanted.asserts, outcomes, strict=True):
+    for (at, _), outcome in zip(asserts, outcomes, strict=True):
         of = f", at a budget of {outcome.worst['budget']:,}" if at is None and outcome.worst is not None else ""
         if outcome.held:
             console.detail(f"  holds: {outcome.message()}{of}")

@@ -3,29 +3,32 @@
 from __future__ import annotations
 
 import functools
-from typing import Any
+import json
+import sys
+import time
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..tables.files import FORMS
-from .camera_options import camera_options, cameras_from
-from .command import Command
-from .console import Console
-from .options.common import common_options, overwrite_option, table_form
-from .paths import OutputPath, claim_stdout, keep_apart
-from .usage import exclude
-from .world_options import files_meant, placements_from, streaming_from, viewer_from, viewer_options, world_options
+from .command import COMMON, Command
+from .console import Console, for_screen, is_terminal
+from .options import cameras, cut, inputs, streaming
+from .options import table as tables
+from .options.common import General, common_options
+from .paths import claim_stdout, keep_apart
+from .usage import options_of
+
+if TYPE_CHECKING:
+    from ..simulation.outputs import WrittenFrames
+    from ..tables.assertions import Assertion
 
 #: Below this share of splats in front of the cameras, path and scene probably do not share their axes.
 LEAST_IN_FRONT = 0.05
 
-#: Options of the table.
-OF_TABLES = ("form", "per_instance", "no_timing")
-
 EXAMPLES = """
 \b
 Examples:
-  sparklod traverse scene-lod.spz --budget 500k            # an orbit, CSV on standard output
+  sparklod traverse scene-lod.spz --budget 500k            # an orbit; the summary, or CSV into a pipe
   sparklod traverse scene-lod.spz --camera-path path.json -o frames.csv --summary
   sparklod traverse scene-lod.spz --preset quest --assert 'churn_p95<0.2'    # exit status 3
   sparklod traverse scene-lod.spz --dolly --bandwidth 20Mbit --latency 60ms --plot path.png
@@ -33,113 +36,139 @@ Examples:
   sparklod traverse scene-lod.spz --look-at 0,-1,4:0,0,0 --indices-out cuts --padded
 """
 
+HEADINGS = (COMMON, inputs.HEADING, cameras.HEADING, cut.HEADING, streaming.HEADING, tables.HEADING)
 
-@click.command("traverse", cls=Command, epilog=EXAMPLES, context_settings={"show_default": True})
-@world_options
-@camera_options
-@viewer_options
-@click.option("-o", "--output", metavar="FILE", type=OutputPath(), help="Of the table.  [default: standard output]")
-@overwrite_option
-@click.option(
-    "--format",
-    "form",
-    type=click.Choice(list(FORMS)),
-    help="Of the table.  [default: by the name of --output, or csv]",
-)
-@click.option("--per-instance", is_flag=True, help="A row for each instance, too.")
-@click.option("--no-timing", is_flag=True, help="Leave out traverse_ms, so that two runs give the same bytes.")
-@click.option(
-    "--summary/--no-summary",
-    default=None,
-    help="Say on standard error what the frames come to.  [default: if that is a terminal]",
-)
-@click.option(
-    "--assert",
-    "asserts",
-    metavar="TEXT",
-    multiple=True,
-    help="What must hold, such as 'churn_p95<0.2'; the exit status is 3 if it does not.",
-)
-@click.option(
-    "--plot", metavar="FILE", type=OutputPath(suffixes=[".png"]), help="Draw the table and the path as a .png."
-)
-@click.option(
-    "--indices-out",
-    metavar="DIR",
-    type=OutputPath(folder=True),
-    help="Write the nodes of every cut as .npy of uint32.",
-)
-@click.option("--padded", is_flag=True, help="Fill them up to rows of 16,384, as Spark's index texture has them.")
+
+@click.command("traverse", cls=Command, headings=HEADINGS, epilog=EXAMPLES, context_settings={"show_default": True})
+@tables.table_options
+@inputs.input_options
+@cameras.camera_options
+@cut.cut_options
+@streaming.streaming_options
 @functools.partial(
-    common_options, json="Print the summary, as one JSON object, on standard output; the table goes to --output alone."
+    common_options, json="Print the summary as one JSON object on standard output; write a table only to --output."
 )
 @click.pass_context
-def traverse(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, **settings: Any) -> None:
+def traverse(ctx: click.Context, /, **_: Any) -> None:
     """Simulate what a viewer draws of Level-of-Detail files along a camera path.
 
-    Finds for every frame the cut that Spark's traversal would find: the nodes of the trees that it draws within its
-    budget. Tells how fine they are, how many change from frame to frame, and what has to be fetched, as a table with a
-    row a frame. Files are those that build-lod writes; several are drawn together, within one budget.
+    Finds the cut of every frame as Spark's traversal would find it: the nodes of the trees that a viewer draws within
+    its budget. Reports how fine the cuts are, how much changes from frame to frame, and what has to be fetched, as a
+    table with a row for each frame. Files are those that build-lod writes; several share one budget.
 
     Coordinates are those of the files; --up, --world-transform and --camera-axes bring cameras into them.
     """
-    from ..scenes.reading import TRAVERSED, read_scenes
-    from ..simulation import columns
-    from ..simulation.frames import Simulation
-    from ..tables import assertions
-    from .traverse_job import Job, Wanted
-
-    viewer = viewer_from(ctx, settings)
-    placements = placements_from(settings)
-    keep_apart(ctx, files_meant(settings, placements))
-    form = table_form("--output", settings["output"], settings["form"])
-    try:
-        asserts = [assertions.parse(text, columns.COLUMNS) for text in settings["asserts"]]
-    except assertions.BadAssertionError as error:
-        raise click.UsageError(f"--assert {error}") from None
-    wanted = Wanted(
-        output=settings["output"],
-        form=form,
-        columns=columns.select(timing=not settings["no_timing"]),
-        summary=settings["summary"],
-        as_json=as_json,
-        asserts=asserts,
-        plot=settings["plot"],
-        indices=settings["indices_out"],
-        padded=settings["padded"],
-        overwrite=settings["overwrite"],
+    place, general = options_of(ctx, tables.Table), options_of(ctx, General)
+    where, lod, network = (
+        options_of(ctx, cameras.Cameras),
+        options_of(ctx, cut.Cut),
+        options_of(ctx, streaming.Streaming),
     )
-    claim_stdout(ctx, "output", as_json=as_json)
-    if as_json and wanted.output is None:
-        exclude(ctx, OF_TABLES, "--json without --output, which writes no table")
-    if wanted.padded and wanted.indices is None:
-        raise click.UsageError("--padded only means something with --indices-out")
-    with Console(quiet=quiet, verbose=verbose) as console:
+    files = options_of(ctx, inputs.Inputs)
+    for group in (where, lod, network):
+        group.check(ctx)
+    place.check(ctx, as_json=general.as_json)
+    claim_stdout(ctx, "output", as_json=general.as_json)
+    budget = lod.one_budget()
+    instances = files.instances()
+    besides = {"scene": files.read(instances), "world_transform": where.files()}
+    keep_apart(ctx, besides)
+    table = place.table(ctx, as_json=general.as_json)
+    asserts = place.assertions()
+    with general.console() as console:
         from ..model.splats import COLUMNS
+        from ..scenes.reading import TRAVERSED, read_scenes
+        from ..simulation.frames import Simulation
+        from ..simulation.outputs import FrameOutputs, write_frames
 
+        outputs = FrameOutputs(
+            table=table,
+            indices=place.indices_out,
+            padded=place.padded,
+            plot=place.plot,
+            overwrite=place.overwrite,
+        )
         console.announce_compiling("traverse")
-        wanted.check()
-        world = read_scenes(
-            placements,
+        outputs.check()
+        scenes = read_scenes(
+            instances,
+            columns=TRAVERSED if outputs.plot is None else COLUMNS,
             trees_only=True,
-            columns=TRAVERSED if wanted.plot is None else COLUMNS,
-            precision=settings["precision"],
-            threads=settings["threads"],
+            precision=lod.precision,
+            threads=general.threads,
             progress=console.progress,
         )
-        path = cameras_from(settings, world.balls)
+        path = where.read(scenes.balls)
         try:
-            simulation = Simulation(world, viewer, streaming_from(settings), by_instance=settings["per_instance"])
+            simulation = Simulation(
+                scenes, lod.settings(budget.of(scenes.leaves)), network.settings(), by_instance=place.per_instance
+            )
         except ValueError as error:
             raise click.UsageError(str(error)) from None
         for note in path.notes:
             console.say(note)
-        job = Job(console, wanted, simulation, path)
-        keep_apart(ctx, {**files_meant(settings, placements), "indices_out": job.index_files()})
-        job.run(settings["threads"])
-        if job.in_front < LEAST_IN_FRONT:
+        keep_apart(ctx, {**besides, "indices_out": outputs.index_files(path.numbers, len(instances))})
+        start = time.perf_counter()
+        screen = table.on_stdout and is_terminal(sys.stdout)
+        written = write_frames(
+            simulation,
+            path,
+            outputs,
+            threads=general.threads,
+            # A bar and a table do not go together on one screen.
+            **({} if screen else {"progress": console.progress}),
+            passed=for_screen if screen and table.form != "parquet" else None,
+        )
+        console.clear()
+        console.detail(f"  {len(path.cameras):,} frames of {path.format}, {time.perf_counter() - start:.2f} s")
+        if written.note:
+            console.say(f"{outputs.plot}: {written.note}")
+        if written.in_front < LEAST_IN_FRONT:
             console.say(
-                f"warning: only {job.in_front:.1%} of the splats lie in front of the cameras; path and scene may not"
-                " share their axes (--camera-axes, --world-transform, --up)"
+                f"warning: only {written.in_front:.1%} of the splats lie in front of the cameras; path and scene may"
+                " not share their axes (--camera-axes, --world-transform, --up)"
             )
-        ctx.exit(job.report())
+        on_stdout = place.summary_on_stdout(ctx, as_json=general.as_json)
+        ctx.exit(_report(console, written, asserts, place.summary, as_json=general.as_json, on_stdout=on_stdout))
+
+
+def _report(
+    console: Console,
+    written: WrittenFrames,
+    asserts: list[Assertion],
+    summary: bool | None,
+    *,
+    as_json: bool,
+    on_stdout: bool,
+) -> int:
+    """Says what is asked for; the exit status.
+
+    Args:
+        console: says it.
+        written: the frames.
+        asserts: what must hold.
+        summary: whether to print it; None where a person reads standard error.
+        as_json: print it as JSON on standard output.
+        on_stdout: print it on standard output, in place of the table.
+    """
+    from ..simulation.columns import EMPTY
+    from ..simulation.summary import summarize
+    from ..tables.assertions import check
+    from .traverse_text import lines
+
+    outcomes = check(asserts, written.rows, empty=EMPTY)
+    whole = summarize(written.rows)
+    if as_json:
+        held = [{"assert": each.assertion.text, "held": each.held, "value": each.value} for each in outcomes]
+        click.echo(json.dumps(whole.as_dict() | {"asserts": held}, allow_nan=False))
+    if on_stdout:
+        click.echo("\n".join(lines(whole)))
+    elif summary or (summary is None and is_terminal(sys.stderr)):
+        for line in lines(whole):
+            console.say(line)
+    for outcome in outcomes:
+        if not outcome.held:
+            console.error(outcome.message())
+        else:
+            console.detail(f"  holds: {outcome.message()}")
+    return 0 if all(outcome.held for outcome in outcomes) else 3

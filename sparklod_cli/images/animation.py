@@ -1,4 +1,4 @@
-"""Animations: GIF and WebP, which Pillow writes, and MP4, which needs the extra `video`."""
+"""Animations: GIF and WebP, which Pillow writes, and MP4 and WebM, which need the extra `video`."""
 
 from __future__ import annotations
 
@@ -17,29 +17,39 @@ from ..support.progress import Progress, silent
 from .pixels import Pixels
 
 #: What animations are written as.
-ANIMATIONS = ("gif", "webp", "mp4")
+ANIMATIONS = ("gif", "webp", "mp4", "webm")
 
 #: GIF counts time in hundredths of a second, and what plays it slows down where a frame is shorter than this.
 GIF_STEP, GIF_LEAST = 10, 2
 
-#: Milliseconds that a frame lasts at most: 16 bits of hundredths in GIF, 24 bits in WebP; of MP4, what ffmpeg takes.
-LONGEST = {"gif": 10 * 0xFFFF, "webp": 0xFFFFFF, "mp4": 1_000_000}
+#: Milliseconds that a frame lasts at most: 16 bits of hundredths in GIF, 24 bits in WebP; of videos, what ffmpeg takes.
+LONGEST = {"gif": 10 * 0xFFFF, "webp": 0xFFFFFF, "mp4": 1_000_000, "webm": 1_000_000}
 
-#: Quality of WebP, 0 to 100, and of H.264, 51 to 0: what is lost is hardly seen.
-WEBP_QUALITY, H264_QUALITY = 90, 16
+#: Quality of WebP, 0 to 100, of H.264, 51 to 0, and of VP9, 63 to 0: what is lost is hardly seen.
+WEBP_QUALITY, H264_QUALITY, VP9_QUALITY = 90, 16, 24
+
+#: What ffmpeg is told for each video, besides the codec. VP9 takes its quality as it is only without a bit rate, and
+#: uses more than one processor only where rows are coded side by side.
+VIDEOS = {
+    "mp4": ("libx264", ["-crf", str(H264_QUALITY), "-preset", "medium", "-movflags", "+faststart"]),
+    "webm": (
+        "libvpx-vp9",
+        ["-crf", str(VP9_QUALITY), "-b:v", "0", "-deadline", "good", "-cpu-used", "3", "-row-mt", "1"],
+    ),
+}
 
 
 def check(form: str, fps: float) -> None:
     """Raises a `SparklodError` where an animation cannot be written, before work goes into it."""
-    if form == "mp4":
-        load_imageio()
+    if form in VIDEOS:
+        load_imageio(form)
     longest = LONGEST[form] / 1000
     if 1 / fps > longest:
         raise SparklodError(f"a frame of .{form} lasts {longest:,.3f} s at most, not {1 / fps:,.7g} s; see --fps")
 
 
-def load_imageio() -> ModuleType:
-    """Imports imageio, with what writes MP4.
+def load_imageio(form: str) -> ModuleType:
+    """Imports imageio, with the ffmpeg that writes videos of a form.
 
     Raises:
         SparklodError: it is not installed.
@@ -50,7 +60,7 @@ def load_imageio() -> ModuleType:
 
         imageio_ffmpeg.get_ffmpeg_exe()
     except (ImportError, RuntimeError) as error:
-        raise SparklodError(f".mp4 is written by imageio: pip install 'sparklod[video]' ({error})") from None
+        raise SparklodError(f".{form} is written by imageio: pip install 'sparklod[video]' ({error})") from None
     module: ModuleType = imageio.v2
     return module
 
@@ -62,15 +72,15 @@ def animate(frames: Iterable[Pixels], form: str, fps: float, progress: Progress 
         frames: at least one, all of one size; with alpha for "webp" only.
         form: one of `ANIMATIONS`.
         fps: frames a second.
-        progress: is told how many frames are written, where that begins when all of them are there: MP4's are
-            written as they come.
+        progress: is told how many frames are written, where that begins when all of them are there: those of videos
+            are written as they come.
 
     Raises:
-        SparklodError: MP4 cannot be written here.
+        SparklodError: videos cannot be written here.
     """
     out = io.BytesIO()
-    if form == "mp4":
-        _write_mp4(out, frames, fps)
+    if form in VIDEOS:
+        _write_video(out, frames, form, fps)
     elif form == "gif":
         pictures = (Image.fromarray(frame).convert("P", palette=Image.Palette.ADAPTIVE, colors=256) for frame in frames)
         _write_images(out, "GIF", pictures, _times(fps, GIF_STEP, GIF_LEAST), progress)
@@ -105,11 +115,11 @@ def _sought(seek: Callable[[int], None], progress: Progress, number: int, total:
     progress("encoding", number + 1, total, "frame")
 
 
-def _write_mp4(out: io.BytesIO, frames: Iterable[Pixels], fps: float) -> None:
-    imageio = load_imageio()
-    settings = {"codec": "libx264", "quality": None, "pixelformat": "yuv420p", "macro_block_size": 1}
-    tuned = ["-crf", str(H264_QUALITY), "-preset", "medium", "-movflags", "+faststart"]
-    with imageio.get_writer(out, format=".mp4", mode="I", fps=fps, output_params=tuned, **settings) as writer:
+def _write_video(out: io.BytesIO, frames: Iterable[Pixels], form: str, fps: float) -> None:
+    imageio = load_imageio(form)
+    codec, tuned = VIDEOS[form]
+    settings = {"codec": codec, "quality": None, "pixelformat": "yuv420p", "macro_block_size": 1}
+    with imageio.get_writer(out, format=f".{form}", mode="I", fps=fps, output_params=tuned, **settings) as writer:
         for frame in frames:
             # Its colours are kept for every second pixel, so sides are even: the last row and column are repeated.
             odd = [(0, side % 2) for side in frame.shape[:2]]

@@ -12,6 +12,7 @@ from PIL import ImageDraw
 
 from ..render.color_scales import Coloring, smooth
 from ..render.rasterizer import Image
+from .defaults import JPEG_QUALITY
 from .text import BACKGROUND, write_scale
 
 #: (H, W, 3) or, with alpha that red, green and blue are not multiplied by, (H, W, 4).
@@ -22,6 +23,7 @@ Color = tuple[float, float, float]
 
 #: Deflate level of PNG: the next ones take twice as long for a few percent.
 PNG_LEVEL = 4
+
 
 #: Height of a picture whose scale is drawn in its own size; the least size, and the least picture that has a scale.
 WHOLE_HEIGHT, LEAST_UNIT, LEAST_PICTURE = 1000, 0.62, (400, 240)
@@ -118,11 +120,19 @@ def difference_bar(gain: float) -> Coloring:
     return smooth("difference", np.empty(0), GRAYS, marks)
 
 
-def encode(pixels: Pixels, form: str) -> bytes:
-    """The bytes of a "png" or, without loss, of a "webp"."""
+def encode(pixels: Pixels, form: str, jpeg_quality: int = JPEG_QUALITY) -> bytes:
+    """The bytes of a "png", of a "webp" without loss, or of a "jpg".
+
+    Args:
+        pixels: with alpha for "png" and "webp" only.
+        form: one of the three.
+        jpeg_quality: of a "jpg", 1 to 100.
+    """
     out = io.BytesIO()
     picture = Pillow.fromarray(pixels)
-    if form == "webp":
+    if form == "jpg":
+        picture.save(out, "JPEG", quality=jpeg_quality, subsampling="4:4:4", optimize=True)
+    elif form == "webp":
         picture.save(out, "WEBP", lossless=True, exact=True, method=2)
     else:
         picture.save(out, "PNG", compress_level=PNG_LEVEL)

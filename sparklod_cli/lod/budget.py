@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 
 from ..support.units import parse_count
 
 #: A share of the leaves, in percent, with at most nine digits after the point.
 SHARE = re.compile(r"([0-9]{1,3}(?:\.[0-9]{1,9})?|\.[0-9]{1,9})\s*%")
+
+#: The largest count: all up to it are whole numbers in every format of a table.
+LARGEST = 1 << 53
 
 
 @dataclass(frozen=True)
@@ -20,30 +23,35 @@ class Budget:
         text: as it was written: "5%" or "500k".
         share: of the leaves of all instances together; None for a count.
         count: splats; None for a share.
+        scale: multiplies it, Spark's `lodSplatScale`.
     """
 
     text: str
     share: Fraction | None
     count: int | None
+    scale: float = 1.0
 
     @classmethod
     def of_count(cls, count: int) -> Budget:
         """A budget of so many splats."""
         return cls(f"{count}", None, count)
 
+    def scaled(self, scale: float) -> Budget:
+        """The budget times a factor."""
+        return replace(self, scale=self.scale * scale)
+
     def of(self, leaves: int) -> int:
         """Splats, where all instances together have so many leaves; at least 1."""
-        if self.count is not None:
-            return self.count
-        assert self.share is not None
-        return max(1, int(self.share * leaves))
+        splats = self.count if self.share is None else self.share * leaves
+        assert splats is not None
+        return max(1, int(splats if self.scale == 1 else float(splats) * self.scale))
 
 
 def parse_budget(text: str) -> Budget:
     """The budget of a text such as "5%" or "500k".
 
     Raises:
-        ValueError: it is neither a share nor a count, or it is 0.
+        ValueError: it is neither a share nor a count, or it is 0 or a count beyond `LARGEST`.
     """
     text = text.strip()
     found = SHARE.fullmatch(text)
@@ -51,8 +59,10 @@ def parse_budget(text: str) -> Budget:
         budget = Budget(text, Fraction(found[1]) / 100, None) if found else Budget(text, None, parse_count(text))
     except ValueError:
         raise ValueError(f"{text!r} is neither a share such as 5% nor a count such as 500k") from None
-    if not (budget.share or budget.count):
-        raise ValueError(f"a budget of {text!r} leaves nothing to draw; give more than 0")
+    if budget.share == 0:
+        raise ValueError(f"a budget of {text} leaves nothing to draw; give more than 0%")
+    if budget.count is not None and not 1 <= budget.count <= LARGEST:
+        raise ValueError(f"the budget must be from 1 to 2^53, not {text}")
     return budget
 
 

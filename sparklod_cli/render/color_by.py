@@ -16,6 +16,7 @@ from ..model.splats import FloatArray
 from ..scenes.finder import CutSource
 from ..scenes.loaded import Index, LoadedScene, Part
 from ..support.errors import SparklodError
+from ..support.progress import Progress, silent
 from ..support.ticks import ticks
 from .color_scales import (
     CLIPPED,
@@ -79,8 +80,14 @@ def values_of(by: str, part: Part) -> FloatArray:
     return spark_size(part.splats) * np.float32(np.cbrt(np.linalg.det(part.object_to_world[:3, :3])))
 
 
-def scale_of_splats(by: str, source: CutSource, cameras: Sequence[Camera]) -> Scale:
+def scale_of_splats(by: str, source: CutSource, cameras: Sequence[Camera], progress: Progress = silent) -> Scale:
     """The scale of a colour that is of splats, for all that cameras may see; of whole numbers, for what they do see.
+
+    Args:
+        by: "level", "lod-opacity", "size" or "chunk".
+        source: of the splats.
+        cameras: that see them.
+        progress: is told how many cuts were looked at.
 
     Raises:
         SparklodError: by level, where no file is a tree.
@@ -89,7 +96,7 @@ def scale_of_splats(by: str, source: CutSource, cameras: Sequence[Camera]) -> Sc
     if by == "level" and not any(part.scene.is_tree for part in candidates):
         raise SparklodError("there are no levels to colour by: no file is a Level-of-Detail tree")
     if by in ("chunk", "level"):
-        return _whole(by, source, cameras)
+        return _whole(by, source, cameras, progress)
     every = max(1, sum(len(part.index) for part in candidates) // SAMPLE)
     values = np.concatenate([values_of(by, part)[::every] for part in candidates])
     return _opacities(values) if by == "lod-opacity" else _sizes(values)
@@ -122,12 +129,16 @@ def scale_of_overdraw(counts: Sequence[FloatArray]) -> Scale:
     return _linear("overdraw", 0.0, max(1.0, float(math.ceil(most))), MAGMA, ends=True)
 
 
-def _whole(by: str, source: CutSource, cameras: Sequence[Camera]) -> Scale:
+def _whole(by: str, source: CutSource, cameras: Sequence[Camera], progress: Progress) -> Scale:
     """From the least to the most that some cameras see; others may see less, or more."""
     every = -(-len(cameras) // CUTS)
-    parts = [part for camera in cameras[::every] for part in source.cut(camera).parts]
-    seen = [numbers_of(by, part.scene, part.index) for part in parts]
-    ends = [(int(numbers.min()), int(numbers.max())) for numbers in seen if len(numbers)] or [(0, 0)]
+    some = cameras[::every]
+    ends = []
+    for done, camera in enumerate(some, 1):
+        seen = (numbers_of(by, part.scene, part.index) for part in source.cut(camera).parts)
+        ends += [(int(numbers.min()), int(numbers.max())) for numbers in seen if len(numbers)]
+        progress("colours", done, len(some), "cut")
+    ends = ends or [(0, 0)]
     low, high = min(low for low, _ in ends), max(high for _, high in ends)
     beyond = int(every > 1)
     return Scale(whole_numbers(by, np.arange(low - beyond, high + 1 + beyond), low, high), low, high)

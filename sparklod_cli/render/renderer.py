@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ..cameras.camera import Camera
 from ..scenes.finder import CutSource
 from ..scenes.loaded import Cut
+from ..support.progress import Progress, silent
 from . import color_by, styles
 from .color_by import Scale
 from .rasterizer import Image
@@ -45,6 +46,7 @@ class Renderer:
         source: what is drawn.
         settings: how.
         cameras: that will see it; colours that mean something mean the same in the pictures of all of them.
+        progress: is told how many of the cameras were looked at for that.
 
     Attributes:
         scale: what the colours mean; None where they are those of the splats.
@@ -53,11 +55,13 @@ class Renderer:
         SparklodError: there is nothing to colour by.
     """
 
-    def __init__(self, source: CutSource, settings: RenderSettings, cameras: Sequence[Camera]) -> None:
+    def __init__(
+        self, source: CutSource, settings: RenderSettings, cameras: Sequence[Camera], *, progress: Progress = silent
+    ) -> None:
         self.source, self.settings = source, settings
-        self.scale = self._scale(cameras)
+        self.scale = self._scale(cameras, progress)
 
-    def _scale(self, cameras: Sequence[Camera]) -> Scale | None:
+    def _scale(self, cameras: Sequence[Camera], progress: Progress) -> Scale | None:
         by = self.settings.color_by
         if by is None:
             return None
@@ -66,7 +70,7 @@ class Renderer:
         if by == "overdraw":
             some = {number: cameras[number] for number in (0, len(cameras) // 2, len(cameras) - 1)}
             return color_by.scale_of_overdraw([self._overdraw(self.source.cut(at), at) for at in some.values()])
-        return color_by.scale_of_splats(by, self.source, cameras)
+        return color_by.scale_of_splats(by, self.source, cameras, progress)
 
     def draw(self, camera: Camera) -> Drawn:
         """The picture of a camera.

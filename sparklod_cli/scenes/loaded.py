@@ -198,6 +198,11 @@ class Scenes:
         return [loaded for loaded in self.loaded if loaded.is_tree]
 
     @functools.cached_property
+    def leaves(self) -> int:
+        """Leaves of all instances of trees together: what budgets are shares of."""
+        return sum(len(loaded.leaves) for loaded in self.of_instance if loaded.is_tree)
+
+    @functools.cached_property
     def forest(self) -> Forest:
         """The trees as the traversal reads them."""
         return Forest([self._nodes(loaded.scene) for loaded in self.trees])

@@ -14,16 +14,15 @@ from sparklod_cli.cameras.frame import DEFAULT_UP, Settings, camera_of
 from sparklod_cli.cameras.framing import (
     FILLED,
     OUTSIDE,
-    Balls,
-    balls_of,
     covered,
     distance,
     fitted,
     framing,
     middle_of,
-    with_reach,
+    reach,
 )
 from sparklod_cli.cameras.generators import orbit
+from sparklod_cli.model.balls import Balls, balls_of
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.render.settings import RasterSettings
 from sparklod_cli.support.errors import InvalidSplatsError
@@ -146,11 +145,12 @@ def test_a_scene_of_any_size_is_in_reach(size: float) -> None:
     scene = covered(Balls(np.random.default_rng(0).normal(size=(500, 3)) * size, np.zeros(500)))
     frames = orbit(5, (0, 0, 0), 1, 0, DEFAULT_UP)
     cameras = [fitted(camera_of(frame.matrix, frame.lens, 0, "", Settings()), scene) for frame in frames]
-    look = with_reach(RasterSettings(), cameras, scene)
+    default = RasterSettings()
+    near, far = reach(default.near, default.far, cameras, scene)
     for camera in cameras:
         depth = (scene.center - camera.position) @ camera.forward
-        assert look.near < depth.min()
-        assert look.far > depth.max()
-    assert look.near <= RasterSettings().near
-    assert look.far >= RasterSettings().far
-    assert np.isfinite(np.float32(look.far))
+        assert near < depth.min()
+        assert far > depth.max()
+    assert near <= default.near
+    assert far >= default.far
+    assert np.isfinite(np.float32(far))

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fixtures import by_hand, by_hand_compressed_ply, by_hand_ksplat, by_hand_sog, by_hand_splat
-from sparklod_cli.codecs import ply, splat, spz
+from sparklod_cli.codecs import ply, quantize, splat, spz
 from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.sh import SH_C0
@@ -165,7 +165,7 @@ def as_spz(source: Scene, version: int) -> bytes:
 def spz_precision(source: Scene, version: int) -> Precision:
     bits = spz.settled(source, WriteOptions(spz_version=version)).fractional_bits
     assert bits is not None
-    coding = spz.quantize.decode_quat_smallest_three if version == 3 else spz.quantize.decode_quat_first_three
+    coding = quantize.decode_quat_smallest_three if version == 3 else quantize.decode_quat_first_three
     return Precision(
         center=0.5 * 2.0**-bits,
         log_scale=1.001 / 32,

@@ -14,9 +14,11 @@ import pytest
 from click.testing import CliRunner, Result
 
 from sparklod_cli.cameras import generators
-from sparklod_cli.cameras.framing import FILLED, Balls
+from sparklod_cli.cameras.framing import FILLED
 from sparklod_cli.cameras.path import CameraPath
-from sparklod_cli.commands.camera_options import camera_options, cameras_from
+from sparklod_cli.commands.options.cameras import Cameras, camera_options
+from sparklod_cli.commands.usage import options_of
+from sparklod_cli.model.balls import Balls
 from sparklod_cli.support.errors import CameraPathError
 from tests.cameras.known import FOLDER, KNOWN, SIZE, check_pose
 
@@ -39,8 +41,11 @@ def run(*arguments: str | Path, scene: Any = scene_of_shells) -> tuple[Result, l
     @click.command()
     @camera_options
     @click.argument("inputs", nargs=-1)
-    def command(inputs: tuple[str, ...], **settings: Any) -> None:
-        found.append(cameras_from(settings, scene))
+    @click.pass_context
+    def command(ctx: click.Context, **_: Any) -> None:
+        asked = options_of(ctx, Cameras)
+        asked.check(ctx)
+        found.append(asked.read(scene))
 
     return CliRunner().invoke(command, [str(argument) for argument in arguments]), found
 
@@ -149,22 +154,22 @@ def test_a_world_transform_may_be_a_file(name: str, tmp_path: Path) -> None:
 
 
 def test_wrong_camera_options_are_errors_that_name_them() -> None:
-    assert "--orbit and --dolly cannot go together" in usage_error("--orbit", "3", "--dolly")
-    assert "--camera-path and --look-at" in usage_error("--camera-path", "x", "--look-at", "0,0,0:1,1,1")
-    assert "--camera-axes only means something with --camera-path" in usage_error("--camera-axes", "opencv-c2w")
-    assert "--center only means something with --orbit or --dolly" in usage_error(
+    assert "--orbit and --dolly cannot be used together" in usage_error("--orbit", "3", "--dolly")
+    assert "--camera-path and --look-at cannot" in usage_error("--camera-path", "x", "--look-at", "0,0,0:1,1,1")
+    assert "--camera-axes can only be used with --camera-path" in usage_error("--camera-axes", "opencv-c2w")
+    assert "--center can only be used with --orbit or --dolly" in usage_error(
         "--center", "0,0,0", "--look-at", "0,0,0:1,1,1"
     )
-    assert "--seconds only means something with --dolly or --keyframes" in usage_error("--seconds", "3")
+    assert "--seconds can only be used with --dolly or --keyframes" in usage_error("--seconds", "3")
     for wrong in ("1,2,3", "1,2,3:1,2", "1,2,3:1,2,3", "a:b", "1,2,3:4,5,nan"):
         assert "Invalid value for '--look-at'" in usage_error("--look-at", wrong)
-    assert "takes two keyframes" in usage_error("--keyframes", "1,2,3:4,5,6")
+    assert "fewer than two keyframes" in usage_error("--keyframes", "1,2,3:4,5,6")
     for wrong in ("640", "640x", "0x480", "640x99999", "640x4.8", "-640x480", "6\u00b2x7"):
         assert "such as 1280x720" in usage_error("--size", wrong)
     for option, wrong in {"--fov": "180", "--fps": "0", "--every": "0", "--orbit": "0", "--elevation": "90"}.items():
         assert f"Invalid value for '{option}'" in usage_error(option, wrong)
     assert "is no direction" in usage_error("--up", "0,0,0")
-    assert "--world-transform only means something with" in usage_error("--orbit", "3", "--world-transform", TURN)
+    assert "--world-transform can only be used with" in usage_error("--orbit", "3", "--world-transform", TURN)
     for wrong, said in {
         TURN.replace("-1", "1", 1): "has a matrix that mirrors",
         TURN.replace("-1", "-2", 1): "has axes that are not at right angles, or not of one length",
@@ -190,7 +195,7 @@ def test_files_that_are_not_what_they_should_be(tmp_path: Path) -> None:
 
 
 def test_a_file_of_gigabytes_is_not_read(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sparklod_cli.commands.camera_options.LARGEST", 100)
+    monkeypatch.setattr("sparklod_cli.cameras.sources.LARGEST", 100)
     assert "inria.json is larger than 0 MiB" in file_error("--camera-path", FOLDER / "inria.json")
     assert "it is a pipe or a device" in file_error("--camera-path", "/dev/null")
 
@@ -230,7 +235,7 @@ def test_the_help_names_what_there_is() -> None:
 
 def test_help_needs_nothing_heavy() -> None:
     code = (
-        "import sys, sparklod_cli.commands.camera_options; print([m for m in ('numpy', 'numba') if m in sys.modules])"
+        "import sys, sparklod_cli.commands.options.cameras; print([m for m in ('numpy', 'numba') if m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "[]\n"

@@ -14,8 +14,8 @@ from PIL import Image
 
 from sparklod_cli.figures import pyvista_scene
 from sparklod_cli.figures import tree_plot as plotting
-from sparklod_cli.figures.labels import BACKGROUND
 from sparklod_cli.figures.tree_plot import Picture, plot
+from sparklod_cli.images.text import BACKGROUND
 from sparklod_cli.lod import quick
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene

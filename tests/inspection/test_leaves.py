@@ -92,7 +92,7 @@ def test_any_coding_has_the_same_leaves(count: int, bits: int, degree: int, seed
     splats = random_splats(count, sh_degree=degree, seed=seed, extent=0.02)
     bits = min(bits, spz_options.largest_fractional_bits(splats.center))
     for version in (2, 3):
-        assert check(tree_of(splats, version=version, fractional_bits=bits), Scene(splats)) == []
+        assert check(tree_of(splats, spz_version=version, fractional_bits=bits), Scene(splats)) == []
 
 
 @pytest.mark.parametrize("column", ["quat_xyzw", "sh", "rgb", "scale", "opacity"])
@@ -204,7 +204,7 @@ def test_an_original_that_is_a_tree_has_leaves_of_its_own() -> None:
     splats = random_splats(100)
     scene = tree_of(splats)
     assert check(scene, scene) == []
-    assert check(scene, tree_of(splats, version=3, fractional_bits=20)) == []
+    assert check(scene, tree_of(splats, spz_version=3, fractional_bits=20)) == []
     assert check(tree_of(splats.take(slice(99))), scene) != []
 
 

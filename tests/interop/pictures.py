@@ -15,12 +15,13 @@ from sparklod_cli.cameras.framing import framing
 from sparklod_cli.cameras.pose import look_at
 from sparklod_cli.codecs.gpu import ext_splats, lod_tree
 from sparklod_cli.io import read_scene
-from sparklod_cli.lod.traversal import Forest, Instance, Traversal, View, pixel_limit
+from sparklod_cli.lod.settings import pixel_limit
+from sparklod_cli.lod.traversal import Forest, Traversal, TreeInstance, View
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.render.rasterizer import draw
 from sparklod_cli.render.settings import RasterSettings
-from sparklod_cli.render.shading import show
+from sparklod_cli.render.shading import shade
 from tests.interop.page import Page
 
 FOV_Y = math.radians(50)
@@ -75,7 +76,7 @@ def cut_of(held: Scene, camera: Camera, budget: int) -> NDArray[np.uint32]:
     nodes = lod_tree.unpack(lod_tree.pack(held.splats, held.tree))
     view = View(camera.camera_to_world, camera.fov_x, camera.fov_y)
     smallest = pixel_limit(camera.fov_y, camera.height)
-    return Traversal(Forest([nodes]), [Instance()]).cut(view, budget=budget, smallest=smallest).indices()[0]
+    return Traversal(Forest([nodes]), [TreeInstance()]).cut(view, budget=budget, smallest=smallest).indices()[0]
 
 
 def compare(
@@ -105,7 +106,7 @@ def _difference(
     nodes = cut_of(held, camera, budget) if budget else None
     rows = slice(None) if nodes is None else nodes
     image, again = (
-        np.clip(draw(show([(some.take(rows), np.eye(4))], camera), camera, look), 0, 1)
+        np.clip(draw(shade([(some.take(rows), np.eye(4))], camera), camera, look), 0, 1)
         for some in (splats, held.splats)
     )
     off = (np.rint(255 * image) / 255 - theirs.rounded)[..., :3]

@@ -14,9 +14,11 @@ import pytest
 
 from sparklod_cli.bake import BUILDERS
 from sparklod_cli.codecs.gpu import ext_splats, lod_tree
-from sparklod_cli.codecs.gpu.lod_tree import Nodes
 from sparklod_cli.io import read_scene
-from sparklod_cli.lod.traversal import CHUNK_NODES, Cones, Cut, Forest, Instance, Traversal, View, pixel_limit, views_of
+from sparklod_cli.lod.settings import pixel_limit
+from sparklod_cli.lod.traversal import CHUNK_NODES, Forest, Traversal, TreeCut, TreeInstance, View, views_of
+from sparklod_cli.model.foveation import Cones
+from sparklod_cli.model.nodes import Nodes
 from tests.conftest import FIXTURES, real_scene
 from tests.interop.spark import NODE, Spark
 from tests.lod.forests import rotation, transform
@@ -75,7 +77,7 @@ class Both:
         self._ids = [spark.keep_tree(tree.words) for tree in trees]
         self._forest = Forest([tree.nodes for tree in trees])
 
-    def check(self, instances: Sequence[Instance], camera: np.ndarray, budget: int, smallest: float) -> Cut:
+    def check(self, instances: Sequence[TreeInstance], camera: np.ndarray, budget: int, smallest: float) -> TreeCut:
         """The same nodes of each instance, the same least pixel scale, and the same chunks in the order in which they
         are wanted; but for those of the roots, which Spark always looks into.
         """
@@ -99,12 +101,12 @@ class Both:
         assert [nodes.tolist() for nodes in again.indices()] == [nodes.tolist() for nodes in cut.indices()]
         return cut
 
-    def pixel_scale(self, instance: Instance, camera: np.ndarray) -> np.float32:
+    def pixel_scale(self, instance: TreeInstance, camera: np.ndarray) -> np.float32:
         """Of the root."""
         (view,) = views_of(self._forest, [instance], View(camera, FOV_Y, FOV_Y))
         return budgeted_cuts.pixel_scale(self._forest.nodes[view["node_base"]], view)
 
-    def _instance(self, instance: Instance, camera: np.ndarray) -> dict[str, Any]:
+    def _instance(self, instance: TreeInstance, camera: np.ndarray) -> dict[str, Any]:
         view_to_object = np.linalg.inv(instance.object_to_world) @ camera
         cones = instance.foveation
         assert isinstance(cones, Cones)
@@ -157,7 +159,7 @@ def test_the_cut_of_one_tree_is_that_of_spark(spark: Spark, name: str, method: s
     both = Both(spark, [tree])
     reasons = set()
     for number, camera in enumerate(cameras(tree.nodes, views, seed=len(tree.words))):
-        instance = Instance(0, np.eye(4), LOD_SCALES[number % 5], FOVEATIONS[number % len(FOVEATIONS)])
+        instance = TreeInstance(0, np.eye(4), LOD_SCALES[number % 5], FOVEATIONS[number % len(FOVEATIONS)])
         # Three of four limits end above what the budget allows.
         smallest = LIMITS[number // 2 % len(LIMITS)] if number % 4 else 0.0
         budget = BUDGETS[number % len(BUDGETS)]
@@ -170,7 +172,7 @@ def test_every_cone_at_a_budget_that_is_used_up(spark: Spark) -> None:
     both = Both(spark, [tree])
     for camera in cameras(tree.nodes, 12, seed=3):
         for foveation in FOVEATIONS:
-            cut = both.check([Instance(0, foveation=foveation)], camera, len(tree.words) // 7, 0.0)
+            cut = both.check([TreeInstance(0, foveation=foveation)], camera, len(tree.words) // 7, 0.0)
             assert cut.reason == "budget" or foveation.behind == 0  # there, everything may count nothing
 
 
@@ -181,7 +183,7 @@ def test_the_cut_of_every_budget_is_that_of_spark(spark: Spark) -> None:
     camera = cameras(tree.nodes, 2, seed=4)[1]
     leaves = int(np.count_nonzero(tree.nodes.tree.is_leaf))
     for budget in (*range(1, 150), leaves - 1, leaves, leaves + 1):
-        cut = both.check([Instance(0, foveation=SPARKS_CONES)], camera, budget, 0.0)
+        cut = both.check([TreeInstance(0, foveation=SPARKS_CONES)], camera, budget, 0.0)
         assert (cut.reason == "exhausted") == (budget >= leaves)
 
 
@@ -198,7 +200,7 @@ def test_instances_compete_for_one_budget(spark: Spark, names: list[str], views:
             if instances and rng.random() < 0.3:
                 moved = instances[-1].object_to_world
             chosen = (int(rng.integers(len(trees))), rng.choice(LOD_SCALES), FOVEATIONS[rng.integers(len(FOVEATIONS))])
-            instances.append(Instance(chosen[0], moved, float(chosen[1]), chosen[2]))
+            instances.append(TreeInstance(chosen[0], moved, float(chosen[1]), chosen[2]))
         if number % 4 == 0:
             instances = [instances[0]] * len(instances)  # they tie all the way down
         both.check(instances, camera, BUDGETS[number % 5], LIMITS[number % 3])
@@ -212,7 +214,7 @@ def test_the_cut_of_a_tree_that_spark_built_is_that_of_spark(spark: Spark, name:
     assert (tree.nodes.tree.child_count == words.view(NODE)["child_count"][:, 0]).all()
     both = Both(spark, [tree])
     for number, camera in enumerate(cameras(tree.nodes, 40, seed=6)):
-        instance = Instance(0, np.eye(4), LOD_SCALES[number % 5], FOVEATIONS[number % len(FOVEATIONS)])
+        instance = TreeInstance(0, np.eye(4), LOD_SCALES[number % 5], FOVEATIONS[number % len(FOVEATIONS)])
         both.check([instance], camera, BUDGETS[number % 6], LIMITS[number % 3])
 
 
@@ -227,7 +229,7 @@ def test_pixel_scales_are_those_of_spark_bit_for_bit(spark: Spark) -> None:
     for number in range(600):
         camera = transform(rng, spread=(0.2, 3.0, 100.0)[number % 3])
         moved = transform(rng, scale=math.exp(rng.normal())) if number % 2 else np.eye(4)
-        instance = Instance(0, moved, rng.uniform(0.1, 3), FOVEATIONS[rng.integers(len(FOVEATIONS))])
+        instance = TreeInstance(0, moved, rng.uniform(0.1, 3), FOVEATIONS[rng.integers(len(FOVEATIONS))])
         scale = both.pixel_scale(instance, camera)
         if scale > 0:
             assert len(both.check([instance], camera, 9, float(np.nextafter(scale, np.float32(0))))) == 2
@@ -242,7 +244,7 @@ def test_the_chunks_that_are_wanted_are_those_of_spark(spark: Spark, name: str) 
     chunks = -(-len(tree.words) // CHUNK_NODES)
     assert chunks > 2
     touched = {
-        len(both.check([Instance()], camera, budget, 0.0).chunks())
+        len(both.check([TreeInstance()], camera, budget, 0.0).chunks())
         for camera in cameras(tree.nodes, 15, seed=7)
         for budget in (1_000, 30_000, 200_000)
     }

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from hypothesis import strategies as st
 
-from sparklod_cli.codecs.gpu.lod_tree import Nodes
-from sparklod_cli.lod.traversal import Cones, Cut, Forest, Frustum, Instance, Traversal, View
+from sparklod_cli.lod.traversal import Forest, Traversal, TreeCut, TreeInstance, View
+from sparklod_cli.model.foveation import Cones, Frustum
 from sparklod_cli.model.lod_tree import LodTree
+from sparklod_cli.model.nodes import Nodes
 from tests.references import budgeted_cuts
 
 FOVEATIONS = (
@@ -34,7 +35,7 @@ class Case:
     """What a cut is asked of."""
 
     trees: list[Nodes]
-    instances: list[Instance]
+    instances: list[TreeInstance]
     view: View
     budget: int
     smallest: float
@@ -42,7 +43,7 @@ class Case:
     def traversal(self) -> Traversal:
         return Traversal(Forest(self.trees), self.instances)
 
-    def find(self, found: Traversal | None = None, resident: np.ndarray | None = None) -> Cut:
+    def find(self, found: Traversal | None = None, resident: np.ndarray | None = None) -> TreeCut:
         found = found or self.traversal()
         return found.cut(self.view, budget=self.budget, smallest=self.smallest, resident=resident)
 
@@ -52,19 +53,21 @@ class Case:
         return sum(len(self.trees[instance.tree].size) for instance in self.instances)
 
 
-def expected_cut(case: Case, cut: Cut, resident: np.ndarray | None = None, bits: int = 16) -> budgeted_cuts.BudgetedCut:
+def expected_cut(
+    case: Case, cut: TreeCut, resident: np.ndarray | None = None, bits: int = 16
+) -> budgeted_cuts.BudgetedCut:
     """The twin's, for the views of a cut."""
     forest = Forest(case.trees)
     there = np.ones(forest.chunks, bool) if resident is None else resident
     return budgeted_cuts.budgeted_cut(forest.nodes, cut.views, case.budget, case.smallest, there.__getitem__, bits)
 
 
-def drawn(cut: Cut) -> list[tuple[int, int]]:
+def drawn(cut: TreeCut) -> list[tuple[int, int]]:
     """(instance, index) of each node of a cut."""
     return list(zip(cut.instance.tolist(), cut.node.tolist(), strict=True))
 
 
-def check(case: Case, cut: Cut, resident: np.ndarray | None = None, bits: int = 16) -> None:
+def check(case: Case, cut: TreeCut, resident: np.ndarray | None = None, bits: int = 16) -> None:
     """A cut is that of the queue, with all that is told of it."""
     expected = expected_cut(case, cut, resident, bits)
     nodes = drawn(cut)
@@ -164,9 +167,9 @@ def cases(draw: st.DrawFn, max_nodes: int = 40) -> Case:
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
 
     @st.composite
-    def some_instances(draw: st.DrawFn) -> Instance:
+    def some_instances(draw: st.DrawFn) -> TreeInstance:
         scale = draw(st.sampled_from([1.0, 1.0, 0.5, 1.7]))
-        return Instance(
+        return TreeInstance(
             tree=draw(st.integers(0, len(trees) - 1)),
             object_to_world=np.eye(4) if draw(st.booleans()) else transform(rng, scale=scale),
             lod_scale=draw(st.sampled_from([1.0, 1.0, 1.0, 0.25, 3.0, 0.0])),

@@ -10,8 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sparklod_cli.lod.continuous import BlendedCut, ContinuousCuts, faded, find_threshold, pixel_scales, shares
-from sparklod_cli.lod.traversal import Cones, Forest, Instance, Traversal, View
+from sparklod_cli.lod.continuous import BlendedCut, ContinuousCuts, faded, find_threshold, shares
+from sparklod_cli.lod.foveation import pixel_scales
+from sparklod_cli.lod.traversal import Forest, Traversal, TreeInstance, View
+from sparklod_cli.model.foveation import Cones
 from sparklod_cli.model.gaussian import lod_opacity
 from tests.lod.forests import Case, cases, random_tree, transform
 from tests.references import budgeted_cuts
@@ -50,7 +52,7 @@ def some_case(seed: int, count: int = 400, foveation: Cones = SPARK) -> Case:
     """A tree twice."""
     rng = np.random.default_rng(seed)
     tree = random_tree(rng, count, 5)
-    instances = [Instance(0, np.eye(4), 1.0, foveation), Instance(0, transform(rng, spread=4), 0.7, foveation)]
+    instances = [TreeInstance(0, np.eye(4), 1.0, foveation), TreeInstance(0, transform(rng, spread=4), 0.7, foveation)]
     return Case([tree], instances, view_from((0.3, -0.2, 6.0)), count // 2, 0.0)
 
 

@@ -10,9 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sparklod_cli.codecs.gpu.lod_tree import Nodes
 from sparklod_cli.lod.cut_statistics import Changes, Measured, measure
-from sparklod_cli.lod.traversal import Cut, Instance, Traversal, View, pixel_limit
+from sparklod_cli.lod.settings import pixel_limit
+from sparklod_cli.lod.traversal import Traversal, TreeCut, TreeInstance, View
+from sparklod_cli.model.nodes import Nodes
 from tests.lod.forests import Case, cases, drawn, expected_cut, links, views
 
 SIZE = (640, 480)
@@ -22,12 +23,12 @@ def levels(case: Case) -> np.ndarray:
     return np.concatenate([tree.tree.depths() for tree in case.trees])
 
 
-def told(case: Case, cut: Cut, *, size: tuple[int, int] = SIZE) -> tuple[Measured, list[Measured]]:
+def told(case: Case, cut: TreeCut, *, size: tuple[int, int] = SIZE) -> tuple[Measured, list[Measured]]:
     found = case.traversal()
     return measure(found.forest, levels(case), cut, case.view, size=size, by_instance=True)
 
 
-def expected(case: Case, cut: Cut, instances: list[int], waiting: set[tuple[int, int]]) -> dict:
+def expected(case: Case, cut: TreeCut, instances: list[int], waiting: set[tuple[int, int]]) -> dict:
     """The same figures of the nodes of some instances, in numpy, an instance at a time."""
     level, pixels, places, sizes = [], [], [], []
     tan_x, tan_y = (np.float32(math.tan(fov / 2)) for fov in (case.view.fov_x, case.view.fov_y))
@@ -117,7 +118,7 @@ def test_changes_are_those_of_sets(case: Case, data: st.DataObject) -> None:
 def at_distance(center: list[float], size: float) -> Measured:
     """Of one splat, seen from the origin."""
     tree = Nodes(np.array([center], np.float32), np.array([size], np.float32), links([]))
-    case = Case([tree], [Instance()], View(np.eye(4), math.radians(90), math.radians(90)), 1, 0.0)
+    case = Case([tree], [TreeInstance()], View(np.eye(4), math.radians(90), math.radians(90)), 1, 0.0)
     found = Traversal(case.traversal().forest, case.instances)
     whole, parts = told(case, case.find(found), size=(100, 100))
     assert parts == [whole]
@@ -146,7 +147,7 @@ def test_a_size_that_is_none_fills_the_picture(bad: float) -> None:
 
 def test_a_cut_of_nothing_has_no_figures() -> None:
     tree = Nodes(np.zeros((1, 3), np.float32), np.ones(1, np.float32), links([]))
-    case = Case([tree], [Instance()], View(np.eye(4), 1.0, 1.0), 1, 0.0)
+    case = Case([tree], [TreeInstance()], View(np.eye(4), 1.0, 1.0), 1, 0.0)
     cut = case.find(resident=np.zeros(1, np.bool_))
     whole, parts = told(case, cut)
     nothing = Measured(0, 0, 0, 0, 0, 0, None, None, None, None, None, 0.0)

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sparklod_cli.lod import traversal
-from sparklod_cli.lod.traversal import Forest, Instance, View
+from sparklod_cli.lod.traversal import Forest, TreeInstance, View
 from sparklod_cli.support import jit
 from tests.lod.forests import Case, ancestors_drawn, cases, check, random_tree, transform
 
@@ -97,7 +97,7 @@ class TestSmallChunks:
 def test_the_cut_of_large_trees_with_missing_chunks_is_that_of_one_queue(seed: int) -> None:
     rng = np.random.default_rng(seed)
     trees = [random_tree(rng, 200_000, 6), random_tree(rng, 100_000, 3)]
-    instances = [Instance(tree, transform(rng, spread=2.0), 1.0 + tree) for tree in (0, 1, 0)]
+    instances = [TreeInstance(tree, transform(rng, spread=2.0), 1.0 + tree) for tree in (0, 1, 0)]
     view = View(transform(rng, spread=4.0), math.radians(80), math.radians(60))
     case = Case(trees, instances, view, 30_000, 0.0)
     found = case.traversal()

@@ -24,15 +24,15 @@ from sparklod_cli.images.metrics import psnr
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod import quality, quick
 from sparklod_cli.lod.kernels.prune import MOST_CHILDREN, STEPS
-from sparklod_cli.lod.traversal import Forest, Instance, Traversal
+from sparklod_cli.lod.traversal import Forest, Traversal, TreeInstance
 from sparklod_cli.model.gaussian import spark_size
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.selection import Selection
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.render.rasterizer import Image, draw
 from sparklod_cli.render.settings import RasterSettings
-from sparklod_cli.render.shading import show
-from sparklod_cli.simulation.frames import view_of
+from sparklod_cli.render.shading import shade
+from sparklod_cli.scenes.finder import view_of
 from sparklod_cli.support import jit
 from sparklod_cli.support.errors import InvalidSplatsError
 from tests.conftest import real_scene
@@ -210,14 +210,14 @@ def cameras_around(splats: Splats) -> tuple[Camera, ...]:
 
 
 def picture(splats: Splats, camera: Camera) -> Image:
-    return draw(show([(splats, np.eye(4))], camera), camera, RasterSettings())
+    return draw(shade([(splats, np.eye(4))], camera), camera, RasterSettings())
 
 
 def fidelity(splats: Splats, built: tuple[Splats, LodTree], share: float) -> float:
     """Mean PSNR of cuts of so many of the leaves, in dB."""
     nodes, tree = built
     forest = Forest([lod_tree.unpack(lod_tree.pack(nodes, tree, threads=2))])
-    traversal = Traversal(forest, [Instance()])
+    traversal = Traversal(forest, [TreeInstance()])
     found = []
     for camera in cameras_around(splats):
         full = picture(splats, camera)

@@ -12,8 +12,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sparklod_cli.codecs.gpu.lod_tree import Nodes
-from sparklod_cli.lod.traversal import CHUNK_NODES, LOOKS, Cones, Forest, Frustum, Instance, View, pixel_limit, views_of
+from sparklod_cli.lod.settings import pixel_limit
+from sparklod_cli.lod.traversal import CHUNK_NODES, VISITS, Forest, TreeInstance, View, views_of
+from sparklod_cli.model.foveation import Cones, Frustum
+from sparklod_cli.model.nodes import Nodes
 from tests.lod.forests import Case, ancestors_drawn, cases, check, drawn, links, random_tree, rotation, transform, views
 from tests.references import budgeted_cuts
 
@@ -103,7 +105,9 @@ def large_case(seed: int, *, nodes: int = 150_000, instances: int = 3) -> Case:
     trees = [random_tree(rng, nodes, 5), random_tree(rng, nodes // 3, 2)]
     foveations = (Cones(90, 120, 0.4, 0.2), Frustum(0.3, 0.1), Cones())
     placed = [
-        Instance(number % 2, transform(rng, scale=rng.uniform(0.5, 2), spread=2.0), 1.0 + number, foveations[number])
+        TreeInstance(
+            number % 2, transform(rng, scale=rng.uniform(0.5, 2), spread=2.0), 1.0 + number, foveations[number]
+        )
         for number in range(instances)
     ]
     return Case(trees, placed, View(transform(rng, spread=4.0), math.radians(80), math.radians(60)), 10_000, 0.0)
@@ -137,11 +141,11 @@ def test_threads_share_a_traversal() -> None:
 def test_chains_that_are_longer_than_the_buffers(ends: int) -> None:
     """A node of one child adds nothing, so no budget bounds how many are looked at."""
     length = 4 * CHUNK_NODES
-    assert length > LOOKS * ends + CHUNK_NODES
+    assert length > VISITS * ends + CHUNK_NODES
     tree = links([1] * length + ([ends] + [1] * ends * 1000 if ends > 1 else []))
     rng = np.random.default_rng(ends)
     size = rng.uniform(0.5, 1, len(tree)).astype(np.float32)
-    case = Case([Nodes(np.zeros((len(tree), 3), np.float32), size, tree)], [Instance()], seen_from(2.0), ends, 0.0)
+    case = Case([Nodes(np.zeros((len(tree), 3), np.float32), size, tree)], [TreeInstance()], seen_from(2.0), ends, 0.0)
     found = case.traversal()
     for budget in (ends, 1, ends):
         cut = dataclasses.replace(case, budget=budget).find(found)
@@ -161,7 +165,7 @@ def test_a_node_is_looked_at_twice() -> None:
     """Where the buffers are as long as the tree: by the threshold, then by the queue."""
     tree = links([2, 2, 2])
     size = np.array([1, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5], np.float32)
-    case = Case([Nodes(np.zeros((7, 3), np.float32), size, tree)], [Instance()], seen_from(5.0), 3, 0.0)
+    case = Case([Nodes(np.zeros((7, 3), np.float32), size, tree)], [TreeInstance()], seen_from(5.0), 3, 0.0)
     cut = case.find()
     check(case, cut)
     assert sorted(cut.node.tolist()) == [1, 5, 6]
@@ -171,7 +175,7 @@ def test_many_children_and_many_instances() -> None:
     tree = links([65535])
     rng = np.random.default_rng(0)
     center = rng.normal(size=(65536, 3)).astype(np.float32)
-    instances = [Instance(object_to_world=transform(rng)) for _ in range(300)]
+    instances = [TreeInstance(object_to_world=transform(rng)) for _ in range(300)]
     case = Case([Nodes(center, np.ones(65536, np.float32), tree)], instances, seen_from(20.0), 65534 + 300, 0.0)
     cut = case.find()
     assert len(cut) == 300 + 65534
@@ -185,7 +189,7 @@ def test_pixel_scales_are_those_of_the_world(seed: int, foveation: Cones | Frust
     """An instance is seen in its own space, which comes to the same but for rounding."""
     rng = np.random.default_rng(seed)
     scale = rng.uniform(0.2, 5)
-    placed = Instance(0, transform(rng, scale=scale), rng.uniform(0.5, 2), foveation)
+    placed = TreeInstance(0, transform(rng, scale=scale), rng.uniform(0.5, 2), foveation)
     view = View(transform(rng, spread=3.0), 1.4, 1.0)
     tree = random_tree(rng, 50, 3)
     forest = Forest([tree])
@@ -220,7 +224,7 @@ def test_the_order_of_equals_is_that_of_instances_and_indices() -> None:
     """The last instance first, and in it the last node."""
     tree = links([3, 2, 2, 2])
     nodes = Nodes(np.zeros((10, 3), np.float32), np.ones(10, np.float32), tree)
-    case = Case([nodes], [Instance(), Instance()], seen_from(2.0), 0, 0.0)
+    case = Case([nodes], [TreeInstance(), TreeInstance()], seen_from(2.0), 0, 0.0)
     found = case.traversal()
     divided = {2: [], 3: [], 4: [(1, 0)], 5: [(1, 0), (1, 3)], 7: [(1, 0), (1, 3), (1, 2), (1, 1)], 9: [(1, 0), (0, 0)]}
     everything = set(itertools.product(range(2), range(10)))

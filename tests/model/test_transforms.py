@@ -18,7 +18,7 @@ from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.model.transforms import LARGEST, ROWS, Transform, sh_basis, sh_rotations
 from sparklod_cli.render.rasterizer import Image, draw
 from sparklod_cli.render.settings import RasterSettings
-from sparklod_cli.render.shading import show
+from sparklod_cli.render.shading import shade
 from sparklod_cli.support.defaults import UP_AXES
 from tests.references.gaussians import covariance as reference_covariance
 from tests.references.gaussians import rotation_matrix
@@ -312,7 +312,7 @@ def picture(splats: Splats, transform: Transform) -> Image:
     moved[:3, 3] = transform.scale * transform.rotation @ pose[:3, 3] + transform.translation
     camera = Camera(moved, 160, 120, (150.0, 150.0), (80.0, 60.0))
     settings = RasterSettings(near=0.01 * transform.scale, far=100 * transform.scale)
-    return draw(show([(splats, np.eye(4))], camera), camera, settings)
+    return draw(shade([(splats, np.eye(4))], camera), camera, settings)
 
 
 MOVES = [

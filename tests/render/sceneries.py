@@ -1,15 +1,15 @@
-"""Splats, cameras and sceneries to draw in tests."""
+"""Splats, cameras and scenes to draw in tests."""
 
 from __future__ import annotations
-
-from pathlib import Path
 
 import numpy as np
 
 from sparklod_cli.cameras.camera import Camera
+from sparklod_cli.model.instances import Instance
+from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
-from sparklod_cli.scenery import Scenery, Source
-from sparklod_cli.world import Placement
+from sparklod_cli.scenes.finder import CutFinder
+from sparklod_cli.scenes.reading import read_scenes
 
 
 def balls(*centers: tuple[float, float, float], size: float = 0.3, opacity: float = 1.0, rgb: object = 1.0) -> Splats:
@@ -31,10 +31,7 @@ def camera(width: int = 64, height: int = 48, z: float = 5.0) -> Camera:
     return Camera(pose, width, height, (focal, focal), (width / 2, height / 2))
 
 
-def plain(*parts: Splats) -> Scenery:
-    """Splats of files that have no tree."""
-    sources, chunks = [], 0
-    for part in parts:
-        sources.append(Source(part, None, np.arange(len(part)), chunks))
-        chunks += sources[-1].chunks
-    return Scenery([Placement(Path(f"{number}.ply"), str(number)) for number in range(len(parts))], sources, None)
+def plain(*parts: Splats) -> CutFinder:
+    """Scenes without trees, in full."""
+    instances = [Instance(Scene(part), str(number)) for number, part in enumerate(parts)]
+    return CutFinder(read_scenes(instances), None)

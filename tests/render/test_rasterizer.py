@@ -18,7 +18,7 @@ from sparklod_cli.model.gaussian import normalized_quat
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.render.rasterizer import Image, draw
 from sparklod_cli.render.settings import PROFILES, SORTS, RasterSettings
-from sparklod_cli.render.shading import ShadedSplats, show
+from sparklod_cli.render.shading import ShadedSplats, shade
 from sparklod_cli.support import jit
 from tests.references import spark_pictures
 from tests.scenes import random_splats
@@ -183,7 +183,7 @@ def test_more_than_opaque_is_never_more_than_five() -> None:
 def test_colours_follow_the_direction_by_spherical_harmonics(sh_degree: int) -> None:
     splats = random_splats(200, sh_degree=sh_degree)
     eye = (1.0, -2.0, 3.0)
-    seen = show([(splats, np.eye(4))], camera_at(eye))
+    seen = shade([(splats, np.eye(4))], camera_at(eye))
     np.testing.assert_allclose(seen.rgb, spark_pictures.seen_rgb(splats, np.array(eye)), atol=2e-6)
     check(seen, camera_at(eye))
 
@@ -196,8 +196,8 @@ def test_placing_splats_is_moving_the_camera(size: float) -> None:
     moved = matrix @ camera.camera_to_world
     moved[:3, :3] /= size
     there = dataclasses.replace(camera, camera_to_world=moved)
-    placed = draw(show([(splats, matrix)], there), there, RasterSettings())
-    plain = draw(show([(splats, np.eye(4))], camera), camera, RasterSettings())
+    placed = draw(shade([(splats, matrix)], there), there, RasterSettings())
+    plain = draw(shade([(splats, np.eye(4))], camera), camera, RasterSettings())
     close = np.abs(placed - plain).max(axis=-1) < MOST
     assert close.mean() > 0.99 and plain[..., 3].mean() > 0.02
 
@@ -205,8 +205,8 @@ def test_placing_splats_is_moving_the_camera(size: float) -> None:
 def test_several_objects_are_drawn_as_one() -> None:
     splats, camera = random_splats(300, sh_degree=2), camera_at()
     parts = [(splats.take(slice(0, 100)), np.eye(4)), (splats.take(slice(100, 300)), np.eye(4))]
-    whole = draw(show([(splats, np.eye(4))], camera), camera, RasterSettings())
-    np.testing.assert_array_equal(draw(show(parts, camera), camera, RasterSettings()), whole)
+    whole = draw(shade([(splats, np.eye(4))], camera), camera, RasterSettings())
+    np.testing.assert_array_equal(draw(shade(parts, camera), camera, RasterSettings()), whole)
 
 
 @pytest.mark.parametrize("profile", PROFILES)
@@ -262,7 +262,7 @@ def test_alpha_is_no_more_than_one(seed: int, most: float, profile: str) -> None
 def test_an_empty_scene_is_transparent() -> None:
     assert not draw(shown(0), camera_at(), RasterSettings()).any()
     no_splats = Splats(*(column[:0] for column in dataclasses.astuple(random_splats(1))))
-    assert not draw(show([(no_splats, np.eye(4))], camera_at()), camera_at(), RasterSettings()).any()
+    assert not draw(shade([(no_splats, np.eye(4))], camera_at()), camera_at(), RasterSettings()).any()
 
 
 def test_splats_without_opacity_are_not_drawn() -> None:

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from sparklod_cli.render.backends import BACKENDS
-from sparklod_cli.render.renderer import Drawn, Renderer, RenderSettings
-from sparklod_cli.render.settings import RasterSettings
-from sparklod_cli.render.shading import show
+from sparklod_cli.render.renderer import Drawn, Renderer
+from sparklod_cli.render.settings import RasterSettings, RenderSettings
+from sparklod_cli.render.shading import shade
 from sparklod_cli.render.styles import BILLBOARD_ALPHA
-from sparklod_cli.scenery import Scenery
+from sparklod_cli.scenes.finder import CutFinder
 from sparklod_cli.support.defaults import COLOR_BY, STYLES
 from sparklod_cli.support.errors import SparklodError
 from tests.render.sceneries import balls, camera, plain
@@ -23,22 +23,22 @@ RED, GREEN, BLUE = np.eye(3)
 MIDDLE = (24, 32)
 
 
-def drawn(scenery: Scenery, **how: object) -> Drawn:
-    return Renderer(scenery, RenderSettings(**how), [camera()]).draw(camera())
+def drawn(source: CutFinder, **how: object) -> Drawn:
+    return Renderer(source, RenderSettings(**how), [camera()]).draw(camera())
 
 
 def test_splats_are_what_the_backend_draws() -> None:
     splats, at = random_splats(300, sh_degree=2), camera()
     image = Renderer(plain(splats), RenderSettings(), [at]).draw(at).image
-    assert np.array_equal(image, BACKENDS["numba"].draw(show([(splats, np.eye(4))], at), at, RasterSettings()))
+    assert np.array_equal(image, BACKENDS["numba"].draw(shade([(splats, np.eye(4))], at), at, RasterSettings()))
 
 
 def test_several_threads_draw_the_same() -> None:
     at = camera()
-    painter = Renderer(plain(random_splats(2000)), RenderSettings(), [at])
-    expected = painter.draw(at).image
+    renderer = Renderer(plain(random_splats(2000)), RenderSettings(), [at])
+    expected = renderer.draw(at).image
     with ThreadPoolExecutor(4) as pool:
-        for drawn in pool.map(painter.draw, [at] * 12):
+        for drawn in pool.map(renderer.draw, [at] * 12):
             assert np.array_equal(drawn.image, expected)
 
 
@@ -59,9 +59,9 @@ def test_a_point_is_an_opaque_pixel() -> None:
 def test_points_and_billboards_are_in_the_order_of_the_file() -> None:
     near, far = (0.0, 0.0, 1.0), (0.0, 0.0, -1.0)
     for first, last, top in ((near, far, GREEN), (far, near, GREEN)):
-        scenery = plain(balls(first, last, rgb=[RED, GREEN]))
-        assert np.array_equal(drawn(scenery, style="points").image[MIDDLE][:3], top)
-        image = drawn(scenery, style="billboards").image
+        source = plain(balls(first, last, rgb=[RED, GREEN]))
+        assert np.array_equal(drawn(source, style="points").image[MIDDLE][:3], top)
+        image = drawn(source, style="billboards").image
         expected = BILLBOARD_ALPHA * (1 - BILLBOARD_ALPHA) * RED + BILLBOARD_ALPHA * GREEN
         assert np.allclose(image[MIDDLE], [*expected, 1 - (1 - BILLBOARD_ALPHA) ** 2])
 
@@ -72,7 +72,7 @@ def test_sorted_billboards_have_the_nearest_on_top() -> None:
     for centers, rgb in (((far, near), [RED, GREEN]), ((near, far), [GREEN, RED])):
         for sort in ("radial", "z"):
             image = drawn(
-                plain(balls(*centers, rgb=rgb)), style="sorted-billboards", look=RasterSettings(sort=sort)
+                plain(balls(*centers, rgb=rgb)), style="sorted-billboards", raster=RasterSettings(sort=sort)
             ).image
             assert np.allclose(image[MIDDLE][:3], expected)
 
@@ -88,10 +88,10 @@ def test_a_billboard_is_as_wide_as_its_splat() -> None:
 
 @pytest.mark.parametrize("style", STYLES)
 def test_what_is_too_near_or_too_far_is_not_drawn(style: str) -> None:
-    scenery = plain(balls((0, 0, 0)))
-    for look in (RasterSettings(near=5.1), RasterSettings(far=4.9)):
-        assert not drawn(scenery, style=style, look=look).image.any()
-    assert drawn(scenery, style=style, look=RasterSettings(near=4.9, far=5.1)).image.any()
+    source = plain(balls((0, 0, 0)))
+    for raster in (RasterSettings(near=5.1), RasterSettings(far=4.9)):
+        assert not drawn(source, style=style, raster=raster).image.any()
+    assert drawn(source, style=style, raster=RasterSettings(near=4.9, far=5.1)).image.any()
     assert not drawn(plain(balls((0, 0, 9))), style=style).image.any()
 
 
@@ -99,9 +99,9 @@ def test_what_is_too_near_or_too_far_is_not_drawn(style: str) -> None:
 def test_colours_are_those_of_the_scale(by: str) -> None:
     left, right = (-1.0, 0.0, 0.0), (1.0, 0.0, 0.0)
     first, second = balls(left, opacity=1.0, size=0.25), balls(right, opacity=30.0, size=0.4)
-    painter = Renderer(plain(first, second), RenderSettings(color_by=by), [camera()])
-    assert painter.scale is not None
-    image = painter.draw(camera()).image
+    renderer = Renderer(plain(first, second), RenderSettings(color_by=by), [camera()])
+    assert renderer.scale is not None
+    image = renderer.draw(camera()).image
     values = {"lod-opacity": (1.0, np.sqrt(1 + np.e * np.log(30))), "chunk": (0, 1)}
     large = 2 * 0.4 * (1 + 0.7 * (values["lod-opacity"][1] - 1))
     values["size"] = (0.5, large)
@@ -109,7 +109,7 @@ def test_colours_are_those_of_the_scale(by: str) -> None:
         column = round(32 + camera().focal[0] * center[0] / 5)
         pixel = image[24, column]
         assert pixel[3] > 0.8
-        assert np.allclose(pixel[:3] / pixel[3], painter.scale.rgb(np.array(value)), atol=0.01)
+        assert np.allclose(pixel[:3] / pixel[3], renderer.scale.rgb(np.array(value)), atol=0.01)
 
 
 def test_a_colour_that_means_something_is_not_lit() -> None:
@@ -140,10 +140,10 @@ def test_a_scale_is_of_all_cameras() -> None:
     assert scale is not None
     assert (scale.low, scale.high) == pytest.approx((3, 30))
     for by in ("overdraw", "size"):
-        painter = Renderer(plain(random_splats(500)), RenderSettings(color_by=by), [near, far])
-        before = painter.scale
-        painter.draw(near)
-        assert painter.scale is before
+        renderer = Renderer(plain(random_splats(500)), RenderSettings(color_by=by), [near, far])
+        before = renderer.scale
+        renderer.draw(near)
+        assert renderer.scale is before
 
 
 def test_depth_is_the_mean_by_what_is_seen() -> None:
@@ -154,8 +154,8 @@ def test_depth_is_the_mean_by_what_is_seen() -> None:
 
 
 def test_overdraw_counts_splats_a_pixel() -> None:
-    scenery = plain(balls((0, 0, 1), (0, 0, 0), (0, 0, -1), (1.5, 0, 0), size=0.2))
-    result = drawn(scenery, color_by="overdraw")
+    source = plain(balls((0, 0, 1), (0, 0, 0), (0, 0, -1), (1.5, 0, 0), size=0.2))
+    result = drawn(source, color_by="overdraw")
     assert result.values is not None
     assert result.values[MIDDLE] == 3
     assert result.values[24, round(32 + camera().focal[0] * 1.5 / 5)] == 1
@@ -167,9 +167,9 @@ def test_overdraw_counts_splats_a_pixel() -> None:
 def test_overdraw_is_where_something_is_drawn(profile: str) -> None:
     splats = random_splats(40, seed=4)
     splats.opacity[::4] = 20  # merged ones, too
-    at, look = camera(200, 150), RasterSettings(profile=profile)
+    at, raster = camera(200, 150), RasterSettings(profile=profile)
     counted, image = (
-        Renderer(plain(splats), RenderSettings(look=look, color_by=by), [at]).draw(at) for by in ("overdraw", None)
+        Renderer(plain(splats), RenderSettings(raster=raster, color_by=by), [at]).draw(at) for by in ("overdraw", None)
     )
     assert counted.values is not None
     differ = (counted.values > 0) != (image.image[..., 3] > 0)

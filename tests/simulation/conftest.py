@@ -1,29 +1,33 @@
-"""The worlds that tests of frames share."""
+"""The scenes that tests of frames share."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from sparklod_cli.lod.traversal import Frustum
-from sparklod_cli.world import Placement, World, read_world
+from sparklod_cli.model.foveation import Frustum
+from sparklod_cli.model.instances import Instance
+from sparklod_cli.scenes.loaded import Scenes
+from sparklod_cli.scenes.reading import TRAVERSED, read_scenes
 from tests.lod.forests import transform
 from tests.simulation.worlds import HAND, TOWN
 
 
 @pytest.fixture(scope="package")
-def town() -> World:
+def town() -> Scenes:
     """165,205 nodes in three chunks."""
-    return read_world([Placement(TOWN, "town")])
+    return read_scenes([Instance(TOWN, "town")], columns=TRAVERSED, trees_only=True)
 
 
 @pytest.fixture(scope="package")
-def three() -> World:
+def three() -> Scenes:
     """The town twice, once turned and larger, and a small tree."""
-    return read_world(
+    return read_scenes(
         [
-            Placement(TOWN, "here"),
-            Placement(TOWN, "there", transform(np.random.default_rng(1), scale=1.5, spread=3), 0.5, Frustum(0.3, 0.1)),
-            Placement(HAND, "hand"),
-        ]
+            Instance(TOWN, "here"),
+            Instance(TOWN, "there", transform(np.random.default_rng(1), scale=1.5, spread=3), 0.5, Frustum(0.3, 0.1)),
+            Instance(HAND, "hand"),
+        ],
+        columns=TRAVERSED,
+        trees_only=True,
     )

@@ -10,10 +10,13 @@ import numpy as np
 import pytest
 
 from sparklod_cli.cameras.path import CameraPath
+from sparklod_cli.lod.settings import LodSettings
+from sparklod_cli.model.instances import TOTAL
+from sparklod_cli.scenes.loaded import Scenes
 from sparklod_cli.simulation.columns import COLUMNS
-from sparklod_cli.simulation.frames import LodSettings, Simulation
+from sparklod_cli.simulation.frames import Simulation
+from sparklod_cli.simulation.streaming import StreamingSettings
 from sparklod_cli.tables.columns import Row
-from sparklod_cli.world import TOTAL, World
 from tests.simulation.worlds import OF_THE_PAST, SPARK, around, camera, path_of, resting, rows_of, viewers, without
 
 #: Cells that only the row of all instances has.
@@ -24,9 +27,9 @@ OF_ALL = {
 
 
 @pytest.mark.parametrize("viewer", viewers(), ids=str)
-def test_laws_of_all_rows(three: World, viewer: LodSettings) -> None:
-    path = around(12)
-    rows = rows_of(three, viewer, path, by_instance=True)
+def test_laws_of_all_rows(three: Scenes, viewer: tuple[LodSettings, StreamingSettings]) -> None:
+    path, (settings, streaming) = around(12), viewer
+    rows = rows_of(three, settings, path, streaming, by_instance=True)
     assert len(rows) == 12 * 4
     assert all(list(row) == [column.name for column in COLUMNS] for row in rows)
     totals: dict[Any, Row] = {row["frame"]: row for row in rows if row["instance"] == TOTAL}
@@ -36,8 +39,8 @@ def test_laws_of_all_rows(three: World, viewer: LodSettings) -> None:
         where = cell["instance"]
         assert cell["selected"] == cell["leaves"] + cell["interior"]
         assert cell["selected"] == cell["in_frustum"] + cell["outside"] + cell["behind"]
-        assert cell["frontier"] <= cell["selected"] <= viewer.budget == cell["budget"]
-        assert cell["budget_used"] == round(cell["selected"] / viewer.budget, 4)
+        assert cell["frontier"] <= cell["selected"] <= settings.budget == cell["budget"]
+        assert cell["budget_used"] == round(cell["selected"] / settings.budget, 4)
         last: Any = before.get(where, {"selected": 0})
         assert cell["added"] - cell["removed"] == cell["selected"] - last["selected"]
         assert 0 <= cell["added"] <= cell["selected"]
@@ -79,9 +82,10 @@ def test_laws_of_all_rows(three: World, viewer: LodSettings) -> None:
 
 
 @pytest.mark.parametrize("viewer", viewers(), ids=str)
-def test_a_cut_stops_for_the_reason_it_says(three: World, viewer: LodSettings) -> None:
-    for cell in map(dict[str, Any], rows_of(three, viewer, around(6))):
-        assert cell["pixel_scale_limit"] == pytest.approx(viewer.smallest(around(6).cameras[0]), rel=1e-5)
+def test_a_cut_stops_for_the_reason_it_says(three: Scenes, viewer: tuple[LodSettings, StreamingSettings]) -> None:
+    settings, streaming = viewer
+    for cell in map(dict[str, Any], rows_of(three, settings, around(6), streaming)):
+        assert cell["pixel_scale_limit"] == pytest.approx(settings.limit(around(6).cameras[0].fov_y, 360), rel=1e-5)
         if cell["stop_reason"] == "exhausted":
             assert cell["interior"] == 0 == cell["missing"]
         elif cell["stop_reason"] == "pixel":
@@ -91,43 +95,45 @@ def test_a_cut_stops_for_the_reason_it_says(three: World, viewer: LodSettings) -
             assert cell["missing"] > 0
         else:
             assert cell["stop_reason"] == "budget"
-            assert cell["selected"] + 160 > viewer.budget or viewer.budget < 160
+            assert cell["selected"] + 160 > settings.budget or settings.budget < 160
 
 
-def test_every_reason_comes_up(three: World) -> None:
-    assert {row["stop_reason"] for viewer in viewers() for row in rows_of(three, viewer, around(3))} == {
-        *("budget", "pixel", "exhausted", "missing")
-    }
+def test_every_reason_comes_up(three: Scenes) -> None:
+    assert {
+        row["stop_reason"]
+        for settings, streaming in viewers()
+        for row in rows_of(three, settings, around(3), streaming)
+    } == {*("budget", "pixel", "exhausted", "missing")}
 
 
-def test_threads_do_not_change_a_row(three: World) -> None:
-    for viewer in (viewers()[0], viewers()[6]):
+def test_threads_do_not_change_a_row(three: Scenes) -> None:
+    for settings, streaming in (viewers()[0], viewers()[6]):
         first, *others = (
             [
                 without(row, {"traverse_ms"})
-                for row in rows_of(three, viewer, around(25), by_instance=True, threads=threads)
+                for row in rows_of(three, settings, around(25), streaming, by_instance=True, threads=threads)
             ]
             for threads in (1, 2, 5)
         )
         assert all(rows == first for rows in others)
 
 
-def test_a_frame_does_not_depend_on_those_before(three: World) -> None:
-    path, viewer = around(9), LodSettings(5_000, SPARK)
-    rows = rows_of(three, viewer, path, by_instance=True)
+def test_a_frame_does_not_depend_on_those_before(three: Scenes) -> None:
+    path, settings = around(9), LodSettings(5_000, SPARK)
+    rows = rows_of(three, settings, path, by_instance=True)
     for number, at in enumerate(path.cameras):
-        alone = rows_of(three, viewer, CameraPath((at,), "a test", (), (number,)), by_instance=True)
+        alone = rows_of(three, settings, CameraPath((at,), "a test", (), (number,)), by_instance=True)
         assert [without(row, OF_THE_PAST) for row in alone] == [
             without(row, OF_THE_PAST) for row in rows[4 * number : 4 * number + 4]
         ]
     backwards = rows_of(
-        three, viewer, CameraPath(path.cameras[::-1], "a test", (), path.numbers[::-1]), by_instance=True
+        three, settings, CameraPath(path.cameras[::-1], "a test", (), path.numbers[::-1]), by_instance=True
     )
     by_place = {(row["frame"], row["instance"]): without(row, OF_THE_PAST) for row in rows}
     assert all(without(row, OF_THE_PAST) == by_place[row["frame"], row["instance"]] for row in backwards)
 
 
-def test_numbers_and_names_are_those_of_the_path(town: World) -> None:
+def test_numbers_and_names_are_those_of_the_path(town: Scenes) -> None:
     first, second = (
         camera((0, -1, -3), time=0.5),
         dataclasses.replace(camera((1, -2, -4), (0, 0, 1), time=2), name="door"),
@@ -142,7 +148,7 @@ def test_numbers_and_names_are_those_of_the_path(town: World) -> None:
     assert [rows[1][f"forward_{axis}"] for axis in "xyz"] == pytest.approx(ahead, abs=1e-6)
 
 
-def test_the_limit_follows_each_camera(town: World) -> None:
+def test_the_limit_follows_each_camera(town: Scenes) -> None:
     """A pixel's size over its distance: 2 tan(fov / 2) over the height."""
     lenses = [(60.0, (640, 360)), (60.0, (640, 720)), (90.0, (640, 360)), (20.0, (100, 50))]
     path = path_of([camera((0, -1, -3), fov=fov, size=size) for fov, size in lenses])
@@ -158,7 +164,7 @@ def test_the_limit_follows_each_camera(town: World) -> None:
     assert len({row["selected"] for row in fixed}) == 1  # without foveation it is all that counts
 
 
-def test_churn_of_one_who_rests_and_of_one_who_jumps(town: World) -> None:
+def test_churn_of_one_who_rests_and_of_one_who_jumps(town: Scenes) -> None:
     rows: list[Any] = rows_of(town, LodSettings(4_000, SPARK), resting(4))
     assert [(row["added"], row["removed"], row["churn"]) for row in rows[1:]] == [(0, 0, 0.0)] * 3
     assert (rows[0]["added"], rows[0]["removed"], rows[0]["churn"]) == (rows[0]["selected"], 0, None)
@@ -169,17 +175,17 @@ def test_churn_of_one_who_rests_and_of_one_who_jumps(town: World) -> None:
     assert (again["added"], again["removed"], again["churn"]) == (1, cut["selected"], 1.0)
 
 
-def test_budgets_and_caches_that_are_too_small(three: World) -> None:
+def test_budgets_and_caches_that_are_too_small(three: Scenes) -> None:
     with pytest.raises(ValueError, match="a budget of 2 splats is less than one for each of 3 instances"):
         Simulation(three, LodSettings(2))
     with pytest.raises(ValueError, match="cannot hold the roots of 2 trees"):
-        Simulation(three, LodSettings(3, chunk_cache=1))
-    many = World(three.trees, three.forest, three.placements[:1] * 65_536, three.instances[:1] * 65_536)
+        Simulation(three, LodSettings(3), StreamingSettings(chunk_cache=1))
+    many = Scenes([three.instances[0]] * 65_536, three.loaded, [three.of_instance[0]] * 65_536)
     with pytest.raises(ValueError, match="65,536 instances are more than 65,535"):
         Simulation(many, LodSettings(10**6))
 
 
-def test_frames_tell_how_much_is_in_front(town: World) -> None:
+def test_frames_tell_how_much_is_in_front(town: Scenes) -> None:
     at, away = camera((0, -1, -6)), camera((0, -1, -6), (0, -1, -20))
     first, second = Simulation(town, LodSettings(5_000)).run(path_of([at, away]))
     assert (first.in_front, second.in_front) == (1.0, 0.0)

@@ -7,18 +7,20 @@ from typing import Any
 
 import pytest
 
-from sparklod_cli.simulation.frames import LodSettings
-from sparklod_cli.simulation.streaming import Network
-from sparklod_cli.world import Placement, World, read_world
+from sparklod_cli.lod.settings import LodSettings
+from sparklod_cli.model.instances import Instance
+from sparklod_cli.scenes.loaded import Scenes
+from sparklod_cli.scenes.reading import read_scenes
+from sparklod_cli.simulation.streaming import Network, StreamingSettings
 from tests.simulation.worlds import HAND, OF_THE_PAST, SPARK, TOWN, around, path_of, resting, rows_of, without
 
 
 @pytest.mark.parametrize("capacity", [2, 3, 4])
-def test_a_cache_never_holds_more_than_fits(three: World, capacity: int) -> None:
+def test_a_cache_never_holds_more_than_fits(three: Scenes, capacity: int) -> None:
     """The town has three chunks, the small tree one; both roots are always there."""
     for network in (Network(), Network(5e5, 0.02)):
-        viewer = LodSettings(6_000, SPARK, network=network, chunk_cache=capacity)
-        rows: list[Any] = rows_of(three, viewer, around(30))
+        streaming = StreamingSettings(network, capacity)
+        rows: list[Any] = rows_of(three, LodSettings(6_000, SPARK), around(30), streaming)
         assert all(row["chunks_resident"] <= capacity for row in rows)
         assert max(row["chunks_resident"] for row in rows) == capacity
         assert sum(row["chunks_new"] for row in rows) >= capacity
@@ -29,20 +31,20 @@ def test_a_cache_never_holds_more_than_fits(three: World, capacity: int) -> None
             assert any(row["missing"] for row in rows)
 
 
-def test_what_fits_is_never_missing(three: World) -> None:
+def test_what_fits_is_never_missing(three: Scenes) -> None:
     for cache in (None, 4):
-        rows = rows_of(three, LodSettings(20_000, SPARK, chunk_cache=cache), around(20))
+        rows = rows_of(three, LodSettings(20_000, SPARK), around(20), StreamingSettings(chunk_cache=cache))
         assert all(row["missing"] == 0 for row in rows)
         assert all(row["complete_in_s"] is None for row in rows)
 
 
-def test_without_bandwidth_or_latency_all_comes_at_once(three: World) -> None:
+def test_without_bandwidth_or_latency_all_comes_at_once(three: Scenes) -> None:
     timing = {"traverse_ms"}
     for cache in (None, 2):
         default, infinite = (
             [
                 without(row, timing)
-                for row in rows_of(three, LodSettings(9_000, SPARK, network=network, chunk_cache=cache), around(8))
+                for row in rows_of(three, LodSettings(9_000, SPARK), around(8), StreamingSettings(network, cache))
             ]
             for network in (Network(), Network(math.inf, 0.0, 1))
         )
@@ -51,7 +53,7 @@ def test_without_bandwidth_or_latency_all_comes_at_once(three: World) -> None:
 
 @pytest.mark.parametrize("network", [Network(6e4, 0.05), Network(2e4, 0.2, 1), Network(math.inf, 0.3)], ids=str)
 @pytest.mark.parametrize("budget", [300, 20_000])
-def test_a_resting_camera_gets_the_whole_cut(town: World, network: Network, budget: int) -> None:
+def test_a_resting_camera_gets_the_whole_cut(town: Scenes, network: Network, budget: int) -> None:
     """The first frame says when, at the soonest.
 
     It reckons as if all chunks of the cut were known at once. The viewer knows of those that it has, so it may be
@@ -60,7 +62,7 @@ def test_a_resting_camera_gets_the_whole_cut(town: World, network: Network, budg
     fps = 100.0
     path = resting(700, fps)
     (instant,) = rows_of(town, LodSettings(budget, SPARK), path_of(path.cameras[:1]))
-    rows: list[Any] = rows_of(town, LodSettings(budget, SPARK, network=network), path)
+    rows: list[Any] = rows_of(town, LodSettings(budget, SPARK), path, StreamingSettings(network))
     missing = [row["missing"] for row in rows]
     assert missing[0] > 0
     complete = missing.index(0)
@@ -79,9 +81,9 @@ def test_a_resting_camera_gets_the_whole_cut(town: World, network: Network, budg
 
 
 def test_a_tree_of_one_chunk_is_there_when_it_was_promised() -> None:
-    world = read_world([Placement(HAND, "hand")])
+    hand = read_scenes([Instance(HAND, "hand")])
     size, latency, speed = HAND.stat().st_size, 0.1, 500.0
-    rows: list[Any] = rows_of(world, LodSettings(100, SPARK, network=Network(speed, latency)), resting(60))
+    rows: list[Any] = rows_of(hand, LodSettings(100, SPARK), resting(60), StreamingSettings(Network(speed, latency)))
     expected = latency + size / speed
     for row in rows:
         assert row["complete_in_s"] == pytest.approx(max(0, expected - row["time_s"]), abs=1e-4)

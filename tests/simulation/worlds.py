@@ -1,4 +1,4 @@
-"""Worlds, cameras and viewers to simulate, and the rows that come of them."""
+"""Cameras and viewers to simulate, and the rows that come of them."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ import numpy as np
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.cameras.path import CameraPath
 from sparklod_cli.cameras.pose import look_at
-from sparklod_cli.lod.traversal import Cones, Frustum
-from sparklod_cli.simulation.frames import LodSettings, Simulation
-from sparklod_cli.simulation.streaming import Network
+from sparklod_cli.lod.settings import LodSettings
+from sparklod_cli.model.foveation import Cones, Frustum
+from sparklod_cli.scenes.loaded import Scenes
+from sparklod_cli.simulation.frames import Simulation
+from sparklod_cli.simulation.streaming import Network, StreamingSettings
 from sparklod_cli.tables.columns import Row
-from sparklod_cli.world import World
 from tests.conftest import FIXTURES
 
 TOWN, HAND = FIXTURES / "traverse" / "town.spz", FIXTURES / "golden" / "hand-tree-v3.spz"
@@ -55,9 +56,15 @@ def resting(count: int, fps: float = 30.0) -> CameraPath:
 
 
 def rows_of(
-    world: World, viewer: LodSettings, path: CameraPath, *, by_instance: bool = False, threads: int = 1
+    scenes: Scenes,
+    settings: LodSettings,
+    path: CameraPath,
+    streaming: StreamingSettings | None = None,
+    *,
+    by_instance: bool = False,
+    threads: int = 1,
 ) -> list[Row]:
-    simulation = Simulation(world, viewer, by_instance=by_instance)
+    simulation = Simulation(scenes, settings, streaming, by_instance=by_instance)
     return [row for frame in simulation.run(path, threads=threads) for row in frame.rows]
 
 
@@ -65,14 +72,16 @@ def without(row: Row, names: set[str]) -> Row:
     return {name: cell for name, cell in row.items() if name not in names}
 
 
-def viewers() -> list[LodSettings]:
+def viewers() -> list[tuple[LodSettings, StreamingSettings]]:
+    """What is drawn, and how it gets there."""
+    there = StreamingSettings()
     return [
-        LodSettings(20_000, SPARK),
-        LodSettings(2_000, Cones(), chunk_cache=2),
-        LodSettings(3, SPARK),
-        LodSettings(10**9, SPARK, render_scale=40.0),
-        LodSettings(10**9, Frustum(0.2, 0.1), pixel_scale_limit=0.1),
-        LodSettings(1_000_000, Cones()),
-        LodSettings(20_000, SPARK, network=Network(1e6, 0.03), chunk_cache=3),
-        LodSettings(20_000, SPARK, network=Network(3e4, 0.1, 1)),
+        (LodSettings(20_000, SPARK), there),
+        (LodSettings(2_000, Cones()), StreamingSettings(chunk_cache=2)),
+        (LodSettings(3, SPARK), there),
+        (LodSettings(10**9, SPARK, render_scale=40.0), there),
+        (LodSettings(10**9, Frustum(0.2, 0.1), pixel_scale_limit=0.1), there),
+        (LodSettings(1_000_000, Cones()), there),
+        (LodSettings(20_000, SPARK), StreamingSettings(Network(1e6, 0.03), chunk_cache=3)),
+        (LodSettings(20_000, SPARK), StreamingSettings(Network(3e4, 0.1, 1))),
     ]

@@ -185,7 +185,7 @@ def test_a_column_without_values_cannot_be_asserted(text: str, why: str) -> None
 
 
 def test_the_churn_of_one_frame() -> None:
-    with pytest.raises(BadAssertionError, match="there is one frame only"):
+    with pytest.raises(BadAssertionError, match="there is only one frame"):
         asked("churn<1", flight(1))
     assert asked("churn_count==0", flight(1)).held
 

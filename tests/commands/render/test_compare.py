@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from sparklod_cli.cli import run
-from sparklod_cli.compare import COLUMNS
+from sparklod_cli.tables.comparison import COLUMNS
 from tests.conftest import FIXTURES, ROOT
 
 TOWN = FIXTURES / "traverse" / "town.spz"

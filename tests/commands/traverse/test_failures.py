@@ -20,34 +20,39 @@ from tests.conftest import FIXTURES, ROOT
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ([], "a FILE is missing, or --scene"),
-        ([TREE, "--scene", "s.json"], "--scene names the files; leave out FILE"),
+        ([], "a FILE is missing; name one, or an instances file with --scene"),
+        ([TREE, "--scene", "s.json"], "FILE cannot be used with --scene"),
         ([TREE, "--budget", "many"], "--budget"),
-        ([TREE, "--budget", "0"], "the budget is to be more than 0"),
-        ([TREE, "--budget", "1e60"], "the budget is to be more than 0, and no more than"),
-        ([TREE, "--budget", "5k", "--preset", "quest"], "--budget and --preset exclude each other"),
+        ([TREE, "--budget", "0"], "the budget must be from 1 to 2^53, not 0"),
+        ([TREE, "--budget", "1e60"], "the budget must be from 1 to 2^53, not 1e60"),
+        ([TREE, "--budget", "0%"], "a budget of 0% leaves nothing to draw"),
+        ([TREE, "--budget", "5%,10%"], "--budget 5%,10% names several, which only render --compare takes"),
+        ([TREE, "--budget", "5k", "--preset", "quest"], "--preset cannot be used with --budget"),
         ([TREE, "--preset", "phone"], "--preset"),
         ([TREE, "--lod-splat-scale", "0"], "--lod-splat-scale"),
-        ([TREE, "--lod-splat-scale", "inf"], "the budget is to be more than 0, and no more than"),
+        ([TREE, "--lod-splat-scale", "inf"], "2^53, not 2500000 times --lod-splat-scale inf"),
         ([TREE, "--lod-render-scale", "-1"], "--lod-render-scale"),
-        ([TREE, "--lod-render-scale", "inf"], "--lod-render-scale inf is beyond"),
+        ([TREE, "--lod-render-scale", "inf"], "--lod-render-scale inf is too large; it must be at most 1e+12"),
         ([TREE, "--pixel-scale-limit", "nan"], "--pixel-scale-limit"),
-        ([TREE, "--pixel-scale-limit", "1e39"], "--pixel-scale-limit 1e+39 is beyond"),
-        ([TREE, "--pixel-scale-limit", "0.1", "--lod-render-scale", "2"], "exclude each other"),
+        ([TREE, "--pixel-scale-limit", "1e39"], "--pixel-scale-limit 1e+39 is too large"),
+        (
+            [TREE, "--pixel-scale-limit", "0.1", "--lod-render-scale", "2"],
+            "--lod-render-scale cannot be used with --pixel-",
+        ),
         ([TREE, "--outside-foveate", "0.5", "--cone-fov", "100"], "--cone-fov cannot be used with --outside-foveate"),
         ([TREE, "--cone-fov0", "181"], "--cone-fov0"),
         ([TREE, "--behind-foveate", "-1"], "--behind-foveate"),
         ([TREE, "--chunk-cache", "0"], "--chunk-cache"),
-        ([TREE, "--latency", "60ms"], "--latency only means something with --bandwidth"),
-        ([TREE, "--fetchers", "3"], "--fetchers only means something with --bandwidth"),
+        ([TREE, "--latency", "60ms"], "--latency can only be used with --bandwidth"),
+        ([TREE, "--fetchers", "3"], "--fetchers can only be used with --bandwidth"),
         ([TREE, "--bandwidth", "20"], "--bandwidth"),
         ([TREE, "--bandwidth", "0Mbit"], "--bandwidth"),
         ([TREE, "--bandwidth", "1Mbit", "--latency", "60"], "--latency"),
         ([TREE, "--precision", "float8"], "--precision"),
-        ([TREE, "--orbit", "3", "--dolly"], "--orbit and --dolly cannot go together"),
+        ([TREE, "--orbit", "3", "--dolly"], "--orbit and --dolly cannot be used together"),
         ([TREE, "--camera-axes", "opengl-c2w"], "--camera-axes"),
         ([TREE, "--orbit", "0"], "--orbit"),
-        ([TREE, "--look-at", "0,0,0:0,0,0"], "looks at the point where it is"),
+        ([TREE, "--look-at", "0,0,0:0,0,0"], "looks at its own eye"),
         ([TREE, "--keyframes", "0,0,0:1,0,0"], "two keyframes"),
         ([TREE, "--size", "0x720"], "--size"),
         ([TREE, "--fov", "180"], "--fov"),
@@ -58,9 +63,9 @@ from tests.conftest import FIXTURES, ROOT
         ([TREE, "-o", "t.png"], "--output t.png: tables are written as .csv"),
         ([TREE, "-o", "t.spz", "--format", "json"], "t.spz does not end in .json, which --format asks for"),
         ([TREE, "--plot", "t.jpg"], "'t.jpg' does not end in .png, which is what is written"),
-        ([TREE, "--json", "-o", "-"], "--json and the table cannot both go to standard output"),
+        ([TREE, "--json", "-o", "-"], "--output - and --json cannot both go to standard output"),
         ([TREE, "--json", "--per-instance"], "--per-instance cannot be used with --json without --output"),
-        ([TREE, "--padded"], "--padded only means something with --indices-out"),
+        ([TREE, "--padded"], "--padded can only be used with --indices-out"),
         ([TREE, "--assert", "churn"], "--assert 'churn' is not an assertion"),
         ([TREE, "--threads", "0"], "--threads"),
         ([TREE, OTHER, "--budget", "1"], "a budget of 1 splat is less than one for each of 2 instances"),
@@ -94,7 +99,7 @@ def test_traverse_never_writes_over_its_inputs(tmp_path: Path, capsys: Said) -> 
         assert traverse(*said, "--overwrite") == 2
         assert "is an input; write elsewhere" in capsys.readouterr().err
     assert traverse(tree, "-o", tmp_path / "x", "--plot", tmp_path / "x") == 2
-    assert "is an output already" in capsys.readouterr().err
+    assert "two outputs would be written to" in capsys.readouterr().err
     assert {path: path.read_bytes() for path in before} == before
 
 

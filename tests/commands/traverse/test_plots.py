@@ -30,7 +30,7 @@ def test_a_plot_shows_what_the_frame_had(tmp_path: Path, monkeypatch: pytest.Mon
 
     shown: list[traversal_chart.Scenery] = []
 
-    def drawn(rows: object, title: str, scenery: traversal_chart.Scenery) -> traversal_chart.Plot:
+    def drawn(rows: object, marked: object, title: str, scenery: traversal_chart.Scenery) -> traversal_chart.Plot:
         shown.append(scenery)
         return traversal_chart.Plot(b"a plot", None)
 

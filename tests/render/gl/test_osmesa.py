@@ -19,7 +19,7 @@ from sparklod_cli.render.backends import BACKENDS, BackendError
 from sparklod_cli.render.gl import order, osmesa, texture
 from sparklod_cli.render.rasterizer import Image
 from sparklod_cli.render.settings import MIN_ALPHA, PROFILES, SORTS, RasterSettings
-from sparklod_cli.render.shading import ShadedSplats, show
+from sparklod_cli.render.shading import ShadedSplats, shade
 from tests.conftest import FIXTURES
 from tests.scenes import random_splats
 
@@ -115,7 +115,7 @@ def test_the_demo_is_drawn_as_the_reference_draws_it(eye: tuple[float, ...], sor
     """The scene of the fixtures, through Backend, and with spherical harmonics of the camera's direction."""
     splats = read_scene(FIXTURES / "demo.ply", threads=2).splats
     seen = camera(eye, target=tuple(np.median(splats.center, axis=0)), size=(320, 200))
-    shown = show([(splats, np.eye(4))], seen)
+    shown = shade([(splats, np.eye(4))], seen)
     reference = rasterizer.draw(shown, seen, RasterSettings(sort=sort))
     assert psnr(BACKENDS["osmesa"].draw(shown, seen, RasterSettings(sort=sort)), reference) >= FLOAT
     assert psnr(osmesa.draw(shown, seen, RasterSettings(sort=sort), precision="half"), reference) >= HALF
@@ -320,7 +320,7 @@ def test_sorting_by_16_bits_hardly_changes_a_picture() -> None:
 
 def test_halves_are_the_texture_of_the_viewer() -> None:
     splats = random_splats(1500)
-    shown = show([(splats, np.eye(4))], CAMERAS["front"])
+    shown = shade([(splats, np.eye(4))], CAMERAS["front"])
     words = texture.data_texture_of("half")
     assert words.update(shown) == (True, True)
     theirs = data_texture.pack(splats)["texture"]

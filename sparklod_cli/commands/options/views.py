@@ -1,4 +1,4 @@
-"""Parameter types of the options that are about cameras."""
+"""Types of the parameters that are about cameras: views and sizes of pictures."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from .options.types import Numbers
+from .types import Numbers
 
 #: Pixels along a side of a picture, and digits of no more than a few times that.
 MAX_SIDE, DIGITS = 1 << 16, 6
@@ -21,10 +21,10 @@ class View(click.ParamType):
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         eye, colon, target = value.partition(":")
         if not colon:
-            self.fail(f"{value!r} is not eye:target, x,y,z:x,y,z", param, ctx)
+            self.fail(f"{value!r} is not EYE:TARGET, x,y,z:x,y,z", param, ctx)
         view = self._point.convert(eye, param, ctx), self._point.convert(target, param, ctx)
         if view[0] == view[1]:
-            self.fail(f"{value!r} looks at the point where it is", param, ctx)
+            self.fail(f"{value!r} looks at its own eye; give a target elsewhere", param, ctx)
         return view
 
     def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:
@@ -37,7 +37,7 @@ class Views(View):
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         views = tuple(super(Views, self).convert(view, param, ctx) for view in value.replace(";", " ").split())
         if len(views) < 2:
-            self.fail("a path takes two keyframes, or more", param, ctx)
+            self.fail(f"{value!r} has fewer than two keyframes, EYE:TARGET EYE:TARGET", param, ctx)
         return views
 
     def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:

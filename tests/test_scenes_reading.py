@@ -1,4 +1,4 @@
-"""Trees and where they stand: `World` against plain matrices."""
+"""Scenes and where they stand: what is read of files, against plain matrices."""
 
 from __future__ import annotations
 
@@ -12,13 +12,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sparklod_cli import world
 from sparklod_cli.io import read_scene
-from sparklod_cli.lod.traversal import CHUNK_NODES, Cones, Frustum
+from sparklod_cli.lod.traversal import CHUNK_NODES
+from sparklod_cli.model.foveation import Cones, Frustum
 from sparklod_cli.model.gaussian import moved, placed, spark_size
-from sparklod_cli.model.splats import COLUMNS
+from sparklod_cli.model.instances import Instance, names_of
+from sparklod_cli.model.splats import Splats
+from sparklod_cli.scenes import reading
+from sparklod_cli.scenes.loaded import Cut, Part
+from sparklod_cli.scenes.reading import TRAVERSED, read_scenes
 from sparklod_cli.support.errors import FormatError, SparklodError, TreeError
-from sparklod_cli.world import Placement, World, names_of, read_world
 from tests.conftest import FIXTURES
 from tests.lod.forests import transform
 from tests.references import gaussians
@@ -63,12 +66,12 @@ def test_nothing_moves_where_it_stands() -> None:
     assert np.allclose(np.abs((there.quat_xyzw * splats.quat_xyzw).sum(axis=1)), 1, atol=1e-6)
 
 
-def five() -> list[Placement]:
+def five() -> list[Instance]:
     """Three trees, two of them twice."""
     spots = [np.eye(4), SHIFTED, *matrices(3)[-3:]]
     files = [TREE, TOWN, TREE, HAND, HAND]
     return [
-        Placement(file, f"{number}", spot, 1 + number)
+        Instance(file, f"{number}", spot, 1 + number)
         for number, (file, spot) in enumerate(zip(files, spots, strict=True))
     ]
 
@@ -77,31 +80,33 @@ def test_centres_are_those_of_all_leaves_in_the_world() -> None:
     placements = five()
     parts = []
     for place in placements:
-        scene = read_scene(place.file)
+        scene = read_scene(place.source)
         assert scene.tree is not None
         leaves = scene.splats.center[scene.tree.child_count == 0].astype(np.float64)
         parts.append(leaves @ place.object_to_world[:3, :3].T + place.object_to_world[:3, 3])
-    centers = read_world(placements).balls().center
+    centers = read_scenes(placements, columns=TRAVERSED, trees_only=True).balls().center
     assert np.allclose(centers, np.concatenate(parts), rtol=1e-6, atol=1e-5)
 
 
 def test_splats_of_an_instance_are_placed() -> None:
     placements = five()
-    made = read_world(placements, columns=COLUMNS)
+    made = read_scenes(placements)
     for number, place in enumerate(placements):
-        splats = read_scene(place.file).splats
+        splats = read_scene(place.source).splats
         nodes = np.array([5, 0, 3], np.uint32)
-        expected = placed(splats.take(nodes), place.object_to_world)
+        expected = splats.take(nodes) if number == 0 else placed(splats.take(nodes), place.object_to_world)
+        part = Part(made.of_instance[number], nodes, None, place.object_to_world)
         for column in dataclasses.fields(expected):
-            found = getattr(made.splats_of(number, nodes), column.name)
+            found = getattr(Cut((part,)).splats, column.name)
             assert np.array_equal(found, getattr(expected, column.name)), column.name
 
 
 def test_the_forest_has_the_nodes_of_the_files() -> None:
-    made = read_world(five())
+    made = read_scenes(five())
+    instances = made.tree_instances(Cones())
     assert [tree.file for tree in made.trees] == [TREE, TOWN, HAND]
-    assert [instance.tree for instance in made.instances] == [0, 1, 0, 2, 2]
-    assert [instance.lod_scale for instance in made.instances] == [1, 2, 3, 4, 5]
+    assert [instance.tree for instance in instances] == [0, 1, 0, 2, 2]
+    assert [instance.lod_scale for instance in instances] == [1, 2, 3, 4, 5]
     for tree, (start, end) in zip(made.trees, itertools.pairwise(made.forest.node_base), strict=True):
         scene = read_scene(tree.file)
         assert scene.tree is not None
@@ -115,12 +120,12 @@ def test_the_forest_has_the_nodes_of_the_files() -> None:
         for node in np.flatnonzero(scene.tree.child_count):
             first = int(scene.tree.child_start[node])
             level[first : first + int(scene.tree.child_count[node])] = level[node] + 1
-        assert np.array_equal(tree.level, level)
+        assert np.array_equal(tree.depth, level)
 
 
 def test_precision_float16_is_what_float16_holds() -> None:
     exact, half = (
-        read_world([Placement(TOWN, "town")], precision=name).forest.nodes for name in ("float32", "float16")
+        read_scenes([Instance(TOWN, "town")], precision=name).forest.nodes for name in ("float32", "float16")
     )
     for name in ("x", "y", "z", "size"):
         assert np.array_equal(half[name], exact[name].astype(np.float16).astype(np.float32))
@@ -131,32 +136,33 @@ def test_precision_float16_is_what_float16_holds() -> None:
 
 def test_a_file_is_read_once(monkeypatch: pytest.MonkeyPatch) -> None:
     read: list[Path] = []
-    examine: Callable[..., object] = world.examine_scene
+    examine: Callable[..., object] = reading.examine_scene
 
     def counted(file: Path, **settings: object) -> object:
         read.append(file)
         return examine(file, **settings)
 
-    monkeypatch.setattr(world, "examine_scene", counted)
-    assert len(read_world(five()).trees) == 3
+    monkeypatch.setattr(reading, "examine_scene", counted)
+    assert len(read_scenes(five()).trees) == 3
     assert read == [TREE, TOWN, HAND]
 
 
 def test_chunks_share_the_bytes_of_a_file() -> None:
-    made = read_world(five())
-    for tree, sizes in zip(made.trees, made.chunk_bytes(), strict=True):
+    made = read_scenes(five())
+    for tree in made.trees:
+        sizes = tree.chunk_bytes()
+        assert tree.file is not None
         assert sizes.sum() == tree.bytes == tree.file.stat().st_size
-        assert len(sizes) == -(-len(tree.level) // CHUNK_NODES)
-        nodes = np.minimum(len(tree.level) - CHUNK_NODES * np.arange(len(sizes)), CHUNK_NODES)
-        assert (np.abs(sizes - nodes * tree.bytes / len(tree.level)) <= 1).all()  # each its share of the nodes
-    assert made.forest.chunks == sum(map(len, made.chunk_bytes())) == 1 + 3 + 1
+        assert len(sizes) == -(-len(tree.splats) // CHUNK_NODES)
+        nodes = np.minimum(len(tree.splats) - CHUNK_NODES * np.arange(len(sizes)), CHUNK_NODES)
+        assert (np.abs(sizes - nodes * tree.bytes / len(tree.splats)) <= 1).all()  # each its share of the nodes
+    assert made.forest.chunks == sum(tree.chunks for tree in made.loaded) == 1 + 3 + 1
 
 
 @pytest.mark.parametrize("nodes", [1, CHUNK_NODES - 1, CHUNK_NODES, CHUNK_NODES + 1, 3 * CHUNK_NODES])
 def test_chunks_end_where_nodes_do(nodes: int) -> None:
-    (tree,) = read_world([Placement(TREE, "tree")]).trees
-    long = dataclasses.replace(tree, level=np.zeros(nodes, np.int32), bytes=10**12 + 7)
-    (sizes,) = World([long], None, [], []).chunk_bytes()  # type: ignore[arg-type]
+    (tree,) = read_scenes([Instance(TREE, "tree")]).trees
+    sizes = dataclasses.replace(tree, splats=Splats.zeros(nodes, 0), bytes=10**12 + 7).chunk_bytes()
     assert len(sizes) == -(-nodes // CHUNK_NODES)
     assert sizes.sum() == 10**12 + 7
     assert sizes.min() > 0
@@ -164,13 +170,13 @@ def test_chunks_end_where_nodes_do(nodes: int) -> None:
 
 def test_foveation_is_that_of_all_or_its_own() -> None:
     own, of_all = Frustum(0.5, 0.1), Cones(90, 120, 0.4, 0.2)
-    placements = [Placement(TREE, "a"), Placement(TREE, "b", SHIFTED, 3.0, own), Placement(HAND, "c")]
-    made = read_world(placements)
-    instances = made.foveated(of_all)
+    placements = [Instance(TREE, "a"), Instance(TREE, "b", SHIFTED, 3.0, own), Instance(HAND, "c")]
+    made = read_scenes(placements)
+    instances = made.tree_instances(of_all)
     assert [instance.foveation for instance in instances] == [of_all, own, of_all]
     assert [instance.lod_scale for instance in instances] == [1, 3, 1]
     assert np.array_equal(instances[1].object_to_world, SHIFTED)
-    assert made.foveated(Cones())[1].foveation == own
+    assert made.tree_instances(Cones())[1].foveation == own
 
 
 @pytest.mark.parametrize(
@@ -190,7 +196,7 @@ def test_foveation_is_that_of_all_or_its_own() -> None:
 )
 def test_what_cannot_be_read_names_its_file(file: Path, kind: type[SparklodError], said: str) -> None:
     with pytest.raises(kind) as caught:
-        read_world([Placement(TREE, "good"), Placement(file, "bad")])
+        read_scenes([Instance(TREE, "good"), Instance(file, "bad")], columns=TRAVERSED, trees_only=True)
     assert str(caught.value).startswith(f"{file}: {said}") or said in str(caught.value)
     assert str(file) in str(caught.value)
     assert "\n" not in str(caught.value)
@@ -200,11 +206,11 @@ def test_what_cannot_be_read_names_its_file(file: Path, kind: type[SparklodError
 def test_faulty_trees_are_refused_or_traversed(file: Path) -> None:
     """Whatever a file's tree is, it is refused in a line, or sound."""
     try:
-        made = read_world([Placement(file, "tree")])
+        made = read_scenes([Instance(file, "tree")])
     except SparklodError as error:
         assert str(error).startswith(f"{file}: ")
     else:
-        assert made.trees[0].level.max() < len(made.forest.nodes)
+        assert made.trees[0].depth.max() < len(made.forest.nodes)
 
 
 def test_names_are_those_of_files() -> None:

@@ -12,15 +12,15 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from sparklod_cli.lod.traversal import Cones, Frustum
+from sparklod_cli.model.foveation import Cones, Frustum
+from sparklod_cli.model.instances import Instance
+from sparklod_cli.scenes.instances_file import KEYS, InstancesFileError, read_instances
 from sparklod_cli.support.errors import FormatError, SparklodError
-from sparklod_cli.world import Placement
-from sparklod_cli.world_file import KEYS, WorldFileError, read_placements
 
 
-def written(path: Path, *instances: object) -> list[Placement]:
+def written(path: Path, *instances: object) -> list[Instance]:
     path.write_text(json.dumps({"instances": instances}))
-    return read_placements(path)
+    return read_instances(path)
 
 
 @pytest.fixture
@@ -168,7 +168,7 @@ WRONG: list[tuple[object, str]] = [
 
 @pytest.mark.parametrize(("wrong", "said"), WRONG, ids=[said[:30] for _, said in WRONG])
 def test_a_mistake_is_told_in_a_line(wrong: object, said: str, scene: Path) -> None:
-    with pytest.raises(WorldFileError) as caught:
+    with pytest.raises(InstancesFileError) as caught:
         written(scene, {"file": "good.spz"}, wrong)
     text = str(caught.value)
     assert text.startswith(f"{scene}: instance 1 ")
@@ -194,8 +194,8 @@ def test_a_mistake_is_told_in_a_line(wrong: object, said: str, scene: Path) -> N
 )
 def test_a_file_that_is_none(text: str, said: str, scene: Path) -> None:
     scene.write_text(text)
-    with pytest.raises(WorldFileError) as caught:
-        read_placements(scene)
+    with pytest.raises(InstancesFileError) as caught:
+        read_instances(scene)
     assert str(caught.value).startswith(str(scene))
     assert said in str(caught.value)
     assert "\n" not in str(caught.value)
@@ -204,21 +204,21 @@ def test_a_file_that_is_none(text: str, said: str, scene: Path) -> None:
 @pytest.mark.parametrize("depth", range(900, 1000, 7))
 def test_however_deep_it_is(depth: int, scene: Path) -> None:
     scene.write_text('{"instances": [{"file": "a", "scale": ' + "[" * depth + "]" * depth + "}]}")
-    with pytest.raises(WorldFileError):
-        read_placements(scene)
+    with pytest.raises(InstancesFileError):
+        read_instances(scene)
 
 
 def test_a_file_that_cannot_be_read(tmp_path: Path) -> None:
     (tmp_path / "bytes.json").write_bytes(b"\xff\xfe\x00")
     for path in (tmp_path / "missing.json", tmp_path, tmp_path / "bytes.json"):
         with pytest.raises(FormatError, match="cannot be read") as caught:
-            read_placements(path)
+            read_instances(path)
         assert str(caught.value).startswith(str(path))
 
 
 def test_a_byte_order_mark_is_no_mistake(scene: Path) -> None:
     scene.write_bytes(b'\xef\xbb\xbf{"instances": [{"file": "a.spz"}]}')
-    assert len(read_placements(scene)) == 1
+    assert len(read_instances(scene)) == 1
 
 
 def test_many_instances_take_no_time(scene: Path) -> None:
@@ -238,11 +238,11 @@ plausible = st.fixed_dictionaries({"file": st.text(min_size=1)}, optional=option
 
 def test_what_never_ends_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(SparklodError, match="it is a pipe or a device"):
-        read_placements(Path("/dev/zero"))
+        read_instances(Path("/dev/zero"))
     monkeypatch.setattr("sparklod_cli.io.MAX_TEXT", 100)
     (tmp_path / "large.json").write_bytes(b" " * 101)
     with pytest.raises(SparklodError, match=r"large\.json is larger than"):
-        read_placements(tmp_path / "large.json")
+        read_instances(tmp_path / "large.json")
 
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=300)
@@ -250,7 +250,7 @@ def test_what_never_ends_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyP
 def test_whatever_it_says_it_is_understood_or_refused_in_a_line(scene: Path, data: Any) -> None:
     scene.write_text(json.dumps(data))
     try:
-        places = read_placements(scene)
+        places = read_instances(scene)
     except SparklodError as error:
         assert str(error).startswith(str(scene))
         assert "\n" not in str(error)

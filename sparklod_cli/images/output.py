@@ -1,4 +1,4 @@
-"""Where the pictures of `sparklod render` go, and as what."""
+"""Where pictures go, and as what: one file, a file a frame, an animation or a contact sheet."""
 
 from __future__ import annotations
 
@@ -7,12 +7,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import click
-
 from ..io import check_writable
 
-#: Forms of single pictures, and of several in one file.
-STILL, MOVING = ("png", "webp", "npy"), ("webp", "gif", "mp4")
+#: Forms of single pictures, of several in one file, and of contact sheets.
+STILL = ("png", "jpg", "webp", "npy")
+MOVING = ("webp", "gif", "mp4", "webm")
+SHEETS = ("png", "jpg", "webp")
+
+#: Forms that keep alpha.
+WITH_ALPHA = ("png", "webp", "npy")
+
+#: Forms by suffix, where that has another name.
+SUFFIXES = {"jpeg": "jpg"}
 
 #: What the number of a frame stands for in a name.
 NUMBER = re.compile(r"%(?:0\d{1,2})?d")
@@ -46,7 +52,7 @@ class Output:
         return [self.path(number) for number in (numbers if self.kind == "frames" else [0])]
 
     def check(self, numbers: Sequence[int], *, overwrite: bool) -> None:
-        """Raises an `OutputError` where one cannot be written, before work goes into it."""
+        """Raises an `OutputError` where a file cannot be written, before work goes into it."""
         for path in self.paths(numbers):
             check_writable(path, overwrite=overwrite)
 
@@ -55,39 +61,45 @@ def output_for(name: Path | None, default: str, cameras: int, *, sheet: bool) ->
     """Where the pictures of some cameras go.
 
     Args:
-        name: that was asked for; None for one made of `default`, in the current directory.
+        name: that was asked for; "-" for standard output; None for one made of `default`, in the current directory.
         default: the name of the scene.
         cameras: how many there are.
         sheet: all in one picture.
 
     Raises:
-        click.UsageError: they do not fit into what was asked for.
+        ValueError: the cameras do not fit into what was asked for.
     """
     several = cameras > 1 and not sheet
     if name is not None and str(name) == "-":
         if several:
-            raise click.UsageError(f"standard output takes one picture, not {cameras:,}; see --output")
+            raise ValueError(f"standard output takes one picture, not {cameras:,}; name a file with --output")
         return Output(None, "png", "sheet" if sheet else "picture")
     if name is None:
         name = Path(f"{default.replace('%', '_')}{'.%04d' if several else ''}.png")
     form = name.suffix.lower().removeprefix(".")
+    form = SUFFIXES.get(form, form)
     if form not in STILL + MOVING:
-        known = ", ".join(f".{each}" for each in dict.fromkeys(STILL + MOVING))
-        raise click.UsageError(f"--output {name} is none of {known}")
+        raise ValueError(f"--output {name} does not end in {_suffixes(dict.fromkeys(STILL + MOVING))}")
     places = len(NUMBER.findall(name.name))
     if sheet:
-        if form not in ("png", "webp") or places:
-            raise click.UsageError(f"a contact sheet is one .png or .webp, which --output {name} is not")
+        if form not in SHEETS or places:
+            raise ValueError(f"a contact sheet is one {_suffixes(SHEETS)}, which --output {name} is not")
         return Output(name, form, "sheet")
     if places:
         if places > 1 or form not in STILL:
-            raise click.UsageError(f"--output {name} does not name frames, as out.%04d.png, .webp or .npy would")
+            stills = _suffixes(STILL, "out.%04d")
+            raise ValueError(f"--output {name} does not name frames; write {stills}")
         return Output(name, form, "frames")
-    if form in ("gif", "mp4") or (several and form in MOVING):
+    if form not in STILL or (several and form in MOVING):
         return Output(name, form, "animation")
     if several:
-        raise click.UsageError(
-            f"--output {name} is one picture and there are {cameras:,} cameras: write frames"
-            f" ({name.stem}.%04d{name.suffix}), an animation (.mp4, .gif, .webp) or a --sheet"
+        raise ValueError(
+            f"--output {name} is one picture, and there are {cameras:,} cameras: write frames"
+            f" ({name.stem}.%04d{name.suffix}), an animation ({_suffixes(MOVING)}) or a --sheet"
         )
     return Output(name, form, "picture")
+
+
+def _suffixes(forms: Sequence[str] | dict[str, None], stem: str = "") -> str:
+    *some, last = (f"{stem}.{form}" for form in forms)
+    return f"{', '.join(some)} or {last}"

@@ -1,0 +1,250 @@
+"""Where cameras come from: a file, an orbit around a scene, a dolly towards it, single views, or keyframes."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .. import io
+from ..support.errors import CameraPathError, SparklodError
+from . import framing, generators
+from .camera import Matrix
+from .defaults import ELEVATION
+from .formats.source import Files, Parsed
+from .formats.table import NAMES
+from .frame import DEFAULT_FPS, DEFAULT_UP, Frame, Settings, camera_of
+from .path import GENERATED, CameraPath, cameras_of, read
+from .world_transform import similarity
+
+if TYPE_CHECKING:
+    from ..model.balls import Balls
+
+#: Bytes of a camera path's file. COLMAP's images.txt has all points that its images see.
+LARGEST = 1 << 31
+
+#: x, y and z in world units.
+Point = tuple[float, ...]
+
+#: Gives what the splats cover; called only by sources that are chosen for the scene.
+Scene = Callable[[], "Balls"]
+
+
+@dataclass(frozen=True)
+class CameraFile:
+    """The cameras of a file, or of a folder that COLMAP wrote.
+
+    Attributes:
+        path: of the file or folder.
+        format: its name in `formats.table.FORMATS`; None tells it by the content.
+    """
+
+    path: Path
+    format: str | None = None
+
+    fits_scene = False
+
+    def cameras(self, settings: Settings, scene: Scene) -> CameraPath:
+        """The cameras of the file; the scene is not looked at."""
+        return read_path(self.path, self.format, settings)
+
+
+@dataclass(frozen=True)
+class Orbit:
+    """Cameras once around a scene.
+
+    Attributes:
+        count: how many.
+        center: what they look at; None for the middle of the scene.
+        distance: from there, world units; None for where the scene fits the image.
+        elevation: above there, degrees.
+    """
+
+    count: int
+    center: Point | None = None
+    distance: float | None = None
+    elevation: float = ELEVATION
+
+    @property
+    def fits_scene(self) -> bool:
+        """Whether the distance is chosen for the scene."""
+        return self.distance is None
+
+    def cameras(self, settings: Settings, scene: Scene) -> CameraPath:
+        """The cameras around the scene."""
+        up, tilt = settings.up or DEFAULT_UP, math.radians(self.elevation)
+        center, distance = self.center, self.distance
+        if center is None or distance is None:
+            around = generators.orbit(self.count, (0.0, 0.0, 0.0), 1, tilt, up)
+            center, fits = _fit(around, center, scene(), settings)
+            distance = distance or fits
+        return _generated("orbit", generators.orbit(self.count, center, distance, tilt, up), settings)
+
+
+@dataclass(frozen=True)
+class Dolly:
+    """Cameras straight towards a scene, from far to near.
+
+    Attributes:
+        seconds: how long it takes.
+        center: what they look at; None for the middle of the scene.
+        distance: of the first camera from there, world units; None for 4 times where the scene fits the image.
+        elevation: above there, degrees.
+    """
+
+    seconds: float = generators.SECONDS
+    center: Point | None = None
+    distance: float | None = None
+    elevation: float = ELEVATION
+
+    @property
+    def fits_scene(self) -> bool:
+        """Whether the distance is chosen for the scene."""
+        return self.distance is None
+
+    def cameras(self, settings: Settings, scene: Scene) -> CameraPath:
+        """The cameras on the way to the scene."""
+        up, tilt = settings.up or DEFAULT_UP, math.radians(self.elevation)
+        count = max(2, round(self.seconds * (settings.fps or DEFAULT_FPS)))
+        center, distance = self.center, self.distance
+        if center is None or distance is None:
+            ahead = generators.dolly(2, (0.0, 0.0, 0.0), 1, 1, tilt, up)
+            center, fits = _fit(ahead, center, scene(), settings)
+            distance = distance or generators.DOLLY_START * fits
+        last = distance / generators.DOLLY_ZOOM
+        return _generated("dolly", generators.dolly(count, center, distance, last, tilt, up), settings)
+
+
+@dataclass(frozen=True)
+class WholeScene:
+    """One camera that has the whole scene just inside its picture.
+
+    Attributes:
+        elevation: above the middle of the scene, degrees.
+    """
+
+    elevation: float = ELEVATION
+
+    fits_scene = True
+
+    def cameras(self, settings: Settings, scene: Scene) -> CameraPath:
+        """The camera, in front of the scene."""
+        path = Orbit(1, (0.0, 0.0, 0.0), 1.0, self.elevation).cameras(settings, scene)
+        fitted = framing.fitted(path.cameras[0], framing.covered(scene()))
+        return dataclasses.replace(path, cameras=(fitted,))
+
+
+@dataclass(frozen=True)
+class Views:
+    """A camera for each pair of an eye and the target that it looks at.
+
+    Attributes:
+        views: at least one (eye, target).
+        named: each camera is called after its eye and target.
+    """
+
+    views: Sequence[tuple[Point, Point]]
+    named: bool = False
+
+    fits_scene = False
+
+    def cameras(self, settings: Settings, scene: Scene) -> CameraPath:
+        """The cameras, all at time 0; the scene is not looked at."""
+        up = settings.up or DEFAULT_UP
+        paths = [_generated("look_at", [generators.frame_looking(*view, up)], settings) for view in self.views]
+        cameras = [path.cameras[0] for path in paths]
+        if self.named:
+            cameras = [
+                dataclasses.replace(camera, name=" to ".join(", ".join(f"{x:g}" for x in point) for point in view))
+                for camera, view in zip(cameras, self.views, strict=True)
+            ]
+        return dataclasses.replace(paths[0], cameras=tuple(cameras), numbers=tuple(range(len(cameras))))
+
+
+@dataclass(frozen=True)
+class Keyframes:
+    """Cameras that move smoothly from view to view.
+
+    Attributes:
+        views: at least two (eye, target).
+        seconds: from one to the next, on average.
+    """
+
+    views: Sequence[tuple[Point, Point]]
+    seconds: float = generators.SECONDS
+
+    fits_scene = False
+
+    def cameras(self, settings: Settings, scene: Scene) -> CameraPath:
+        """The cameras on the way; the scene is not looked at."""
+        keys = [generators.Key(eye, target) for eye, target in self.views]
+        fps, up = settings.fps or DEFAULT_FPS, settings.up or DEFAULT_UP
+        return _generated("keyframes", generators.between(keys, fps, up, seconds=self.seconds), settings)
+
+
+#: Each has `fits_scene`, whether its cameras are as far away as the scene asks for, and
+#: `cameras(settings, scene) -> CameraPath`, which raises a `CameraPathError` where a camera makes no sense, its
+#: subclass `TooManyCamerasError` where there are too many, and an `InvalidSplatsError` where there is no scene to fit.
+CameraSource = CameraFile | Orbit | Dolly | WholeScene | Views | Keyframes
+
+
+def read_path(path: Path, format: str | None = None, settings: Settings | None = None) -> CameraPath:
+    """The cameras of a file, or of a folder that COLMAP wrote.
+
+    Args:
+        path: of the file or folder.
+        format: its name in `formats.table.FORMATS`; None tells it by the content.
+        settings: what is said over what the file says.
+
+    Raises:
+        CameraPathError: it cannot be read, is of no known format, or has a camera that makes no sense; names the file.
+    """
+    try:
+        contents = io.read_together(path, NAMES, LARGEST)
+    except SparklodError as error:
+        raise CameraPathError(str(error)) from None
+    try:
+        return read(Files(path, contents), format=format, settings=settings)
+    except CameraPathError as error:
+        raise CameraPathError(f"{path}: {error}") from None
+
+
+def read_world_transform(path: Path) -> Matrix:
+    """(4, 4) the rotation, uniform scale and translation of a file of 16 numbers.
+
+    Raises:
+        CameraPathError: it cannot be read, or has another matrix; names the file.
+    """
+    try:
+        return similarity(io.read_text(path))
+    except CameraPathError as error:
+        raise CameraPathError(f"{path}: --world-transform {error}") from None
+    except SparklodError as error:
+        raise CameraPathError(str(error)) from None
+
+
+def _generated(name: str, frames: Sequence[Frame], settings: Settings) -> CameraPath:
+    return cameras_of(Parsed(frames), GENERATED[name], settings)
+
+
+def _fit(frames: Sequence[Frame], center: Point | None, scene: Balls, settings: Settings) -> tuple[Any, float]:
+    """What cameras of these directions look at, (3,), and how far from there they all have the scene in their pictures.
+
+    Args:
+        frames: at least one.
+        center: (3,) where it is known; None for the middle of the scene.
+        scene: all that the splats cover.
+        settings: that the cameras are made with.
+    """
+    kept = framing.covered(scene)
+    middle = framing.middle_of(kept) if center is None else np.asarray(center, np.float64)
+    try:
+        cameras = [camera_of(frame.matrix, frame.lens, 0, "", settings) for frame in framing.some(frames)]
+    except ValueError as error:
+        raise CameraPathError(f"the camera {error}") from None
+    return middle, framing.distance(cameras, middle, kept)

@@ -1,0 +1,161 @@
+"""Where the table of `sparklod traverse` goes, what is in it, and what else is made of the frames."""
+
+from __future__ import annotations
+
+import functools
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from ...tables.files import FORMS
+from ..command import COMMON, option
+from ..console import is_terminal
+from ..paths import DASH, OutputPath
+from ..usage import exclude, given, require
+from .common import Command, overwrite_option, table_form
+
+if TYPE_CHECKING:
+    from ...tables.assertions import Assertion
+    from ...tables.output import TableOutput
+
+HEADING = "Output"
+
+#: Options that say what is in the table.
+OF_TABLES = ("form", "per_instance", "no_timing")
+
+
+@dataclass(frozen=True)
+class Table:
+    """What the options of `table_options` were given; None where one was not.
+
+    Attributes:
+        output: file of the table, or -.
+        overwrite: replace files that exist.
+        form: a key of `FORMS`.
+        per_instance: rows for single instances, too.
+        no_timing: leave out the column of the time that traversals took.
+        summary: print what the frames come to.
+        asserts: texts of what must hold.
+        plot: file of the charts.
+        indices_out: folder of the nodes of each cut.
+        padded: fill their files up to rows of Spark's index texture.
+    """
+
+    output: Path | None
+    overwrite: bool
+    form: str | None
+    per_instance: bool
+    no_timing: bool
+    summary: bool | None
+    asserts: tuple[str, ...]
+    plot: Path | None
+    indices_out: Path | None
+    padded: bool
+
+    def check(self, ctx: click.Context, *, as_json: bool) -> None:
+        """Raises a `click.UsageError` where options contradict each other, or have nothing to do."""
+        if as_json and self.output is None:
+            exclude(ctx, OF_TABLES, "--json without --output, which writes no table")
+        if self.indices_out is None:
+            require(ctx, ["padded"], "--indices-out")
+
+    def summary_on_stdout(self, ctx: click.Context, *, as_json: bool) -> bool:
+        """Whether the summary takes the place of a table that would scroll by on a terminal, and nobody asked for."""
+        asked = self.output is not None or as_json or self.summary is False or given(ctx, OF_TABLES)
+        return not asked and is_terminal(sys.stdout)
+
+    def table(self, ctx: click.Context, *, as_json: bool) -> TableOutput:
+        """Where the table goes.
+
+        Raises:
+            click.UsageError: the suffix of --output promises something else.
+        """
+        from ...simulation import columns
+        from ...tables.output import TableOutput
+
+        nowhere = self.output is None and (as_json or self.summary_on_stdout(ctx, as_json=as_json))
+        return TableOutput(
+            path=None if self.output == DASH else self.output,
+            form=None if nowhere else table_form("--output", self.output, self.form),
+            columns=columns.select(timing=not self.no_timing),
+            overwrite=self.overwrite,
+        )
+
+    def assertions(self) -> list[Assertion]:
+        """What must hold.
+
+        Raises:
+            click.UsageError: an assertion cannot be understood.
+        """
+        from ...simulation.columns import COLUMNS
+        from ...tables import assertions
+
+        try:
+            return [assertions.parse(text, COLUMNS) for text in self.asserts]
+        except assertions.BadAssertionError as error:
+            raise click.UsageError(f"--assert {error}") from None
+
+
+def table_options(command: Command) -> Command:
+    """The options of `Table`."""
+    add = functools.partial(option, heading=HEADING)
+    common = functools.partial(option, heading=COMMON)
+    for each in reversed(
+        (
+            common(
+                "-o",
+                "--output",
+                metavar="FILE",
+                type=OutputPath(),
+                help="Write the table to FILE: .csv, .json or .parquet; - is standard output.  [default: standard"
+                " output, but for a terminal, which gets the summary]",
+            ),
+            overwrite_option,
+            common(
+                "--summary/--no-summary",
+                default=None,
+                help="Print what the frames come to, on standard error.  [default: if that is a terminal]",
+            ),
+            common(
+                "--assert",
+                "asserts",
+                metavar="TEXT",
+                multiple=True,
+                help="Condition that must hold, such as 'churn_p95<0.2'; the exit status is 3 if it does not.",
+            ),
+            common(
+                "--plot",
+                metavar="FILE",
+                type=OutputPath(suffixes=[".png"]),
+                help="Draw charts of the table and the path over the scene, as a .png.",
+            ),
+            add(
+                "--format",
+                "form",
+                type=click.Choice(list(FORMS)),
+                help="Format of the table.  [default: by the suffix of --output, or csv]",
+            ),
+            add("--per-instance", is_flag=True, help="Write a row for each instance, besides that of all together."),
+            add(
+                "--no-timing",
+                is_flag=True,
+                help="Leave out traverse_ms, the time that each traversal took, so that two runs write the same bytes.",
+            ),
+            add(
+                "--indices-out",
+                metavar="DIR",
+                type=OutputPath(folder=True),
+                help="Write the nodes of every cut to DIR, as .npy of uint32.",
+            ),
+            add(
+                "--padded",
+                is_flag=True,
+                help="With --indices-out: pad each file to rows of 16,384 nodes, as Spark's index texture has them.",
+            ),
+        )
+    ):
+        command = each(command)
+    return command

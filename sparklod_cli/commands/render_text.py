@@ -1,0 +1,76 @@
+"""What `sparklod render` says of the pictures that it drew."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING
+
+import click
+
+from .console import Console, count_of, size_of
+
+if TYPE_CHECKING:
+    from ..cameras.path import CameraPath
+    from ..images.output import Output
+    from ..images.sequence import Pictures
+    from ..render.settings import RenderSettings
+
+
+def report(
+    console: Console,
+    written: Pictures,
+    output: Output,
+    path: CameraPath,
+    settings: RenderSettings,
+    seconds: float,
+    *,
+    as_json: bool,
+) -> None:
+    """A line, or one JSON object as well, and a warning where nothing is to be seen.
+
+    Args:
+        console: says it.
+        written: what was drawn.
+        output: where it went.
+        path: the cameras.
+        settings: how it was drawn.
+        seconds: of the whole command.
+        as_json: print an object on standard output.
+    """
+    if written.empty:
+        console.say(
+            "warning: nothing is in view; cameras and scene may not share their axes (--camera-axes,"
+            " --world-transform, --up), or nothing lies between --near and --far"
+        )
+    if as_json:
+        whole = {
+            "output": str(output.name),
+            "format": output.form,
+            "kind": output.kind,
+            "bytes": written.bytes,
+            "frames": written.frames,
+            "seconds": round(seconds, 3),
+        }
+        click.echo(json.dumps(whole if written.gain is None else whole | {"gain": written.gain}, allow_nan=False))
+    name = "standard output" if output.name is None else output.name
+    console.say(f"{name}  {_told(written)}, {seconds:.2f} s")
+    console.detail(
+        f"  {path.format}, {size_of(written.bytes)} of {output.form}; {settings.style} by {settings.backend},"
+        f" from {settings.raster.near:g} to {settings.raster.far:g} units away"
+    )
+
+
+def _told(written: Pictures) -> str:
+    """ "60 frames, 1280 x 720, 499,102 to 500,000 splats"."""
+    frames = written.frames
+    sizes = dict.fromkeys(f"{frame['width']} x {frame['height']}" for frame in frames)
+    splats = sorted({frame["splats"] for frame in frames})
+    told = [count_of(len(frames), "frame")] if len(frames) > 1 else []
+    told.append(next(iter(sizes)) + (" and others" if len(sizes) > 1 else ""))
+    least = "" if splats[0] == splats[-1] else f"{splats[0]:,} to "
+    told.append(least + count_of(splats[-1], "splat"))
+    if written.gain is not None:
+        worst = min(frame["psnr_db"] for frame in frames)
+        told.append(f"PSNR {worst:.2f} dB" + (" or more" if len(frames) > 1 else ""))
+        told.append(f"differences times {written.gain:g}" if written.gain != 1 else "differences as they are")
+    return ", ".join(told)

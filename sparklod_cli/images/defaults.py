@@ -1,0 +1,7 @@
+"""What pictures are where nobody says otherwise; imports nothing, so that `--help` stays quick."""
+
+#: Quality of JPEG, 1 to 100: what is lost is hardly seen.
+JPEG_QUALITY = 92
+
+#: Width and height of a thumbnail, pixels, and the pixels along each side that each of them is the mean of.
+THUMBNAIL_SIZE, THUMBNAIL_SUPERSAMPLE = (512, 512), 2

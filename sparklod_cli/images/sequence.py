@@ -1,0 +1,261 @@
+"""From cameras to picture files: draws the frames of a camera path, compares and encodes them, and writes them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..cameras.frame import DEFAULT_FPS
+from ..io import write_stdout, write_whole
+from ..render.renderer import Renderer
+from ..support import jit
+from ..support.defaults import OF_PIXELS
+from ..support.parallel import ordered_map
+from ..support.progress import Progress, silent
+from . import pixels as codes
+from .animation import animate
+from .contact_sheet import sheet
+from .defaults import JPEG_QUALITY
+from .metrics import check_covered, psnr
+
+if TYPE_CHECKING:
+    from ..cameras.camera import Camera
+    from ..cameras.path import CameraPath
+    from ..render.color_scales import Coloring
+    from ..render.renderer import Drawn
+    from ..render.settings import RenderSettings
+    from ..scenes.finder import CutSource
+    from .output import Output
+    from .pixels import Color, Pixels
+
+#: Pixels, of all pictures together, that are kept from finding a gain until their frames are written: 2 GB of floats.
+KEPT_PIXELS = 1 << 26
+
+
+@dataclass(frozen=True)
+class PictureSettings:
+    """How pictures become files.
+
+    Attributes:
+        background: red, green and blue, 0..1, behind the splats; None keeps alpha.
+        bar: stands beside a picture whose colours mean something.
+        gain: factor by which differences are multiplied; None chooses one for the pictures.
+        jpeg_quality: of .jpg, 1 to 100.
+        jobs: pictures to work on at a time.
+        threads: of the kernels.
+    """
+
+    background: Color | None = None
+    bar: bool = True
+    gain: float | None = None
+    jpeg_quality: int = JPEG_QUALITY
+    jobs: int = 2
+    threads: int = 1
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """What was written.
+
+    Attributes:
+        frames: for each camera its number, time, name, splats drawn, width and height of the picture, the file where
+            each has its own, and with a reference the PSNR in dB.
+        bytes: of all files.
+        gain: factor by which differences were multiplied; None without a reference.
+        empty: no splat is in view of any camera.
+    """
+
+    frames: list[dict[str, Any]]
+    bytes: int
+    gain: float | None
+    empty: bool
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """A picture that is done: pixels, or bytes of a file where each frame has its own."""
+
+    facts: dict[str, Any]
+    pixels: Pixels | None
+    data: bytes
+    empty: bool
+
+
+def write_pictures(
+    source: CutSource,
+    path: CameraPath,
+    output: Output,
+    render: RenderSettings,
+    settings: PictureSettings,
+    *,
+    reference: CutSource | None = None,
+    overwrite: bool = False,
+    progress: Progress = silent,
+) -> Pictures:
+    """Draws and writes the pictures of a camera path.
+
+    Args:
+        source: what is drawn.
+        path: the cameras; all of one size for an animation or a contact sheet.
+        output: where the pictures go.
+        render: how they are drawn.
+        settings: how they become files.
+        reference: what they are compared with: the difference is written.
+        overwrite: replace files that exist.
+        progress: is told how many frames are looked at for the colours, compared, drawn and encoded.
+
+    Raises:
+        BackendError: the backend cannot draw here.
+        OutputError: a file cannot be written.
+        SparklodError: there is nothing to colour by, the reference covers no pixel of a frame, or an animation cannot
+            be encoded here.
+    """
+    jit.use_threads(settings.threads)
+    renderer = Renderer(source, render, path.cameras, progress=progress)
+    other = None if reference is None else Renderer(reference, render, path.cameras, progress=progress)
+    return _Writer(renderer, path, output, settings, other, overwrite, progress).run()
+
+
+def frame_rate(path: CameraPath) -> float:
+    """Frames a second, on average."""
+    span = path.cameras[-1].time - path.cameras[0].time
+    return (len(path.cameras) - 1) / span if span > 0 else DEFAULT_FPS
+
+
+class _Writer:
+    """One run of `write_pictures`, which has the arguments."""
+
+    def __init__(
+        self,
+        renderer: Renderer,
+        path: CameraPath,
+        output: Output,
+        settings: PictureSettings,
+        reference: Renderer | None,
+        overwrite: bool,
+        progress: Progress,
+    ) -> None:
+        self._renderer, self._path, self._output, self._settings = renderer, path, output, settings
+        self._reference, self._overwrite, self._progress = reference, overwrite, progress
+        self._drawn: dict[int, tuple[Drawn, Drawn]] = {}  # by the place of a camera, what finding the gain drew
+        self._gain = 1.0 if reference is None else settings.gain or self._fitting_gain(reference)
+        self._bytes = 0
+
+    def run(self) -> Pictures:
+        output, facts, empty = self._output, [], True
+
+        def drawn() -> Iterator[_Frame]:
+            nonlocal empty
+            for frame in self._frames():
+                facts.append(frame.facts)
+                empty &= frame.empty
+                yield frame
+
+        if output.kind == "frames":
+            for number, frame in zip(self._path.numbers, drawn(), strict=True):
+                self._write(output.path(number), frame.data)
+        elif output.kind == "picture":
+            (frame,) = drawn()
+            self._write(output.name, frame.data)
+        elif output.kind == "animation":
+            pictures = (_pixels(frame) for frame in drawn())
+            self._write(output.name, animate(pictures, output.form, frame_rate(self._path), self._progress))
+        else:
+            whole = sheet([_pixels(frame) for frame in drawn()], self._captions())
+            self._write(output.name, self._encode(whole))
+        return Pictures(facts, self._bytes, self._gain if self._reference is not None else None, empty)
+
+    def _captions(self) -> list[str]:
+        cameras = zip(self._path.numbers, self._path.cameras, strict=True)
+        return [camera.name or f"frame {number}" for number, camera in cameras]
+
+    def _frames(self) -> Iterator[_Frame]:
+        """The pictures, in order."""
+        count = len(self._path.cameras)
+        for done, frame in enumerate(ordered_map(self._frame, range(count), min(self._settings.jobs, count)), 1):
+            self._progress("drawing", done, count, "frame")
+            yield frame
+
+    def _frame(self, at: int) -> _Frame:
+        jit.use_threads(self._settings.threads)  # each thread has a number of its own
+        camera, number = self._path.cameras[at], self._path.numbers[at]
+        drawn, other = self._draw(at)
+        facts = self._facts(number, camera, drawn)
+        image = codes.over(drawn.image, self._settings.background)
+        if other is not None:
+            check_covered(other.image, f"what --diff names, in frame {number},")
+            reference = codes.over(other.image, self._settings.background)
+            facts["psnr_db"] = round(psnr(*(np.clip(each[..., :3], 0, 1) for each in (image, reference))), 3)
+            image = codes.difference(image, reference, self._gain)
+        empty = not drawn.image[..., 3].any()
+        if self._output.form == "npy":
+            return _Frame(facts, None, codes.encode_floats(self._floats(drawn, image)), empty)
+        pixels = codes.eight_bits(image)
+        bar = self._bar()
+        if bar is not None:
+            pixels = codes.with_scale(pixels, bar)
+            facts["width"] = pixels.shape[1]
+        if self._output.kind in ("picture", "frames"):
+            return _Frame(facts, None, self._encode(pixels), empty)
+        return _Frame(facts, pixels, b"", empty)
+
+    def _draw(self, at: int) -> tuple[Drawn, Drawn | None]:
+        """The picture of a camera, and that of the reference."""
+        if at in self._drawn:
+            return self._drawn.pop(at)
+        camera = self._path.cameras[at]
+        return self._renderer.draw(camera), None if self._reference is None else self._reference.draw(camera)
+
+    def _bar(self) -> Coloring | None:
+        """What colours mean; None where no bar says it."""
+        if not self._settings.bar:
+            return None
+        if self._reference is not None:
+            return codes.difference_bar(self._gain)
+        return self._renderer.scale.bar if self._renderer.scale is not None else None
+
+    def _fitting_gain(self, reference: Renderer) -> float:
+        """The gain that suits the first picture, the last and the one in the middle; the same for all."""
+        cameras, background = self._path.cameras, self._settings.background
+        some = sorted({0, len(cameras) // 2, len(cameras) - 1}, reverse=True)
+        keep = 2 * sum(cameras[at].width * cameras[at].height for at in some) <= KEPT_PIXELS
+        differences = []
+        for done, at in enumerate(some, 1):
+            both = self._renderer.draw(cameras[at]), reference.draw(cameras[at])
+            differences.append(codes.apart(*(codes.over(drawn.image, background) for drawn in both)))
+            if keep:
+                self._drawn[at] = both
+            self._progress("comparing", done, len(some), "frame")
+        return codes.gain_for(differences)
+
+    def _facts(self, number: int, camera: Camera, drawn: Drawn) -> dict[str, Any]:
+        facts = {"frame": number, "time_s": camera.time, "name": camera.name, "splats": drawn.splats}
+        facts |= {"width": camera.width, "height": camera.height}
+        if self._output.kind == "frames":
+            facts["file"] = str(self._output.path(number))
+        return facts
+
+    def _floats(self, drawn: Drawn, image: NDArray[np.float32]) -> NDArray[np.float32]:
+        """What a .npy holds: the numbers behind the colours where those are of pixels, else the colours."""
+        by = self._renderer.settings.color_by
+        return drawn.values if by in OF_PIXELS and drawn.values is not None else image
+
+    def _encode(self, pixels: Pixels) -> bytes:
+        return codes.encode(pixels, self._output.form, self._settings.jpeg_quality)
+
+    def _write(self, target: Path | None, data: bytes) -> None:
+        self._bytes += len(data)
+        if target is None:
+            write_stdout([data])
+        else:
+            write_whole(target, [data], overwrite=self._overwrite)
+
+
+def _pixels(frame: _Frame) -> Pixels:
+    assert frame.pixels is not None
+    return frame.pixels

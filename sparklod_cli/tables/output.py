@@ -1,0 +1,70 @@
+"""Where the table of a command goes: a file, standard output, or nowhere but into a summary."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from ..io import check_writable, write_stdout, write_whole
+from .columns import Column, Row
+from .files import encode, load_pyarrow
+
+#: What the bytes of a table are passed through on their way to standard output.
+Filter = Callable[[Iterable[bytes]], Iterable[bytes]]
+
+
+@dataclass(frozen=True)
+class TableOutput:
+    """Where a table goes.
+
+    Attributes:
+        path: of its file; None for standard output, or for nowhere.
+        form: a key of `files.FORMS`; None for nowhere: rows are made, and not written.
+        columns: of the table.
+        overwrite: replace a file that exists.
+    """
+
+    path: Path | None
+    form: str | None
+    columns: Sequence[Column]
+    overwrite: bool = False
+
+    @property
+    def on_stdout(self) -> bool:
+        """Whether the table goes to standard output."""
+        return self.path is None and self.form is not None
+
+    def check(self) -> None:
+        """Raises a `SparklodError` where the table cannot be written, before work goes into it."""
+        if self.path is not None:
+            check_writable(self.path, overwrite=self.overwrite)
+        if self.form == "parquet":
+            load_pyarrow()
+
+    def write(self, rows: Iterable[Row], *, passed: Filter | None = None) -> None:
+        """Makes all rows and writes them, as they come.
+
+        Args:
+            rows: of the table.
+            passed: what the bytes are passed through on their way to standard output.
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
+        if self.form is None:
+            for _ in rows:
+                pass
+            return
+        data: Iterable[bytes] = encode(iter(rows), self.columns, self.form)
+        if self.path is not None:
+            write_whole(self.path, data, overwrite=self.overwrite)
+        else:
+            write_stdout(passed(data) if passed is not None else data)
+
+
+def kept(rows: Iterable[Row], into: list[Row]) -> Iterator[Row]:
+    """The rows, each put into a list on its way."""
+    for row in rows:
+        into.append(row)
+        yield row

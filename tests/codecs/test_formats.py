@@ -1,0 +1,68 @@
+"""Every row of the table of formats keeps the contract of codecs, and can be asked for without loading any."""
+
+from __future__ import annotations
+
+import inspect
+import subprocess
+import sys
+from importlib import import_module
+
+import numpy as np
+import pytest
+
+from sparklod_cli.codecs.formats import FORMATS, WRITABLE, Format
+from sparklod_cli.codecs.gpu.table import ENCODINGS
+from sparklod_cli.codecs.options import WriteOptions
+from sparklod_cli.model.lod_tree import LodTree
+from sparklod_cli.model.scene import Scene
+from sparklod_cli.support.errors import FormatError
+from tests.scenes import random_splats
+
+
+def parameters(function: object) -> dict[str, bool]:
+    """The parameters of a function, and whether each must be named."""
+    found = inspect.signature(function).parameters.values()  # type: ignore[arg-type]
+    return {each.name: each.kind == each.KEYWORD_ONLY for each in found}
+
+
+@pytest.mark.parametrize("form", FORMATS, ids=lambda form: form.module)
+def test_a_codec_has_the_signatures_of_all(form: Format) -> None:
+    codec = form.codec()
+    more = {"beside": True} if form.companions else {}
+    assert parameters(codec.decode) == {"file": False, "threads": True, "progress": True} | more
+    assert hasattr(codec, "examine") == form.selective
+    assert hasattr(codec, "encode") == hasattr(codec, "settled") == form.writable
+    if form.writable:
+        assert parameters(codec.encode) == {"scene": False, "options": False, "threads": True, "progress": True}
+        assert parameters(codec.settled) == {"scene": False, "options": False}
+
+
+def test_one_format_is_written_by_each_suffix() -> None:
+    assert sum(len(form.suffixes) for form in FORMATS if form.writable) == len(WRITABLE)
+    assert set(WRITABLE) == {".ply", ".spz", ".splat"}
+
+
+@pytest.mark.parametrize("suffix", sorted(set(WRITABLE) - {".spz"}))
+def test_what_holds_no_tree_says_so_before_a_byte_is_written(suffix: str) -> None:
+    tree = Scene(random_splats(2), LodTree(np.array([1, 0], np.uint16), np.array([1, 0], np.uint32)))
+    codec = WRITABLE[suffix].codec()
+    with pytest.raises(FormatError, match="holds no Level-of-Detail tree"):
+        codec.settled(tree, WriteOptions())
+    with pytest.raises(FormatError, match="holds no Level-of-Detail tree"):
+        next(codec.encode(tree))
+
+
+def test_tables_load_nothing_heavy() -> None:
+    """`--help` names what stands in them."""
+    program = (
+        "import sys; from sparklod_cli.codecs import formats, rounding; from sparklod_cli.codecs.gpu import table;"
+        "from sparklod_cli.tables import files; from sparklod_cli.cameras.formats import table;"
+        "assert not {'numpy', 'numba'} & set(sys.modules), 'heavy'"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True)
+
+
+@pytest.mark.parametrize("name", ENCODINGS)
+def test_an_encoding_has_a_module_that_dumps(name: str) -> None:
+    module = import_module(f"sparklod_cli.codecs.gpu.{ENCODINGS[name]}")
+    assert parameters(module.dump) == {"scene": False, "threads": True}
