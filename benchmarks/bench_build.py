@@ -16,12 +16,11 @@ from pathlib import Path
 import numpy as np
 from scenes import load, tiled, write_ply
 
-from sparklod_cli.bake import BUILDERS
 from sparklod_cli.codecs import spz
 from sparklod_cli.codecs.options import WriteOptions
+from sparklod_cli.lod.builders import BUILDERS, METHODS
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.support import jit
-from sparklod_cli.support.defaults import METHODS
 from sparklod_cli.support.parallel import processors
 
 HERE = Path(__file__).resolve().parent
@@ -55,7 +54,7 @@ def machine() -> str:
 def warm_build(path: Path, method: str, runs: int) -> list[float]:
     """Seconds of each run of the builder alone, decoded splats to final order, after one that is not counted."""
     splats = load(path)
-    builder, _ = BUILDERS[method]
+    builder = BUILDERS[method].load()
     jit.use_threads(processors())
     # The first touch of a page is slow on a virtual machine, which may take free pages back; a process that has run for
     # a while has its pages, and those are the builder's own costs.

@@ -17,7 +17,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from sparklod_cli.support.defaults import METHODS
+from sparklod_cli.lod.builders import METHODS
 from sparklod_cli.support.jit import WAITING
 
 #: What OpenMP does by itself, what sparklod asks of it, and what else could be asked; one thread for comparison.

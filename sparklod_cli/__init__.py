@@ -1,3 +1,152 @@
-"""sparklod: bakes Level-of-Detail trees for 3D Gaussian splat scenes."""
+"""sparklod: Level-of-Detail trees for 3D Gaussian splat scenes, from Python.
+
+    import sparklod_cli as sparklod
+
+    tree = sparklod.build_lod(sparklod.read("scene.ply"))
+    sparklod.write("scene-lod.spz", tree)
+
+What `__all__` names is the public interface, described in docs/python.md. Nothing else is promised to stay as it is.
+"""
+
+from __future__ import annotations
+
+import sys
+from importlib import import_module
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .api.cameras import orbit, read_cameras
+    from .api.files import Written, build_lod, extract_leaves, inspect, read, write
+    from .api.results import ComparisonTable, Frames, Picture, show
+    from .api.views import compare, cut, psnr, render, ssim, traverse
+    from .cameras.camera import Camera
+    from .cameras.path import CameraPath
+    from .inspection.report import Report
+    from .lod.settings import LodSettings
+    from .model.foveation import Cones, Frustum
+    from .model.instances import Instance
+    from .model.lod_tree import LodTree
+    from .model.scene import Scene, Tree
+    from .model.selection import Selection
+    from .model.splats import Splats
+    from .model.transforms import Transform
+    from .render.backends import BackendError
+    from .render.settings import RasterSettings, RenderSettings
+    from .scenes.instances_file import InstancesFileError, read_instances
+    from .scenes.loaded import Cut
+    from .simulation.streaming import Network, StreamingSettings
+    from .support.errors import (
+        CameraPathError,
+        FormatError,
+        InvalidSplatsError,
+        OutOfMemoryError,
+        OutputError,
+        SparklodError,
+        TreeError,
+    )
 
 __version__ = "0.1.0"
+
+#: Where each public name is. Its module is imported when the name is first used (PEP 562), so that importing the
+#: package loads neither numpy nor numba. tests/test_api.py holds this and the imports above together.
+_MODULES = {
+    "api.cameras": ("orbit", "read_cameras"),
+    "api.files": ("Written", "build_lod", "extract_leaves", "inspect", "read", "write"),
+    "api.results": ("ComparisonTable", "Frames", "Picture", "show"),
+    "api.views": ("compare", "cut", "psnr", "render", "ssim", "traverse"),
+    "cameras.camera": ("Camera",),
+    "cameras.path": ("CameraPath",),
+    "inspection.report": ("Report",),
+    "lod.settings": ("LodSettings",),
+    "model.foveation": ("Cones", "Frustum"),
+    "model.instances": ("Instance",),
+    "model.lod_tree": ("LodTree",),
+    "model.scene": ("Scene", "Tree"),
+    "model.selection": ("Selection",),
+    "model.splats": ("Splats",),
+    "model.transforms": ("Transform",),
+    "render.backends": ("BackendError",),
+    "render.settings": ("RasterSettings", "RenderSettings"),
+    "scenes.instances_file": ("InstancesFileError", "read_instances"),
+    "scenes.loaded": ("Cut",),
+    "simulation.streaming": ("Network", "StreamingSettings"),
+    "support.errors": (
+        *("CameraPathError", "FormatError", "InvalidSplatsError", "OutOfMemoryError", "OutputError"),
+        *("SparklodError", "TreeError"),
+    ),
+}
+
+_HOMES = {name: module for module, names in _MODULES.items() for name in names}
+
+__all__ = [
+    "BackendError",
+    "Camera",
+    "CameraPath",
+    "CameraPathError",
+    "ComparisonTable",
+    "Cones",
+    "Cut",
+    "FormatError",
+    "Frames",
+    "Frustum",
+    "Instance",
+    "InstancesFileError",
+    "InvalidSplatsError",
+    "LodSettings",
+    "LodTree",
+    "Network",
+    "OutOfMemoryError",
+    "OutputError",
+    "Picture",
+    "RasterSettings",
+    "RenderSettings",
+    "Report",
+    "Scene",
+    "Selection",
+    "SparklodError",
+    "Splats",
+    "StreamingSettings",
+    "Transform",
+    "Tree",
+    "TreeError",
+    "Written",
+    "build_lod",
+    "compare",
+    "cut",
+    "extract_leaves",
+    "inspect",
+    "orbit",
+    "psnr",
+    "read",
+    "read_cameras",
+    "read_instances",
+    "render",
+    "show",
+    "ssim",
+    "traverse",
+    "write",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(import_module(f".{_HOMES[name]}", __name__), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_HOMES})
+
+
+class _Package(ModuleType):
+    """Keeps public functions: importing a module of the same name (`render`, `compare`) would put it in their place."""
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name not in _HOMES or not isinstance(value, ModuleType):
+            super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Package

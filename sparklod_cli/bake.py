@@ -1,45 +1,49 @@
-"""Baking: from a splat file to a Level-of-Detail file. What `sparklod build-lod` calls, and a program can call."""
+"""Baking: from a splat file to a Level-of-Detail file."""
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from .codecs import clamps, spz
+from .codecs.clamps import Clamp, Clamps
 from .codecs.gpu import dump
 from .codecs.options import WriteOptions
-from .io import Sink, read_rgba, read_scene
-from .lod import quality, quick
+from .io import Sink, read_rgba, read_scene, sink
+from .lod.builders import BUILDERS, METHODS
+from .model.lod_tree import LodTree
 from .model.scene import Scene
 from .model.selection import Selection
 from .model.splats import Splats
-from .support.defaults import DEFAULT_BASE, DEFAULT_GROWTH, MAX_SH_DEGREE, METHODS
-from .support.errors import FormatError, memory_told
+from .model.transforms import Transform
+from .support import jit
+from .support.defaults import DEFAULT_BASE, DEFAULT_GROWTH, MAX_SH_DEGREE
+from .support.errors import FormatError, InvalidSplatsError, memory_told
 from .support.progress import Progress, silent
-
-#: What has `build`, by method, and what of a recipe it takes.
-BUILDERS = {"quick": (quick, "base"), "quality": (quality, "growth")}
 
 
 @dataclass(frozen=True)
-class Recipe:
+class BakeSettings:
     """How to bake.
 
     Attributes:
-        method: one of `defaults.METHODS`.
-        base: of quick, growth of the cells from level to level, 1.1 to 2.0.
-        growth: of quality, the most nodes a leaf, 1.05 to 2.0.
-        max_sh: SH degrees above this are left out.
-        selection: which splats to keep.
-        rgba: a file of colours and opacities that take the place of the splats' own, see `io.read_rgba`.
-        encoding: one of `codecs.gpu.table.ENCODINGS`, to write the arrays of that instead of SPZ.
-        raw: write their words alone, rather than as .npz.
+        method: of `lod.builders.BUILDERS`.
+        base: of quick, growth of the voxel grid from level to level, 1.1 to 2.0.
+        growth: of quality, the largest number of nodes for each leaf, 1.05 to 2.0.
+        max_sh: the highest SH degree that is kept.
+        selection: which splats are kept; its coordinates are those of the input.
+        transform: turns, scales and moves the splats that are kept.
+        rgba: a file of colours and opacities that replace the splats' own, see `io.read_rgba`.
         spz: how to write SPZ.
-        threads: to work on.
+        encoding: of `codecs.gpu.table.ENCODINGS`, to write arrays in that layout instead of SPZ.
+        raw: write their words alone, rather than as .npz.
     """
 
     method: str = METHODS[0]
@@ -47,27 +51,33 @@ class Recipe:
     growth: float = DEFAULT_GROWTH
     max_sh: int = MAX_SH_DEGREE
     selection: Selection = field(default_factory=Selection)
+    transform: Transform = field(default_factory=Transform)
     rgba: Path | None = None
+    spz: WriteOptions = field(default_factory=WriteOptions)
     encoding: str | None = None
     raw: bool = False
-    spz: WriteOptions = field(default_factory=WriteOptions)
-    threads: int = 1
+
+    def builder(self) -> Callable[..., tuple[Splats, LodTree]]:
+        """What makes `(nodes, tree)` of splats; takes `progress`, too."""
+        row = BUILDERS[self.method]
+        return functools.partial(row.load().build, **{row.setting: getattr(self, row.setting)})
 
 
 @dataclass(frozen=True)
 class Baked:
-    """What came of it.
+    """What was baked.
 
     Attributes:
         format: of the input, for people.
-        splats, sh_degree: of the input as far as it was kept; `read` counts what was in the file.
-        dropped: how many splats were left out, by reason (`selection.REASONS`).
+        read: the number of splats in the input.
+        splats, sh_degree: of those that were kept.
+        dropped: the number of splats that were left out, by reason (`selection.REASONS`).
         method: that built the tree.
         nodes, levels: of the tree; a tree of one node has one level.
         bytes: of the output.
         version, fractional_bits: of an SPZ output, else None.
         arrays: shapes of the arrays of another output, in its order.
-        clamped: nodes with a value that the output cannot hold, by the column of `Splats` where there are any.
+        clamped: by the column of `Splats`, the number of nodes with a value that the output cannot hold.
         clamps: at which ends, and how far beyond.
         notes: what the reader had to leave out, for people.
         seconds: by stage (read, build, write).
@@ -86,75 +96,107 @@ class Baked:
     fractional_bits: int | None
     arrays: dict[str, tuple[int, ...]]
     clamped: dict[str, int]
-    clamps: tuple[clamps.Clamp, ...]
+    clamps: tuple[Clamp, ...]
     notes: tuple[str, ...]
     seconds: dict[str, float]
 
 
-def bake(source: Path, write: Sink, recipe: Recipe, *, progress: Progress = silent) -> Baked:
-    """Reads `source`, builds its tree and hands the LoD file to `write`.
+def bake(
+    source: Path,
+    target: Path,
+    settings: BakeSettings,
+    *,
+    overwrite: bool = False,
+    make_parent: bool = False,
+    threads: int = 1,
+    progress: Progress = silent,
+) -> Baked:
+    """Reads a splat file, builds its tree and writes a Level-of-Detail file.
+
+    Args:
+        source: of any format that is read; - is standard input.
+        target: an SPZ file, or one of arrays, whatever its name; - is standard output.
+        settings: how.
+        overwrite: replace a file that exists.
+        make_parent: make the folder of the output if there is none.
+        threads: to work on.
+        progress: told of the stages.
 
     Raises:
-        FormatError, InvalidSplatsError, OutputError: see `io.read_scene`, `Selection.apply` and `write`.
+        FormatError, InvalidSplatsError, OutputError: see `io.read_scene`, `Selection.apply` and `io.sink`.
         OutOfMemoryError: it does not fit into memory.
     """
     with memory_told():
-        return _bake(source, write, recipe, progress)
-
-
-def _bake(source: Path, write: Sink, recipe: Recipe, progress: Progress) -> Baked:
-    threads = recipe.threads
-    start = time.perf_counter()
-    scene = read_scene(source, threads=threads, progress=progress)
-    if scene.tree is not None:
-        raise FormatError("it is a Level-of-Detail file already; --unlod writes its splats back out")
-    total = len(scene.splats)
-    kept, dropped = recipe.selection.apply(_recolored(scene.splats, recipe.rgba).with_max_sh(recipe.max_sh))
-    read_done = time.perf_counter()
-    antialiased, name, notes = scene.antialiased, scene.format, scene.notes
-    count, degree = len(kept), kept.sh_degree
-    # Before building, so that what does not fit is said at once.
-    if not recipe.encoding:
-        spz.settled(Scene(kept), recipe.spz)
-    # The builder frees its input as it goes, if nobody else holds it: a third of the peak.
-    handed_over = [kept]
-    del scene, kept
-    builder, setting = BUILDERS[recipe.method]
-    nodes, tree = builder.build(handed_over.pop(), getattr(recipe, setting), progress=progress)
-    levels = int(tree.depths().max()) + 1
-    build_done = time.perf_counter()
-    output = Scene(nodes, tree, antialiased)
-    arrays = dump.pack(output, recipe.encoding, threads) if recipe.encoding else {}
-    options = None if arrays else spz.settled(output, recipe.spz)
-    if options is None:
-        size = write(dump.encode_raw(arrays) if recipe.raw else dump.encode_npz(arrays))
-    else:
-        size = write(spz.encode(output, options, threads=threads, progress=progress))
-    clamped = {} if arrays else clamps.clamped(nodes, threads)
-    ends = tuple(clamps.clamps(nodes, clamped))
-    seconds = {
-        "read": read_done - start,
-        "build": build_done - read_done,
-        "write": time.perf_counter() - build_done,
-    }
+        write = sink(target, overwrite=overwrite, make_parent=make_parent)
+        start = time.perf_counter()
+        scene = read_scene(source, threads=threads, progress=progress)
+        if scene.tree is not None:
+            raise FormatError("it is a Level-of-Detail file already; --unlod writes its splats back out")
+        facts: dict[str, Any] = {"format": scene.format, "notes": scene.notes, "read": len(scene.splats)}
+        kept, facts["dropped"] = settings.selection.apply(
+            _recolored(scene.splats, settings.rgba).with_max_sh(settings.max_sh)
+        )
+        kept = _transformed(kept, settings.transform)
+        read_done = time.perf_counter()
+        facts |= {"splats": len(kept), "sh_degree": kept.sh_degree}
+        antialiased = scene.antialiased
+        # Before building, so that what does not fit is said at once.
+        if settings.encoding is None:
+            spz.settled(Scene(kept), settings.spz)
+        jit.use_threads(threads)
+        # The builder frees its input as it goes, if nobody else holds it: a third of the peak.
+        handed_over = [kept]
+        del scene, kept
+        nodes, tree = settings.builder()(handed_over.pop(), progress=progress)
+        levels = int(tree.depths().max()) + 1
+        build_done = time.perf_counter()
+        facts |= _written(Scene(nodes, tree, antialiased), write, settings, threads, progress)
+        seconds = {
+            "read": read_done - start,
+            "build": build_done - read_done,
+            "write": time.perf_counter() - build_done,
+        }
     return Baked(
-        format=name,
-        read=total,
-        splats=count,
-        sh_degree=degree,
-        dropped=dropped,
-        method=recipe.method,
+        **facts,
+        method=settings.method,
         nodes=len(nodes),
         levels=levels,
-        bytes=size,
-        version=None if options is None else options.spz_version,
-        fractional_bits=None if options is None else options.fractional_bits,
-        arrays={array: words.shape for array, words in arrays.items()},
-        clamped=clamped,
-        clamps=ends,
-        notes=notes,
         seconds={stage: round(value, 4) for stage, value in seconds.items()},
     )
+
+
+def _written(scene: Scene, write: Sink, settings: BakeSettings, threads: int, progress: Progress) -> dict[str, Any]:
+    """Writes a tree; the facts of `Baked` about that."""
+    if settings.encoding is not None:
+        arrays = dump.pack(scene, settings.encoding, threads)
+        size = write(dump.encode_raw(arrays) if settings.raw else dump.encode_npz(arrays))
+        options, beyond = WriteOptions(), Clamps()
+    else:
+        arrays, options = {}, spz.settled(scene, settings.spz)
+        size = write(spz.encode(scene, options, threads=threads, progress=progress))
+        beyond = clamps.find(scene.splats, threads)
+    return {
+        "bytes": size,
+        "version": options.spz_version,
+        "fractional_bits": options.fractional_bits,
+        "arrays": {name: words.shape for name, words in arrays.items()},
+        "clamped": beyond.splats,
+        "clamps": beyond.ends,
+    }
+
+
+def _transformed(splats: Splats, transform: Transform) -> Splats:
+    """Splats turned, scaled and moved.
+
+    Raises:
+        InvalidSplatsError: one leaves the range of float32.
+    """
+    turned = transform.apply(splats)
+    if turned is not splats and turned.invalid():
+        raise InvalidSplatsError(
+            "scaled and moved like this, it leaves the range of float32; give a smaller --scale or --translate"
+        )
+    return turned
 
 
 def _recolored(splats: Splats, rgba: Path | None) -> Splats:

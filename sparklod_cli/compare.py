@@ -6,10 +6,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from .cameras.path import CameraPath
-from .images.metrics import check_covered, psnr, ssim, worst_tile
+from .images.metrics import check_covered, on_background, psnr, ssim, worst_tile
 from .io import write_whole
 from .lod.budget import Budget
 from .lod.settings import LodSettings
@@ -96,11 +94,6 @@ class Comparison:
                     "selected": drawn.splats,
                 }
                 yield row, drawn.image, full
-
-
-def on_background(image: Image, gray: float) -> Image:
-    """(H, W, 3), 0..1: an image of which red, green and blue are multiplied by alpha, on a background 0..1."""
-    return np.clip(image[..., :3] + np.float32(gray) * (1 - image[..., 3:]), 0, 1)
 
 
 def _measured(picture: tuple[Row, Image, Image]) -> Row:

@@ -1,11 +1,10 @@
-"""From a Level-of-Detail file back to its splats. What `sparklod build-lod --unlod` calls, and a program can call."""
+"""From a Level-of-Detail file back to its splats, which are the leaves of its tree."""
 
 from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -13,30 +12,18 @@ import numpy as np
 from .codecs.formats import WRITABLE
 from .codecs.options import WriteOptions
 from .codecs.spz_options import like
-from .io import Sink, read_scene
+from .io import read_scene, sink
 from .model.scene import Scene
 from .support.errors import FormatError, memory_told
 from .support.progress import Progress, silent
 
-
-@dataclass(frozen=True)
-class Target:
-    """How to write.
-
-    Attributes:
-        suffix: one of `formats.WRITABLE`.
-        options: of the file; what is None is taken from the input, which keeps its values as they are.
-        threads: to work on.
-    """
-
-    suffix: str = ".spz"
-    options: WriteOptions = field(default_factory=WriteOptions)
-    threads: int = 1
+#: Of outputs whose name has none.
+SUFFIX = ".spz"
 
 
 @dataclass(frozen=True)
-class Unbaked:
-    """What came of it.
+class Extracted:
+    """What was written.
 
     Attributes:
         format: of the input, for people.
@@ -54,42 +41,62 @@ class Unbaked:
     seconds: dict[str, float]
 
 
-def unlod(source: Path, write: Sink, target: Target, *, progress: Progress = silent) -> Unbaked:
-    """Reads the tree at `source` and hands its leaves to `write`, in their order, as a file of plain splats.
+def leaves_of(scene: Scene) -> Scene:
+    """The splats that the tree of a scene was built of, as a scene without a tree.
 
     Raises:
-        FormatError, OutputError: see `io.read_scene` and `write`; the file has no tree.
+        FormatError: it has no tree.
+    """
+    if scene.tree is None:
+        raise FormatError("it has no Level-of-Detail tree whose leaves could be written")
+    leaves = scene.splats.take(scene.tree.is_leaf)
+    # A leaf is an input splat. One whose opacity is above 1 comes from a writer that rounds up.
+    leaves = dataclasses.replace(leaves, opacity=np.minimum(leaves.opacity, np.float32(1)))
+    return dataclasses.replace(scene, splats=leaves, tree=None)
+
+
+def extract_leaves(
+    source: Path,
+    target: Path,
+    options: WriteOptions,
+    *,
+    overwrite: bool = False,
+    make_parent: bool = False,
+    threads: int = 1,
+    progress: Progress = silent,
+) -> Extracted:
+    """Reads the tree of a Level-of-Detail file and writes its leaves, in their order, as a file of plain splats.
+
+    Args:
+        source: a Level-of-Detail file; - is standard input.
+        target: its suffix tells the format, which is SPZ where it has none; - is standard output.
+        options: how to write; what is None is taken from the input, which keeps its values as they are.
+        overwrite: replace a file that exists.
+        make_parent: make the folder of the output if there is none.
+        threads: to work on.
+        progress: told of the stages.
+
+    Raises:
+        FormatError, OutputError: see `io.read_scene` and `io.sink`; the file has no tree.
         OutOfMemoryError: it does not fit into memory.
+        ValueError: no format of plain splats has that suffix.
     """
     with memory_told():
-        return _unlod(source, write, target, progress)
-
-
-def _unlod(source: Path, write: Sink, target: Target, progress: Progress) -> Unbaked:
-    start = time.perf_counter()
-    scene = read_scene(source, threads=target.threads, progress=progress)
-    if scene.tree is None:
-        raise FormatError("it has no Level-of-Detail tree that could be undone")
-    leaves = scene.splats.take(scene.tree.is_leaf)
-    read_done = time.perf_counter()
-    # A leaf is an input splat. One that is more than opaque comes from a writer that rounds up.
-    leaves = dataclasses.replace(leaves, opacity=np.minimum(leaves.opacity, np.float32(1)))
-    plain = Scene(leaves, antialiased=scene.antialiased, header=scene.header)
-    size = write(_encode(plain, target, progress))
-    seconds = {"read": read_done - start, "write": time.perf_counter() - read_done}
-    return Unbaked(
+        write = sink(target, overwrite=overwrite, make_parent=make_parent)
+        suffix = target.suffix.lower() or SUFFIX
+        if suffix not in WRITABLE:
+            raise ValueError(f"{suffix} is not one of {', '.join(WRITABLE)}")
+        start = time.perf_counter()
+        scene = read_scene(source, threads=threads, progress=progress)
+        leaves = leaves_of(scene)
+        read_done = time.perf_counter()
+        size = write(WRITABLE[suffix].codec().encode(leaves, like(scene, options), threads=threads, progress=progress))
+        seconds = {"read": read_done - start, "write": time.perf_counter() - read_done}
+    return Extracted(
         format=scene.format,
         nodes=len(scene.splats),
-        splats=len(leaves),
-        sh_degree=leaves.sh_degree,
+        splats=len(leaves.splats),
+        sh_degree=leaves.splats.sh_degree,
         bytes=size,
         seconds={stage: round(value, 4) for stage, value in seconds.items()},
     )
-
-
-def _encode(scene: Scene, target: Target, progress: Progress) -> Iterator[bytes]:
-    if target.suffix not in WRITABLE:
-        raise ValueError(f"{target.suffix} is not one of {', '.join(WRITABLE)}")
-    codec, options = WRITABLE[target.suffix].codec(), like(scene, target.options)
-    pieces: Iterator[bytes] = codec.encode(scene, options, threads=target.threads, progress=progress)
-    return pieces

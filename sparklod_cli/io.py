@@ -21,6 +21,7 @@ from .model.splats import COLUMNS, FloatArray
 from .support import atomic
 from .support.errors import FormatError, OutputError, StdoutError, UnknownFormatError, UnreadableError
 from .support.progress import Progress, silent
+from .support.stdin import DASH, spooled
 from .support.stdout import ReaderGoneError, told
 from .support.units import count_of
 from .support.untrusted import shown
@@ -36,7 +37,7 @@ def read_scene(path: Path, *, threads: int = 1, progress: Progress = silent) -> 
     """Reads a splat file of any known format, told by its content, or else by its suffix.
 
     Args:
-        path: of a file, or of a folder that holds an unpacked SOG.
+        path: of a file, or of a folder that holds an unpacked SOG; - is standard input.
         threads: to decode with.
         progress: is told how much is done.
 
@@ -75,13 +76,11 @@ def examine_scene(
 def _opened(path: Path) -> Iterator[tuple[BinaryIO, Format, dict[str, Any]]]:
     """A splat file, its format, and what else its codec takes."""
     try:
-        if str(path) == "-":
-            raise UnreadableError("standard input is not read; save it to a file first")
         if path.is_dir():
             path = _in_folder(path)
-        if path.exists() and not path.is_file():
+        if path != DASH and path.exists() and not path.is_file():
             raise UnreadableError("it is a pipe or a device; save it to a file first")
-        with path.open("rb") as file:
+        with contextlib.nullcontext(spooled()) if path == DASH else path.open("rb") as file:
             head = file.read(HEAD)
             file.seek(0)
             if not head:
@@ -89,16 +88,21 @@ def _opened(path: Path) -> Iterator[tuple[BinaryIO, Format, dict[str, Any]]]:
             form = sniff(head, path.suffix)
             if form is None:
                 names = ", ".join(form.name for form in FORMATS)
-                raise UnknownFormatError(f"not a splat file that sparklod reads ({names})")
-            yield file, form, {"beside": functools.partial(_open_beside, path.parent)} if form.companions else {}
+                hint = "; a .splat file is told by its name alone" if path == DASH else ""
+                raise UnknownFormatError(f"not a splat file that sparklod reads ({names}){hint}")
+            yield file, form, {"beside": functools.partial(_open_beside, path)} if form.companions else {}
     except OSError as error:
         raise UnreadableError(f"cannot be read: {_reason(error)}") from None
 
 
-def size_on_disk(path: Path) -> int | None:
-    """Bytes of a file, None where that cannot be told."""
+def size_of_input(path: Path) -> int | None:
+    """Bytes of a file, or of standard input; None where that cannot be told."""
     try:
+        if path == DASH:
+            return spooled().seek(0, os.SEEK_END)
         return path.stat().st_size if path.is_file() else None
+    except UnreadableError:
+        return None
     except OSError:
         return None
 
@@ -186,11 +190,13 @@ def _leads_away(name: str) -> bool:
     return name in ("", ".", "..") or any(mark in name for mark in "/\\:") or not is_file_name(name)
 
 
-def _open_beside(folder: Path, name: str) -> BinaryIO:
+def _open_beside(first: Path, name: str) -> BinaryIO:
     """Opens a file that another one names; `FormatError` where the name could lead out of their folder."""
+    if first == DASH:
+        raise FormatError(f"it names {shown(name)}, and no file is beside standard input; name the folder instead")
     if _leads_away(name):
         raise FormatError(f"it names {shown(name)}, which is not a file beside it")
-    path = folder / name
+    path = first.parent / name
     try:
         if path.exists() and not path.is_file():
             raise FormatError(f"{shown(name)}, which it names, is not a file")
@@ -287,6 +293,18 @@ def write_whole(path: Path, pieces: Iterable[bytes], *, overwrite: bool) -> int:
         raise OutputError(f"{path} exists, add --overwrite to replace it") from None
     except OSError as error:
         raise OutputError(f"cannot write {path}: {_reason(error)}") from None
+
+
+def sink(path: Path, *, overwrite: bool, make_parent: bool = False) -> Sink:
+    """What writes an output, and is known to be able to as far as that can be told before; - is standard output.
+
+    Raises:
+        OutputError: see `check_writable`.
+    """
+    if path == DASH:
+        return write_stdout
+    check_writable(path, overwrite=overwrite, make_parent=make_parent)
+    return functools.partial(write_whole, path, overwrite=overwrite)
 
 
 def write_stdout(pieces: Iterable[bytes]) -> int:

@@ -17,7 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fixtures import by_hand, by_hand_ksplat, by_hand_splat
-from sparklod_cli.bake import Recipe, bake
+from sparklod_cli.bake import BakeSettings, bake
 from sparklod_cli.codecs import ply, spz_options
 from sparklod_cli.codecs.gpu.table import ENCODINGS
 from sparklod_cli.codecs.options import WriteOptions
@@ -25,12 +25,13 @@ from sparklod_cli.inspection import leaves, values
 from sparklod_cli.inspection.findings import ERROR, NOTE, Finding
 from sparklod_cli.inspection.report import Wanted, inspect
 from sparklod_cli.io import read_scene
+from sparklod_cli.lod.builders import METHODS
 from sparklod_cli.model.gaussian import normalized_quat
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.selection import Selection
 from sparklod_cli.model.sh import COEFFICIENTS
 from sparklod_cli.model.splats import Splats
-from sparklod_cli.support.defaults import MAX_FRACTIONAL_BITS, METHODS, SPZ_VERSIONS
+from sparklod_cli.support.defaults import MAX_FRACTIONAL_BITS, SPZ_VERSIONS
 from sparklod_cli.support.errors import InvalidSplatsError, SparklodError
 from sparklod_cli.tables import histograms
 from tests.conftest import FIXTURES, real_scene
@@ -117,11 +118,11 @@ def checked(output: Path, source: Path) -> list[Finding]:
     return [*(report.findings or []), *leaves.check(scene, read_scene(source))]
 
 
-def findings_of(source: Path, recipe: Recipe) -> list[Finding]:
+def findings_of(source: Path, how: BakeSettings) -> list[Finding]:
     """What it finds in a bake."""
     with tempfile.TemporaryDirectory() as folder:
         output = Path(folder, "out.spz")
-        bake(source, lambda pieces: write(output, pieces), recipe)
+        bake(source, output, how)
         return checked(output, source)
 
 
@@ -140,9 +141,9 @@ def refused(error: SparklodError) -> bool:
 @settings(max_examples=300, deadline=None)
 def test_what_is_written_passes_our_own_check(splats: Splats, method: str, version: int, bits: int | None) -> None:
     with tempfile.TemporaryDirectory() as folder:
-        recipe = Recipe(method=method, spz=WriteOptions(spz_version=version, fractional_bits=bits))
+        how = BakeSettings(method=method, spz=WriteOptions(spz_version=version, fractional_bits=bits))
         try:
-            found = findings_of(file_of(folder, splats), recipe)
+            found = findings_of(file_of(folder, splats), how)
         except SparklodError as error:
             assert refused(error)
         else:
@@ -159,12 +160,12 @@ def test_a_coordinate_is_written_up_to_the_last_but_one_code(bits: int | None, m
         splats.center[:] = 0
         splats.center[3, 1] = sign * (spz_options.LAST_CODE + code) * step
         source = file_of(tmp_path, splats)
-        recipe = Recipe(method=method, spz=WriteOptions(fractional_bits=bits))
+        how = BakeSettings(method=method, spz=WriteOptions(fractional_bits=bits))
         if code < 1:
-            assert [each.code for each in findings_of(source, recipe) if each.severity == ERROR] == []
+            assert [each.code for each in findings_of(source, how) if each.severity == ERROR] == []
         else:
             with pytest.raises(SparklodError, match=r"does not fit|SPZ holds at most 8388606: scale the scene"):
-                findings_of(source, recipe)
+                findings_of(source, how)
 
 
 @given(scenes(), st.sampled_from(METHODS), st.sampled_from(list(ENCODINGS)))
@@ -175,7 +176,7 @@ def test_every_encoding_and_every_report_of_an_extreme_scene_is_made_without_a_w
     with tempfile.TemporaryDirectory() as folder:
         source, output = file_of(folder, splats), Path(folder, "out")
         try:
-            bake(source, lambda pieces: write(output, pieces), Recipe(method=method, encoding=encoding))
+            bake(source, output, BakeSettings(method=method, encoding=encoding))
         except InvalidSplatsError as error:  # of which none can be seen
             assert refused(error)
         reported(source)
@@ -223,9 +224,9 @@ def test_any_numbers_are_baked_refused_and_reported_without_a_warning(
     with tempfile.TemporaryDirectory() as folder:
         source, output = Path(folder, f"scene{kind}"), Path(folder, "out.spz")
         source.write_bytes(data)
-        recipe = Recipe(method=method, encoding=encoding, selection=Selection(drop_invalid=drop))
+        how = BakeSettings(method=method, encoding=encoding, selection=Selection(drop_invalid=drop))
         try:
-            bake(source, lambda pieces: write(output, pieces), recipe)
+            bake(source, output, how)
         except SparklodError as error:
             assert refused(error)
         else:
@@ -242,7 +243,7 @@ REAL = ("biker.ply", "biker.spz", "playbot-125k.ply", "meadow.sog", "playbot.sog
 
 def passes(source: Path, method: str) -> None:
     """The law of docs/ci.md: `--check --fail-on warning`."""
-    found = findings_of(source, Recipe(method=method, threads=2))
+    found = findings_of(source, BakeSettings(method=method))
     assert {each.code for each in found if each.severity != NOTE} == ODD.get(source.name, set()), found
 
 

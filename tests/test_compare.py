@@ -15,14 +15,13 @@ import pytest
 from PIL import Image
 
 from sparklod_cli import bake
-from sparklod_cli import io as files
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.cameras.path import CameraPath
 from sparklod_cli.cameras.pose import look_at
 from sparklod_cli.commands import render_compare
 from sparklod_cli.commands.console import Console
-from sparklod_cli.compare import Comparison, on_background
-from sparklod_cli.images.metrics import MOST_PSNR
+from sparklod_cli.compare import Comparison
+from sparklod_cli.images.metrics import MOST_PSNR, on_background
 from sparklod_cli.lod.budget import parse_budgets
 from sparklod_cli.lod.settings import LodSettings
 from sparklod_cli.model.foveation import Cones
@@ -43,7 +42,7 @@ RENDER = RenderSettings()
 def twice(tmp_path_factory: pytest.TempPathFactory) -> Scenes:
     """A few hundred splats with SH, as a tree, twice."""
     baked = tmp_path_factory.mktemp("compare") / "sh3.spz"
-    bake.bake(FIXTURES / "sh3.ply", lambda pieces: files.write_whole(baked, pieces, overwrite=True), bake.Recipe())
+    bake.bake(FIXTURES / "sh3.ply", baked, bake.BakeSettings())
     there = np.eye(4)
     there[:3, 3] = 3, 0, 1
     return read_scenes([Instance(baked, "here"), Instance(baked, "there", there)])

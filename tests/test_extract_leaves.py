@@ -85,20 +85,20 @@ def test_leaves_that_cannot_be_drawn_are_written_too(tmp_path: Path) -> None:
 
 def test_what_is_no_tree_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert unlod(FIXTURES / "one.ply", "--output-dir", tmp_path) == 1
-    assert "it has no Level-of-Detail tree that could be undone" in capsys.readouterr().err
+    assert "it has no Level-of-Detail tree whose leaves could be written" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--base", "1.2"], "--base is of no use with --unlod"),
-        (["--method", "quick"], "--method is of no use with --unlod"),
-        (["--growth", "1.2"], "--growth is of no use with --unlod"),
-        (["--rgba", "c.npy"], "--rgba is of no use with --unlod"),
-        (["--encoding", "ext"], "--encoding is of no use with --unlod"),
+        (["--base", "1.2"], "--base cannot be used with --unlod"),
+        (["--method", "quick"], "--method cannot be used with --unlod"),
+        (["--growth", "1.2"], "--growth cannot be used with --unlod"),
+        (["--rgba", "c.npy"], "--rgba cannot be used with --unlod"),
+        (["--encoding", "ext"], "--encoding cannot be used with --unlod"),
         (["-o", "x.sog"], "--unlod writes .ply, .spz, .splat, not .sog"),
-        (["-o", "x.ply", "--spz-version", "2"], "--spz-version is of SPZ, not of .ply"),
+        (["-o", "x.ply", "--spz-version", "2"], "--spz-version is an option of SPZ, not of .ply"),
     ],
 )
 def test_options_that_do_not_suit_unlod_are_refused(

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..support.errors import CameraPathError
+
 Matrix = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Camera:
     """A pinhole camera, in the axes of OpenGL and three.js: x to the right, y up, looking along -z.
 
@@ -31,6 +34,47 @@ class Camera:
     principal: tuple[float, float]
     time: float = 0.0
     name: str = ""
+
+    @classmethod
+    def look_at(
+        cls,
+        eye: Sequence[float],
+        target: Sequence[float],
+        *,
+        up: Sequence[float] = (0.0, -1.0, 0.0),
+        fov_y: float = 60.0,
+        size: tuple[int, int] = (1280, 720),
+        time: float = 0.0,
+        name: str = "",
+    ) -> Camera:
+        """A camera at a point that looks at another.
+
+        Args:
+            eye, target: x, y, z in world units.
+            up: x, y, z of what is up in the picture; -y in scenes as training leaves them.
+            fov_y: vertical field of view, degrees.
+            size: width and height of the image, pixels.
+            time: seconds since the start of its path.
+            name: of its frame, for people.
+
+        Raises:
+            CameraPathError: eye and target are the same point, or a number is out of its range.
+        """
+        from .pose import look_at  # which needs this module
+
+        if not 0 < fov_y < 180 or min(size) < 1:
+            raise CameraPathError(f"a camera of {fov_y:g} degrees and {size[0]} x {size[1]} pixels sees nothing")
+        try:
+            pose = look_at(eye, target, up)
+        except ValueError as error:
+            raise CameraPathError(f"the camera {error}") from None
+        focal = size[1] / (2 * math.tan(math.radians(fov_y) / 2))
+        return cls(pose, *size, (focal, focal), (size[0] / 2, size[1] / 2), time, name)
+
+    def __repr__(self) -> str:
+        at, ahead = (", ".join(f"{value:.4g}" for value in vector) for vector in (self.position, self.forward))
+        view = f"{math.degrees(self.fov_y):.4g} degrees, {self.width} x {self.height}"
+        return f"Camera(at {at}, looking along {ahead}, {view})"
 
     @property
     def position(self) -> Matrix:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,7 +30,7 @@ GENERATED = {
 }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class CameraPath:
     """Cameras in the order in which they are passed.
 
@@ -44,6 +45,18 @@ class CameraPath:
     format: str
     notes: tuple[str, ...]
     numbers: tuple[int, ...]
+
+    def __len__(self) -> int:
+        return len(self.cameras)
+
+    def __iter__(self) -> Iterator[Camera]:
+        return iter(self.cameras)
+
+    def __getitem__(self, index: int) -> Camera:
+        return self.cameras[index]
+
+    def __repr__(self) -> str:
+        return f"CameraPath({len(self.cameras):,} camera{'s' * (len(self.cameras) != 1)} of {self.format})"
 
 
 def read(files: Files, *, format: str | None = None, settings: Settings | None = None) -> CameraPath:

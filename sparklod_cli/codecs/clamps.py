@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -31,35 +30,38 @@ class Clamp:
     farthest: float
 
 
-def clamped(splats: Splats, threads: int = 1) -> dict[str, int]:
-    """How many splats have a value that its code cannot hold, by the column (scale, rgb, sh) where there are any."""
-    counts = {}
+@dataclass(frozen=True)
+class Clamps:
+    """What a file cannot hold.
+
+    Attributes:
+        splats: by the column of `Splats`, how many have a value beyond either end; columns without any are left out.
+        ends: the ends that values lie beyond.
+    """
+
+    splats: dict[str, int] = field(default_factory=dict)
+    ends: tuple[Clamp, ...] = ()
+
+
+def find(splats: Splats, threads: int = 1) -> Clamps:
+    """What SPZ cannot hold of splats."""
+    counts, ends = {}, []
     for name, (low, high) in quantize.CLAMPS.items():
         column = getattr(splats, name).reshape(len(splats), -1)
+        if not column.size:
+            continue
 
-        def outside(part: slice, column: FloatArray = column, low: float = low, high: float = high) -> int:
-            values = column[part]
-            return int(np.count_nonzero(((values < low) | (values > high)).any(axis=1)))
+        def look(part: slice, column: FloatArray = column, low: float = low, high: float = high) -> tuple[float, ...]:
+            least, most = column[part].min(axis=1), column[part].max(axis=1)
+            below, above = least < low, most > high
+            counted = (int(np.count_nonzero(mask)) for mask in (below | above, below, above))
+            return *counted, float(least.min()), float(most.max())
 
-        counts[name] = sum(ordered_map(outside, chunks_of(len(splats)), threads))
-    return {name: count for name, count in counts.items() if count}
-
-
-def clamps(splats: Splats, columns: Iterable[str]) -> list[Clamp]:
-    """Which ends of their codes values lie beyond.
-
-    Args:
-        splats: as they are written.
-        columns: of `Splats`, those that `clamped` found some in.
-    """
-    found = []
-    for name in columns:
-        values = getattr(splats, name).reshape(len(splats), -1)
-        least, most = values.min(axis=1), values.max(axis=1)
-        low, high = quantize.CLAMPS[name]
-        below, above = int(np.count_nonzero(least < low)), int(np.count_nonzero(most > high))
-        if below:
-            found.append(Clamp(name, False, below, low, float(least.min())))
-        if above:
-            found.append(Clamp(name, True, above, high, float(most.max())))
-    return found
+        either, below, above, least, most = zip(*ordered_map(look, chunks_of(len(splats)), threads), strict=True)
+        if sum(either):
+            counts[name] = int(sum(either))
+        if sum(below):
+            ends.append(Clamp(name, False, int(sum(below)), low, min(least)))
+        if sum(above):
+            ends.append(Clamp(name, True, int(sum(above)), high, max(most)))
+    return Clamps(counts, tuple(ends))

@@ -21,6 +21,7 @@ class Format:
         writable: its module also has `encode(scene, options, *, threads, progress) -> Iterator[bytes]`, and
             `settled(scene, options) -> WriteOptions`, the options with nothing left open, which raises `FormatError`
             where the scene cannot be written.
+        trees: what is written can be a Level-of-Detail tree.
         suffixes: lower case, with the dot.
         beginning: a regular expression that the first bytes of its files match; None where they can be anything, and
             only the suffix tells.
@@ -34,6 +35,7 @@ class Format:
     suffixes: tuple[str, ...]
     beginning: bytes | None
     writable: bool = False
+    trees: bool = False
     companions: bool = False
     selective: bool = False
 
@@ -57,7 +59,7 @@ FORMATS = (
     ),
     Format("PLY", "ply", (".ply",), rb"ply[\r\n]", writable=True),
     # Gzipped up to version 3.
-    Format("SPZ", "spz", (".spz",), rb"\x1f\x8b\x08[\0-\x1f]|NGSP", writable=True, selective=True),
+    Format("SPZ", "spz", (".spz",), rb"\x1f\x8b\x08[\0-\x1f]|NGSP", writable=True, trees=True, selective=True),
     # A zip, or its meta.json unpacked.
     Format("SOG", "sog", (".sog", ".json"), rb"PK\x03\x04|\s*\{\s*\"\w+\"\s*:", companions=True),
     Format("KSPLAT", "ksplat", (".ksplat",), rb"\0[\x01-\xff]\0\0"),  # version 0.1 and up; a float would be denormal

@@ -3,313 +3,240 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import json
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..codecs.formats import WRITABLE
-from ..codecs.gpu.table import ENCODINGS, RAW_SUFFIXES
-from ..codecs.options import WriteOptions
-from ..support import defaults
+from ..codecs.formats import FORMATS, WRITABLE
+from ..codecs.gpu.table import NPZ, RAW_SUFFIXES
+from ..support.errors import SparklodError
 from ..support.printable import MOST, shortened
-from .command import Command
-from .console import Console
-from .options.common import common_options, overwrite_option
-from .options.types import AutoOr, Ball, Numbers, Real
-from .paths import DASH, InputPath, OutputPath, claim_stdout, keep_apart
-from .reports import report_baked, report_unbaked
-from .usage import is_given, refuse
+from ..support.stdin import DASH, name_of
+from .command import COMMON, Command, option
+from .options.baking import (
+    OF_PLACE,
+    OF_SELECTION,
+    OF_SPZ,
+    OF_TREES,
+    bake_settings,
+    baking_options,
+    check_method,
+    write_options,
+)
+from .options.common import General, common_options, overwrite_option
+from .paths import InputPath, OutputPath, claim_stdout, keep_apart
+from .reports import report_baked, report_extracted
+from .usage import options_of, refuse
 
 if TYPE_CHECKING:
     from ..bake import Baked
-    from ..extract_leaves import Unbaked
-    from ..io import Sink
+    from ..extract_leaves import Extracted
+    from .console import Console
 
-    #: Makes the output of an input through a sink, and reports what came of it.
-    Work = Callable[[Path, Path, Sink], Baked | Unbaked]
+#: Suffixes of the formats in which a tree can be written, and the one of files that are given a name.
+TREES = tuple(suffix for suffix, form in WRITABLE.items() if form.trees)
+SPZ = TREES[0]
 
-#: Options that only mean something for a tree that is built, and for SPZ.
-OF_BAKING = (
-    *("method", "base", "growth", "max_sh", "min_opacity", "min_box", "max_box", "within", "on_invalid", "rgba"),
-    "encoding",
-)
-OF_SPZ = ("spz_version", "fractional_bits", "compression_level")
-
-#: Options of one method only.
-OF_METHOD = {"quick": ("base",), "quality": ("growth",)}
-
-#: Names that promise what a tree is not written as.
-OTHER_SUFFIXES = {".ply", ".splat", ".ksplat", ".sog", ".json"}
+#: Suffixes of formats that hold no tree.
+PLAIN = {suffix for form in FORMATS for suffix in form.suffixes if not form.trees}
 
 EXAMPLES = """
 \b
 Examples:
-  sparklod build-lod scene.ply                    # writes scene-lod.spz
-  sparklod build-lod scans/*.ply --output-dir web --overwrite
-  sparklod build-lod scene.ply --method quality   # for what is published
-  sparklod build-lod scene.ply -o - | aws s3 cp - s3://bucket/scene-lod.spz
+  sparklod build-lod scene.ply                          # writes scene-lod.spz
+  sparklod build-lod scene.ply --up -y                  # y up, as viewers want it
+  sparklod build-lod scene.ply --method quality         # for publishing
+  sparklod build-lod scans/*.ply --output-dir web -f
+  cat scene.ply | sparklod build-lod - -o - | aws s3 cp - s3://bucket/scene-lod.spz
   sparklod build-lod scene.ply --within 0,1,0,25 --min-opacity 0.02
   sparklod build-lod scene.ply --json | jq .nodes
-  sparklod build-lod scene.sog --encoding ext     # writes scene-lod.npz
+  sparklod build-lod scene.sog --encoding ext           # writes scene-lod.npz
   sparklod build-lod scene-lod.spz --unlod -o scene.ply
 """
 
 
+@dataclass(frozen=True)
+class Outputs:
+    """Where outputs go.
+
+    Attributes:
+        output: the file of a single input.
+        output_dir: the folder of all of them.
+        overwrite: replace files that exist.
+        unlod: write the splats of trees.
+        encoding: of array files.
+    """
+
+    output: Path | None
+    output_dir: Path | None
+    overwrite: bool
+    unlod: bool
+    encoding: str | None
+
+    @property
+    def suffix(self) -> str:
+        """Of the output that was named, if one was."""
+        return self.output.suffix.lower() if self.output is not None and self.output != DASH else ""
+
+    @property
+    def is_raw(self) -> bool:
+        """Whether words go out alone: what is named is no .npz."""
+        return self.output is not None and self.suffix != NPZ
+
+    def target(self, source: Path) -> Path:
+        """Where an input goes."""
+        return self.output or (self.output_dir or source.parent) / self._name(source)
+
+    def _name(self, source: Path) -> str:
+        # The meta.json of an unpacked SOG has the name of its folder.
+        stem = source.absolute().parent.name if source.name == "meta.json" else source.stem
+        if self.unlod:
+            return f"{stem.removesuffix('-lod')}-unlod{SPZ}"
+        return f"{stem}-lod{NPZ if self.encoding else SPZ}"
+
+
 @click.command("build-lod", cls=Command, epilog=EXAMPLES, context_settings={"show_default": True})
-@click.argument("inputs", metavar="INPUT...", nargs=-1, required=True, type=InputPath())
-@click.option(
+@click.argument("inputs", metavar="INPUT...", nargs=-1, required=True, type=InputPath(stdin=True))
+@option(
     "-o",
     "--output",
+    heading=COMMON,
     metavar="FILE",
     type=OutputPath(),
     help="Output of a single input; - is standard output.  [default: NAME-lod.spz beside the input;"
     " NAME-lod.npz with --encoding, NAME-unlod.spz with --unlod]",
     show_default=False,
 )
-@click.option(
+@option(
     "--output-dir",
+    heading=COMMON,
     metavar="DIR",
     type=OutputPath(folder=True),
-    help="Directory for the outputs; made if it is not there.",
+    help="Folder for the outputs; created if it does not exist.",
     show_default=False,
 )
 @overwrite_option
-@click.option(
-    "--method",
-    type=click.Choice(defaults.METHODS),
-    default=defaults.METHODS[0],
-    help="How to merge: quick takes next to no time, cuts of quality are nearer to full detail.",
-)
-@click.option(
-    "--base",
-    metavar="N",
-    type=Real(defaults.MIN_BASE, defaults.MAX_BASE),
-    default=defaults.DEFAULT_BASE,
-    help="With --method quick: growth of the voxel grid from level to level; nearer 1, smoother transitions and more"
-    " nodes.",
-)
-@click.option(
-    "--growth",
-    metavar="N",
-    type=Real(defaults.MIN_GROWTH, defaults.MAX_GROWTH),
-    default=defaults.DEFAULT_GROWTH,
-    help="With --method quality: at most so many nodes a leaf.",
-)
-@click.option(
-    "--max-sh",
-    metavar="N",
-    type=click.IntRange(0, defaults.MAX_SH_DEGREE),
-    default=defaults.MAX_SH_DEGREE,
-    help="Leave out spherical harmonics above this degree.",
-)
-@click.option("--min-opacity", metavar="N", type=Real(0, 1), default=0.0, help="Leave out splats of lower opacity.")
-@click.option("--min-box", type=Numbers("x", "y", "z"), help="Leave out splats whose centre is below this on any axis.")
-@click.option("--max-box", type=Numbers("x", "y", "z"), help="Leave out splats whose centre is above this on any axis.")
-@click.option("--within", type=Ball(), help="Leave out splats whose centre is outside this ball.")
-@click.option(
-    "--on-invalid",
-    type=click.Choice(["error", "drop"]),
-    default="error",
-    help="What to do about invalid splats: numbers that are not finite, or negative scales.",
-)
-@click.option(
-    "--rgba",
-    metavar="FILE",
-    type=InputPath(),
-    help="Take colours and opacities from a .npy or raw file of (N, 4) bytes or floats 0..1; alpha 0 drops a splat.",
-)
-@click.option(
-    "--encoding",
-    type=click.Choice(list(ENCODINGS)),
-    help="Write the tree as arrays in a viewer's memory layout: .npz, or the words alone if FILE is .bin or .raw.",
-)
-@click.option(
+@option(
     "--unlod",
+    heading=COMMON,
     is_flag=True,
-    help="The way back: write the splats of Level-of-Detail files, as SPZ or, if FILE ends so, as .ply or .splat.",
+    help="Write the original splats of Level-of-Detail files instead, as SPZ or, by the name of FILE, .ply or .splat.",
 )
-@click.option(
-    "--spz-version",
-    type=click.Choice([str(version) for version in defaults.SPZ_VERSIONS]),
-    default=str(defaults.DEFAULT_SPZ_VERSION),
-    help="2 is 4 to 8 % smaller, 3 keeps rotations ten times as exact.",
-)
-@click.option(
-    "--fractional-bits",
-    type=AutoOr(0, defaults.MAX_FRACTIONAL_BITS),
-    default="auto",
-    help="Bits after the binary point of a position; auto suits the extent and the smallest splats.",
-)
-@click.option(
-    "--compression-level",
-    metavar="N",
-    type=click.IntRange(defaults.MIN_COMPRESSION, defaults.MAX_COMPRESSION),
-    default=defaults.DEFAULT_COMPRESSION,
-    help="1 is fast, 9 small.",
-)
+@baking_options
 @common_options
 @click.pass_context
-def build_lod(
-    ctx: click.Context,
-    /,
-    inputs: tuple[Path, ...],
-    output: Path | None,
-    output_dir: Path | None,
-    overwrite: bool,
-    as_json: bool,
-    quiet: bool,
-    verbose: bool,
-    **settings: Any,
-) -> None:
-    """Bake splat scenes into Level-of-Detail files for Spark.
+def build_lod(ctx: click.Context, /, inputs: tuple[Path, ...], **_: Any) -> None:
+    """Bake splat files into Level-of-Detail files for Spark.
 
-    Reads PLY (3D Gaussian Splatting's and PlayCanvas's compressed one), SPZ, SOG (.sog, or a folder with a meta.json),
-    .splat and .ksplat, merges splats into a tree, and writes it as SPZ with Spark's extension. The axes of the input
-    are kept as they are.
+    Reads PLY (also PlayCanvas's compressed PLY), SPZ, SOG (.sog, or a folder with a meta.json), .splat and .ksplat;
+    merges splats into a tree, and writes the tree as SPZ with Spark's extension. An INPUT of - is standard input.
 
-    A file that fails does not stop the others; the exit status is 1 if any did.
+    The axes of the input are kept unless --up or --rotate turns them. Selection goes by the coordinates of the input.
+
+    An input that fails does not stop the others; the exit status is 1 if any did.
     """
-    outputs = _outputs(inputs, output, output_dir, settings)
-    keep_apart(ctx, {"output" if output_dir is None else "output_dir": outputs})
-    _check_usage(ctx, inputs, output, settings)
-    claim_stdout(ctx, "output", as_json=as_json, binary=True)
+    general, outputs = options_of(ctx, General), options_of(ctx, Outputs)
+    _check(ctx, inputs, outputs, general)
     failed = False
-    with Console(quiet=quiet, verbose=verbose) as console:
-        work = _unlod(ctx, settings, console) if settings["unlod"] else _bake(settings, output, console)
-        from .. import io
-        from ..support.errors import SparklodError
-
-        for source, target in zip(inputs, outputs, strict=True):
+    with general.console() as console:
+        work = (_extracting if outputs.unlod else _baking)(ctx, outputs, general.threads, console)
+        for source in inputs:
+            target = outputs.target(source)
             try:
-                if target == DASH:
-                    write: Sink = io.write_stdout
-                else:
-                    io.check_writable(target, overwrite=overwrite, make_parent=output_dir is not None)
-                    write = functools.partial(io.write_whole, target, overwrite=overwrite)
-                result = work(source, target, write)
+                result = work(source, target)
             except SparklodError as error:
                 failed = True
-                console.error(f"{source}: {error}")
+                console.error(f"{name_of(source)}: {error}")
                 record: dict[str, Any] = {"input": str(source), "error": shortened(str(error), MOST)}
             else:
                 record = {"input": str(source), "output": str(target), **dataclasses.asdict(result)}
-            if as_json:
+            if general.as_json:
                 click.echo(json.dumps(record))
     if failed:
         ctx.exit(1)
 
 
-def _check_usage(ctx: click.Context, inputs: tuple[Path, ...], output: Path | None, settings: dict[str, Any]) -> None:
-    """A usage error where options contradict each other or the name of the output."""
-    suffix = output.suffix.lower() if output is not None and output != DASH else ""
-    if settings["unlod"]:
-        refuse(ctx, OF_BAKING, "is of no use with --unlod, which writes what there is")
-        if suffix and suffix not in WRITABLE:
-            raise click.UsageError(f"--unlod writes {', '.join(WRITABLE)}, not {suffix}")
-        if suffix not in ("", ".spz"):
-            refuse(ctx, OF_SPZ, f"is of SPZ, not of {suffix}")
-    elif settings["encoding"]:
-        refuse(ctx, OF_SPZ, "is of SPZ, not of --encoding")
-        if suffix not in ("", ".npz", *RAW_SUFFIXES):
-            known = ", ".join((".npz", *RAW_SUFFIXES))
-            raise click.UsageError(f"--encoding writes {known}, not {suffix}")
-    elif suffix in OTHER_SUFFIXES:
-        raise click.UsageError(f"{suffix} holds no tree, which is written as SPZ; name the output .spz")
-    elif suffix in (".npz", *RAW_SUFFIXES):
-        raise click.UsageError(f"a {suffix} output needs --encoding")
-    elif suffix not in ("", ".spz"):
-        raise click.UsageError(f"a tree is written as SPZ, not as {suffix}; name the output .spz")
-    for method, names in OF_METHOD.items():
-        if method != settings["method"]:
-            refuse(ctx, names, f"is of --method {method}, not of {settings['method']}")
-    if settings["rgba"] is not None and len(inputs) > 1:
-        raise click.UsageError(f"--rgba takes one input, not {len(inputs)}")
-
-
-def _outputs(
-    inputs: tuple[Path, ...], output: Path | None, output_dir: Path | None, settings: dict[str, Any]
-) -> list[Path]:
-    """Where each input goes; a usage error where two would go to one place."""
-    if output is not None:
-        if output_dir is not None:
-            raise click.UsageError("-o and --output-dir exclude each other")
+def _check(ctx: click.Context, inputs: tuple[Path, ...], outputs: Outputs, general: General) -> None:
+    """Raises a `click.UsageError` where options contradict each other, or the names of files."""
+    if outputs.output is not None:
+        if outputs.output_dir is not None:
+            raise click.UsageError("--output cannot be used with --output-dir")
         if len(inputs) > 1:
-            raise click.UsageError(f"-o takes one input, not {len(inputs)}; use --output-dir")
-        outputs = [output]
-    else:
-        outputs = [(output_dir or source.parent) / _output_name(source, settings) for source in inputs]
-    return outputs
+            raise click.UsageError(f"--output takes one input, not {len(inputs)}; use --output-dir")
+    elif DASH in inputs:
+        raise click.UsageError("standard input has no name to derive one from; give --output")
+    targets = [outputs.target(source) for source in inputs]
+    keep_apart(ctx, {"output" if outputs.output_dir is None else "output_dir": targets})
+    claim_stdout(ctx, "output", as_json=general.as_json, binary=True)
+    if ctx.params["rgba"] is not None and len(inputs) > 1:
+        raise click.UsageError(f"--rgba takes one input, not {len(inputs)}")
+    suffix = outputs.suffix
+    if outputs.unlod:
+        refuse(ctx, (*OF_TREES, *OF_SELECTION, *OF_PLACE, "encoding"), "cannot be used with --unlod")
+        if suffix not in ("", *WRITABLE):
+            raise click.UsageError(f"--unlod writes {', '.join(WRITABLE)}, not {suffix}")
+        if suffix not in ("", SPZ):
+            refuse(ctx, OF_SPZ, f"is an option of SPZ, not of {suffix}")
+        return
+    check_method(ctx)
+    if outputs.encoding:
+        refuse(ctx, OF_SPZ, "is an option of SPZ, not of --encoding")
+        if suffix not in ("", NPZ, *RAW_SUFFIXES):
+            raise click.UsageError(f"--encoding writes {', '.join((NPZ, *RAW_SUFFIXES))}, not {suffix}")
+    elif suffix in (NPZ, *RAW_SUFFIXES):
+        raise click.UsageError(f"{suffix} is a file of arrays; choose their layout with --encoding")
+    elif suffix in PLAIN:
+        raise click.UsageError(f"{suffix} cannot hold a tree; name the output {SPZ}")
+    elif suffix not in ("", *TREES):
+        raise click.UsageError(f"trees are written as SPZ, not as {suffix}; name the output {SPZ}")
 
 
-def _output_name(source: Path, settings: dict[str, Any]) -> str:
-    # The meta.json of an unpacked SOG is called as its folder.
-    stem = source.absolute().parent.name if source.name == "meta.json" else source.stem
-    if settings["unlod"]:
-        return f"{stem.removesuffix('-lod')}-unlod.spz"
-    return f"{stem}-lod.npz" if settings["encoding"] else f"{stem}-lod.spz"
-
-
-def _bake(settings: dict[str, Any], output: Path | None, console: Console) -> Work:
+def _baking(ctx: click.Context, outputs: Outputs, threads: int, console: Console) -> Callable[[Path, Path], Baked]:
     """What bakes a file and reports it; the point where numpy and numba are loaded."""
-    from ..bake import Recipe, bake
-    from ..model.selection import Selection
-    from ..support import jit
+    from ..bake import bake
 
-    jit.use_threads(settings["threads"])
-    console.announce_compiling(settings["method"])
-    recipe = Recipe(
-        method=settings["method"],
-        base=settings["base"],
-        growth=settings["growth"],
-        max_sh=settings["max_sh"],
-        selection=Selection(
-            drop_invalid=settings["on_invalid"] == "drop",
-            min_opacity=settings["min_opacity"],
-            min_box=settings["min_box"],
-            max_box=settings["max_box"],
-            within=settings["within"],
-        ),
-        rgba=settings["rgba"],
-        encoding=settings["encoding"],
-        raw=output is not None and output.suffix.lower() != ".npz",
-        spz=WriteOptions(
-            spz_version=int(settings["spz_version"]),
-            fractional_bits=settings["fractional_bits"],
-            compression_level=settings["compression_level"],
-        ),
-        threads=settings["threads"],
-    )
+    settings = bake_settings(ctx, raw=outputs.is_raw)
+    console.announce_compiling(settings.method)
 
-    def work(source: Path, target: Path, write: Sink) -> Baked:
-        baked = bake(source, write, recipe, progress=console.progress)
+    def work(source: Path, target: Path) -> Baked:
+        baked = bake(
+            source,
+            target,
+            settings,
+            overwrite=outputs.overwrite,
+            make_parent=outputs.output_dir is not None,
+            threads=threads,
+            progress=console.progress,
+        )
         report_baked(console, source, target, baked)
         return baked
 
     return work
 
 
-def _unlod(ctx: click.Context, settings: dict[str, Any], console: Console) -> Work:
+def _extracting(
+    ctx: click.Context, outputs: Outputs, threads: int, console: Console
+) -> Callable[[Path, Path], Extracted]:
     """What writes the leaves of a file and reports it."""
-    from ..extract_leaves import Target, unlod
+    from ..extract_leaves import extract_leaves
 
-    chosen = is_given(ctx, "spz_version")
+    options = write_options(ctx)
 
-    def work(source: Path, target: Path, write: Sink) -> Unbaked:
-        how = Target(
-            suffix=".spz" if target == DASH else target.suffix.lower() or ".spz",
-            options=WriteOptions(
-                spz_version=int(settings["spz_version"]) if chosen else None,
-                fractional_bits=settings["fractional_bits"],
-                compression_level=settings["compression_level"],
-            ),
-            threads=settings["threads"],
+    def work(source: Path, target: Path) -> Extracted:
+        extracted = extract_leaves(
+            source,
+            target,
+            options,
+            overwrite=outputs.overwrite,
+            make_parent=outputs.output_dir is not None,
+            threads=threads,
+            progress=console.progress,
         )
-        unbaked = unlod(source, write, how, progress=console.progress)
-        report_unbaked(console, source, target, unbaked)
-        return unbaked
+        report_extracted(console, source, target, extracted)
+        return extracted
 
     return work

@@ -48,7 +48,7 @@ def _print_schema(ctx: click.Context, param: click.Parameter, value: bool) -> No
 
 
 @click.command("inspect", cls=Command, epilog=EXAMPLES, context_settings={"show_default": True})
-@click.argument("files", metavar="FILE...", nargs=-1, required=True, type=InputPath())
+@click.argument("files", metavar="FILE...", nargs=-1, required=True, type=InputPath(stdin=True))
 @click.option("--stats", is_flag=True, help="Statistics of all quantities, not only of the main ones.")
 @click.option("--histogram", metavar="NAME", multiple=True, help="Text bars of a quantity that --stats names.")
 @click.option("--field", metavar="NAME", help="Print one value of the JSON report, such as tree.leaves.")

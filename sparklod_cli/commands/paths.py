@@ -13,11 +13,9 @@ from typing import Any
 
 import click
 
+from ..support.stdin import DASH
 from .console import is_terminal
 from .usage import flag_of
-
-#: Standard input or output, where a command takes those.
-DASH = Path("-")
 
 #: What a place is taken by.
 INPUT, OUTPUT = "an input", "an output"
@@ -46,9 +44,19 @@ class _NamedPath(click.Path):
 
 
 class InputPath(_NamedPath):
-    """A file or folder that a command reads."""
+    """A file or folder that a command reads; with `stdin` also -, which is standard input."""
 
     _to_do = "download it first"
+
+    def __init__(self, *, stdin: bool = False) -> None:
+        super().__init__()
+        self.stdin = stdin
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        path = super().convert(value, param, ctx)
+        if path == DASH and not self.stdin:
+            self.fail("standard input is not read here; save it to a file first", param, ctx)
+        return path
 
 
 class OutputPath(_NamedPath):
@@ -139,6 +147,8 @@ def _all_read(paths: Iterable[Path]) -> Iterator[Path]:
     from ..io import companions
 
     for path in dict.fromkeys(paths):
+        if path == DASH:
+            continue
         yield path
         yield from companions(path, NAMES)
 

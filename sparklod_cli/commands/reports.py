@@ -5,41 +5,43 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..support.stdin import DASH, name_of
 from .console import Console, count_of, size_of
 
 if TYPE_CHECKING:
     from ..bake import Baked
     from ..codecs.clamps import Clamp
-    from ..extract_leaves import Unbaked
+    from ..extract_leaves import Extracted
 
-#: What SPZ clamps, by column and whether it is above the upper end: what it is called, what comes of it, what to do.
+#: What clamping does to a scene and what to do about it, by column of `Splats` and whether the upper end clamps.
 CLAMPED = {
     ("scale", False): (
         "scales",
-        "too small to be seen from farther away than 0.1 units; if the whole scene is that small, scale it up first",
+        "too small to be seen from farther away than 0.1 units; if the whole scene is that small, enlarge it (--scale)",
     ),
     ("scale", True): (
         "scales",
-        "such splats, of a sky perhaps, shrink; scale the scene down first, or leave them out (--within, --max-box)",
+        "such splats, of a sky perhaps, shrink; make the scene smaller (--scale), or leave them out (--within,"
+        " --max-box)",
     ),
-    ("rgb", False): ("colours", "darker than black, so little is seen of it; nothing need be done"),
-    ("rgb", True): ("colours", "brighter than white, so little is seen of it; nothing need be done"),
-    ("sh", False): ("SH", "reflections get weaker; nothing need be done unless render --diff shows it"),
-    ("sh", True): ("SH", "reflections get weaker; nothing need be done unless render --diff shows it"),
+    ("rgb", False): ("colours", "darker than black, so the loss is hardly visible"),
+    ("rgb", True): ("colours", "brighter than white, so the loss is hardly visible"),
+    ("sh", False): ("SH", "reflections get weaker; render --diff shows whether it matters"),
+    ("sh", True): ("SH", "reflections get weaker; render --diff shows whether it matters"),
 }
 
 
 def report_baked(console: Console, source: Path, target: Path, baked: Baked) -> None:
-    """A line, and one for each thing that a person should know."""
+    """A line about the file, and one for each thing that a person should know."""
     from ..model.selection import describe
 
     console.say(
-        f"{source}  {count_of(baked.splats, 'splat')}, SH {baked.sh_degree}  ->  {target} "
+        f"{name_of(source)}  {count_of(baked.splats, 'splat')}, SH {baked.sh_degree}  ->  {_name(target)} "
         f" {count_of(baked.nodes, 'node')}, {count_of(baked.levels, 'level')},"
         f" {size_of(baked.bytes)}, {_total(baked.seconds)}"
     )
     if baked.dropped:
-        console.say(f"  dropped {describe(baked.dropped)}")
+        console.say(f"  left out: {describe(baked.dropped)}")
     for note in baked.notes:
         console.say(f"  {note}")
     for clamp in baked.clamps:
@@ -52,20 +54,29 @@ def report_baked(console: Console, source: Path, target: Path, baked: Baked) -> 
 
 
 def _clamped(clamp: Clamp, nodes: int) -> str:
-    """Which end of what SPZ holds values are clamped to, how many, how far they were beyond, and what that means."""
+    """How many nodes have values that were clamped, how far these were off, and what that means."""
     name, advice = CLAMPED[clamp.column, clamp.above]
     share = f"{count_of(clamp.splats, 'node')} ({100 * clamp.splats / nodes:.3g} %)"
-    where = f"{'above' if clamp.above else 'below'} {clamp.end:.3g}, {'up' if clamp.above else 'down'} to"
-    return f"{name} of {share} are {where} {clamp.farthest:.3g}, and are clamped to what SPZ holds: {advice}"
-
-
-def report_unbaked(console: Console, source: Path, target: Path, unbaked: Unbaked) -> None:
-    """A line."""
-    console.say(
-        f"{source}  {count_of(unbaked.nodes, 'node')}  ->  {target}  {count_of(unbaked.splats, 'splat')},"
-        f" SH {unbaked.sh_degree}, {size_of(unbaked.bytes)}, {_total(unbaked.seconds)}"
+    where, way = ("above", "up") if clamp.above else ("below", "down")
+    farthest = clamp.farthest or 0.0  # no -0
+    return (
+        f"{name} of {share} are {where} {clamp.end:.3g}, {way} to {farthest:.3g}, and are clamped to what SPZ holds:"
+        f" {advice}"
     )
-    console.detail(f"  {unbaked.format}; {_stages(unbaked.seconds)}")
+
+
+def report_extracted(console: Console, source: Path, target: Path, extracted: Extracted) -> None:
+    """A line about the file."""
+    console.say(
+        f"{name_of(source)}  {count_of(extracted.nodes, 'node')}  ->  {_name(target)} "
+        f" {count_of(extracted.splats, 'splat')}, SH {extracted.sh_degree}, {size_of(extracted.bytes)},"
+        f" {_total(extracted.seconds)}"
+    )
+    console.detail(f"  {extracted.format}; {_stages(extracted.seconds)}")
+
+
+def _name(target: Path) -> str:
+    return "standard output" if target == DASH else str(target)
 
 
 def _total(seconds: dict[str, float]) -> str:

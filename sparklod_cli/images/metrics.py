@@ -57,6 +57,11 @@ def check_covered(reference: Image, what: str) -> None:
         )
 
 
+def on_background(image: Image, gray: float) -> Image:
+    """(H, W, 3), 0..1: an image of which red, green and blue are multiplied by alpha, on a background 0..1."""
+    return np.clip(image[..., :3] + np.float32(gray) * (1 - image[..., 3:]), 0, 1)
+
+
 def psnr_of(mse: float) -> float:
     """dB of a mean square error of images of 0..1; `MOST_PSNR` at most."""
     return min(-10 * math.log10(mse), MOST_PSNR) if mse > 0 else MOST_PSNR

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ..codecs.spz_layout import KNOWN_FLAGS
-from ..io import examine_scene, size_on_disk
+from ..io import examine_scene, size_of_input
 from ..model.scene import Scene
 from ..model.sh import COEFFICIENTS
 from ..model.splats import COLUMNS
@@ -85,7 +85,7 @@ def inspect(
 ) -> tuple[Report, Scene | None]:
     """Looks at a file; what cannot be read is a finding, not an error. Also gives what was read of the scene."""
     columns = COLUMNS if wanted.values or wanted.check else TREE_COLUMNS
-    size = size_on_disk(path)
+    size = size_of_input(path)
     try:
         scene = examine_scene(path, columns=columns, threads=threads, progress=progress)
     except FormatError as error:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
-from ..model.foveation import Cones, Foveation
+from ..model.foveation import SPARK, Foveation
 
 
 @dataclass(frozen=True)
@@ -14,7 +14,8 @@ class LodSettings:
 
     Attributes:
         budget: the most splats that are drawn, all instances together.
-        foveation: how much nodes count by direction, where an instance has no foveation of its own.
+        foveation: how much nodes count by direction, where an instance has no foveation of its own;
+            Spark 2's by default.
         pixel_scale_limit: nodes of this pixel scale or less are not refined; None for the pixel scale of a pixel.
         render_scale: multiplies the pixel scale of a pixel, Spark's `lodRenderScale`.
         continuous: width of continuous cuts, the ratio of the pixel scales between which a node fades into its
@@ -22,7 +23,7 @@ class LodSettings:
     """
 
     budget: int
-    foveation: Foveation = field(default_factory=Cones)
+    foveation: Foveation = SPARK
     pixel_scale_limit: float | None = None
     render_scale: float = 1.0
     continuous: float | None = None

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from ..support.defaults import BEHIND_FOVEATE, CONE_FOV, CONE_FOV0, CONE_FOVEATE
+
 
 @dataclass(frozen=True)
 class Cones:
@@ -36,3 +38,6 @@ class Frustum:
 
 
 Foveation = Cones | Frustum
+
+#: Spark 2's.
+SPARK = Cones(CONE_FOV0, CONE_FOV, CONE_FOVEATE, BEHIND_FOVEATE)

@@ -1,16 +1,18 @@
-"""The backends that draw splats, behind one interface."""
+"""The table of backends that draw splats: adding one is a module and a row. Imports nothing heavy."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from importlib import import_module
-from typing import Any, Protocol, cast
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
-from ..cameras.camera import Camera
 from ..support.errors import SparklodError
-from .rasterizer import Image
-from .settings import RasterSettings
-from .shading import ShadedSplats
+
+if TYPE_CHECKING:
+    from ..cameras.camera import Camera
+    from .rasterizer import Image
+    from .settings import RasterSettings
+    from .shading import ShadedSplats
 
 
 class BackendError(SparklodError):
@@ -42,6 +44,7 @@ class Backend:
         return cast(Draw, import_module(self.module, __package__).draw)(splats, camera, settings, **options)
 
 
+#: By name; the first is the default.
 BACKENDS = {
     backend.name: backend
     for backend in (

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from ..codecs.rounding import after
-from ..io import examine_scene, size_on_disk
+from ..io import examine_scene, size_of_input
 from ..model.instances import Instance
 from ..model.scene import Scene
 from ..model.selection import Selection, describe
@@ -64,7 +64,7 @@ def read_scenes(
         notes += (f"{name}: {note}" for note in scene.notes)
         if scene.tree is None:
             scene = _drawable(str(name), scene, notes)
-        size = (size_on_disk(file) or 0) if file is not None else _size_of(scene.splats)
+        size = (size_of_input(file) or 0) if file is not None else _size_of(scene.splats)
         drawn = after(through, file or Path(UNNAMED), scene, threads)
         loaded[_key(source)] = entry = LoadedScene(file, size, scene, drawn, chunks)
         chunks += entry.chunks

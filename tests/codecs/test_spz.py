@@ -237,21 +237,20 @@ def test_what_is_clamped_is_counted_by_splat() -> None:
     low, high = math.exp(-10 - 1 / 32), math.exp(255.5 / 16 - 10)
     splats.scale[0] = low * 1.001  # rounds to the last code that is in
     splats.scale[1] = high * 0.999
-    assert clamps.clamped(splats) == {}
+    assert clamps.find(splats) == clamps.Clamps()
     splats.scale[2, 1] = low * 0.999
     splats.scale[3, 2] = high * 1.001
     splats.scale[4] = 0  # a splat counts once, however many of its axes are out
     splats.rgb[5] = -0.5
     splats.sh[6:, 2] = 1.1
-    assert clamps.clamped(splats, threads=2) == {"scale": 3, "rgb": 1, "sh": 2}
-    found = {(at.column, at.above): (at.splats, at.farthest) for at in clamps.clamps(splats, ["scale", "rgb", "sh"])}
+    assert clamps.find(splats, threads=2).splats == {"scale": 3, "rgb": 1, "sh": 2}
+    found = {(at.column, at.above): (at.splats, at.farthest) for at in clamps.find(splats).ends}
     assert found == {
         ("scale", False): (2, 0.0),
         ("scale", True): (1, pytest.approx(high * 1.001)),
         ("rgb", False): (1, -0.5),
         ("sh", True): (2, pytest.approx(1.1)),
     }
-    assert clamps.clamps(splats, []) == []
 
 
 @pytest.mark.parametrize(("name", "decode"), [("scale", quantize.decode_log_scale), ("rgb", quantize.decode_color)])

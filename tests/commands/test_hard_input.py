@@ -23,8 +23,8 @@ import pytest
 from fixtures import by_hand
 from sparklod_cli.cli import run
 from sparklod_cli.io import read_scene
+from sparklod_cli.lod.builders import METHODS
 from sparklod_cli.model.splats import COLUMNS
-from sparklod_cli.support.defaults import METHODS
 from tests.conftest import FIXTURES
 from tests.scenes import splat_columns
 

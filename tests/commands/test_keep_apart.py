@@ -108,7 +108,7 @@ def test_two_outputs_are_two_files(command: str, tmp_path: Path, capsys: pytest.
     target = str(tmp_path / f"y{SUFFIXES[command]}")
     arguments = [target if argument == "Y" else argument for argument in (*one, *two)]
     assert run([command, str(LOD), *arguments]) == 2
-    assert f"{target} is an output already" in capsys.readouterr().err
+    assert f"two outputs would be written to {target}" in capsys.readouterr().err
 
 
 def test_the_images_of_an_unpacked_sog_are_inputs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -173,7 +173,7 @@ def test_names_in_other_letters_where_those_are_the_same(
     assert run(given) != 2
     monkeypatch.setattr(paths, "_folds_case", lambda folder: True)
     assert run(given) == 2
-    assert "out is an output already" in capsys.readouterr().err
+    assert "two outputs would be written to" in capsys.readouterr().err
 
 
 def test_what_a_folder_tells_of_letters(tmp_path: Path) -> None:

@@ -7,20 +7,19 @@ import dataclasses
 import numpy as np
 import pytest
 
-from sparklod_cli.bake import BUILDERS
 from sparklod_cli.codecs import spz, spz_options
 from sparklod_cli.codecs.options import WriteOptions
+from sparklod_cli.lod.builders import BUILDERS, METHODS
 from sparklod_cli.model.lod_tree import MAX_CHILDREN
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
-from sparklod_cli.support.defaults import METHODS
 from tests.interop import laws
 from tests.interop.spark import Spark
 from tests.scenes import random_splats
 
 
 def baked(splats: Splats, method: str = "quick") -> Scene:
-    return Scene(*BUILDERS[method][0].build(splats))
+    return Scene(*BUILDERS[method].load().build(splats))
 
 
 def encoded(scene: Scene) -> bytes:

@@ -7,9 +7,9 @@ from functools import cache
 import numpy as np
 import pytest
 
-from sparklod_cli.bake import BUILDERS
 from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.io import read_scene
+from sparklod_cli.lod.builders import BUILDERS
 from sparklod_cli.model.scene import Scene
 from tests.conftest import real_scene
 from tests.interop import laws
@@ -18,7 +18,7 @@ from tests.interop.spark import Spark
 
 @cache
 def baked(name: str, method: str = "quick") -> Scene:
-    return Scene(*BUILDERS[method][0].build(read_scene(real_scene(name)).splats))
+    return Scene(*BUILDERS[method].load().build(read_scene(real_scene(name)).splats))
 
 
 @pytest.mark.parametrize("version", [2, 3])

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sparklod_cli.bake import BUILDERS
 from sparklod_cli.codecs.gpu import ext_splats, lod_tree
 from sparklod_cli.io import read_scene
+from sparklod_cli.lod.builders import BUILDERS
 from sparklod_cli.lod.settings import pixel_limit
 from sparklod_cli.lod.traversal import CHUNK_NODES, Forest, Traversal, TreeCut, TreeInstance, View, views_of
 from sparklod_cli.model.foveation import Cones
@@ -61,7 +61,7 @@ class Tree:
 @cache
 def baked(path: Path, method: str = "quick") -> Tree:
     """Our tree of a scene, measured as Spark does: what it holds of the splats, after their coding."""
-    splats, tree = BUILDERS[method][0].build(read_scene(path).splats)
+    splats, tree = BUILDERS[method].load().build(read_scene(path).splats)
     return Tree.of(lod_tree.pack(ext_splats.unpack(ext_splats.pack(splats)), tree)["lod_tree"])
 
 

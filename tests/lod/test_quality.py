@@ -19,8 +19,7 @@ from sparklod_cli.cameras.framing import framing
 from sparklod_cli.cameras.generators import orbit
 from sparklod_cli.cameras.path import GENERATED, cameras_of
 from sparklod_cli.codecs.gpu import lod_tree
-from sparklod_cli.compare import on_background
-from sparklod_cli.images.metrics import psnr
+from sparklod_cli.images.metrics import on_background, psnr
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod import quality, quick
 from sparklod_cli.lod.kernels.prune import MOST_CHILDREN, STEPS

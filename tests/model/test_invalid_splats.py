@@ -14,9 +14,9 @@ from fixtures import by_hand_ksplat, by_hand_splat
 from sparklod_cli.cli import run
 from sparklod_cli.codecs.gpu.table import ENCODINGS
 from sparklod_cli.lod import quality, quick
+from sparklod_cli.lod.builders import METHODS
 from sparklod_cli.model.selection import REASONS, Selection
 from sparklod_cli.model.splats import INVALID, Splats
-from sparklod_cli.support.defaults import METHODS
 from sparklod_cli.support.errors import InvalidSplatsError
 from tests.scenes import random_splats
 

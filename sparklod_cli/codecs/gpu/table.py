@@ -9,5 +9,8 @@ from __future__ import annotations
 #: words of a scene by their names; docs/formats.md has their layout.
 ENCODINGS = {"packed": "packed_splats", "ext": "ext_splats", "lodtree": "lod_tree", "texture": "data_texture"}
 
-#: Suffixes of dumps without a header: nothing but the words of all arrays, one after the other.
+#: Suffix of dumps with a header.
+NPZ = ".npz"
+
+#: Suffixes of dumps without one: nothing but the words of all arrays, one after the other.
 RAW_SUFFIXES = (".bin", ".raw")

@@ -70,9 +70,9 @@ def test_a_bin_has_the_words_of_all_arrays_one_after_the_other(encoding: str, tm
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--encoding", "ext", "--fractional-bits", "9"], "--fractional-bits is of SPZ, not of --encoding"),
-        (["-o", "x.npz"], "a .npz output needs --encoding"),
-        (["-o", "x.splat"], ".splat holds no tree"),
+        (["--encoding", "ext", "--fractional-bits", "9"], "--fractional-bits is an option of SPZ, not of --encoding"),
+        (["-o", "x.npz"], ".npz is a file of arrays; choose their layout with --encoding"),
+        (["-o", "x.splat"], ".splat cannot hold a tree"),
     ],
 )
 def test_outputs_that_do_not_suit_an_encoding_are_refused(

@@ -98,7 +98,7 @@ def test_what_is_dropped_is_said(scene: Path, capsys: pytest.CaptureFixture[str]
     cropped = int((splats.center[:, 0] > x).sum())
     assert record["dropped"] == {"cropped": cropped}
     assert record["splats"] + cropped == record["read"] == len(splats)
-    assert f"dropped {cropped} cropped" in err
+    assert f"left out: {cropped} cropped" in err
 
 
 def test_quiet_says_nothing_and_verbose_more(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sparklod_cli.io import read_scene
-from sparklod_cli.support.defaults import METHODS
+from sparklod_cli.lod.builders import METHODS
 from tests.commands.build_lod.runs import build
 from tests.conftest import FIXTURES
 
@@ -85,7 +85,7 @@ def test_options_reach_the_tree(scene: Path, tmp_path: Path, capsys: pytest.Capt
 
 
 def test_more_processors_than_threads_that_are_taken(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sparklod_cli.commands.options.processors", lambda: 5000)
+    monkeypatch.setattr("sparklod_cli.support.parallel.processors", lambda: 5000)
     assert build(scene) == 0
 
 
@@ -99,9 +99,9 @@ def test_more_processors_than_threads_that_are_taken(scene: Path, monkeypatch: p
         (["a.ply", "--method", "quality", "--growth", "1.04"], "--growth"),
         (["a.ply", "--method", "quality", "--growth", "2.1"], "--growth"),
         (["a.ply", "--method", "quality", "--growth", "nan"], "--growth"),
-        (["a.ply", "--method", "quality", "--base", "1.5"], "--base is of --method quick, not of quality"),
-        (["a.ply", "--method", "quick", "--growth", "1.4"], "--growth is of --method quality, not of quick"),
-        (["a.ply", "--growth", "1.4"], "--growth is of --method quality, not of quick"),
+        (["a.ply", "--method", "quality", "--base", "1.5"], "--base is an option of --method quick, not of quality"),
+        (["a.ply", "--method", "quick", "--growth", "1.4"], "--growth is an option of --method quality, not of quick"),
+        (["a.ply", "--growth", "1.4"], "--growth is an option of --method quality, not of quick"),
         (["a.ply", "--spz-version", "4"], "--spz-version"),
         (["a.ply", "--fractional-bits", "25"], "--fractional-bits"),
         (["a.ply", "--fractional-bits", "many"], "--fractional-bits"),
@@ -109,19 +109,19 @@ def test_more_processors_than_threads_that_are_taken(scene: Path, monkeypatch: p
         (["a.ply", "--max-box", "1,2,nan"], "x,y,z"),
         (["a.ply", "--within", "1,2,3"], "x,y,z,radius"),
         (["a.ply", "--within", "1,2,3,-1"], "radius"),
-        (["a.ply", "b.ply", "-o", "c.spz"], "-o takes one input"),
-        (["a.ply", "-o", "c.spz", "--output-dir", "d"], "exclude each other"),
-        (["x/a.ply", "y/a.ply", "--output-dir", "d"], "would both be written to"),
+        (["a.ply", "b.ply", "-o", "c.spz"], "--output takes one input, not 2"),
+        (["a.ply", "-o", "c.spz", "--output-dir", "d"], "--output cannot be used with --output-dir"),
+        (["x/a.ply", "y/a.ply", "--output-dir", "d"], "two outputs would be written to d/a-lod.spz"),
         (["a.ply", "-o", "-", "--json"], "standard output"),
         (["a.ply", "--threads", "0"], "--threads"),
-        (["a.ply", "-o", "out.glb"], "a tree is written as SPZ, not as .glb; name the output .spz"),
-        (["a.ply", "-o", "out.RAD"], "a tree is written as SPZ, not as .rad"),
-        (["a.ply", "-o", "out.spz.gz"], "a tree is written as SPZ, not as .gz"),
-        (["a.ply", "-o", "out.ply"], ".ply holds no tree"),
-        (["a.ply", "-o", "out.bin"], "a .bin output needs --encoding"),
+        (["a.ply", "-o", "out.glb"], "trees are written as SPZ, not as .glb; name the output .spz"),
+        (["a.ply", "-o", "out.RAD"], "trees are written as SPZ, not as .rad"),
+        (["a.ply", "-o", "out.spz.gz"], "trees are written as SPZ, not as .gz"),
+        (["a.ply", "-o", "out.ply"], ".ply cannot hold a tree; name the output .spz"),
+        (["a.ply", "-o", "out.bin"], ".bin is a file of arrays; choose their layout with --encoding"),
         (["a.ply", "-o", "out.spz", "--encoding", "ext"], "--encoding writes .npz, .bin, .raw, not .spz"),
         (["a.ply", "-o", "out.png", "--encoding", "packed"], "--encoding writes .npz, .bin, .raw, not .png"),
-        (["a-lod.spz", "-o", "out.glb", "--unlod"], "--unlod writes .spz, .ply, .splat, not .glb"),
+        (["a-lod.spz", "-o", "out.glb", "--unlod"], "--unlod writes .ply, .spz, .splat, not .glb"),
         (["a.ply", "--quality"], "there is no option --quality; did you mean --method quality?"),
         (["a.ply", "--ext"], "there is no option --ext; did you mean --encoding ext?"),
         (["a.ply", "--overwritten"], "--overwrite"),

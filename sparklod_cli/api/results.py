@@ -1,0 +1,80 @@
+"""What traversals, comparisons and pictures come to: tables, and a picture that notebooks show."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ..tables.table import Table
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from ..simulation.summary import Summary
+    from ..tables.comparison import BudgetSummary
+
+
+class Frames(Table):
+    """The rows of a traversal: one for each frame and, if asked for, one for each of its instances."""
+
+    def summary(self) -> Summary:
+        """Statistics of the frames, totals, and the frames that are worth a look."""
+        from ..simulation.summary import summarize
+
+        return summarize(self.rows)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ComparisonTable(Table):
+    """The rows of a comparison: for each camera one for each budget.
+
+    Attributes:
+        budgets: as they were given.
+    """
+
+    budgets: Sequence[str]
+
+    def summary(self) -> list[BudgetSummary]:
+        """Means and extremes over the frames, for each budget."""
+        from ..tables.comparison import summarize
+
+        return summarize(self.rows, self.budgets)
+
+
+class Picture:
+    """A picture that Jupyter shows.
+
+    Attributes:
+        png: the bytes of the file.
+    """
+
+    def __init__(self, png: bytes) -> None:
+        self.png = png
+
+    def _repr_png_(self) -> bytes:
+        return self.png
+
+    def save(self, path: Path | str, *, overwrite: bool = False) -> None:
+        """Writes the PNG, whole or not at all.
+
+        Raises:
+            OutputError: the file exists, or cannot be written.
+        """
+        from ..io import write_whole
+
+        write_whole(Path(path), [self.png], overwrite=overwrite)
+
+
+def show(image: NDArray[np.float32], *, background: tuple[float, float, float] | None = (0.0, 0.0, 0.0)) -> Picture:
+    """A picture of floats as one that Jupyter shows.
+
+    Args:
+        image: (H, W, 4) float32 with alpha multiplied in, as `render` draws it.
+        background: red, green and blue, 0..1, behind it; None keeps alpha.
+    """
+    from ..images import pixels
+
+    return Picture(pixels.encode(pixels.eight_bits(pixels.over(image, background)), "png"))

@@ -1,0 +1,274 @@
+"""What viewers draw of trees and scenes: cuts, pictures, camera paths, and comparisons with full detail."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from fractions import Fraction
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..cameras.camera import Camera
+from ..cameras.path import CameraPath
+from ..images import metrics
+from ..lod.budget import Budget, parse_budget
+from ..lod.settings import LodSettings
+from ..model.instances import Instance, names_of
+from ..model.scene import Scene
+from ..render.rasterizer import Image
+from ..render.renderer import Renderer
+from ..render.settings import RenderSettings
+from ..scenes.finder import CutFinder, FixedCut
+from ..scenes.loaded import UNNAMED, Cut, Scenes
+from ..scenes.reading import read_scenes
+from ..support.defaults import BLEND, PRESETS
+from ..support.errors import FormatError, memory_told
+from ..support.threads import on_threads, thread_count
+from ..tables.comparison import COLUMNS as OF_COMPARISON
+from .progress import Told, telling
+from .results import ComparisonTable, Frames
+
+if TYPE_CHECKING:
+    from ..simulation.streaming import StreamingSettings
+
+#: What is looked at: a scene or a tree, or several and where they stand.
+Viewed = Scene | Instance | Iterable["Scene | Instance"]
+
+#: A count of splats, a share of full detail (a float, 0 to 1), or either as text: "500k", "5%".
+BudgetLike = int | float | str
+
+#: Where a scene keeps what was prepared of it for looking at it once more.
+_PREPARED = "_prepared_scenes"
+
+
+def cut(
+    viewed: Viewed,
+    camera: Camera,
+    *,
+    budget: BudgetLike | None = None,
+    settings: LodSettings | None = None,
+    continuous: bool | float = False,
+    threads: int | None = None,
+) -> Cut:
+    """The nodes that a viewer draws for a camera.
+
+    Args:
+        viewed: a tree, or instances. Of scenes without a tree all splats are drawn.
+        camera: that sees them.
+        budget: the most splats that are drawn; that of `settings` unless given.
+        settings: foveation, pixel-scale limit and so on; Spark 2's on a desktop unless given.
+        continuous: a cut that fades nodes into their children; the width of that, or True for 1.25.
+        threads: to prepare the trees on; None for all processors.
+
+    Raises:
+        ValueError: the budget is out of its range, or less than one splat for each instance.
+    """
+    with on_threads(threads) as count, memory_told():
+        scenes = scenes_of(viewed, count)
+        return CutFinder(scenes, _lod(scenes, budget, settings, continuous)).cut(camera)
+
+
+def render(
+    viewed: Viewed | Cut,
+    camera: Camera,
+    *,
+    settings: RenderSettings | None = None,
+    backend: str | None = None,
+    threads: int | None = None,
+) -> Image:
+    """The picture of a camera: of a cut, or of scenes and trees in full detail.
+
+    Splats of scenes without trees that cannot be drawn are left out.
+
+    Args:
+        viewed: what is drawn.
+        camera: that sees it.
+        settings: how it is drawn; as Spark 2 does unless given.
+        backend: "numba" (the reference), "osmesa" or "open3d"; that of `settings` unless given.
+        threads: to draw on; None for all processors. The picture does not depend on it.
+
+    Returns:
+        (H, W, 4) float32: red, green and blue, multiplied by alpha, and alpha.
+
+    Raises:
+        BackendError: the backend cannot draw here.
+        InvalidSplatsError: a scene has nothing to draw.
+    """
+    settings = settings or RenderSettings()
+    if backend is not None:
+        settings = replace(settings, backend=backend)
+    with on_threads(threads) as count, memory_told():
+        source = FixedCut(viewed) if isinstance(viewed, Cut) else FixedCut(scenes_of(viewed, count).full())
+        return Renderer(source, settings, [camera]).draw(camera).image
+
+
+def traverse(
+    viewed: Viewed,
+    cameras: CameraPath | Iterable[Camera],
+    *,
+    budget: BudgetLike | None = None,
+    settings: LodSettings | None = None,
+    streaming: StreamingSettings | None = None,
+    by_instance: bool = False,
+    threads: int | None = None,
+    progress: Told = None,
+) -> Frames:
+    """What a viewer draws and fetches along a camera path: a row for each frame.
+
+    Args:
+        viewed: a tree, or instances of trees.
+        cameras: the path.
+        budget: the most splats that are drawn; that of `settings` unless given.
+        settings: foveation, pixel-scale limit and so on; Spark 2's on a desktop unless given.
+        streaming: network and chunk cache; everything is there unless given.
+        by_instance: rows of single instances, too.
+        threads: to find cuts on; None for all processors. Only `traverse_ms` depends on it.
+        progress: is told how much is done.
+
+    Raises:
+        FormatError: a scene has no tree.
+        ValueError: the budget, or the cache, is too small for the roots.
+    """
+    from ..simulation.columns import COLUMNS
+    from ..simulation.frames import Simulation
+
+    with on_threads(threads) as count, telling(progress) as told, memory_told():
+        scenes = _trees(viewed, count)
+        simulation = Simulation(scenes, _lod(scenes, budget, settings, False), streaming, by_instance=by_instance)
+        frames = simulation.run(_path(cameras), threads=count, progress=told)
+        return Frames([row for frame in frames for row in frame.rows], COLUMNS)
+
+
+def compare(
+    viewed: Viewed,
+    scene: Viewed | None,
+    cameras: CameraPath | Iterable[Camera],
+    *,
+    budgets: Sequence[BudgetLike],
+    settings: LodSettings | None = None,
+    render: RenderSettings | None = None,
+    threads: int | None = None,
+    progress: Told = None,
+) -> ComparisonTable:
+    """How far cuts of some budgets are from full detail, in PSNR and SSIM on black and on white.
+
+    Args:
+        viewed: a tree, or instances of trees.
+        scene: what full detail is; None for the leaves of the trees.
+        cameras: that both are seen by.
+        budgets: of the cuts.
+        settings: of the cuts; with Spark 2's foveation and without a pixel-scale limit unless given.
+        render: how pictures are drawn; as Spark 2 does unless given.
+        threads: to work on; None for all processors. The table does not depend on it.
+        progress: is told how much is done.
+
+    Raises:
+        FormatError: what is cut has no tree.
+        SparklodError: a budget is less than one splat for each instance, or full detail covers no pixel.
+    """
+    from ..compare import Comparison
+
+    with on_threads(threads) as count, telling(progress) as told, memory_told():
+        scenes = _trees(viewed, count)
+        full = None if scene is None else scenes_of(scene, count)
+        given = [_budget(budget) for budget in budgets]
+        lod = settings or LodSettings(1, pixel_scale_limit=0.0)
+        comparison = Comparison(scenes, lod, given, render or RenderSettings(), full=full)
+        rows = list(comparison.run(_path(cameras), threads=count, progress=told))
+    return ComparisonTable(rows, OF_COMPARISON, [budget.text for budget in given])
+
+
+def psnr(a: Image, b: Image, *, background: float = 0.0) -> float:
+    """Peak signal-to-noise ratio of two pictures, in dB; 100 where they are the same.
+
+    Args:
+        a, b: (H, W, 3) 0..1, or (H, W, 4) with alpha multiplied in, as `render` draws them.
+        background: gray, 0..1, behind pictures with alpha.
+
+    Raises:
+        ValueError: they have different shapes, or are no pictures.
+    """
+    return metrics.psnr(*_opaque(a, b, background))
+
+
+def ssim(a: Image, b: Image, *, background: float = 0.0) -> float:
+    """Structural similarity of two pictures (Wang et al. 2004), 1 where they are the same; see `psnr`.
+
+    Raises:
+        ValueError: they have different shapes, or are no pictures.
+    """
+    return metrics.ssim(*_opaque(a, b, background))
+
+
+def _opaque(a: Image, b: Image, background: float) -> list[Image]:
+    a, b = np.asarray(a), np.asarray(b)
+    if a.shape != b.shape or a.ndim != 3 or a.shape[2] not in (3, 4):
+        raise ValueError(f"the pictures have the shapes {a.shape} and {b.shape}; give two of (H, W, 3) or (H, W, 4)")
+    return [metrics.on_background(each, background) if each.shape[2] == 4 else each for each in (a, b)]
+
+
+def scenes_of(viewed: Viewed, threads: int | None) -> Scenes:
+    """What is looked at, prepared; a single scene keeps it for the next time."""
+    if isinstance(viewed, Scene):
+        prepared: Scenes | None = viewed.__dict__.get(_PREPARED)
+        if prepared is None:
+            prepared = viewed.__dict__[_PREPARED] = read_scenes(
+                [Instance(viewed, UNNAMED)], threads=thread_count(threads)
+            )
+        return prepared
+    every: list[Any] = [viewed] if isinstance(viewed, Instance) else list(viewed)
+    instances = [each if isinstance(each, Instance) else Instance(each) for each in every]
+    if not instances:
+        raise ValueError("there is nothing to look at; give at least one scene or instance")
+    return read_scenes(_named(instances), threads=thread_count(threads))
+
+
+def _named(instances: Sequence[Instance]) -> list[Instance]:
+    """The instances, those without a name with one of their own."""
+    from pathlib import Path
+
+    unnamed = [each.file or Path(UNNAMED) for each in instances if not each.name]
+    names = iter(names_of(unnamed, [each.name for each in instances if each.name]))
+    return [each if each.name else replace(each, name=next(names)) for each in instances]
+
+
+def _trees(viewed: Viewed, threads: int) -> Scenes:
+    scenes = scenes_of(viewed, threads)
+    plain = next((loaded.name for loaded in scenes.loaded if not loaded.is_tree), None)
+    if plain is not None:
+        raise FormatError(f"{plain}: it is not a Level-of-Detail tree; build_lod makes one of it")
+    return scenes
+
+
+def _lod(
+    scenes: Scenes, budget: BudgetLike | None, settings: LodSettings | None, continuous: bool | float
+) -> LodSettings:
+    settings = settings or LodSettings(next(iter(PRESETS.values())))
+    if budget is not None:
+        settings = replace(settings, budget=_budget(budget).of(scenes.leaves))
+    if continuous:
+        settings = replace(settings, continuous=BLEND if continuous is True else float(continuous))
+    return settings
+
+
+def _budget(budget: BudgetLike) -> Budget:
+    if isinstance(budget, str):
+        return parse_budget(budget)
+    if not budget > 0 or (isinstance(budget, float) and budget > 1):
+        raise ValueError(f"the budget is {budget}; give a count of 1 or more, or a share of full detail up to 1.0")
+    if isinstance(budget, float):
+        return Budget(f"{100 * budget:g}%", Fraction(str(budget)), None)
+    return Budget.of_count(int(budget))
+
+
+def _path(cameras: CameraPath | Iterable[Camera]) -> CameraPath:
+    if isinstance(cameras, CameraPath):
+        return cameras
+    every = tuple([cameras] if isinstance(cameras, Camera) else cameras)
+    if not every:
+        raise ValueError("there are no cameras; give at least one")
+    if any(later.time < earlier.time for earlier, later in itertools.pairwise(every)):
+        raise ValueError("the cameras are not in the order of their times")
+    return CameraPath(every, "cameras", (), tuple(range(len(every))))

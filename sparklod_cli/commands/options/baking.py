@@ -1,0 +1,231 @@
+"""Options of `sparklod build-lod`: which splats, how they are merged, where they stand, and how they are written."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import click
+
+from ...codecs.gpu.table import ENCODINGS, NPZ, RAW_SUFFIXES
+from ...lod.builders import BUILDERS, METHODS
+from ...support import defaults
+from ..command import COMMON, option
+from ..paths import InputPath
+from ..usage import is_given, refuse
+from .common import Command
+from .types import AutoOr, Ball, Numbers, Real
+
+if TYPE_CHECKING:
+    from ...bake import BakeSettings
+    from ...codecs.options import WriteOptions
+
+TREE, SELECTION, PLACE, FORMAT = "Tree", "Selection", "Rotation, scale and position", "File format"
+
+#: Parameters of the headings above, of which a file that is only converted back has nothing.
+OF_TREES = ("method", "base", "growth", "max_sh")
+OF_SELECTION = ("min_opacity", "min_box", "max_box", "within", "on_invalid", "rgba")
+OF_PLACE = ("up", "rotate", "scale", "translate")
+OF_SPZ = ("spz_version", "fractional_bits", "compression_level")
+
+OPTIONS: tuple[Callable[[Command], Command], ...] = (
+    option(
+        "--method",
+        heading=COMMON,
+        type=click.Choice(METHODS),
+        default=METHODS[0],
+        help="How splats are merged. quick takes seconds; quality takes longer, and its cuts come closer to full"
+        " detail.",
+    ),
+    option(
+        "--max-sh",
+        heading=COMMON,
+        metavar="N",
+        type=click.IntRange(0, defaults.MAX_SH_DEGREE),
+        default=defaults.MAX_SH_DEGREE,
+        help="Highest degree of spherical harmonics to keep.",
+    ),
+    option(
+        "--min-opacity",
+        heading=COMMON,
+        metavar="N",
+        type=Real(0, 1),
+        default=0.0,
+        help="Leave out splats whose opacity is lower than this.",
+    ),
+    option(
+        "--within",
+        heading=COMMON,
+        type=Ball(),
+        help="Leave out splats whose centre is outside this ball, in the input's coordinates.",
+    ),
+    option(
+        "--up",
+        heading=COMMON,
+        type=click.Choice(defaults.UP_AXES),
+        default=defaults.UP_AXES[0],
+        help="Axis of the input that points up; the scene is turned so that it becomes +y. Scenes as trained are"
+        " mostly -y.",
+    ),
+    option(
+        "--base",
+        heading=TREE,
+        metavar="N",
+        type=Real(defaults.MIN_BASE, defaults.MAX_BASE),
+        default=defaults.DEFAULT_BASE,
+        help="Growth of the voxel grid from level to level, with --method quick. Smaller values give smoother"
+        " transitions and more nodes.",
+    ),
+    option(
+        "--growth",
+        heading=TREE,
+        metavar="N",
+        type=Real(defaults.MIN_GROWTH, defaults.MAX_GROWTH),
+        default=defaults.DEFAULT_GROWTH,
+        help="Largest number of nodes for each leaf, with --method quality.",
+    ),
+    option(
+        "--min-box",
+        heading=SELECTION,
+        type=Numbers("x", "y", "z"),
+        help="Leave out splats whose centre is below this on any axis, in the input's coordinates.",
+    ),
+    option(
+        "--max-box",
+        heading=SELECTION,
+        type=Numbers("x", "y", "z"),
+        help="Leave out splats whose centre is above this on any axis, in the input's coordinates.",
+    ),
+    option(
+        "--on-invalid",
+        heading=SELECTION,
+        type=click.Choice(["error", "drop"]),
+        default="error",
+        help="Whether to fail on invalid splats or leave them out: numbers that are not finite, negative scales.",
+    ),
+    option(
+        "--rgba",
+        heading=SELECTION,
+        metavar="FILE",
+        type=InputPath(),
+        help="Replace colours and opacities by those of a .npy or raw file of (N, 4) bytes or floats 0..1; splats of"
+        " alpha 0 are left out.",
+    ),
+    option(
+        "--rotate",
+        heading=PLACE,
+        type=Numbers("x", "y", "z"),
+        default="0,0,0",
+        help="Turn the scene by these angles in degrees, about x, then y, then z, after --up.",
+    ),
+    option(
+        "--scale",
+        heading=PLACE,
+        metavar="X",
+        type=Real(0, min_open=True),
+        default=1.0,
+        help="Multiply the size of the scene by this, about its origin, after --rotate.",
+    ),
+    option(
+        "--translate",
+        heading=PLACE,
+        type=Numbers("x", "y", "z"),
+        default="0,0,0",
+        help="Move the scene by this, in world units, after --scale.",
+    ),
+    option(
+        "--encoding",
+        heading=FORMAT,
+        type=click.Choice(list(ENCODINGS)),
+        help=f"Write arrays in a viewer's memory layout instead of SPZ: a {NPZ} file, or the words alone if FILE ends"
+        f" in {' or '.join(RAW_SUFFIXES)}.",
+    ),
+    option(
+        "--spz-version",
+        heading=FORMAT,
+        type=click.Choice([str(version) for version in defaults.SPZ_VERSIONS]),
+        default=str(defaults.DEFAULT_SPZ_VERSION),
+        help="SPZ version: 2 gives files 4 to 8 % smaller, 3 rotations ten times as exact.",
+    ),
+    option(
+        "--fractional-bits",
+        heading=FORMAT,
+        type=AutoOr(0, defaults.MAX_FRACTIONAL_BITS),
+        default="auto",
+        help="Bits after the binary point of SPZ positions; auto goes by the extent of the scene and its smallest"
+        " splats.",
+    ),
+    option(
+        "--compression-level",
+        heading=FORMAT,
+        metavar="N",
+        type=click.IntRange(defaults.MIN_COMPRESSION, defaults.MAX_COMPRESSION),
+        default=defaults.DEFAULT_COMPRESSION,
+        help="Compression of SPZ, from 1 (fast) to 9 (small).",
+    ),
+)
+
+
+def baking_options(command: Command) -> Command:
+    """Adds the options of this module; `bake_settings` and `write_options` take what they are given."""
+    for add in reversed(OPTIONS):
+        command = add(command)
+    return command
+
+
+def check_method(ctx: click.Context) -> None:
+    """Raises a `click.UsageError` where the number of one method is given with another."""
+    chosen = ctx.params["method"]
+    for method, row in BUILDERS.items():
+        if method != chosen:
+            refuse(ctx, [row.setting], f"is an option of --method {method}, not of {chosen}")
+
+
+def bake_settings(ctx: click.Context, *, raw: bool) -> BakeSettings:
+    """What the options ask for; loads numpy.
+
+    Args:
+        ctx: of the command.
+        raw: write the words of --encoding alone.
+    """
+    from ...bake import BakeSettings
+    from ...model.selection import Selection
+    from ...model.transforms import Transform
+
+    given = ctx.params
+    try:
+        transform = Transform.from_parts(
+            up=given["up"], rotate=given["rotate"], scale=given["scale"], translate=given["translate"]
+        )
+    except ValueError as error:
+        raise click.UsageError(str(error)) from None
+    return BakeSettings(
+        method=given["method"],
+        base=given["base"],
+        growth=given["growth"],
+        max_sh=given["max_sh"],
+        selection=Selection(
+            drop_invalid=given["on_invalid"] == "drop",
+            min_opacity=given["min_opacity"],
+            min_box=given["min_box"],
+            max_box=given["max_box"],
+            within=given["within"],
+        ),
+        transform=transform,
+        rgba=given["rgba"],
+        spz=write_options(ctx),
+        encoding=given["encoding"],
+        raw=raw,
+    )
+
+
+def write_options(ctx: click.Context) -> WriteOptions:
+    """How to write SPZ; what nobody chose is left to the library, which may take it from the input."""
+    from ...codecs.options import WriteOptions
+
+    given = ctx.params
+    return WriteOptions(
+        spz_version=int(given["spz_version"]) if is_given(ctx, "spz_version") else None,
+        fractional_bits=given["fractional_bits"],
+        compression_level=given["compression_level"],
+    )

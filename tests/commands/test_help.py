@@ -1,0 +1,131 @@
+"""`--help` has every option under a heading, and whoever mistypes hears what was meant."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+
+import click
+import pytest
+
+from sparklod_cli.cli import COMMANDS, cli, run
+from sparklod_cli.commands.command import ALIASES, COMMON, GENERAL, Command
+
+COMMAND_NAMES = [name for name in COMMANDS if name != "help"]
+
+
+def command_of(name: str) -> Command:
+    command = cli.get_command(click.Context(cli), name)
+    assert isinstance(command, Command)
+    return command
+
+
+def printed(*arguments: str, capsys: pytest.CaptureFixture[str]) -> str:
+    assert run([*arguments]) == 0
+    return capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", COMMAND_NAMES)
+def test_each_option_stands_under_one_heading(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    command = command_of(name)
+    headings = command.by_heading(click.Context(command))
+    listed = [param for params in headings.values() for param in params]
+    options = [param for param in command.get_params(click.Context(command)) if isinstance(param, click.Option)]
+    assert sorted(map(id, listed)) == sorted(map(id, options))
+    text = printed(name, "--help", capsys=capsys)
+    for heading in headings:
+        assert f"\n{heading}:\n" in text
+    for option in options:
+        assert len(re.findall(rf"^  (?:-\w, )?{re.escape(option.opts[-1])}(?![\w-])", text, re.MULTILINE)) == 1
+    assert next(iter(reversed(headings))) == GENERAL
+
+
+@pytest.mark.parametrize("name", ["build-lod"])
+def test_the_first_heading_has_the_few_options_that_most_people_need(name: str) -> None:
+    command = command_of(name)
+    first, params = next(iter(command.by_heading(click.Context(command)).items()))
+    assert first == COMMON
+    assert 5 <= len(params) <= 12
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_the_help_of_a_command_can_be_had_by_help(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert printed("help", name, capsys=capsys) == printed(name, "--help", capsys=capsys)
+
+
+def test_help_alone_is_that_of_the_program(capsys: pytest.CaptureFixture[str]) -> None:
+    text = printed("help", capsys=capsys)
+    assert text == printed("--help", capsys=capsys)
+    for name, summary in COMMANDS.items():
+        assert re.search(rf"^  {name} +{re.escape(summary)}$", text, re.MULTILINE)
+
+
+@pytest.mark.parametrize(
+    ("typed", "meant"),
+    [
+        *ALIASES.items(),
+        ("build_lod", "build-lod"),
+        ("Build-LOD", "build-lod"),
+        ("buildlod", "build-lod"),
+        ("inspct", "inspect"),
+        ("travers", "traverse"),
+        ("rendr", "render"),
+        ("warm-up", "warmup"),
+    ],
+)
+def test_a_command_that_there_is_not_names_the_one_that_was_meant(
+    typed: str, meant: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for arguments in ([typed, "scene.ply"], ["help", typed]):
+        assert run(arguments) == 2
+        assert capsys.readouterr().err.endswith(f"error: there is no command {typed!r}; did you mean {meant}?\n")
+
+
+def test_every_alias_means_a_command() -> None:
+    assert {meant.split()[0] for meant in ALIASES.values()} <= set(COMMANDS)
+    assert not set(ALIASES) & set(COMMANDS)
+
+
+def test_a_command_like_no_other_lists_them(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["xyzzy"]) == 2
+    assert f"there is no command 'xyzzy'; the commands are {', '.join(COMMANDS)}\n" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "meant"),
+    [
+        (["build-lod", "--ouput", "x"], "--output"),
+        (["build-lod", "--spz-versoin", "2"], "--spz-version"),
+        (["inspect", "--chek"], "--check"),
+        (["build-lod", "--quality"], "--method quality"),
+        (["--verison"], "--version"),
+    ],
+)
+def test_an_option_that_there_is_not_names_the_one_that_was_meant(
+    arguments: list[str], meant: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(arguments) == 2
+    err = capsys.readouterr().err
+    wrong = next(each for each in arguments if each.startswith("--"))
+    assert err.splitlines()[-1] == f"error: there is no option {wrong}; did you mean {meant}?"
+
+
+def test_help_loads_no_command_and_nothing_heavy() -> None:
+    code = (
+        "import sys; from sparklod_cli.cli import run; run(['--help']);"
+        "print(*[name for name in sys.modules if name.split('.')[0] in ('numpy', 'numba', 'tqdm')"
+        " or name.startswith('sparklod_cli.commands.build')])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == ""
+
+
+@pytest.mark.parametrize("name", COMMAND_NAMES)
+def test_the_help_of_a_command_loads_nothing_heavy(name: str) -> None:
+    code = (
+        f"import sys; from sparklod_cli.cli import run; run([{name!r}, '--help']);"
+        "print(*[name for name in sys.modules if name in ('numpy', 'numba', 'tqdm')])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == ""
