@@ -36,4 +36,4 @@ def test_the_notebook_runs_and_shows_its_pictures(tmp_path: Any, monkeypatch: py
     folder = {"metadata": {"path": str(NOTEBOOK.parent)}}
     nbclient.NotebookClient(notebook, timeout=TIMEOUT, kernel_name="python3", resources=folder).execute()
     shown = [kind for cell in code_cells(notebook) for output in cell.outputs for kind in output.get("data", ())]
-    assert shown.count("image/png") == 3  # the cut, full detail, the chart
+    assert shown.count("image/png") == 4  # the cut, full detail, two charts
