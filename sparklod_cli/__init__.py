@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from .api.cameras import orbit, read_cameras
-    from .api.files import Written, build_lod, extract_leaves, inspect, read, write
+    from .api.files import Written, build_lod, extract_leaves, inspect, pack, read, unpack, write
     from .api.results import ComparisonTable, Frames, Picture, show
     from .api.views import compare, cut, psnr, render, ssim, traverse
     from .cameras.camera import Camera
@@ -52,7 +52,7 @@ __version__ = "0.1.0"
 #: package loads neither numpy nor numba. tests/test_api.py holds this and the imports above together.
 _MODULES = {
     "api.cameras": ("orbit", "read_cameras"),
-    "api.files": ("Written", "build_lod", "extract_leaves", "inspect", "read", "write"),
+    "api.files": ("Written", "build_lod", "extract_leaves", "inspect", "pack", "read", "unpack", "write"),
     "api.results": ("ComparisonTable", "Frames", "Picture", "show"),
     "api.views": ("compare", "cut", "psnr", "render", "ssim", "traverse"),
     "cameras.camera": ("Camera",),
@@ -117,6 +117,7 @@ __all__ = [
     "extract_leaves",
     "inspect",
     "orbit",
+    "pack",
     "psnr",
     "read",
     "read_cameras",
@@ -125,6 +126,7 @@ __all__ = [
     "show",
     "ssim",
     "traverse",
+    "unpack",
     "write",
 ]
 

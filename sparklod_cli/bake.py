@@ -23,10 +23,10 @@ from .model.scene import Scene
 from .model.selection import Selection
 from .model.splats import Splats
 from .model.transforms import Transform
-from .support import jit
 from .support.defaults import DEFAULT_BASE, DEFAULT_GROWTH, MAX_SH_DEGREE
 from .support.errors import FormatError, InvalidSplatsError, memory_told
 from .support.progress import Progress, silent
+from .support.threads import on_threads
 
 
 @dataclass(frozen=True)
@@ -143,11 +143,11 @@ def bake(
         # Before building, so that what does not fit is said at once.
         if settings.encoding is None:
             spz.settled(Scene(kept), settings.spz)
-        jit.use_threads(threads)
         # The builder frees its input as it goes, if nobody else holds it: a third of the peak.
         handed_over = [kept]
         del scene, kept
-        nodes, tree = settings.builder()(handed_over.pop(), progress=progress)
+        with on_threads(threads):
+            nodes, tree = settings.builder()(handed_over.pop(), progress=progress)
         levels = int(tree.depths().max()) + 1
         build_done = time.perf_counter()
         facts |= _written(Scene(nodes, tree, antialiased), write, settings, threads, progress)

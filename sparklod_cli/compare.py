@@ -19,6 +19,7 @@ from .scenes.loaded import Scenes
 from .support.errors import SparklodError
 from .support.parallel import ordered_map
 from .support.progress import Progress, silent
+from .support.threads import on_threads
 from .tables.columns import Row
 from .tables.comparison import COLUMNS, rows_by_budget
 from .tables.statistics import numbers
@@ -68,23 +69,25 @@ class Comparison:
     def run(self, path: CameraPath, *, threads: int = 1, progress: Progress = silent) -> Iterator[Row]:
         """Rows of `tables.comparison.COLUMNS`: for each camera one for each budget.
 
-        Pictures are drawn one after the other, each on all threads that kernels have; meanwhile others are measured.
+        Pictures are drawn one after the other, each on all the threads; meanwhile others are measured.
 
         Raises:
             SparklodError: full detail covers no pixel of a frame.
         """
         total = len(path.cameras) * len(self.counts)
-        for at, row in enumerate(ordered_map(_measured, self._pictures(path), min(threads, MEASURERS))):
+        for at, row in enumerate(ordered_map(_measured, self._pictures(path, threads), min(threads, MEASURERS))):
             progress("compare", at + 1, total, "picture")
             yield row
 
-    def _pictures(self, path: CameraPath) -> Iterator[tuple[Row, Image, Image]]:
+    def _pictures(self, path: CameraPath, threads: int) -> Iterator[tuple[Row, Image, Image]]:
         """What is known of a row, its picture, and that of full detail."""
         for number, camera in zip(path.numbers, path.cameras, strict=True):
-            full = self._full.draw(camera).image
+            with on_threads(threads):
+                full = self._full.draw(camera).image
             check_covered(full, f"full detail in frame {number}")
             for count, renderer in zip(self.counts, self._cuts, strict=True):
-                drawn = renderer.draw(camera)
+                with on_threads(threads):
+                    drawn = renderer.draw(camera)
                 row: Row = {
                     "frame": number,
                     "time_s": camera.time,

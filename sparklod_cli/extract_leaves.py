@@ -52,7 +52,7 @@ def leaves_of(scene: Scene) -> Scene:
     leaves = scene.splats.take(scene.tree.is_leaf)
     # A leaf is an input splat. One whose opacity is above 1 comes from a writer that rounds up.
     leaves = dataclasses.replace(leaves, opacity=np.minimum(leaves.opacity, np.float32(1)))
-    return dataclasses.replace(scene, splats=leaves, tree=None)
+    return Scene(leaves, antialiased=scene.antialiased, format=scene.format, header=scene.header)
 
 
 def extract_leaves(

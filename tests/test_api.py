@@ -163,6 +163,24 @@ def test_arrays_are_what_the_command_writes(scene: sparklod.Scene, tmp_path: Pat
     assert (tmp_path / "ours.npz").read_bytes() == (tmp_path / "theirs.npz").read_bytes()
 
 
+@pytest.mark.parametrize("encoding", ["packed", "ext"])
+def test_arrays_of_viewers_are_unpacked(scene: sparklod.Scene, tree: sparklod.Tree, encoding: str) -> None:
+    words = sparklod.pack(tree, encoding) | sparklod.pack(tree, "lodtree")
+    again = sparklod.unpack(words)
+    assert isinstance(again, sparklod.Tree)
+    assert np.array_equal(again.tree.child_start, tree.tree.child_start)
+    near = {"packed": 2**-11, "ext": 0.0}[encoding]
+    np.testing.assert_allclose(again.splats.center, tree.splats.center, rtol=near, atol=near and 2**-25)
+    coarse = {"packed": 0.045, "ext": 0.006}[encoding]
+    np.testing.assert_allclose(np.log(again.splats.scale), np.log(tree.splats.scale), atol=coarse)
+    assert again.splats.opacity.max() > 1
+    assert sparklod.unpack(sparklod.pack(scene, encoding)).tree is None
+    with pytest.raises(sparklod.FormatError, match="nodes but"):
+        sparklod.unpack(sparklod.pack(scene, encoding) | sparklod.pack(tree, "lodtree"))
+    with pytest.raises(ValueError, match="no encoding 'zip'"):
+        sparklod.pack(scene, "zip")
+
+
 def test_a_scene_is_made_of_arrays() -> None:
     splats = random_splats(50, sh_degree=1)
     columns = {each.name: getattr(splats, each.name) for each in dataclasses.fields(splats)}
@@ -247,6 +265,19 @@ def test_a_cut_is_within_its_budget(held: sparklod.Tree) -> None:
 def test_what_is_no_budget_is_refused(held: sparklod.Tree, budget: Any) -> None:
     with pytest.raises(ValueError, match=r"budget|neither"):
         sparklod.cut(held, camera(), budget=budget)
+
+
+def test_cuts_in_half_precision_are_those_of_rounded_numbers(file: Path, held: sparklod.Tree, tmp_path: Path) -> None:
+    path = FIXTURES / "cameras" / "sparklod.json"
+    half = ["--camera-path", path, "--budget", 300, "--precision", "float16", "--no-timing"]
+    command("traverse", file, *half, "-o", tmp_path / "theirs.csv", "-q")
+    theirs = list(csv.DictReader(io.StringIO((tmp_path / "theirs.csv").read_text())))
+    frames = sparklod.traverse(held, sparklod.read_cameras(path), budget=300, precision="float16")
+    assert [str(row["pixel_scale_min"]) for row in frames] == [row["pixel_scale_min"] for row in theirs]
+    exact = sparklod.traverse(held, sparklod.read_cameras(path), budget=300)
+    assert frames.column("pixel_scale_min") != exact.column("pixel_scale_min")
+    with pytest.raises(ValueError, match="no precision"):
+        sparklod.cut(held, camera(), precision="float8")
 
 
 @pytest.mark.parametrize("full", [False, True])
@@ -390,10 +421,23 @@ def test_progress_is_told_to_a_function_and_to_bars(scene: sparklod.Scene) -> No
     assert all(bar.closed and bar.n == bar.total for bar in bars)
 
 
-def test_threads_are_left_as_they_were(scene: sparklod.Scene) -> None:
+def test_work_is_done_on_the_threads_that_are_asked_for(
+    scene: sparklod.Scene, held: sparklod.Tree, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from sparklod_cli.render import rasterizer
     from sparklod_cli.support import jit
 
-    before = jit.threads_in_use()
+    before, used = jit.threads_in_use(), set()
+    draw = rasterizer.draw
+
+    def noted(*arguments: Any) -> Any:
+        used.add(jit.threads_in_use())
+        return draw(*arguments)
+
+    monkeypatch.setattr(rasterizer, "draw", noted)
+    sparklod.render(scene, camera(), threads=1)
+    sparklod.compare(held, None, [camera()], budgets=[50, 0.5], threads=1)
+    assert used == {1}
     sparklod.build_lod(scene, threads=1)
     assert jit.threads_in_use() == before
 

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..io import examine_scene, read_scene, write_whole
+from ..lod.builders import BUILDERS, METHODS
 from ..model.scene import Scene, Tree
 from ..model.splats import COLUMNS
-from ..support.defaults import DEFAULT_BASE, DEFAULT_COMPRESSION, DEFAULT_GROWTH, MAX_SH_DEGREE, METHODS
+from ..support.defaults import DEFAULT_BASE, DEFAULT_COMPRESSION, DEFAULT_GROWTH, MAX_SH_DEGREE
 from ..support.errors import FormatError, memory_told
 from ..support.threads import on_threads, thread_count
 from .progress import Told, telling
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from ..inspection.report import Report
     from ..model.selection import Selection
 
@@ -105,16 +109,14 @@ def write(
     """
     from ..codecs.formats import WRITABLE
     from ..codecs.gpu import dump
-    from ..codecs.gpu.table import ENCODINGS, RAW_SUFFIXES
+    from ..codecs.gpu.table import RAW_SUFFIXES
     from ..codecs.options import WriteOptions
 
     path, count = Path(path), thread_count(threads)
     suffix = path.suffix.lower()
     with telling(progress) as told, memory_told():
         if encoding is not None:
-            if encoding not in ENCODINGS:
-                raise ValueError(f"there is no encoding {encoding!r}; give one of {', '.join(ENCODINGS)}")
-            arrays = dump.pack(scene, encoding, count)
+            arrays = pack(scene, encoding, threads=count)
             pieces = dump.encode_raw(arrays) if suffix in RAW_SUFFIXES else dump.encode_npz(arrays)
             return Written(path, encoding, write_whole(path, pieces, overwrite=overwrite))
         form = WRITABLE.get(suffix)
@@ -154,18 +156,18 @@ def build_lod(
         InvalidSplatsError: some splats are invalid and `selection` does not drop them, or none is left.
         ValueError: there is no such method.
     """
-    from ..bake import BUILDERS
+    from ..bake import BakeSettings
     from ..model.selection import Selection
 
     if scene.tree is not None:
         raise FormatError("the scene has a Level-of-Detail tree already; extract_leaves gives its splats")
     if method not in BUILDERS:
         raise ValueError(f"there is no method {method!r}; give one of {', '.join(BUILDERS)}")
-    builder, setting = BUILDERS[method]
+    build = BakeSettings(method=method, base=base, growth=growth).builder()
     with on_threads(threads), telling(progress) as told, memory_told():
         kept, _ = (selection or Selection()).apply(scene.splats.with_max_sh(max_sh))
         # A builder frees its input as it goes where nobody else holds it.
-        nodes, tree = builder.build(kept, {"base": base, "growth": growth}[setting], progress=told)
+        nodes, tree = build(kept, progress=told)
     return Tree(nodes, tree, scene.antialiased)
 
 
@@ -175,15 +177,59 @@ def extract_leaves(tree: Scene) -> Scene:
     Raises:
         FormatError: the scene has no tree.
     """
-    import dataclasses
+    from ..extract_leaves import leaves_of
 
-    import numpy as np
+    return leaves_of(tree)
 
-    if tree.tree is None:
-        raise FormatError("the scene has no Level-of-Detail tree whose leaves could be taken")
-    leaves = tree.splats.take(tree.tree.is_leaf)
-    leaves = dataclasses.replace(leaves, opacity=np.minimum(leaves.opacity, np.float32(1)))
-    return Scene(leaves, antialiased=tree.antialiased, format=tree.format, header=tree.header)
+
+def pack(scene: Scene, encoding: str, *, threads: int | None = None) -> dict[str, NDArray[np.uint32]]:
+    """A scene in the layout of a viewer's memory, as `build-lod --encoding` writes it; docs/formats.md has the words.
+
+    Args:
+        scene: a scene or a tree.
+        encoding: "packed", "ext", "lodtree" (of a tree) or "texture".
+        threads: to encode on; None for all processors.
+
+    Returns:
+        arrays of uint32 words by their names, N rows each but for a texture.
+
+    Raises:
+        ValueError: there is no such encoding, or no tree for it.
+    """
+    from ..codecs.gpu import dump
+    from ..codecs.gpu.table import ENCODINGS
+
+    if encoding not in ENCODINGS:
+        raise ValueError(f"there is no encoding {encoding!r}; give one of {', '.join(ENCODINGS)}")
+    return dump.pack(scene, encoding, thread_count(threads))
+
+
+def unpack(arrays: Mapping[str, NDArray[np.uint32]], *, threads: int | None = None) -> Scene:
+    """The scene that arrays of `pack`, or of a viewer, hold; a `Tree` where the words of a LodTree are among them.
+
+    Args:
+        arrays: those of "packed" or of "ext", and of "lodtree" where there is a tree.
+        threads: to decode on; None for all processors.
+
+    Raises:
+        FormatError: an array is missing, or has another shape or type.
+        TreeError: the tree is broken.
+    """
+    from ..codecs.gpu import ext_splats, lod_tree, packed_splats
+
+    count = thread_count(threads)
+    tree = lod_tree.unpack(arrays).tree if "lod_tree" in arrays else None
+    if "packed" in arrays:
+        encoding = packed_splats.Encoding(lod_opacity=tree is not None)
+        splats = packed_splats.unpack(arrays, encoding, threads=count)
+    else:
+        splats = ext_splats.unpack(arrays, threads=count)
+    if tree is None:
+        return Scene(splats)
+    if len(tree) != len(splats):
+        raise FormatError(f"{len(tree):,} nodes but {len(splats):,} splats")
+    tree.validate()
+    return Tree(splats, tree)
 
 
 def inspect(

@@ -23,7 +23,7 @@ from ..render.settings import RenderSettings
 from ..scenes.finder import CutFinder, FixedCut
 from ..scenes.loaded import UNNAMED, Cut, Scenes
 from ..scenes.reading import read_scenes
-from ..support.defaults import BLEND, PRESETS
+from ..support.defaults import BLEND, PRECISIONS, PRESETS
 from ..support.errors import FormatError, memory_told
 from ..support.threads import on_threads, thread_count
 from ..tables.comparison import COLUMNS as OF_COMPARISON
@@ -50,6 +50,7 @@ def cut(
     budget: BudgetLike | None = None,
     settings: LodSettings | None = None,
     continuous: bool | float = False,
+    precision: str = PRECISIONS[0],
     threads: int | None = None,
 ) -> Cut:
     """The nodes that a viewer draws for a camera.
@@ -60,13 +61,14 @@ def cut(
         budget: the most splats that are drawn; that of `settings` unless given.
         settings: foveation, pixel-scale limit and so on; Spark 2's on a desktop unless given.
         continuous: a cut that fades nodes into their children; the width of that, or True for 1.25.
+        precision: "float32", or "float16" for the centres and sizes that Spark holds of a tree.
         threads: to prepare the trees on; None for all processors.
 
     Raises:
         ValueError: the budget is out of its range, or less than one splat for each instance.
     """
     with on_threads(threads) as count, memory_told():
-        scenes = scenes_of(viewed, count)
+        scenes = scenes_of(viewed, count, precision)
         return CutFinder(scenes, _lod(scenes, budget, settings, continuous)).cut(camera)
 
 
@@ -112,6 +114,7 @@ def traverse(
     settings: LodSettings | None = None,
     streaming: StreamingSettings | None = None,
     by_instance: bool = False,
+    precision: str = PRECISIONS[0],
     threads: int | None = None,
     progress: Told = None,
 ) -> Frames:
@@ -124,6 +127,7 @@ def traverse(
         settings: foveation, pixel-scale limit and so on; Spark 2's on a desktop unless given.
         streaming: network and chunk cache; everything is there unless given.
         by_instance: rows of single instances, too.
+        precision: see `cut`.
         threads: to find cuts on; None for all processors. Only `traverse_ms` depends on it.
         progress: is told how much is done.
 
@@ -135,7 +139,7 @@ def traverse(
     from ..simulation.frames import Simulation
 
     with on_threads(threads) as count, telling(progress) as told, memory_told():
-        scenes = _trees(viewed, count)
+        scenes = _trees(viewed, count, precision)
         simulation = Simulation(scenes, _lod(scenes, budget, settings, False), streaming, by_instance=by_instance)
         frames = simulation.run(_path(cameras), threads=count, progress=told)
         return Frames([row for frame in frames for row in frame.rows], COLUMNS)
@@ -149,6 +153,7 @@ def compare(
     budgets: Sequence[BudgetLike],
     settings: LodSettings | None = None,
     render: RenderSettings | None = None,
+    precision: str = PRECISIONS[0],
     threads: int | None = None,
     progress: Told = None,
 ) -> ComparisonTable:
@@ -161,6 +166,7 @@ def compare(
         budgets: of the cuts.
         settings: of the cuts; with Spark 2's foveation and without a pixel-scale limit unless given.
         render: how pictures are drawn; as Spark 2 does unless given.
+        precision: see `cut`.
         threads: to work on; None for all processors. The table does not depend on it.
         progress: is told how much is done.
 
@@ -171,7 +177,7 @@ def compare(
     from ..compare import Comparison
 
     with on_threads(threads) as count, telling(progress) as told, memory_told():
-        scenes = _trees(viewed, count)
+        scenes = _trees(viewed, count, precision)
         full = None if scene is None else scenes_of(scene, count)
         given = [_budget(budget) for budget in budgets]
         lod = settings or LodSettings(1, pixel_scale_limit=0.0)
@@ -209,20 +215,21 @@ def _opaque(a: Image, b: Image, background: float) -> list[Image]:
     return [metrics.on_background(each, background) if each.shape[2] == 4 else each for each in (a, b)]
 
 
-def scenes_of(viewed: Viewed, threads: int | None) -> Scenes:
-    """What is looked at, prepared; a single scene keeps it for the next time."""
+def scenes_of(viewed: Viewed, threads: int | None, precision: str = PRECISIONS[0]) -> Scenes:
+    """What is looked at, prepared; a single scene keeps that for the next time."""
+    if precision not in PRECISIONS:
+        raise ValueError(f"there is no precision {precision!r}; give one of {', '.join(PRECISIONS)}")
+    count = thread_count(threads)
     if isinstance(viewed, Scene):
-        prepared: Scenes | None = viewed.__dict__.get(_PREPARED)
-        if prepared is None:
-            prepared = viewed.__dict__[_PREPARED] = read_scenes(
-                [Instance(viewed, UNNAMED)], threads=thread_count(threads)
-            )
-        return prepared
+        kept: dict[str, Scenes] = viewed.__dict__.setdefault(_PREPARED, {})
+        if precision not in kept:
+            kept[precision] = read_scenes([Instance(viewed, UNNAMED)], precision=precision, threads=count)
+        return kept[precision]
     every: list[Any] = [viewed] if isinstance(viewed, Instance) else list(viewed)
     instances = [each if isinstance(each, Instance) else Instance(each) for each in every]
     if not instances:
         raise ValueError("there is nothing to look at; give at least one scene or instance")
-    return read_scenes(_named(instances), threads=thread_count(threads))
+    return read_scenes(_named(instances), precision=precision, threads=count)
 
 
 def _named(instances: Sequence[Instance]) -> list[Instance]:
@@ -234,8 +241,8 @@ def _named(instances: Sequence[Instance]) -> list[Instance]:
     return [each if each.name else replace(each, name=next(names)) for each in instances]
 
 
-def _trees(viewed: Viewed, threads: int) -> Scenes:
-    scenes = scenes_of(viewed, threads)
+def _trees(viewed: Viewed, threads: int, precision: str) -> Scenes:
+    scenes = scenes_of(viewed, threads, precision)
     plain = next((loaded.name for loaded in scenes.loaded if not loaded.is_tree), None)
     if plain is not None:
         raise FormatError(f"{plain}: it is not a Level-of-Detail tree; build_lod makes one of it")

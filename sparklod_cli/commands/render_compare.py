@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING
 
 import click
 
+from ..support.stdin import DASH
 from .console import Console, count_of, for_screen, is_terminal
 from .options.common import table_form
-from .paths import DASH, keep_apart
+from .paths import keep_apart
 
 if TYPE_CHECKING:
     from ..cameras.path import CameraPath

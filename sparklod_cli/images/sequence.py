@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from ..cameras.frame import DEFAULT_FPS
 from ..io import write_stdout, write_whole
 from ..render.renderer import Renderer
-from ..support import jit
 from ..support.defaults import OF_PIXELS
 from ..support.parallel import ordered_map
 from ..support.progress import Progress, silent
+from ..support.threads import on_threads
 from . import pixels as codes
 from .animation import animate
 from .contact_sheet import sheet
@@ -115,10 +115,10 @@ def write_pictures(
         SparklodError: there is nothing to colour by, the reference covers no pixel of a frame, or an animation cannot
             be encoded here.
     """
-    jit.use_threads(settings.threads)
-    renderer = Renderer(source, render, path.cameras, progress=progress)
-    other = None if reference is None else Renderer(reference, render, path.cameras, progress=progress)
-    return _Writer(renderer, path, output, settings, other, overwrite, progress).run()
+    with on_threads(settings.threads):
+        renderer = Renderer(source, render, path.cameras, progress=progress)
+        other = None if reference is None else Renderer(reference, render, path.cameras, progress=progress)
+        return _Writer(renderer, path, output, settings, other, overwrite, progress).run()
 
 
 def frame_rate(path: CameraPath) -> float:
@@ -182,9 +182,9 @@ class _Writer:
             yield frame
 
     def _frame(self, at: int) -> _Frame:
-        jit.use_threads(self._settings.threads)  # each thread has a number of its own
         camera, number = self._path.cameras[at], self._path.numbers[at]
-        drawn, other = self._draw(at)
+        with on_threads(self._settings.threads):  # each thread of Python has a number of its own
+            drawn, other = self._draw(at)
         facts = self._facts(number, camera, drawn)
         image = codes.over(drawn.image, self._settings.background)
         if other is not None:

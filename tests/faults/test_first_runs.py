@@ -14,7 +14,7 @@ from tests.faults.runs import ENVIRONMENT
 SCRIPT = """
 import numpy as np
 from numba.core import event
-from sparklod_cli import jit
+from sparklod_cli.support import jit
 from sparklod_cli.lod.kernels.geometry import ellipsoid_area
 from sparklod_cli.lod.kernels import sort
 

@@ -52,7 +52,7 @@ def test_many_files_are_not_open_at_a_time(tmp_path: Path) -> None:
 #: Prints how much address space a process has that has done what all commands do first.
 BASELINE = """
 import re, sys
-from sparklod_cli import interrupts
+from sparklod_cli.support import interrupts
 from sparklod_cli.cli import run
 interrupts.handle()  # by a thread, whose stack and heap count
 code = run(sys.argv[1:])

@@ -23,14 +23,14 @@ pytestmark = pytest.mark.skipif(os.name != "posix", reason="POSIX only")
 #: Writes for ever: new files, or one file again and again.
 WRITER = """
 import itertools, pathlib, sys
-from sparklod_cli import whole
+from sparklod_cli.support import atomic
 folder, unnamed, overwrite = pathlib.Path(sys.argv[1]), sys.argv[2] == "True", sys.argv[3] == "True"
 if not unnamed:
-    whole.UNNAMED = None
+    atomic.UNNAMED = None
 print("ready", flush=True)
 for number in itertools.count():
     name = "out" if overwrite else f"out-{number}"
-    whole.write(folder / name, [bytes([number % 256]) * 100_000] * 4, overwrite=overwrite)
+    atomic.write(folder / name, [bytes([number % 256]) * 100_000] * 4, overwrite=overwrite)
 """
 SIZE = 400_000
 KILLS = 12

@@ -59,7 +59,7 @@ def test_the_cache_is_named_by_all_that_kernels_are_made_of() -> None:
 def test_a_change_of_any_kernel_or_constant_is_a_new_cache(tmp_path: Path) -> None:
     copy = tmp_path / "sparklod_cli"
     shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
-    code = "from sparklod_cli import jit; print(jit.CACHE_FOLDER)"
+    code = "from sparklod_cli.support import jit; print(jit.CACHE_FOLDER)"
     folders = []
     for name in ("tree.py", "tree.py", "lod/kernels/merge.py"):
         command = [sys.executable, "-c", code]
@@ -99,7 +99,7 @@ def test_kernels_that_are_compiled_are_told_and_not_those_inside_them() -> None:
 
 @pytest.mark.parametrize("given", [{}, {"OMP_WAIT_POLICY": "ACTIVE"}, {"GOMP_SPINCOUNT": "7"}])
 def test_threads_do_not_spin_unless_somebody_says_so(given: dict[str, str]) -> None:
-    code = "import os; from sparklod_cli import jit; print(os.environ.get('GOMP_SPINCOUNT'))"
+    code = "import os; from sparklod_cli.support import jit; print(os.environ.get('GOMP_SPINCOUNT'))"
     clean = {name: value for name, value in os.environ.items() if name not in (*jit.WAITING, "OMP_WAIT_POLICY")}
     command = [sys.executable, "-c", code]
     done = subprocess.run(command, cwd=ROOT, env={**clean, **given}, capture_output=True, text=True, check=True)

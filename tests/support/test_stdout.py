@@ -112,7 +112,8 @@ def test_an_error_of_what_is_written_is_not_its_own() -> None:
 
 @pytest.mark.skipif(os.name != "posix", reason="a shell of POSIX")
 def test_no_file_gets_the_number_of_a_closed_stream() -> None:
-    code = "import os; from sparklod_cli import stdout; stdout.reserve(); os._exit(os.open(os.devnull, os.O_RDONLY))"
+    code = "import os; from sparklod_cli.support import stdout; stdout.reserve(); "
+    code += "os._exit(os.open(os.devnull, os.O_RDONLY))"
     for closed in ("<&-", ">&-", "2>&-", "<&- >&- 2>&-"):
         done = subprocess.run(["sh", "-c", f"{sys.executable} -c '{code}' {closed}"], cwd=ROOT, check=False)
         assert done.returncode > 2

@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING
 
 import click
 
+from ...support.stdin import DASH
 from ...tables.files import FORMS
 from ..command import COMMON, option
 from ..console import is_terminal
-from ..paths import DASH, OutputPath
+from ..paths import OutputPath
 from ..usage import exclude, given, require
 from .common import Command, overwrite_option, table_form
 
