@@ -14,9 +14,9 @@ def test_the_figures_of_security_are_those_of_the_code() -> None:
     text = " ".join((ROOT / "SECURITY.md").read_text().split())
     for said in (
         f"promises more than {compression.TRUSTED_SIZE >> 20} MiB",
-        f"at most {compression.MAX_RATIO} times what the file has",
+        f"at most {compression.MAX_RATIO} times the size of the file",
         f"read up to {io.MAX_TEXT >> 20} MiB and {untrusted.MAX_DEPTH} levels deep",
-        f"shortened to {printable.MOST} characters",
+        f"shorten texts to {printable.MOST} characters",
     ):
         assert said in text
     assert (tree.MOST_LEVELS, frame.MAX_FRAMES) == (1000, 1 << 20)
