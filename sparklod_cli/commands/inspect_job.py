@@ -125,7 +125,7 @@ class Job:
         picture = None
         if scene is not None:
             try:
-                picture = plots.plot(scene, by=self.settings["plot_by"], level=self.settings["plot_level"])
+                picture = plots.plot(scene, by=self.settings["plot_by"], depth=self.settings["plot_level"])
             except SparklodError as error:
                 if plot is not None:
                     raise

@@ -1,4 +1,4 @@
-"""A picture of a camera path over the scene that it flies through."""
+"""A picture of a camera path in its scene."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ from .labels import write_png
 from .pyvista_scene import Stage
 from .viewpoint import Viewpoint, bounds, is_drawable, viewpoint
 
-#: Of more splats than this, so many are drawn.
+#: Most splats that are drawn; of more, an even sample.
 MOST_POINTS = 600_000
 
-#: The frusta of so many cameras are drawn at most, and the path itself through so many.
+#: Most cameras whose frusta are drawn, and most cameras that the line of the path goes through.
 MOST_FRUSTA, MOST_STEPS = 24, 5_000
 
-#: How long a frustum is, as a share of what is shown; that of the frame whose cut is drawn is longer.
+#: Length of a frustum as a share of the extent of what is shown, and that of the frame whose cut is drawn.
 LENGTH, CHOSEN_LENGTH = 0.03, 0.075
 
 PATH, CHOSEN = "#ffffff", "#ff5c8a"
 
-#: How much is seen of a line that splats stand before.
+#: Opacity of lines where splats hide them.
 BEHIND = 0.45
 
-#: Left, top, right and bottom of what is shown in the picture; the title, the labels and the colours stand around it.
+#: Left, top, right and bottom of the scene in the picture, 0..1; title, labels and colour scale are around it.
 FRAME = (0.09, 0.17, 0.85, 0.93)
 
 
@@ -41,18 +41,18 @@ FRAME = (0.09, 0.17, 0.85, 0.93)
 def picture_of_path(
     cameras: Sequence[Camera],
     splats: Splats,
-    level: NDArray[Any],
+    depth: NDArray[Any],
     *,
     frame: int | None = None,
     size: tuple[int, int] = (1600, 1000),
 ) -> bytes:
-    """The PNG of a path and its frusta over a cut.
+    """The PNG of a path, its frusta and a cut.
 
     Args:
         cameras: of the path; at least one.
-        splats: N of the cut; those that are not finite are left out.
-        level: (N,) edges from the root to each of them.
-        frame: index of the camera whose cut it is, which is marked.
+        splats: N splats of the cut; those that are not finite are left out.
+        depth: (N,) edges from the root to each node of the cut.
+        frame: index of the camera whose cut it is; that camera is marked.
         size: width and height in pixels.
 
     Raises:
@@ -64,7 +64,7 @@ def picture_of_path(
     drawable = splats.with_max_sh(0).take(index)
     chosen = index[evenly(len(index), MOST_POINTS)]
     shown = splats.with_max_sh(0).take(chosen)
-    coloring = whole_numbers("level", level[chosen], *range_of(level[chosen]))
+    coloring = whole_numbers("tree depth", depth[chosen], *range_of(depth[chosen]))
     low, high = bounds(drawable)
     way = np.array([camera.position for camera in cameras])
     low, high = np.minimum(low, way.min(axis=0)), np.maximum(high, way.max(axis=0))
@@ -80,11 +80,11 @@ def picture_of_path(
             stage.lines(ends, color, 1.0, width=1.5)
         pixels = _seen_through(pixels, stage.photograph(eye))
     if len(chosen) < len(splats):
-        drawn += f", {len(chosen):,} of them, evenly chosen"
-    title = f"The cut of {count_of(len(splats), 'splat')}"
+        drawn += f", an even sample of {len(chosen):,}"
+    title = f"Cut of {count_of(len(splats), 'splat')}"
     said = [f"{drawn}; white: the path and the frusta of {min(len(cameras), MOST_FRUSTA)} of {len(cameras):,} frames"]
     if frame is not None:
-        title += f" for {_called(cameras[frame], frame)}"
+        title += f" of {_called(cameras[frame], frame)}"
         said.append("pink: its frustum")
     return write_png(pixels, title, ["; ".join(said)], coloring, eye, low, high)
 
@@ -94,7 +94,7 @@ def _called(camera: Camera, frame: int) -> str:
 
 
 def _above(cameras: Sequence[Camera], low: Points, high: Points, size: tuple[int, int]) -> Viewpoint:
-    """A place above a corner of the box, where above is what it is for the cameras."""
+    """A viewpoint above a corner of the box, with the mean up axis of the cameras upwards."""
     mean = np.sum([camera.camera_to_world[:3, 1] for camera in cameras], axis=0)
     axis = int(np.abs(mean).argmax())
     up = np.zeros(3)
@@ -104,7 +104,7 @@ def _above(cameras: Sequence[Camera], low: Points, high: Points, size: tuple[int
 
 
 def _path_lines(cameras: Sequence[Camera], way: Points, frame: int | None, extent: float) -> list[tuple[Points, str]]:
-    """The ends of the lines of a path and of its frusta, and their colours."""
+    """Ends of the lines of the path and of its frusta, and their colours."""
     steps = np.unique([*evenly(len(way), MOST_STEPS), len(way) - 1])
     path = np.repeat(way[steps], 2, axis=0)[1:-1]
     frusta = [frustum_lines(cameras[at], LENGTH * extent) for at in evenly(len(cameras), MOST_FRUSTA)]
@@ -115,11 +115,11 @@ def _path_lines(cameras: Sequence[Camera], way: Points, frame: int | None, exten
 
 
 def frustum_lines(camera: Camera, length: float) -> Points:
-    """(18, 3) ends of the lines of a frustum, world units: four edges, the far rectangle, and a mark of what is up.
+    """(20, 3) ends of the lines of a frustum, world units: four edges, the far rectangle and a roof on its upper side.
 
     Args:
-        camera: whose it is; its principal point need not be in the middle.
-        length: along the optical axis to the far rectangle.
+        camera: of the frustum; its principal point need not be in the middle.
+        length: distance of the far rectangle along the optical axis, world units.
     """
     (fx, fy), (cx, cy) = camera.focal, camera.principal
     left, right = -cx / fx, (camera.width - cx) / fx
@@ -133,7 +133,7 @@ def frustum_lines(camera: Camera, length: float) -> Points:
 
 
 def _seen_through(pixels: NDArray[np.uint8], lines: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """(H, W, 3) a picture with the lines in it that are hidden, faintly: from the same lines on an empty ground."""
+    """(H, W, 3) a picture in which hidden lines show faintly, mixed in from the same lines on an empty ground."""
     ground = np.array([int(BACKGROUND[at : at + 2], 16) for at in (1, 3, 5)], np.float32)
     covered = np.abs(lines - ground).max(axis=2, keepdims=True) / (255 - ground.min())
     share = BEHIND * np.clip(covered, 0, 1)

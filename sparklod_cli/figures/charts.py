@@ -1,4 +1,4 @@
-"""The columns of a simulation over time, as small multiples; the one place that talks to matplotlib."""
+"""Charts of a traversal: its columns over time, as small multiples. The only module that imports matplotlib."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from ..support.errors import SparklodError
 from ..tables.columns import Row
 from ..tables.statistics import numbers
 
-#: Pixels an inch, and in them the width of all charts together and the height of a row of two.
+#: Resolution in pixels an inch; width of the figure and height of a row of two charts, in pixels.
 DPI, WIDTH, ROW = 100, 1600, 255
 
-#: How much higher a chart is than its greatest number: room for what is written at frames to look at.
+#: Upper end of an axis over the largest value: leaves room for the labels of marked frames.
 HEADROOM = 1.22
 
-#: Stops of the ramps that the pictures of scenes have.
+#: Colours of the series: stops of the colour scales of `render.color_scales`, and pink for marks.
 GREEN, BLUE, INDIGO, ORANGE, YELLOW, PINK = "#44bf70", "#2a788e", "#414487", "#ed7953", "#fde725", "#ff5c8a"
 
 PANEL = "#141b24"
@@ -32,7 +32,7 @@ Axes = Any
 
 
 def load_matplotlib() -> ModuleType:
-    """Imports matplotlib, without what it shares with other users of it.
+    """Imports matplotlib without pyplot, whose global state belongs to the calling program.
 
     Raises:
         SparklodError: it is not installed.
@@ -48,10 +48,10 @@ def load_matplotlib() -> ModuleType:
 
 
 class Frames:
-    """The columns of some rows as arrays.
+    """Columns of rows as arrays, along an axis of time or of frame numbers.
 
     Attributes:
-        x: (N,) where they are along the axis: seconds, or numbers of frames where there are no times.
+        x: (N,) seconds; frame numbers where the rows have no times.
     """
 
     def __init__(self, rows: Sequence[Row]) -> None:
@@ -59,21 +59,21 @@ class Frames:
         timed = len(times) == len(rows) and len(set(times)) > 1
         self.rows, self._timed = rows, timed
         self.x = np.array(times if timed else numbers(rows, "frame"), np.float64)
-        if len(rows) == 1:  # as wide as a frame, for a line to be seen
+        if len(rows) == 1:  # two points, one frame apart, so that a line can be seen
             self.rows, self.x = [rows[0], rows[0]], self.x + np.array([-0.5, 0.5])
 
     def tick(self, value: float, place: int) -> str:
-        """What stands at a place of the axis."""
+        """The label of a tick of the axis."""
         if self._timed:
             return f"{value:g} s"
         return f"frame {value:,.0f}" if value == round(value) else ""
 
     def has(self, *names: str) -> bool:
-        """Whether there is a number in each of these columns."""
+        """Whether each of these columns has a number in some row."""
         return all(numbers(self.rows, name) for name in names)
 
     def column(self, name: str) -> Series:
-        """(N,) numbers; NaN where a cell is empty."""
+        """(N,) values of a column; NaN for empty cells."""
         return np.array([np.nan if row[name] is None else row[name] for row in self.rows], np.float64)
 
     def ratio(self, name: str, of: str) -> Series:
@@ -84,13 +84,13 @@ class Frames:
 
 @dataclass(frozen=True)
 class Panel:
-    """One of the small multiples.
+    """One chart of the figure.
 
     Attributes:
-        title: what it shows.
-        columns: all of which it needs.
-        draw: draws into axes, and returns (N,) the heights that frames are marked at.
-        marks: the reasons to look at a frame that are marked here.
+        title: of the chart.
+        columns: that the chart needs; without a number in each of them it is left out.
+        draw: draws into matplotlib's axes and returns (N,) heights at which frames are marked.
+        marks: reasons for marking a frame, of those that this chart shows.
     """
 
     title: str
@@ -100,7 +100,7 @@ class Panel:
 
 
 def _drawn(axes: Axes, frames: Frames, matplotlib: ModuleType) -> Series:
-    _stack(axes, frames, (("full detail", "leaves", GREEN), ("stand for others", "interior", BLUE)))
+    _stack(axes, frames, (("leaves", "leaves", GREEN), ("merged", "interior", BLUE)))
     budget = frames.column("budget")
     axes.plot(frames.x, budget, color=YELLOW, linewidth=1.4, label="budget")
     axes.set_ylim(0, max(axes.get_ylim()[1], 1.05 * float(np.nanmax(budget))))
@@ -110,7 +110,7 @@ def _drawn(axes: Axes, frames: Frames, matplotlib: ModuleType) -> Series:
 
 
 def _where(axes: Axes, frames: Frames, matplotlib: ModuleType) -> Series:
-    parts = (("in the picture", "in_frustum", GREEN), ("beside it", "outside", BLUE), ("behind", "behind", INDIGO))
+    parts = (("inside", "in_frustum", GREEN), ("outside", "outside", BLUE), ("behind", "behind", INDIGO))
     _stack(axes, frames, parts)
     _counted(axes, matplotlib)
     axes.set_ylabel("splats")
@@ -127,18 +127,18 @@ def _stack(axes: Axes, frames: Frames, parts: Sequence[tuple[str, str, str]]) ->
 
 
 def _from_zero(axes: Axes, values: Series) -> None:
-    """Makes the axis go from 0 to above the greatest of numbers, some of which may be missing."""
+    """Lets the vertical axis run from 0 to `HEADROOM` times the largest value; NaN is ignored."""
     axes.set_ylim(0, HEADROOM * float(np.nanmax(values)) or 1)
 
 
 def _counted(axes: Axes, matplotlib: ModuleType, unit: str = "") -> None:
-    """Marks an axis of heights in whole numbers, with k and M for thousands and millions."""
+    """Gives the vertical axis ticks at whole numbers, with k and M for thousands and millions."""
     axes.yaxis.set_major_locator(matplotlib.ticker.MaxNLocator(6, steps=[1, 2, 5, 10], integer=True, min_n_ticks=1))
     axes.yaxis.set_major_formatter(matplotlib.ticker.EngFormatter(unit, sep=" " if unit else ""))
 
 
 def _beside(axes: Axes) -> Axes:
-    """A second axis of heights, on the right."""
+    """A second vertical axis, on the right."""
     other = axes.twinx()
     other.grid(False)
     return other
@@ -148,10 +148,10 @@ def _coarse(axes: Axes, frames: Frames, matplotlib: ModuleType) -> Series:
     values = frames.ratio("pixel_scale_min", "pixel_scale_limit")
     values[~(values > 0)] = np.nan
     axes.plot(frames.x, values, color=ORANGE, linewidth=1.4)
-    axes.axhline(1, color=FAINT, linewidth=1, linestyle=(0, (4, 3)), label="the limit")
+    axes.axhline(1, color=FAINT, linewidth=1, linestyle=(0, (4, 3)), label="limit")
     axes.set_yscale("log", base=2)
     axes.yaxis.set_major_formatter(matplotlib.ticker.FormatStrFormatter("%g"))
-    # From at least half to twice the limit, so that what is as good as the limit looks so.
+    # At least from half to twice the limit, so that values close to the limit look close to it.
     finite = [*values[np.isfinite(values)], 1.0]
     axes.set_ylim(min(0.5, 0.8 * min(finite)), max(2.0, 1.6 * max(finite)))
     axes.set_ylabel("times the limit")
@@ -164,51 +164,51 @@ def _churn(axes: Axes, frames: Frames, matplotlib: ModuleType) -> Series:
     axes.plot(frames.x, values, color=ORANGE, linewidth=1.2)
     axes.yaxis.set_major_formatter(lambda value, place: f"{100 * value:.3g} %")
     _from_zero(axes, values)
-    axes.set_ylabel("share of the splats")
+    axes.set_ylabel("share of both frames' splats")
     return values
 
 
 def _fetched(axes: Axes, frames: Frames, matplotlib: ModuleType) -> Series:
     values = frames.column("bytes_new")
     some = values > 0
-    axes.vlines(frames.x[some], 0, values[some], color=ORANGE, linewidth=1.8, label="for a frame")
+    axes.vlines(frames.x[some], 0, values[some], color=ORANGE, linewidth=1.8, label="per frame")
     _counted(axes, matplotlib, "B")
     _from_zero(axes, values)
-    axes.set_ylabel("for a frame")
+    axes.set_ylabel("per frame")
     total = _beside(axes)
     fetched = np.nancumsum(values)
     total.plot(frames.x, fetched, color=GREEN, linewidth=1.6)
-    axes.plot([], [], color=GREEN, linewidth=1.6, label="in all")
+    axes.plot([], [], color=GREEN, linewidth=1.6, label="total")
     _counted(total, matplotlib, "B")
     _from_zero(total, fetched)
-    total.set_ylabel("in all")
+    total.set_ylabel("total")
     return values
 
 
 def _cache(axes: Axes, frames: Frames, matplotlib: ModuleType) -> Series:
     values = frames.column("missing")
     axes.fill_between(frames.x, 0, values, color=ORANGE, alpha=0.35, linewidth=0)
-    axes.plot(frames.x, values, color=ORANGE, linewidth=1.2, label="missing")
+    axes.plot(frames.x, values, color=ORANGE, linewidth=1.2, label="nodes missing")
     _from_zero(axes, values)
     _counted(axes, matplotlib)
-    axes.set_ylabel("splats, missing")
+    axes.set_ylabel("nodes missing")
     chunks = _beside(axes)
     resident = frames.column("chunks_resident")
     chunks.plot(frames.x, resident, color=GREEN, linewidth=1.6)
-    axes.plot([], [], color=GREEN, linewidth=1.6, label="in the cache")
+    axes.plot([], [], color=GREEN, linewidth=1.6, label="chunks resident")
     _from_zero(chunks, resident)
     chunks.yaxis.set_major_locator(matplotlib.ticker.MaxNLocator(5, integer=True))
-    chunks.set_ylabel("chunks, in the cache")
+    chunks.set_ylabel("chunks resident")
     return values
 
 
-def _levels(axes: Axes, frames: Frames, matplotlib: ModuleType) -> Series:
+def _depths(axes: Axes, frames: Frames, matplotlib: ModuleType) -> Series:
     mean, most = frames.column("level_mean"), frames.column("level_max")
-    axes.fill_between(frames.x, frames.column("level_min"), most, color=BLUE, alpha=0.5, linewidth=0, label="all")
+    axes.fill_between(frames.x, frames.column("level_min"), most, color=BLUE, alpha=0.5, linewidth=0, label="range")
     axes.plot(frames.x, mean, color=GREEN, linewidth=1.6, label="mean")
     axes.yaxis.set_major_locator(matplotlib.ticker.MaxNLocator(6, integer=True))
     _from_zero(axes, most)
-    axes.set_ylabel("links from the root")
+    axes.set_ylabel("edges from the root")
     return mean
 
 
@@ -224,14 +224,16 @@ def _line(name: str, unit: str, color: str) -> Callable[[Axes, Frames, ModuleTyp
 
 
 PANELS = (
-    Panel("What is drawn", ("leaves", "interior", "budget"), _drawn),
-    Panel("Where it is", ("in_frustum", "outside", "behind"), _where),
-    Panel("Levels of the cut", ("level_min", "level_mean", "level_max"), _levels),
-    Panel("Pixel scale that all is divided down to", ("pixel_scale_min", "pixel_scale_limit"), _coarse, ("coarsest",)),
-    Panel("Churn: what pops", ("churn",), _churn, ("churn",)),
-    Panel("Fetched", ("bytes_new",), _fetched, ("bytes",)),
-    Panel("Cache", ("missing", "chunks_resident"), _cache, ("missing",)),
-    Panel("Time until all is there", ("complete_in_s",), _line("complete_in_s", "seconds", ORANGE), ("incomplete",)),
+    Panel("Splats drawn", ("leaves", "interior", "budget"), _drawn),
+    Panel("Inside or outside the frustum", ("in_frustum", "outside", "behind"), _where),
+    Panel("Depth of the cut", ("level_min", "level_mean", "level_max"), _depths),
+    Panel("Pixel scale", ("pixel_scale_min", "pixel_scale_limit"), _coarse, ("coarsest",)),
+    Panel("Churn", ("churn",), _churn, ("churn",)),
+    Panel("Bytes fetched", ("bytes_new",), _fetched, ("bytes",)),
+    Panel("Chunk cache", ("missing", "chunks_resident"), _cache, ("missing",)),
+    Panel(
+        "Time until the cut is resident", ("complete_in_s",), _line("complete_in_s", "seconds", ORANGE), ("incomplete",)
+    ),
     Panel("Overdraw", ("overdraw_estimate",), _line("overdraw_estimate", "splats a pixel", ORANGE), ("overdraw",)),
     Panel("Time to find the cut", ("traverse_ms",), _line("traverse_ms", "milliseconds", GREEN)),
 )
@@ -254,7 +256,7 @@ def draw(rows: Sequence[Row], marked: Mapping[str, int]) -> NDArray[np.uint8]:
 
 @contextlib.contextmanager
 def styled(matplotlib: ModuleType) -> Iterator[None]:
-    """Draws inside in the style of charts that go with the pictures of scenes, whatever a matplotlibrc says."""
+    """Applies `style` inside the context, whatever a matplotlibrc says."""
     with matplotlib.rc_context():
         matplotlib.rcdefaults()
         matplotlib.rcParams.update(style())
@@ -262,7 +264,7 @@ def styled(matplotlib: ModuleType) -> Iterator[None]:
 
 
 def style() -> dict[str, Any]:
-    """Parameters of matplotlib for charts that go with the pictures of scenes."""
+    """matplotlib's parameters for charts in the colours of the rendered figures."""
     return {
         "axes.edgecolor": LINE, "axes.facecolor": PANEL, "axes.labelcolor": FAINT, "axes.titlecolor": INK,
         "axes.labelsize": 10, "axes.titlesize": 12, "axes.titlelocation": "left", "axes.titlepad": 8,
@@ -288,7 +290,7 @@ def _draw(matplotlib: ModuleType, rows: Sequence[Row], marked: Mapping[str, int]
     for panel, axes in zip(panels, grid, strict=False):
         axes.set_title(panel.title)
         heights = panel.draw(axes, frames, matplotlib)
-        margin = 0.004 * (frames.x[-1] - frames.x[0])  # so that what is at an end is seen whole
+        margin = 0.004 * (frames.x[-1] - frames.x[0])  # so that markers at either end are not cut
         axes.set_xlim(frames.x[0] - margin, frames.x[-1] + margin)
         axes.xaxis.set_major_formatter(frames.tick)
         if axes.get_legend_handles_labels()[0]:

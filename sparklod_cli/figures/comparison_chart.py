@@ -1,4 +1,4 @@
-"""A comparison of cuts with full detail as charts."""
+"""Charts of a comparison of cuts with full detail."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from ..tables.columns import Row
 from ..tables.statistics import numbers
 from .charts import BLUE, DPI, GREEN, INDIGO, ORANGE, PINK, WIDTH, YELLOW, Frames, load_matplotlib, styled
 
-#: Pixels of a row of charts, and of the title above them.
+#: Heights of a row of charts and of the title above them, in pixels.
 ROW, HEAD = 420, 122
 
-#: Of budgets, from the first on; with more of them they begin again.
+#: Colours of the budgets, in their order; with more budgets than colours they repeat.
 COLORS = (INDIGO, BLUE, GREEN, YELLOW, ORANGE, PINK)
 
 Axes = Any
@@ -68,11 +68,13 @@ def _charts(matplotlib: ModuleType, series: Sequence[Series]) -> NDArray[np.uint
 def _by_budget(
     matplotlib: ModuleType, axes: Axes, groups: Sequence[Sequence[Row]], name: str, title: str, unit: str
 ) -> None:
-    """Mean over the frames, on either background, and the band from the least to the most."""
+    """Mean over the frames, in all and on either background, and the range from the lowest to the highest frame."""
     groups = sorted(groups, key=lambda rows: numbers(rows, "share")[0])
     share = np.array([numbers(rows, "share")[0] for rows in groups])
     cells = np.array([numbers(rows, name) for rows in groups])
-    axes.fill_between(share, cells.min(axis=1), cells.max(axis=1), color=GREEN, alpha=0.25, linewidth=0, label="frames")
+    axes.fill_between(
+        share, cells.min(axis=1), cells.max(axis=1), color=GREEN, alpha=0.25, linewidth=0, label="range of frames"
+    )
     for background, color in (("black", BLUE), ("white", YELLOW)):
         mean = [np.mean(numbers(rows, f"{name}_{background}")) for rows in groups]
         axes.plot(share, mean, color=color, linewidth=1, linestyle=(0, (4, 3)), label=f"on {background}")
@@ -87,7 +89,7 @@ def _by_budget(
 
 
 def _by_frame(axes: Axes, series: Sequence[Series], name: str, title: str, unit: str) -> None:
-    """A line for each budget."""
+    """One line for each budget."""
     for at, (budget, rows) in enumerate(series):
         frames = Frames(rows)
         axes.plot(frames.x, frames.column(name), color=COLORS[at % len(COLORS)], linewidth=1.4, label=budget)

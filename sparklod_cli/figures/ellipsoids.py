@@ -1,4 +1,4 @@
-"""What a picture of a scene is made of, as plain arrays: ellipsoids, cells, boxes and ticks."""
+"""The geometry of pictures of a scene, as plain arrays: ellipsoids, cells, boxes and grids."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from numpy.typing import NDArray
 from ..model.splats import FloatArray, Splats
 from ..support.defaults import DEFAULT_BASE
 
-#: (N, 3) points, or ends of lines by twos; (3,) where it is one.
+#: (N, 3) points, or pairs of ends of lines; (3,) for a single point.
 Points = NDArray[np.floating[Any]]
 
-#: The corners of the unit cube, and which of them its twelve edges join.
+#: The corners of the unit cube, and the pairs of corners that its twelve edges join.
 CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], np.float64)
 EDGES = np.array([(a, b) for a in range(8) for b in range(a + 1, 8) if (a ^ b) in (1, 2, 4)])
 
 
 @dataclass(frozen=True)
 class Mesh:
-    """Triangles: (P, 3) points with a unit normal each, and (T, 3) indices of them."""
+    """Triangles: (P, 3) points, (P, 3) unit normals, and (T, 3) indices of points."""
 
     points: FloatArray
     normals: FloatArray
@@ -31,7 +31,7 @@ class Mesh:
 
 
 def sphere(rounds: int) -> Mesh:
-    """The unit sphere: an icosahedron whose triangles are divided by four so many times."""
+    """The unit sphere: an icosahedron, each of whose triangles is split into four `rounds` times."""
     golden = (1 + math.sqrt(5)) / 2
     one = np.array([[-1, golden, 0], [1, golden, 0], [-1, -golden, 0], [1, -golden, 0]])
     points = np.concatenate([one, np.roll(one, 1, axis=1), np.roll(one, 2, axis=1)])
@@ -65,15 +65,15 @@ def rotation(quat_xyzw: FloatArray) -> FloatArray:
 
 
 def ellipsoids(splats: Splats, deviations: float, of: Mesh, thinnest: float) -> Mesh:
-    """The surfaces of N splats at so many standard deviations, one after the other.
+    """The surfaces of N splats at some number of standard deviations, in their order.
 
-    The normal of an ellipsoid is that of the sphere, divided by the radii where points are multiplied by them.
+    Points of the sphere are multiplied by the radii, its normals divided by them.
 
     Args:
-        splats: N of them.
+        splats: N splats.
         deviations: the radii, in standard deviations.
         of: the unit sphere.
-        thinnest: no radius is drawn smaller than this, so that no splat falls between the pixels; world units.
+        thinnest: smallest radius that is drawn, world units, so that no splat falls between pixels.
     """
     axes = rotation(splats.quat_xyzw)
     radii = np.maximum(splats.scale * np.float32(deviations), np.float32(thinnest))
@@ -85,17 +85,17 @@ def ellipsoids(splats: Splats, deviations: float, of: Mesh, thinnest: float) -> 
 
 
 def evenly(count: int, most: int) -> NDArray[np.int64]:
-    """At most so many of `count` indices, evenly spaced: always the same, and from all parts of the file."""
+    """At most `most` of `count` indices, evenly spaced: the same each time, and from all parts of the file."""
     return np.arange(count) if count <= most else np.arange(most) * count // most
 
 
 def level_of_step(size: float, base: float = DEFAULT_BASE) -> int:
-    """The level of Quick-LoD that a size, 2 * max(scale), belongs to; its cells have edges of base ** level."""
+    """The voxel level of Quick-LoD for a design size, 2 * max(scale); its cells have edges of base ** level."""
     return math.ceil(math.log(size, base) - 1e-9)
 
 
 def cells(center: FloatArray, step: float) -> Points:
-    """(C, 3) lowest corners of the cells of an edge of `step` that these centres are in."""
+    """(C, 3) lowest corners of the cells, with edges of `step`, that hold these (N, 3) centres."""
     return np.unique(np.floor(center.astype(np.float64) / step), axis=0) * step
 
 
@@ -106,7 +106,7 @@ def box_lines(low: Points, high: Points) -> Points:
 
 
 def wall_lines(low: Points, high: Points, far: Points, spacing: float) -> Points:
-    """Ends of the lines at multiples of `spacing` on three walls of a box, those that go through its corner `far`."""
+    """Ends of the lines at multiples of `spacing` on the three walls of a box that meet in its corner `far`."""
     lines: list[Points] = []
     for axis in range(3):
         at = spacing * np.arange(math.ceil(low[axis] / spacing - 1e-9), math.floor(high[axis] / spacing + 1e-9) + 1)

@@ -1,4 +1,4 @@
-"""Writes on a rendered picture what it shows: a title, what the colours mean, and where the axes are."""
+"""Labels of rendered figures: title, colour scale, and axes with ticks."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ..support.ticks import ticks
 from .ellipsoids import Points
 from .viewpoint import Viewpoint
 
-#: Least distance of the labels of an axis, in thousandths of the picture's height.
+#: Smallest distance between the labels of an axis, in thousandths of the picture's height.
 LABEL_DISTANCE = 62
 
 
@@ -28,14 +28,14 @@ def write_png(
     low: Points,
     high: Points,
 ) -> bytes:
-    """The PNG of a picture with its labels.
+    """The PNG of a picture with title, colour scale and axes.
 
     Args:
         pixels: (H, W, 3) of the scene.
-        title, lines: what it shows, in words that fit into its width.
-        coloring: what the colours mean.
-        eye: that it is seen from.
-        low, high: (3,) corners of the box that is measured, world units.
+        title, lines: texts for the upper left corner, which must fit into the width.
+        coloring: the colour scale.
+        eye: viewpoint of the picture.
+        low, high: (3,) corners of the box along whose edges the axes run, world units.
     """
     image = Image.fromarray(pixels)
     draw = ImageDraw.Draw(image)
@@ -51,7 +51,7 @@ def write_png(
 def _axes(
     draw: ImageDraw.ImageDraw, unit: float, size: tuple[int, int], eye: Viewpoint, low: Points, high: Points
 ) -> None:
-    """Numbers along three edges of a box: two of its floor, towards the viewer, and the upright one on the left."""
+    """Draws axes along three edges of a box: the two near ones of its floor, and the upright one on the left."""
     upright = int(np.abs(eye.axes[1]).argmax())
     down = bool(eye.axes[1, upright] < 0)
     ends = np.stack([low, high])
@@ -71,7 +71,7 @@ def _axes(
         if length < LABEL_DISTANCE * unit:
             continue
         draw.line([tuple(first), tuple(last)], LINE, max(1, round(unit)))
-        # Labels stand outside: on the side of the edge that the middle of the box is not on.
+        # Labels lie outside the box: on the side of the edge that faces away from its middle.
         along = (last - first) / length
         out = np.array([-along[1], along[0]])
         out *= -np.sign(out @ (middle - first)) or 1.0
@@ -84,7 +84,7 @@ def _axes(
             draw.text(tuple(at + 24 * unit * out), text, FAINT, font(unit, 17), anchor="mm")
         name = "xyz"[axis]
         place = (first + last) / 2 + 62 * unit * out
-        if axis == upright:  # its name stands above it
+        if axis == upright:  # the name lies beyond its upper end
             name += ", down" if down else ""
             place = first - 26 * unit * along if down else last + 26 * unit * along
         draw.text(tuple(place), name, INK, font(unit, 20), anchor="mm")

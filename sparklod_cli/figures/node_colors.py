@@ -1,4 +1,4 @@
-"""What the colours of splats mean: their level, chunk, opacity or size."""
+"""Colours of nodes by depth, chunk, opacity or size."""
 
 from __future__ import annotations
 
@@ -22,24 +22,24 @@ from ..render.color_scales import (
 )
 from ..support.ticks import ticks
 
-#: Marks nearer to an end of a scale than this would touch its own.
+#: Marks closer to an end of a scale than this share of it are left out: they would touch the mark of the end.
 APART = 0.04
 
 
 def color_by(by: str, splats: Splats, index: NDArray[np.int64], depth: NDArray[np.int32] | None) -> Coloring:
-    """The colours of some splats.
+    """The colours of M of N splats, and the scale that explains them.
 
     Args:
-        by: "level", which wants a depth, "opacity", "size" or "chunk".
-        splats: N of them.
-        index: (M,) of those that are coloured; at least one.
-        depth: (N,) edges from the root, where there is a tree.
+        by: one of `PLOT_BY`: "level", the depth of a node, needs `depth`; else "opacity", "size" or "chunk".
+        splats: all N splats.
+        index: (M,) indices of the splats that are coloured; at least one.
+        depth: (N,) edges from the root; None for a scene without a tree.
     """
     if by == "level" and depth is not None:
-        level = depth[index]
-        if level.min() == level.max():  # the colour tells where in the tree it is
-            return whole_numbers("level", level, 0, int(depth.max()))
-        return whole_numbers("level", level, *range_of(level))
+        chosen = depth[index]
+        if chosen.min() == chosen.max():  # one depth alone: its colour says how far down the tree it lies
+            return whole_numbers("tree depth", chosen, 0, int(depth.max()))
+        return whole_numbers("tree depth", chosen, *range_of(chosen))
     if by == "chunk":
         chunk = index // CHUNK_NODES
         return whole_numbers("chunk", chunk, 0, (len(splats) - 1) // CHUNK_NODES)

@@ -1,4 +1,4 @@
-"""The one place that talks to pyvista: a scene is put on a stage and photographed, off screen."""
+"""Off-screen renderings of splats, points and lines by pyvista. The only module that imports pyvista."""
 
 from __future__ import annotations
 
@@ -18,26 +18,26 @@ from ..support.errors import SparklodError
 from .ellipsoids import Points, ellipsoids, rotation, sphere
 from .viewpoint import Viewpoint
 
-#: More splats than this are drawn as points, and those that would cover the picture more often than this, which takes
-#: minutes.
+#: Most splats that are drawn as ellipsoids, and most times that their areas may cover the picture: more takes minutes.
+#: Beyond either, splats are drawn as points.
 MOST_ELLIPSOIDS, MOST_OVERDRAW = 80_000, 150
 
-#: So many triangles of ellipsoids are drawn at most: fewer ellipsoids are rounder.
+#: Most triangles of all ellipsoids together: the fewer the ellipsoids, the rounder they are.
 MOST_TRIANGLES = 1_700_000
 
-#: How far out the ellipsoids go.
+#: Radii of the ellipsoids, in standard deviations.
 DEVIATIONS = 1
 
-#: The sizes that points are drawn at.
+#: Diameters of points, pixels.
 POINT_PIXELS = np.array([2.0, 3.0, 4.0, 6.0])
 
-#: Each pixel is the mean of so many, squared: what is thinner than a pixel stays visible, and edges are smooth.
+#: Samples along each side of a pixel, of which it is the mean: smooths edges and keeps lines thinner than a pixel.
 OVERSAMPLING = 2
 
-#: Nothing is drawn farther out than so many times the extent of the scene.
+#: Coordinates are clipped to this many times the extent of the scene.
 FARTHEST = 1e6
 
-#: Draws 8 x 8 pixels. Run by itself, because VTK ends the process where there is no OpenGL.
+#: Program that draws 8 x 8 pixels, run in its own process, because VTK ends the process where OpenGL is missing.
 PROBE = """
 import vtkmodules.vtkRenderingOpenGL2
 from vtkmodules.vtkRenderingCore import vtkRenderer, vtkRenderWindow
@@ -51,13 +51,13 @@ window.Render()
 
 @functools.cache
 def load_pyvista() -> ModuleType:
-    """Imports pyvista where it can draw.
+    """Imports pyvista, after a check that it can draw here.
 
     Raises:
-        SparklodError: it is not installed, or there is no OpenGL.
+        SparklodError: pyvista is not installed, or OpenGL is missing.
     """
     if sys.platform == "linux" and not os.environ.get("DISPLAY"):
-        # VTK would find out by itself, but with a warning, and only where the libraries of X are installed.
+        # Without this VTK warns, and falls back to EGL only where the libraries of X are installed.
         os.environ.setdefault("VTK_DEFAULT_OPENGL_WINDOW", "vtkEGLRenderWindow")
     try:
         import pyvista
@@ -68,15 +68,15 @@ def load_pyvista() -> ModuleType:
     except (OSError, subprocess.SubprocessError):
         libraries = "libegl1 libgl1-mesa-dri"
         raise SparklodError(
-            f"pictures cannot be drawn: there is no OpenGL here (on Debian and Ubuntu: apt install {libraries})"
+            f"pictures cannot be drawn: OpenGL is missing (on Debian and Ubuntu: apt install {libraries})"
         ) from None
     return pyvista
 
 
 class Stage:
-    """What is drawn, in units of the scene's extent: float32 has the scene near 0, however far out it is.
+    """A scene to render, in units of its extent and around its middle, so that float32 suffices wherever it lies.
 
-    A context manager, which frees the memory of the pictures.
+    A context manager: it frees pyvista's memory at the end.
     """
 
     def __init__(self, low: Points, high: Points, size: tuple[int, int], background: str) -> None:
@@ -93,25 +93,25 @@ class Stage:
         self._plotter.close()
 
     def splats(self, splats: Splats, rgb: NDArray[np.uint8], eye: Viewpoint) -> str:
-        """Puts splats there in (N, 3) colours: as ellipsoids or, if they are many, as points. Says as which."""
+        """Adds N splats in (N, 3) colours, as ellipsoids or, if they are too many, as points; returns a description."""
         away = (splats.center - eye.position) @ eye.axes[2]
         half = math.tan(math.radians(eye.angle) / 2)
         pixels = splats.scale.mean(axis=1) / np.maximum(away, 1e-3 * self._unit) * self._size[1] / half
         overdraw = float(np.square(pixels, dtype=np.float64).sum()) / (self._size[0] * self._size[1])
         if len(splats) > MOST_ELLIPSOIDS or overdraw > MOST_OVERDRAW:
             self._points(splats, rgb, pixels)
-            return f"points as large as they are, {POINT_PIXELS[0]:g} to {POINT_PIXELS[-1]:g} pixels"
-        # From front to back, so that what is hidden costs little.
+            return f"points of the splats' size, {POINT_PIXELS[0]:g} to {POINT_PIXELS[-1]:g} pixels"
+        # From front to back, so that hidden surfaces cost little.
         order = np.argsort(away - splats.scale.max(axis=1), kind="stable")
         of = sphere(next(n for n in (3, 2, 1, 0) if n == 0 or len(splats) * 20 * 4**n <= MOST_TRIANGLES))
         shape = ellipsoids(splats.take(order), DEVIATIONS, of, thinnest=0.7 * self._unit / self._size[1])
         mesh = self._pyvista.PolyData.from_regular_faces(self._local(shape.points), shape.triangles)
         colors = np.repeat(rgb[order], len(of.points), axis=0)
         self._add(mesh, shape.normals, colors, ambient=0.45, diffuse=0.65, specular=0.15, culling="back")
-        return f"ellipsoids of {DEVIATIONS:g} standard deviation"
+        return f"ellipsoids at {DEVIATIONS:g} standard deviation"
 
     def _points(self, splats: Splats, rgb: NDArray[np.uint8], pixels: FloatArray) -> None:
-        # Most splats of a scene are flat and lie in its surfaces, so their thinnest axis can stand for a normal.
+        # Most splats are flat and lie in the surfaces of the scene, so their thinnest axis serves as the normal.
         flat = rotation(splats.quat_xyzw)[np.arange(len(splats)), :, splats.scale.argmin(axis=1)]
         step = np.searchsorted(POINT_PIXELS[1:], pixels, side="right")
         for number, size in enumerate(POINT_PIXELS):
@@ -120,20 +120,20 @@ class Stage:
                 mesh = self._pyvista.PolyData(self._local(splats.center[here]))
                 self._add(mesh, flat[here], rgb[here], point_size=size * OVERSAMPLING, ambient=0.5, diffuse=0.6)
 
-    def _add(self, mesh: Any, normals: FloatArray, rgb: NDArray[np.uint8], **how: Any) -> None:
+    def _add(self, mesh: Any, normals: FloatArray, rgb: NDArray[np.uint8], **options: Any) -> None:
         mesh.point_data["rgb"] = rgb
         mesh.point_data["Normals"] = normals
         mesh.point_data.active_normals_name = "Normals"
-        actor = self._plotter.add_mesh(mesh, scalars="rgb", rgb=True, **how)
+        actor = self._plotter.add_mesh(mesh, scalars="rgb", rgb=True, **options)
         actor.prop.interpolation = "gouraud"
 
     def dots(self, points: Points, color: str) -> None:
-        """Puts small points there."""
+        """Adds small points of one colour."""
         mesh = self._pyvista.PolyData(self._local(points))
         self._plotter.add_mesh(mesh, color=color, point_size=1.5 * OVERSAMPLING, lighting=False)
 
     def lines(self, ends: Points, color: str, opacity: float, *, width: float = 1) -> None:
-        """Puts lines there, between points by twos, so many pixels wide."""
+        """Adds lines between pairs of points, `width` pixels wide."""
         if len(ends):
             pairs = np.insert(np.arange(len(ends)).reshape(-1, 2), 0, 2, axis=1)
             mesh = self._pyvista.PolyData(self._local(ends), lines=pairs.ravel())
@@ -144,12 +144,12 @@ class Stage:
         return local
 
     def photograph(self, eye: Viewpoint) -> NDArray[np.uint8]:
-        """(H, W, 3) what is seen from a viewpoint."""
+        """(H, W, 3) the picture from a viewpoint."""
         camera = self._plotter.camera
         camera.position, camera.focal_point = self._local(eye.position), self._local(eye.target)
         camera.up, camera.view_angle = eye.axes[1], eye.angle
         camera.SetWindowCenter(*-eye.shift)
-        # VTK would choose a range by the farthest of all splats, in which the scene itself is cut off.
+        # VTK would choose the range by the farthest splat, and its near plane would then cut the scene.
         distance = float(np.linalg.norm(eye.target - eye.position)) / self._unit
         camera.clipping_range = (0.05 * distance, 20 * distance)
         pixels = self._plotter.screenshot(None, return_img=True)

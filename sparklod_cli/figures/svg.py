@@ -1,4 +1,4 @@
-"""Charts as SVG and HTML that need no script: their colours come from the page's style, their figures from tooltips."""
+"""Charts as SVG and HTML without scripts: colours come from the style of the page, exact figures are tooltips."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ import numpy as np
 
 from ..tables.histograms import Histogram, edge_names
 
-#: The size of a chart, and what its axis and its figures take of that, in units of its view box.
+#: Width and height of a chart, and what the labels below and the figure above take of it, in units of its view box.
 WIDTH, HEIGHT, BELOW, ABOVE = 360, 150, 20, 16
 
-#: Labels below a histogram.
+#: Number of labels below a histogram.
 LABELS = 5
 
-#: Up to so many children, each number has a row of its own.
+#: Up to this number of children, every number has its own row; beyond it, ranges double.
 SINGLE_CHILDREN = 8
 
 
 def text_of(value: object) -> str:
-    """Text of a page: escaped, and without what HTML or UTF-8 cannot hold."""
+    """Escaped text for a page; characters that HTML or UTF-8 cannot hold are replaced."""
     plain = str(value).encode("utf-8", "replace").decode("utf-8")
     return escape("".join(mark if mark.isprintable() or mark in "\n\t" else "\ufffd" for mark in plain))
 
@@ -30,10 +30,10 @@ def chart(counts: Sequence[int], tooltips: Sequence[str], labels: Iterable[tuple
     """A bar chart.
 
     Args:
-        counts: of each bar.
-        tooltips: of each bar.
-        labels: places below it, in bars, and what stands there.
-        summary: for who cannot see it.
+        counts: one for each bar.
+        tooltips: one for each bar.
+        labels: positions along the axis, in bars, and their texts.
+        summary: description for screen readers.
     """
     most, room = max(counts, default=0), HEIGHT - ABOVE - BELOW
     step = WIDTH / max(1, len(counts))
@@ -45,7 +45,7 @@ def chart(counts: Sequence[int], tooltips: Sequence[str], labels: Iterable[tuple
     base = HEIGHT - BELOW
     parts.append(f'<line class="line" x1="0" y1="{ABOVE}" x2="{WIDTH}" y2="{ABOVE}"/>')
     for number, (count, tooltip) in enumerate(zip(counts, tooltips, strict=True)):
-        # What is not nothing is seen.
+        # A count above 0 has a visible bar.
         height = max(1.0, room * count / most) if count else 0.0
         x, y = number * step + gap / 2, base - height
         parts.append(f'<g class="bar"><title>{text_of(tooltip)}</title>')
@@ -60,7 +60,7 @@ def chart(counts: Sequence[int], tooltips: Sequence[str], labels: Iterable[tuple
 
 
 def histogram_chart(histogram: Histogram, name: str) -> str:
-    """A histogram as a chart; empty where there are no numbers."""
+    """A histogram as a chart; an empty text if it has no numbers."""
     counts = [int(count) for count in histogram.counts]
     if not counts:
         return ""
@@ -76,10 +76,10 @@ def histogram_chart(histogram: Histogram, name: str) -> str:
 
 
 def children_groups(children: Mapping[str, int]) -> list[tuple[str, int]]:
-    """How many nodes have so many children: by single numbers at first, then by ranges that double.
+    """Numbers of nodes by their number of children: first single numbers, then ranges that double.
 
     Args:
-        children: counts of nodes, by their number of children as text.
+        children: counts of nodes, by number of children as text.
     """
     if not children:
         return []
@@ -96,7 +96,7 @@ def children_groups(children: Mapping[str, int]) -> list[tuple[str, int]]:
 
 
 def bar(*shares: float) -> str:
-    """Bars of shares, 0..1, one after the other, for a cell of a table that has the numbers too."""
+    """Bars of shares, 0..1, side by side, for a cell of a table whose other cells have the numbers."""
     parts = "".join(
         f'<i class="of{n}" style="width:{100 * share:.2f}%"></i>' for n, share in enumerate(shares) if share
     )

@@ -1,4 +1,4 @@
-"""`--plot`: the charts of a path and, below them, the path over the scene, as one PNG."""
+"""The figure of `traverse --plot`: charts of a path and, below them, the path in the scene, as one PNG."""
 
 from __future__ import annotations
 
@@ -20,50 +20,50 @@ from ..tables.statistics import numbers, totals
 from . import charts
 from .camera_path import picture_of_path
 
-#: What the frames to look at are called.
+#: Labels of the reasons for marking a frame (`simulation.summary.MOMENTS`).
 CALLED = {
     "churn": "most churn",
-    "bytes": "most fetched",
+    "bytes": "most bytes fetched",
     "coarsest": "coarsest",
     "missing": "most missing",
-    "incomplete": "longest until complete",
+    "incomplete": "longest until resident",
     "overdraw": "most overdraw",
 }
 
 
 @dataclass(frozen=True)
-class Scenery:
+class PathScene:
     """What the picture of the path shows.
 
     Attributes:
         cameras: of the path.
-        splats: N of the cut of one frame.
-        level: (N,) edges from the root to each of them.
-        frame: index of the camera whose cut it is, which is marked; None for none.
+        splats: N splats of the cut of one frame.
+        depth: (N,) edges from the root to each node of the cut.
+        frame: index of the camera whose cut it is; that camera is marked. None for none.
     """
 
     cameras: Sequence[Camera]
     splats: Splats
-    level: NDArray[Any]
+    depth: NDArray[Any]
     frame: int | None = None
 
 
 @dataclass(frozen=True)
 class Plot:
-    """The bytes of a PNG, and why there is no picture of the path in it; None where there is, or none was wanted."""
+    """The bytes of a PNG, and why it has no picture of the path; None if it has one or none was asked for."""
 
     png: bytes
     note: str | None
 
 
-def plot(rows: Iterable[Row], marked: Mapping[str, int], title: str, scenery: Scenery | None = None) -> Plot:
-    """Draws a simulation: charts of all its columns that are not empty and, where it can be drawn, the path.
+def plot(rows: Iterable[Row], marked: Mapping[str, int], title: str, scene: PathScene | None = None) -> Plot:
+    """Draws charts of all columns that are not empty and, if it can be drawn, the path in the scene.
 
     Args:
         rows: of all frames; those of single instances are left out.
         marked: numbers of frames worth a look, by the reason, a key of `CALLED`.
         title: the name of the scene.
-        scenery: what the path leads through; None for charts alone.
+        scene: what the picture of the path shows; None for charts alone.
 
     Raises:
         SparklodError: matplotlib is not installed, or there is no frame.
@@ -72,17 +72,17 @@ def plot(rows: Iterable[Row], marked: Mapping[str, int], title: str, scenery: Sc
     if not frames:
         raise SparklodError("there is nothing to draw: the path has no frames")
     images, note = [_head(title, frames, marked), Image.fromarray(charts.draw(frames, marked))], None
-    if scenery is not None:
+    if scene is not None:
         try:
-            picture = picture_of_path(scenery.cameras, scenery.splats, scenery.level, frame=scenery.frame)
+            picture = picture_of_path(scene.cameras, scene.splats, scene.depth, frame=scene.frame)
             images.append(Image.open(io.BytesIO(picture)).convert("RGB"))
         except SparklodError as error:
-            note = f"charts alone, without a picture of the path: {error}"
+            note = f"drawn without the picture of the path: {error}"
     return Plot(_stacked(images), note)
 
 
 def _head(title: str, frames: Sequence[Row], marked: Mapping[str, int]) -> Image.Image:
-    """What stands above the charts."""
+    """Title, summary and marked frames, above the charts."""
     lines = [(_about(frames), FAINT)]
     said = ", ".join(f"{CALLED[reason]}: frame {number:,}" for reason, number in marked.items())
     if said:
@@ -93,14 +93,14 @@ def _head(title: str, frames: Sequence[Row], marked: Mapping[str, int]) -> Image
 
 
 def _about(frames: Sequence[Row]) -> str:
-    """What is the same for all charts, in a line."""
+    """Frames, duration, image size and budget of the path, in a line."""
     said = [f"{len(frames):,} frame" + ("" if len(frames) == 1 else "s")]
     times = numbers(frames, "time_s")
     if len(set(times)) > 1:
         said.append(f"{times[-1] - times[0]:.3f} s")
     sizes = list(dict.fromkeys((row["width"], row["height"]) for row in frames if row["width"] and row["height"]))
     if sizes:
-        said.append(f"{sizes[0][0]} x {sizes[0][1]} pixels" + (" and others" if len(sizes) > 1 else ""))
+        said.append(f"{sizes[0][0]} x {sizes[0][1]} pixels" + (" and other sizes" if len(sizes) > 1 else ""))
     budgets = sorted(set(numbers(frames, "budget")))
     if budgets:
         said.append(
@@ -115,7 +115,7 @@ def _one_line(text: str) -> str:
 
 
 def _stacked(images: Sequence[Image.Image]) -> bytes:
-    """The PNG of pictures of the same width, one below the other."""
+    """The PNG of images of the same width, stacked from top to bottom."""
     pixels = np.concatenate([np.asarray(image) for image in images])
     out = io.BytesIO()
     Image.fromarray(pixels).save(out, "PNG", optimize=True)

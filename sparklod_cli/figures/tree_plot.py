@@ -1,4 +1,4 @@
-"""Pictures of a scene: the nodes of a level, the voxel grid that suits it, the boxes of the chunks, and the axes."""
+"""Pictures of a scene or of the nodes at one depth of a tree, with voxel grid, boxes of the chunks, and axes."""
 
 from __future__ import annotations
 
@@ -23,27 +23,28 @@ from .node_colors import color_by
 from .pyvista_scene import Stage
 from .viewpoint import bounds, is_drawable, viewpoint
 
-#: Of more nodes than this, so many are drawn.
+#: Most nodes that are drawn; of more, an even sample.
 MOST_POINTS = 600_000
 
-#: More occupied voxels than this are not outlined one by one; more lines than this an axis are not all drawn.
+#: Most occupied voxels that are outlined one by one, and most lines of the voxel grid along an axis.
 MOST_CELLS, MOST_LINES = 150, 48
 
-#: The boxes of so many chunks are drawn at most.
+#: Most chunks whose boxes are drawn.
 MOST_CHUNKS = 16
 
-#: The way it is looked at, from the front, from the right and from above: in scenes of 3DGS y points down.
+#: Viewing direction, from the front, the right and above, and the up axis: y points down in scenes of 3DGS.
 DIRECTION, UP = np.array([-0.62, 0.5, -1.0]), np.array([0.0, -1.0, 0.0])
 
-#: Left, top, right and bottom of the scene in the picture; the title, the labels and the colours stand around it.
+#: Left, top, right and bottom of the scene in the picture, 0..1; title, labels and colour scale are around it.
 FRAME = (0.09, 0.2, 0.85, 0.93)
 
+#: Colours of leaves above the depth that is drawn, of the voxel grid, and of the chunks' boxes.
 GREY, VOXELS, BOXES = "#5b6673", "#6ea8fe", "#dfe7ef"
 
 
 @dataclass(frozen=True)
 class Picture:
-    """The bytes of a PNG, and what it shows, in words: for who cannot see it."""
+    """The bytes of a PNG, and a description of what it shows."""
 
     png: bytes
     description: str
@@ -54,32 +55,33 @@ class _Subject:
     """What is drawn.
 
     Attributes:
-        index: of the splats that are drawn in colour.
-        total: how many they are a sample of.
-        others: of the leaves that end above the level, drawn as grey dots.
-        depth: (N,) level of each node, -1 where the root does not lead to it; None where there is no tree.
-        title: what they are, in words.
+        index: (M,) splats that are drawn in colour.
+        total: number of splats that they are a sample of.
+        others: (K,) leaves above the depth that is drawn; grey dots.
+        depths: (N,) depth of each node, -1 for a node that the root does not lead to; None without a tree.
+        title: what is drawn, in words.
     """
 
     index: NDArray[np.int64]
     total: int
     others: NDArray[np.int64]
-    depth: NDArray[np.int32] | None
+    depths: NDArray[np.int32] | None
     title: str
 
 
 @np.errstate(over="ignore", invalid="ignore")  # of numbers that are out of range in the file
-def plot(scene: Scene, *, by: str = "level", level: int | None = None, size: tuple[int, int] = (1600, 1000)) -> Picture:
-    """Draws a scene. All levels of a scene are seen from the same place.
+def plot(scene: Scene, *, by: str = "level", depth: int | None = None, size: tuple[int, int] = (1600, 1000)) -> Picture:
+    """Draws a scene. All depths of a tree are seen from the same viewpoint.
 
     Args:
-        scene: N splats; those that are invalid are left out, and the tree may be broken.
-        by: one of `PLOT_BY`; for a scene that is no tree, "level" is taken for "size".
-        level: edges from the root to the nodes that are drawn; None for all leaves, or all splats.
+        scene: N splats; invalid ones are left out. Its tree may be broken.
+        by: one of `PLOT_BY`; for a scene without a tree, "level" means "size".
+        depth: edges from the root to the nodes that are drawn; None for all leaves, or all splats.
         size: width and height in pixels.
 
     Raises:
-        SparklodError: pyvista is not installed or cannot draw here, there is no such level, or nothing to draw.
+        SparklodError: pyvista is not installed or cannot draw here, no node has this depth, or there is
+            nothing to draw.
     """
     if by not in PLOT_BY:
         raise ValueError(f"by is {by}, not one of {', '.join(PLOT_BY)}")
@@ -87,19 +89,19 @@ def plot(scene: Scene, *, by: str = "level", level: int | None = None, size: tup
     drawable = is_drawable(splats)
     if not drawable.any():
         raise SparklodError("there is nothing to draw: no splat is valid and has a size")
-    subject = _subject(scene, level, drawable)
-    by = "size" if by == "level" and subject.depth is None else by
-    coloring = color_by(by, splats, subject.index, subject.depth)
+    subject = _subject(scene, depth, drawable)
+    by = "size" if by == "level" and subject.depths is None else by
+    coloring = color_by(by, splats, subject.index, subject.depths)
     chosen = splats.take(subject.index)
     low, high = bounds(splats.take(drawable))
     eye = viewpoint(box_lines(low[None], high[None]), DIRECTION, UP, aspect=size[0] / size[1], frame=FRAME)
     with Stage(low, high, size, BACKGROUND) as stage:
         drawn = stage.splats(chosen, coloring.rgb, eye)
         if len(subject.index) < subject.total:
-            drawn += f", {len(subject.index):,} of them, evenly chosen"
+            drawn += f", an even sample of {len(subject.index):,}"
         if len(subject.others):
             stage.dots(splats.center[subject.others], GREY)
-            drawn += f"; grey: {len(subject.others):,} leaves of coarser levels"
+            drawn += f"; grey: {len(subject.others):,} leaves of smaller depth"
         voxels = _voxels(stage, chosen, low, high, eye.position)
         boxes = _boxes(stage, scene, subject.index, drawable, by) if scene.tree is not None or by == "chunk" else ""
         pixels = stage.photograph(eye)
@@ -108,27 +110,27 @@ def plot(scene: Scene, *, by: str = "level", level: int | None = None, size: tup
     return Picture(png, "; ".join([subject.title, f"coloured by {coloring.title}", *lines]))
 
 
-def _subject(scene: Scene, level: int | None, drawable: NDArray[np.bool_]) -> _Subject:
+def _subject(scene: Scene, depth: int | None, drawable: NDArray[np.bool_]) -> _Subject:
     none = np.empty(0, np.int64)
     if scene.tree is None:
-        if level is not None:
-            raise SparklodError("there are no levels to draw: it is not a Level-of-Detail tree")
-        index, others, depth = np.flatnonzero(drawable), none, None
+        if depth is not None:
+            raise SparklodError("it has no depths to draw: it is not a Level-of-Detail tree")
+        index, others, depths = np.flatnonzero(drawable), none, None
         title = _counted(len(index), "splat")
     else:
-        depth = walk(scene.tree.child_count, scene.tree.child_start, spark_size(scene.splats))[0]
-        leaf = scene.tree.is_leaf & drawable & (depth >= 0)
-        if level is None:
+        depths = walk(scene.tree.child_count, scene.tree.child_start, spark_size(scene.splats))[0]
+        leaf = scene.tree.is_leaf & drawable & (depths >= 0)
+        if depth is None:
             index, others = np.flatnonzero(leaf), none
-            title = f"{_counted(len(index), 'leaf', 'leaves')} of a tree of {_counted(int(depth.max()) + 1, 'level')}"
+            title = f"{_counted(len(index), 'leaf', 'leaves')} of a tree of depth {depths.max()}"
         else:
-            index, others = np.flatnonzero(drawable & (depth == level)), np.flatnonzero(leaf & (depth < level))
-            title = f"Level {level} of {depth.max()}: {_counted(len(index), 'node')}"
+            index, others = np.flatnonzero(drawable & (depths == depth)), np.flatnonzero(leaf & (depths < depth))
+            title = f"Depth {depth} of {depths.max()}: {_counted(len(index), 'node')}"
         if not len(index):
-            what = "leaf" if level is None else f"level {level}"
-            raise SparklodError(f"there is no {what} to draw: the tree has levels 0 to {depth.max()}")
+            what = "leaf" if depth is None else f"node of depth {depth}"
+            raise SparklodError(f"there is no {what} to draw: the tree has depths 0 to {depths.max()}")
     chosen, others = (of[evenly(len(of), MOST_POINTS)] for of in (index, others))
-    return _Subject(chosen, len(index), others, depth, title)
+    return _Subject(chosen, len(index), others, depths, title)
 
 
 def _counted(count: int, one: str, many: str = "") -> str:
@@ -136,18 +138,19 @@ def _counted(count: int, one: str, many: str = "") -> str:
 
 
 def _voxels(stage: Stage, splats: Splats, low: Points, high: Points, eye: Points) -> str:
-    """The grid whose cells Quick-LoD would sort splats of this size into; says what is drawn of it.
+    """Draws the voxel grid in which Quick-LoD would merge splats of this size; returns a description.
 
-    A file does not tell the base of its grids, nor which of them a node is of, so it is that of the median size.
+    A file says neither the base of its grids nor to which of them a node belongs, so the grid is the one of the default
+    base that the median size belongs to.
     """
     level = level_of_step(2 * float(np.median(splats.scale.max(axis=1))))
     step = DEFAULT_BASE**level
-    said = f"of {step:.3g} ({DEFAULT_BASE:g}^{level}, by their median size)"
+    said = f"of {step:.3g} ({DEFAULT_BASE:g}^{level}, from the median size)"
     inside = ((splats.center >= low) & (splats.center <= high)).all(axis=1)
     occupied = cells(splats.center[inside], step)
     if len(occupied) <= MOST_CELLS:
         stage.lines(box_lines(occupied, occupied + step), VOXELS, 0.4)
-        return f"blue: the {_counted(len(occupied), 'voxel')} {said} that they are in"
+        return f"blue: the {_counted(len(occupied), 'voxel')} {said} that hold them"
     every = max(1, round(nice_step(float((high - low).max()) / (MOST_LINES * step))))
     stage.lines(wall_lines(low, high, np.where(eye > (low + high) / 2, low, high), every * step), VOXELS, 0.35)
     line = f", every {every}{'nd' if every == 2 else 'th'} line" if every > 1 else ""
@@ -155,7 +158,7 @@ def _voxels(stage: Stage, splats: Splats, low: Points, high: Points, eye: Points
 
 
 def _boxes(stage: Stage, scene: Scene, index: NDArray[np.int64], drawable: NDArray[np.bool_], by: str) -> str:
-    """The boxes around all nodes of the chunks that some nodes are in; says which."""
+    """Draws boxes around the chunks that hold some nodes; returns a description."""
     count = -(-len(drawable) // CHUNK_NODES)
     chunks = np.unique(index // CHUNK_NODES)
     colors = ramp(VIRIDIS, count)
@@ -164,6 +167,6 @@ def _boxes(stage: Stage, scene: Scene, index: NDArray[np.int64], drawable: NDArr
         center: FloatArray = scene.splats.center[rows][drawable[rows]]
         color, opacity = (f"#{bytes(colors[chunk]).hex()}", 0.8) if by == "chunk" else (BOXES, 0.4)
         stage.lines(box_lines(center.min(axis=0)[None], center.max(axis=0)[None]), color, opacity)
-    drawn = f", the first {MOST_CHUNKS} of them" if len(chunks) > MOST_CHUNKS else ""
+    drawn = f", the first {MOST_CHUNKS} drawn" if len(chunks) > MOST_CHUNKS else ""
     what = "splats" if scene.tree is None else "nodes"
-    return f"boxes: chunks of {CHUNK_NODES:,} {what}, the {len(chunks)} of {count} that these are in{drawn}"
+    return f"boxes: the {len(chunks)} of {count} chunks of {CHUNK_NODES:,} {what} that hold these{drawn}"

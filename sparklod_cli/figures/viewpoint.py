@@ -1,4 +1,4 @@
-"""Where pictures of a whole scene are seen from, and how much of it they show."""
+"""Viewpoints of pictures of a whole scene, and the box that they show."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from numpy.typing import NDArray
 from ..model.splats import Splats
 from .ellipsoids import Points
 
-#: A picture shows the outermost splats too where they are not farther from the others than this share of these.
+#: Outlying splats are shown too if they lie within this share of the extent of the others.
 NEAR = 0.35
 
 
 @dataclass(frozen=True)
 class Viewpoint:
-    """Where a picture of a whole scene is seen from, in perspective; a path is made of `camera.Camera`s.
+    """A perspective viewpoint of a figure; paths are made of `camera.Camera`s.
 
     Attributes:
         position, target: (3,) world units.
-        axes: (3, 3) rows: to the right, up, and into the picture.
-        angle: degrees that the height of the picture spans.
+        axes: (3, 3), in rows: right, up, and into the picture.
+        angle: vertical field of view, degrees.
         aspect: width over height.
-        shift: where `target` stands in the picture: -1 left or bottom, 0 middle, 1 right or top.
+        shift: (2,) place of `target` in the picture: -1 left or bottom, 0 middle, 1 right or top.
     """
 
     position: Points
@@ -35,7 +35,7 @@ class Viewpoint:
     shift: Points
 
     def project(self, points: Points) -> Points:
-        """(N, 3) points to (N, 2) places in the picture: 0..1 from its left and from its top."""
+        """(N, 3) points to (N, 2) places in the picture, 0..1 from the left and from the top."""
         local = (np.asarray(points, np.float64) - self.position) @ self.axes.T
         return (1 + (_seen(local, self.angle, self.aspect) + self.shift) * (1, -1)) / 2
 
@@ -43,13 +43,13 @@ class Viewpoint:
 def viewpoint(
     points: Points, direction: Points, up: Points, *, aspect: float, frame: tuple[float, float, float, float]
 ) -> Viewpoint:
-    """The viewpoint that looks along a direction and has all points just inside a frame.
+    """The viewpoint that looks along a direction and just fits all points into a frame.
 
     Args:
-        points: (N, 3) to be seen.
+        points: (N, 3) points to show.
         direction, up: (3,) world axes.
         aspect: width over height.
-        frame: left, top, right and bottom of the frame in the picture, 0..1 from its left and from its top.
+        frame: left, top, right and bottom of the frame in the picture, 0..1 from the left and from the top.
     """
     angle = 25.0
     forward = direction / np.linalg.norm(direction)
@@ -62,7 +62,7 @@ def viewpoint(
     room = 2 * np.array([end - left, bottom - top])
     radius = float(np.linalg.norm(local, axis=1).max()) or 1.0
     near, far = 1.01 * radius, 1e3 * radius
-    for _ in range(60):  # halves what the distance can be: the picture shrinks with it
+    for _ in range(60):  # bisects the distance: the picture shrinks as it grows
         distance = (near + far) / 2
         seen = _seen(local + np.array([0, 0, distance]), angle, aspect)
         near, far = (near, distance) if (np.ptp(seen, axis=0) <= room).all() else (distance, far)
@@ -78,16 +78,18 @@ def _seen(local: Points, angle: float, aspect: float) -> Points:
 
 
 def is_drawable(splats: Splats) -> NDArray[np.bool_]:
-    """(N,) whether a splat is valid and has a size."""
+    """(N,) whether each splat is valid and has a size."""
     drawable: NDArray[np.bool_] = splats.is_valid() & (splats.scale.max(axis=1) > 0)
     return drawable
 
 
 def bounds(splats: Splats) -> tuple[Points, Points]:
-    """The box that a picture shows: 1 % to 99 % of the splats along each axis, or all where the others are near.
+    """Lowest and highest corner, (3,) each, of the box that a picture shows.
+
+    Along each axis it spans the 1 % to the 99 % quantile of the splats, or all of them if the rest are within `NEAR`.
 
     Args:
-        splats: at least one, all of them drawable.
+        splats: at least one; all drawable.
     """
     reach = splats.scale.max(axis=1).astype(np.float64)
     ends = np.empty((4, 3))
@@ -98,6 +100,6 @@ def bounds(splats: Splats) -> tuple[Points, Points]:
     least, low, high, most = ends
     near = NEAR * float((high - low).max())
     low, high = np.where(low - least < near, least, low), np.where(most - high < near, most, high)
-    # A speck, far out, is no larger than the steps of the numbers there.
+    # A tiny scene far from the origin may be smaller than the steps of float32 there.
     margin = max(0.02 * float((high - low).max()), 1e-6 * float(np.abs([low, high]).max()))
     return low - margin, high + margin

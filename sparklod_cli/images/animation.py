@@ -1,4 +1,4 @@
-"""Animations: GIF and WebP, which Pillow writes, and MP4 and WebM, which need the extra `video`."""
+"""Animations: GIF and WebP by Pillow, MP4 and WebM by imageio of the extra `video`."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from ..support.errors import SparklodError
 from ..support.progress import Progress, silent
 from .pixels import Pixels
 
-#: What animations are written as.
+#: Suffixes of animations.
 ANIMATIONS = ("gif", "webp", "mp4", "webm")
 
-#: GIF counts time in hundredths of a second, and what plays it slows down where a frame is shorter than this.
+#: GIF counts time in steps of 10 ms; players slow down frames that are shorter than this many steps.
 GIF_STEP, GIF_LEAST = 10, 2
 
-#: Milliseconds that a frame lasts at most: 16 bits of hundredths in GIF, 24 bits in WebP; of videos, what ffmpeg takes.
+#: Longest duration of a frame, ms: 16 bits of hundredths in GIF, 24 bits of ms in WebP, ffmpeg's limit for videos.
 LONGEST = {"gif": 10 * 0xFFFF, "webp": 0xFFFFFF, "mp4": 1_000_000, "webm": 1_000_000}
 
-#: Quality of WebP, 0 to 100, of H.264, 51 to 0, and of VP9, 63 to 0: what is lost is hardly seen.
+#: Quality of WebP (0 to 100), rate factors of H.264 (51 to 0) and VP9 (63 to 0): losses are hardly visible.
 WEBP_QUALITY, H264_QUALITY, VP9_QUALITY = 90, 16, 24
 
-#: What ffmpeg is told for each video, besides the codec. VP9 takes its quality as it is only without a bit rate, and
-#: uses more than one processor only where rows are coded side by side.
+#: Codec and options of ffmpeg for each kind of video. VP9 obeys its rate factor only with a bit rate of 0, and uses
+#: several processors only with -row-mt.
 VIDEOS = {
     "mp4": ("libx264", ["-crf", str(H264_QUALITY), "-preset", "medium", "-movflags", "+faststart"]),
     "webm": (
@@ -40,16 +40,16 @@ VIDEOS = {
 
 
 def check(form: str, fps: float) -> None:
-    """Raises a `SparklodError` where an animation cannot be written, before work goes into it."""
+    """Raises a `SparklodError` if an animation cannot be written; called before any frame is drawn."""
     if form in VIDEOS:
         load_imageio(form)
     longest = LONGEST[form] / 1000
     if 1 / fps > longest:
-        raise SparklodError(f"a frame of .{form} lasts {longest:,.3f} s at most, not {1 / fps:,.7g} s; see --fps")
+        raise SparklodError(f"a frame of .{form} lasts at most {longest:,.3f} s, not {1 / fps:,.7g} s; raise --fps")
 
 
 def load_imageio(form: str) -> ModuleType:
-    """Imports imageio, with the ffmpeg that writes videos of a form.
+    """Imports imageio with its ffmpeg, which writes videos of a form.
 
     Raises:
         SparklodError: it is not installed.
@@ -66,14 +66,14 @@ def load_imageio(form: str) -> ModuleType:
 
 
 def animate(frames: Iterable[Pixels], form: str, fps: float, progress: Progress = silent) -> bytes:
-    """The bytes of an animation that is repeated for ever, or of a video.
+    """The bytes of an animation in an endless loop ("gif", "webp") or of a video ("mp4", "webm").
 
     Args:
         frames: at least one, all of one size; with alpha for "webp" only.
         form: one of `ANIMATIONS`.
         fps: frames a second.
-        progress: is told how many frames are written, where that begins when all of them are there: those of videos
-            are written as they come.
+        progress: called for each frame that GIF and WebP write, which they do at the end; videos write frames as they
+            come, without calling it.
 
     Raises:
         SparklodError: videos cannot be written here.
@@ -91,7 +91,7 @@ def animate(frames: Iterable[Pixels], form: str, fps: float, progress: Progress 
 
 
 def _times(fps: float, step: int, least: int) -> Iterator[int]:
-    """Milliseconds of each frame in whole steps, which do not drift from the time that has passed."""
+    """Durations of the frames in ms, in whole steps whose sum does not drift from the true time."""
     shown = 0
     for number in itertools.count(1):
         end = max(round(1000 * number / (fps * step)), shown + least)
@@ -100,17 +100,22 @@ def _times(fps: float, step: int, least: int) -> Iterator[int]:
 
 
 def _write_images(
-    out: io.BytesIO, name: str, pictures: Iterable[Image.Image], times: Iterator[int], progress: Progress, **how: Any
+    out: io.BytesIO,
+    name: str,
+    pictures: Iterable[Image.Image],
+    times: Iterator[int],
+    progress: Progress,
+    **options: Any,
 ) -> None:
     first, *others = every = list(pictures)
     durations = list(itertools.islice(times, len(every)))
     for number, picture in enumerate(every):
-        # What Pillow does with a picture before it writes it, and all that it tells of how far it is.
-        picture.seek = functools.partial(_sought, picture.seek, progress, number, len(every))  # type: ignore[method-assign]
-    first.save(out, name, save_all=True, append_images=others, duration=durations, loop=0, **how)
+        # Pillow seeks each picture before it writes it, which is the only sign of its progress.
+        picture.seek = functools.partial(_seek, picture.seek, progress, number, len(every))  # type: ignore[method-assign]
+    first.save(out, name, save_all=True, append_images=others, duration=durations, loop=0, **options)
 
 
-def _sought(seek: Callable[[int], None], progress: Progress, number: int, total: int, frame: int) -> None:
+def _seek(seek: Callable[[int], None], progress: Progress, number: int, total: int, frame: int) -> None:
     seek(frame)
     progress("encoding", number + 1, total, "frame")
 
@@ -121,10 +126,10 @@ def _write_video(out: io.BytesIO, frames: Iterable[Pixels], form: str, fps: floa
     settings = {"codec": codec, "quality": None, "pixelformat": "yuv420p", "macro_block_size": 1}
     with imageio.get_writer(out, format=f".{form}", mode="I", fps=fps, output_params=tuned, **settings) as writer:
         for frame in frames:
-            # Its colours are kept for every second pixel, so sides are even: the last row and column are repeated.
+            # yuv420p has colours for every second pixel, so odd sides get their last row or column twice.
             odd = [(0, side % 2) for side in frame.shape[:2]]
             even = np.pad(frame, (*odd, (0, 0)), mode="edge")
             try:
                 writer.append_data(even)
-            except OSError as error:  # its text is what ffmpeg says, at length
+            except OSError as error:  # its text is the whole log of ffmpeg
                 raise SparklodError(f"ffmpeg cannot write it: {str(error).strip().splitlines()[-1]}") from None

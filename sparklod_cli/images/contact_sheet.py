@@ -1,4 +1,4 @@
-"""Contact sheets: several pictures in one, each with a caption."""
+"""Contact sheets: several pictures in one, each with a caption below it."""
 
 from __future__ import annotations
 
@@ -12,32 +12,32 @@ from PIL import Image, ImageDraw, ImageFont
 from .pixels import Pixels
 from .text import BACKGROUND, FAINT, Font
 
-#: Pixels between pictures, and around them; height of a caption, and of its letters, for pictures 720 pixels high.
+#: Pixels between and around the pictures; height of a caption and of its letters below a picture 720 pixels high.
 GAP, CAPTION, LETTERS = 8, 34, 20
 
-#: A sheet is about as wide as this times its height, as screens are.
+#: Width over height that a sheet comes close to: that of most screens.
 ASPECT = 1.6
 
 
 def grid(count: int, size: tuple[int, int]) -> tuple[int, int]:
-    """Columns and rows for pictures of a size: of those without an empty row, what is nearest to `ASPECT`."""
+    """Columns and rows for `count` pictures of a size: the grid without an empty row that is closest to `ASPECT`."""
     shapes = [(columns, math.ceil(count / columns)) for columns in range(1, count + 1)]
     return min(shapes, key=lambda shape: abs(math.log(shape[0] * size[0] / (shape[1] * size[1]) / ASPECT)))
 
 
 def cells(count: int, size: tuple[int, int]) -> list[tuple[int, int]]:
-    """The upper left pixels of the pictures of a sheet."""
+    """The upper left pixel of each picture of a sheet."""
     columns, _ = grid(count, size)
     width, height = size[0] + GAP, size[1] + GAP + _caption_height(size)
     return [(GAP + number % columns * width, GAP + number // columns * height) for number in range(count)]
 
 
 def sheet(pictures: Sequence[Pixels], captions: Sequence[str]) -> Pixels:
-    """One picture of several of one size, each as it is.
+    """One picture of several of the same size, which are not scaled.
 
     Args:
-        pictures: at least one; where one has alpha, the sheet has.
-        captions: of each, cut where it is wider than the picture.
+        pictures: at least one; the sheet has alpha if any of them has.
+        captions: one for each picture; cut to its width.
     """
     height, width = pictures[0].shape[:2]
     size = (width, height)
@@ -62,7 +62,7 @@ def _caption_height(size: tuple[int, int]) -> int:
 
 
 def _fitting(text: str, width: int, draw: ImageDraw.ImageDraw, font: Font) -> str:
-    # No letter is narrower than a pixel, so no more of them can fit; longer texts take long to measure.
+    # No letter is narrower than a pixel, so no more can fit; measuring longer texts would take long.
     marks = text[: width + 1]
     text = "".join(mark if mark.isprintable() else "\N{REPLACEMENT CHARACTER}" for mark in marks)
 

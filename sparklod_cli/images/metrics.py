@@ -1,4 +1,4 @@
-"""How far one image is from another: PSNR, SSIM, and the tile that is farthest off."""
+"""Differences of two images: PSNR, SSIM, and the tile that differs most."""
 
 from __future__ import annotations
 
@@ -14,28 +14,28 @@ from ..support.errors import SparklodError
 #: (H, W, C), 0..1.
 Image = NDArray[np.floating[Any]]
 
-#: No PSNR is greater, in dB: images that are the same have none, and a table, a mean and an assertion want a number.
-#: It is far beyond 59 dB, what rounding to 8 bits leaves of an image.
+#: Largest PSNR, dB, which identical images get: theirs is infinite, and tables, means and assertions need a number. It
+#: is far above the 59 dB of an image rounded to 8 bits.
 MOST_PSNR = 100.0
 
-#: Sides of the tiles that are looked at by themselves, pixels.
+#: Side of a tile, pixels.
 TILE = 64
 
-#: The window of SSIM (Wang, Bovik, Sheikh and Simoncelli 2004): a Gaussian of this standard deviation, cut to so many
-#: pixels, and the constants that keep dark and flat places from dividing by nothing, for images of 0..1.
+#: SSIM as Wang, Bovik, Sheikh and Simoncelli defined it in 2004: standard deviation and width in pixels of its Gaussian
+#: window, and the constants that stabilize the division in dark and flat places, for images of 0..1.
 SIGMA, WINDOW, C1, C2 = 1.5, 11, 0.01**2, 0.03**2
 
-#: Lines that are smoothed at a time: what they need stays in the cache.
+#: Rows that are smoothed at a time, few enough for the processor's cache.
 STRIP = 32
 
 
 @dataclass(frozen=True)
 class Tile:
-    """The tile of an image that differs most.
+    """One tile of an image.
 
     Attributes:
         psnr: dB, of the tile alone.
-        x, y: its upper left pixel.
+        x, y: upper left pixel of the tile.
     """
 
     psnr: float
@@ -44,16 +44,16 @@ class Tile:
 
 
 def check_covered(reference: Image, what: str) -> None:
-    """Raises a `SparklodError` where a picture that others are compared with shows nothing: any would be like it.
+    """Raises a `SparklodError` if the reference of a comparison is empty: its figures would mean nothing.
 
     Args:
-        reference: (H, W, 4), its last channel alpha.
-        what: it is a picture of.
+        reference: (H, W, 4), the last channel alpha.
+        what: what the picture shows, for the error.
     """
     if not (reference[..., 3] > 0).any():
         raise SparklodError(
-            f"{what} covers no pixel, so there is nothing to compare with; cameras and scene may not share their axes"
-            " (--camera-axes, --world-transform, --up), or --near and --far leave nothing"
+            f"{what} covers no pixel, so there is nothing to compare with; check --near and --far, and that cameras"
+            " and scene share their axes (--camera-axes, --world-transform, --up)"
         )
 
 
@@ -63,12 +63,12 @@ def on_background(image: Image, gray: float) -> Image:
 
 
 def psnr_of(mse: float) -> float:
-    """dB of a mean square error of images of 0..1; `MOST_PSNR` at most."""
+    """PSNR in dB of a mean square error of images of 0..1; at most `MOST_PSNR`."""
     return min(-10 * math.log10(mse), MOST_PSNR) if mse > 0 else MOST_PSNR
 
 
 def psnr(a: Image, b: Image) -> float:
-    """Peak signal-to-noise ratio in dB, over all pixels and channels; `MOST_PSNR` at most.
+    """Peak signal-to-noise ratio in dB, over all pixels and channels; at most `MOST_PSNR`.
 
     Args:
         a, b: (H, W, C) of the same shape, 0..1.
@@ -77,11 +77,11 @@ def psnr(a: Image, b: Image) -> float:
 
 
 def worst_tile(a: Image, b: Image, size: int = TILE) -> Tile:
-    """The tile with the lowest PSNR; those at the right and the lower edge may be smaller. The first one of several.
+    """The tile with the lowest PSNR, the first of several. Tiles at the right and lower edge may be smaller.
 
     Args:
         a, b: (H, W, C) of the same shape, 0..1.
-        size: its sides, pixels.
+        size: side of a tile, pixels.
     """
     error = _squared_error(a, b).mean(axis=2)
     height, width = error.shape
@@ -94,9 +94,9 @@ def worst_tile(a: Image, b: Image, size: int = TILE) -> Tile:
 
 
 def ssim(a: Image, b: Image) -> float:
-    """Structural similarity, 1 for images that are the same: the mean over the places that a whole window fits into.
+    """Structural similarity (Wang et al. 2004), 1 for identical images: the mean over all positions of the window.
 
-    The one of Wang et al. 2004, of each channel by itself. Where a side is shorter than the window, it is shortened.
+    Each channel is compared by itself. A window wider than the image is cut to its side.
 
     Args:
         a, b: (H, W, C) of the same shape, 0..1.
@@ -113,10 +113,10 @@ def ssim(a: Image, b: Image) -> float:
 
 
 def _similarity(a: Image, b: Image, taps: list[NDArray[np.float64]]) -> Image:
-    """SSIM of each place that a whole window fits into."""
+    """SSIM at each position of the window inside the image."""
     mean_a, mean_b = _smoothed(a, taps), _smoothed(b, taps)
     square_a, square_b, product = mean_a * mean_a, mean_b * mean_b, mean_a * mean_b
-    # of both variances only the sum is needed
+    # Only the sum of both variances is needed.
     variances = _smoothed(a * a + b * b, taps) - square_a - square_b
     covariance = _smoothed(a * b, taps) - product
     similar: Image = ((2 * product + C1) * (2 * covariance + C2)) / ((square_a + square_b + C1) * (variances + C2))
@@ -124,14 +124,14 @@ def _similarity(a: Image, b: Image, taps: list[NDArray[np.float64]]) -> Image:
 
 
 def _taps(length: int) -> NDArray[np.float64]:
-    """(length,) a Gaussian around the middle, which sums to 1."""
+    """(length,) weights of a Gaussian window, with sum 1."""
     away = np.arange(length) - (length - 1) / 2
     taps = np.exp(-away * away / (2 * SIGMA * SIGMA))
     return taps / taps.sum()
 
 
 def _smoothed(image: Image, taps: list[NDArray[np.float64]]) -> Image:
-    """(H - taps + 1, W - taps + 1, C): each axis by itself, where all taps are inside."""
+    """(H - taps + 1, W - taps + 1, C): the image convolved along each axis, where the window is inside."""
     for axis, weights in enumerate(taps):
         length = image.shape[axis] - len(weights) + 1
         shifted = [image[at : at + length] if axis == 0 else image[:, at : at + length] for at in range(len(weights))]
@@ -142,7 +142,7 @@ def _smoothed(image: Image, taps: list[NDArray[np.float64]]) -> Image:
 
 
 def _squared_error(a: Image, b: Image) -> NDArray[np.float64]:
-    """(H, W, C) float64."""
+    """(H, W, C) float64 squared differences."""
     error = np.subtract(a, b, dtype=np.float64)
     error *= error
     return error

@@ -1,4 +1,4 @@
-"""From images of floats to pixels of 8 bits, and to the bytes of picture files."""
+"""Images of floats to 8-bit pixels and to the bytes of PNG, WebP and .npy files."""
 
 from __future__ import annotations
 
@@ -15,31 +15,32 @@ from ..render.rasterizer import Image
 from .defaults import JPEG_QUALITY
 from .text import BACKGROUND, write_scale
 
-#: (H, W, 3) or, with alpha that red, green and blue are not multiplied by, (H, W, 4).
+#: (H, W, 3), or (H, W, 4) with straight alpha: red, green and blue are not multiplied by it.
 Pixels = NDArray[np.uint8]
 
 #: Red, green and blue, 0..1.
 Color = tuple[float, float, float]
 
-#: Deflate level of PNG: the next ones take twice as long for a few percent.
+#: Deflate level of PNG, of 1 to 9: higher ones take twice as long and save a few percent.
 PNG_LEVEL = 4
 
 
-#: Height of a picture whose scale is drawn in its own size; the least size, and the least picture that has a scale.
+#: Height in pixels at which a colour scale has its full size; its smallest size, as a share of that; and width and
+#: height of the smallest picture that gets one.
 WHOLE_HEIGHT, LEAST_UNIT, LEAST_PICTURE = 1000, 0.62, (400, 240)
 
-#: Width of what stands beside a picture, in thousandths of `WHOLE_HEIGHT`.
+#: Width of the panel with the colour scale, in pixels at `WHOLE_HEIGHT`.
 SCALE_WIDTH = 190
 
-#: How many times as strong differences are shown where nobody says it.
+#: Factors of which `gain_for` chooses the amplification of differences.
 GAINS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0)
 
-#: Colours of a difference that is the same in all channels.
+#: Ends of the colour scale of differences.
 GRAYS = ("000000", "ffffff")
 
 
 def over(image: Image, background: Color | None) -> Image:
-    """An image before a background: (H, W, 4) with alpha 1; as it is where that is None."""
+    """(H, W, 4) an image over a background, with alpha 1; the image itself if the background is None."""
     if background is None:
         return image
     through = 1 - image[..., 3:]
@@ -48,7 +49,7 @@ def over(image: Image, background: Color | None) -> Image:
 
 
 def eight_bits(image: Image) -> Pixels:
-    """(H, W, 4) of an image, colours divided by alpha; (H, W, 3) where alpha is 1 everywhere."""
+    """(H, W, 4) 8-bit pixels of an image, colours divided by alpha; (H, W, 3) if alpha is 1 everywhere."""
     alpha = image[..., 3:]
     if (alpha == 1).all():
         return _codes(image[..., :3])
@@ -63,13 +64,13 @@ def _codes(values: Image) -> Pixels:
 
 
 def difference(a: Image, b: Image, gain: float) -> Image:
-    """(H, W, 4) how far two images of alpha 1 are apart in each channel, so many times."""
+    """(H, W, 4) absolute differences of two images of alpha 1, channel by channel, multiplied by `gain`."""
     shown = np.clip(gain * apart(a, b), 0, 1)
     return np.concatenate([shown, np.ones_like(a[..., 3:])], axis=2).astype(np.float32)
 
 
 def scale_width(width: int, height: int) -> int:
-    """How much wider a picture becomes where it is told what its colours mean: 0 for one too small for that."""
+    """Pixels that a colour scale adds to the width of a picture; 0 for a picture that is too small for one."""
     if width < LEAST_PICTURE[0] or height < LEAST_PICTURE[1]:
         return 0
     return round(SCALE_WIDTH * _unit(width, height))
@@ -80,7 +81,7 @@ def _unit(width: int, height: int) -> float:
 
 
 def with_scale(pixels: Pixels, bar: Coloring) -> Pixels:
-    """A picture, and beside it, on the right, what its colours mean; one too small for that stays as it is."""
+    """A picture with a colour scale on its right; a picture that is too small for one is returned unchanged."""
     height, width = pixels.shape[:2]
     wider = scale_width(width, height)
     if not wider:
@@ -93,18 +94,18 @@ def with_scale(pixels: Pixels, bar: Coloring) -> Pixels:
 
 
 def apart(a: Image, b: Image) -> Image:
-    """(H, W, 3) how far two images of alpha 1 are apart in each channel, 0..1."""
+    """(H, W, 3) absolute differences of two images of alpha 1, channel by channel, 0..1."""
     return np.abs(np.clip(a[..., :3], 0, 1) - np.clip(b[..., :3], 0, 1))
 
 
 def gain_for(differences: Sequence[Image]) -> float:
-    """How many times as strong differences are to be shown, so that nearly all of them are seen and few are cut.
+    """The amplification with which differences are visible and few of them are clipped.
 
     Args:
-        differences: (H, W, 3) of `apart`.
+        differences: (H, W, 3) each, see `apart`.
 
     Returns:
-        1, 2, 5, 10, ... 1000, with which 99 % of the pixels that differ are not cut; 1 where none does.
+        The largest of `GAINS` with which 99 % of the pixels that differ are not clipped; 1 if no pixel differs.
     """
     largest = np.concatenate([each.max(axis=2).ravel() for each in differences])
     differing = largest[largest > 0]
@@ -115,7 +116,7 @@ def gain_for(differences: Sequence[Image]) -> float:
 
 
 def difference_bar(gain: float) -> Coloring:
-    """What the colours of `difference` mean: how far a channel is off, of 1."""
+    """The colour scale of `difference`: absolute difference of a channel, 0..1."""
     marks = [(0.0, "0"), (0.5, f"{0.5 / gain:.3g}"), (1.0, f"{1 / gain:.3g}" + " or more" * (gain > 1))]
     return smooth("difference", np.empty(0), GRAYS, marks)
 

@@ -1,1 +1,1 @@
-"""What is in a splat file, and whether that is as it should be."""
+"""Reports on splat files, and checks of them."""

@@ -1,4 +1,4 @@
-"""Reports as one page that stands by itself: no server, no network, no script."""
+"""Reports as one self-contained page of HTML, without scripts and without access to a network."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from ..figures.tree_plot import Picture
 from ..tables.histograms import Histogram
 from .findings import CODES, ERROR, NOTE, WARNING
 
-#: Nothing but the style and the pictures inside the page is let in, whatever a file is called.
+#: Content security policy: only the style and the pictures inside the page, whatever the name of a file contains.
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
 
-#: What quantities are, for people.
+#: Meaning of the quantities of `values.QUANTITIES` and `values.SH_QUANTITIES`.
 QUANTITIES = {
     "x": "centres, world units",
     "y": "centres, world units",
@@ -26,34 +26,35 @@ QUANTITIES = {
     "scale": "the largest standard deviation, world units",
     "scale_min": "the smallest standard deviation, world units",
     "anisotropy": "the largest standard deviation over the smallest",
-    "opacity": "linear; merged splats may have more than 1",
-    "size": "the feature size that Spark chooses nodes by, world units",
-    "red": "display-referred, 0 to 1",
-    "green": "display-referred, 0 to 1",
-    "blue": "display-referred, 0 to 1",
+    "opacity": "linear opacity; above 1 for merged splats",
+    "size": "the feature size by which Spark chooses nodes, world units",
+    "red": "display-referred colour",
+    "green": "display-referred colour",
+    "blue": "display-referred colour",
     "sh1": "root mean square of the coefficients of degree 1",
     "sh2": "root mean square of the coefficients of degree 2",
     "sh3": "root mean square of the coefficients of degree 3",
 }
 
-#: Numbers of a header that say something to a person, by the names that they have there.
+#: Fields of a header that the page shows, by name, and their titles.
 HEADER = {"version": "Version", "fractional_bits": "Fractional bits"}
 
-#: From bad to harmless.
+#: Severities, the worst first.
 SEVERITIES = (ERROR, WARNING, NOTE)
 
-#: Findings of a file that are listed; a check has some forty kinds, a file of expectations any number.
-MOST_FINDINGS = 200
+#: Most findings of a file that are listed; checks have some forty kinds, but a file of expectations has no limit.
+MAX_FINDINGS = 200
 
+#: Stands for a missing value.
 NONE = "\u2013"
 
 
 @dataclass(frozen=True)
 class Section:
-    """What a page tells of a file.
+    """The part of a page about one file.
 
     Attributes:
-        report: as JSON has it (`report.Report.as_dict`); what is missing or None is left out.
+        report: as for JSON (`report.Report.as_dict`); fields that are missing or None are left out.
         picture: of the scene.
         histograms: by the name of the quantity.
     """
@@ -64,7 +65,7 @@ class Section:
 
 
 def page(sections: Sequence[Section]) -> str:
-    """The page of some files, as HTML; to be written as UTF-8."""
+    """The page about one or more files, as HTML to be written in UTF-8."""
     one = len(sections) == 1
     title = f"{text_of(sections[0].report.get('file', ''))} \u2013 sparklod inspect" if one else "sparklod inspect"
     style = files(__package__).joinpath("page.css").read_text("utf-8")
@@ -82,7 +83,7 @@ def page(sections: Sequence[Section]) -> str:
 {style}</style>
 </head>
 <body>
-<header class="page"><h1>What is in {"this splat file" if one else f"{len(sections)} splat files"}</h1></header>
+<header class="page"><h1>Report on {"a splat file" if one else f"{len(sections)} splat files"}</h1></header>
 <main>
 {contents}{body}
 </main>
@@ -110,7 +111,7 @@ def _panel(title: str, content: str) -> str:
 
 
 def _table(head: Sequence[str], rows: Iterable[Sequence[str]], caption: str) -> str:
-    """A table of cells that are HTML already; the first of each row is its heading."""
+    """A table of cells of HTML; the first cell of each row is its heading."""
     columns = "".join(f'<th scope="col">{cell}</th>' for cell in head)
     lines = (f'<tr><th scope="row">{row[0]}</th>{"".join(_cell(cell) for cell in row[1:])}</tr>' for row in rows)
     body = "\n".join(lines)
@@ -125,7 +126,7 @@ def _cell(content: str) -> str:
 
 
 def _verdict(report: Mapping[str, Any]) -> str:
-    """What the findings come to, as a badge."""
+    """The worst severity of the findings, as a badge."""
     findings = report.get("findings")
     if findings is None:
         return '<span class="badge plain">not checked</span>'
@@ -133,7 +134,7 @@ def _verdict(report: Mapping[str, Any]) -> str:
         count = sum(found.get("severity") == severity for found in findings)
         if count:
             return f'<span class="badge {severity}">{count} {severity}{"s" if count > 1 else ""}</span>'
-    return '<span class="badge good">nothing is wrong</span>'
+    return '<span class="badge good">no faults found</span>'
 
 
 def _contents(sections: Sequence[Section]) -> str:
@@ -183,16 +184,16 @@ def _figures(report: Mapping[str, Any]) -> str:
     if report.get("bytes") is not None:
         each, ratio = report.get("bytes_per_splat"), report.get("compression_ratio")
         of_each = f"{each:.1f} bytes a {noun}" if each else ""
-        of_ratio = f"{ratio:.1f} times smaller than floats" if ratio else ""
+        of_ratio = f"{ratio:.1f} times smaller than as floats" if ratio else ""
         cards.append(("Size", _size(report["bytes"]), ", ".join(filter(None, (of_each, of_ratio)))))
     if tree:
         opaque, needed = 100 * (tree.get("more_than_opaque") or 0), _number(tree.get("chunks_of_coarse_cut"))
         cards += [
-            ("Leaves", _number(tree.get("leaves")), "splats that it is made of"),
-            ("Inner nodes", _number(tree.get("inner")), f"{opaque:.1f} % of all have D &gt; 1"),
-            ("Growth", _number(tree.get("growth")), "nodes a leaf"),
-            ("Levels", _number(_levels_of(tree)), f"depth {_number(tree.get('depth'))}"),
-            ("Chunks", _number(tree.get("chunks")), f"{needed} for the coarsest cut"),
+            ("Leaves", _number(tree.get("leaves")), "splats of the scene"),
+            ("Inner nodes", _number(tree.get("inner")), f"{opaque:.1f} % of all nodes have D &gt; 1"),
+            ("Growth", _number(tree.get("growth")), "nodes per leaf"),
+            ("Depth", _number(tree.get("depth")), "edges to the deepest node"),
+            ("Chunks", _number(tree.get("chunks")), f"{needed} for a coarse cut"),
         ]
     if report.get("sh_degree") is not None:
         cards.append(("SH degree", _number(report["sh_degree"]), ""))
@@ -206,10 +207,6 @@ def _figures(report: Mapping[str, Any]) -> str:
     return f'<dl class="figures">{"".join(items)}</dl>' if cards else ""
 
 
-def _levels_of(tree: Mapping[str, Any]) -> int:
-    return len(tree.get("levels") or ()) + int(tree.get("levels_left_out") or 0)
-
-
 def _findings(report: Mapping[str, Any]) -> str:
     findings = report.get("findings")
     notes = "".join(f"<p>{text_of(note)}</p>" for note in report.get("notes") or ())
@@ -217,13 +214,13 @@ def _findings(report: Mapping[str, Any]) -> str:
         return _panel("Notes", notes)
     items = []
     worst_first = sorted(findings, key=lambda found: SEVERITIES.index(found["severity"]))
-    for found in worst_first[:MOST_FINDINGS]:
+    for found in worst_first[:MAX_FINDINGS]:
         severity, code, message = (text_of(found[name]) for name in ("severity", "code", "message"))
         meaning = text_of(CODES[found["code"]][1]) if found["code"] in CODES else ""
         head = f'<b>{severity}</b><code>{code}</code> <span class="faint">{meaning}</span>'
         items.append(f'<li class="{severity}">{head}<p>{message}</p></li>')
-    if len(findings) > MOST_FINDINGS:
-        items.append(f"<li>{_number(len(findings) - MOST_FINDINGS)} more findings are left out.</li>")
+    if len(findings) > MAX_FINDINGS:
+        items.append(f"<li>{_number(len(findings) - MAX_FINDINGS)} more findings are not listed.</li>")
     return _panel("Findings", f'<ul class="findings">{"".join(items)}</ul>{notes}')
 
 
@@ -243,24 +240,24 @@ def _tree(tree: Mapping[str, Any]) -> str:
         bars = bar((level["nodes"] - level["leaves"]) / most, level["leaves"] / most)
         rows.append([f"{number}", *(_number(level[name]) for name in ("nodes", "leaves", "size")), bars])
     key = '<span class="key">inner</span> <span class="key soft">leaves</span>'
-    caption = "By edges from the root. Size: geometric mean of the feature sizes, world units."
+    caption = "Depth: edges from the root. Size: geometric mean of the feature sizes, world units."
     if tree.get("levels_left_out"):
-        caption += f" {_number(tree['levels_left_out'])} more levels are left out."
-    table = _table(("Level", "Nodes", "Leaves", "Size", key), rows, caption) if rows else ""
+        caption += f" {_number(tree['levels_left_out'])} greater depths are not listed."
+    table = _table(("Depth", "Nodes", "Leaves", "Size", key), rows, caption) if rows else ""
     groups = children_groups(tree.get("children") or {})
     most = max((count for _, count in groups), default=0) or 1
     rows = [[name, _number(count), bar(count / most)] for name, count in groups]
-    children = _table(("Children", "Inner nodes", ""), rows, "Inner nodes by their number of children.") if rows else ""
-    return f'<div class="two">{_panel("Levels of the tree", table)}{_panel("Children", children)}</div>'
+    children = _table(("Children", "Inner nodes", ""), rows, "Inner nodes by number of children.") if rows else ""
+    return f'<div class="two">{_panel("Nodes by depth", table)}{_panel("Children", children)}</div>'
 
 
 def _values(values: Mapping[str, Any]) -> str:
     quantities = values.get("quantities") or {}
     columns = list(dict.fromkeys(name for summary in quantities.values() for name in summary))
     rows = [[text_of(name), *(_number(row.get(column)) for column in columns)] for name, row in quantities.items()]
-    table = _table(["", *map(text_of, columns)], rows, "Numbers that are not finite are left out.") if rows else ""
+    table = _table(["", *map(text_of, columns)], rows, "Without numbers that are not finite.") if rows else ""
     boxes = []
-    for name, what in (("box", "of all centres"), ("box_98", "1 % to 99 %")):
+    for name, what in (("box", "all centres"), ("box_98", "1 % to 99 %")):
         box = values.get(name)
         if box:
             edges = [high - low for low, high in zip(box["min"], box["max"], strict=True)]
@@ -272,11 +269,11 @@ def _values(values: Mapping[str, Any]) -> str:
         ("with a negative scale", "negative_scale"),
         ("of opacity 0", "zero_opacity"),
         ("of scale 0", "zero_scale"),
-        ("more than opaque", "more_than_opaque"),
+        ("of opacity above 1", "more_than_opaque"),
     )
     degenerate = [[what, _number(values[name])] for what, name in counts if name in values]
-    out_of_range = _table(("Splats", "Count"), degenerate, "Of all splats or nodes.") if degenerate else ""
-    side = f"{_panel('Box', extent)}{_panel('Out of the ordinary', out_of_range)}"
+    out_of_range = _table(("Splats", "Count"), degenerate, "Among all splats or nodes.") if degenerate else ""
+    side = f"{_panel('Box', extent)}{_panel('Unusual values', out_of_range)}"
     return f'{_panel("Values", table)}\n<div class="two">{side}</div>'
 
 

@@ -1,4 +1,4 @@
-"""Whether the leaves of a tree are the splats of the file that it was baked from."""
+"""Checks that the leaves of a tree are the splats of the file that it was baked from."""
 
 from __future__ import annotations
 
@@ -15,28 +15,29 @@ from ..support.errors import InvalidSplatsError
 from ..support.units import count_of
 from .findings import Finding
 
-#: Codes of one splat may differ by so much, as writers round, cut off, or go through float16; those of SH have upper
-#: bits only, so that a step is a bucket of 16.
+#: Largest differences of the codes of one splat: writers round, truncate or go through float16. Codes of SH keep upper
+#: bits only, so that a step of theirs is a bucket of 16.
 STEPS, SH_STEPS = 1, 16
 
-#: Degrees of rotation that two codes of one rotation may be apart, by the bytes of the code.
+#: Largest angle in degrees between two codes of one rotation, by the bytes of the code.
 DEGREES = {3: 14.0, 4: 0.8}
 
-#: Of more leaves than this that are neither there nor in the same order, none is looked for nearby.
-MOST_PAIRS = 20_000
+#: Most leaves, without an equal splat or one at the same place of the order, that are searched for nearby: searching
+#: takes time that grows with their number.
+MAX_SEARCHED = 20_000
 
-#: Columns whose codes may differ by a step, in the order of `_Coded.numbers`.
+#: Columns whose codes may differ by a step, in the order in which `_Coded.numbers` has them.
 COLUMNS = ("center", "opacity", "rgb", "scale", "sh")
 
 
 @dataclass(frozen=True)
 class _Coded:
-    """Splats as codes.
+    """N splats as codes.
 
     Attributes:
-        rows: (N,) all bytes of a splat, as one thing to compare.
-        numbers: (N, n) int32 codes of `COLUMNS`; the first three are of the centre.
-        quat_xyzw: (N, 4).
+        rows: (N,) all bytes of a splat as one value, to compare whole splats.
+        numbers: (N, n) int32 codes of `COLUMNS`; the first three are those of the centre.
+        quat_xyzw: (N, 4) rotations.
     """
 
     rows: NDArray[np.void]
@@ -45,24 +46,24 @@ class _Coded:
 
 
 def check(scene: Scene, original: Scene) -> list[Finding]:
-    """Findings where the leaves of `scene`, an SPZ tree, are not exactly the splats of `original` that can be drawn.
+    """A finding if the leaves of `scene`, an SPZ tree, are not exactly the splats of `original` that can be drawn.
 
-    Both are compared as codes of the tree's file: most are the same, and the others must pair with one that lies within
-    a step in everything.
+    Both are compared as codes of the tree's file: most are equal, and each of the others must pair with one whose codes
+    all lie within a step.
     """
     if scene.tree is None:
-        return [Finding("expect.leaves", "there is no tree whose leaves could be compared")]
+        return [Finding("expect.leaves", "the file has no tree whose leaves could be compared")]
     leaves = scene.splats.take(scene.tree.is_leaf)
     source = original.splats if original.tree is None else original.splats.take(original.tree.is_leaf)
     try:
         splats, _ = Selection(drop_invalid=True).apply(source.with_max_sh(leaves.sh_degree))
     except InvalidSplatsError as error:
-        return [Finding("expect.leaves", f"of the original {error}")]
+        return [Finding("expect.leaves", f"the original: {error}")]
     if len(leaves) != len(splats):
         found, expected = count_of(len(leaves), "leaf", "leaves"), count_of(len(splats), "splat")
-        return [Finding("expect.leaves", f"{found}, the original has {expected} to draw")]
+        return [Finding("expect.leaves", f"{found}, but the original has {expected} that can be drawn")]
     if leaves.sh_degree != splats.sh_degree:
-        return [Finding("expect.leaves", f"SH degree {leaves.sh_degree}, the original has {splats.sh_degree}")]
+        return [Finding("expect.leaves", f"SH degree {leaves.sh_degree}, but the original has {splats.sh_degree}")]
     bits, version = int(scene.header["fractional_bits"]), max(2, int(scene.header["version"]))
     layout = Layout(version, len(leaves), leaves.sh_degree, bits, LOD)
     missing = _unpaired(_coded(layout, leaves), _coded(layout, splats), DEGREES[3 if version == 2 else 4])
@@ -77,7 +78,7 @@ def _coded(layout: Layout, splats: Splats) -> _Coded:
     parts, numbers = [], {}
     for stream in layout.streams():
         if not hasattr(splats, stream.column):
-            continue  # the links
+            continue  # the columns of the tree
         values = np.ascontiguousarray(stream.encode(getattr(splats, stream.column)))
         codes = values.view(np.uint8).reshape(len(splats), stream.size)
         parts.append(codes)
@@ -91,16 +92,16 @@ def _coded(layout: Layout, splats: Splats) -> _Coded:
 
 
 def _unpaired(ours: _Coded, theirs: _Coded, degrees: float) -> NDArray[np.intp]:
-    """Ascending indices of ours that have no counterpart among theirs; each of theirs is one of one only."""
+    """Ascending indices of ours without a counterpart among theirs; each of theirs pairs with one of ours only."""
     left, right = _not_equal(ours.rows, theirs.rows)
-    # Where a writer rounds otherwise, most still follow each other in the same order.
+    # Splats of a writer that rounds differently mostly still have the same order when sorted.
     left = left[np.lexsort(ours.numbers[left].T[::-1])]
     right = right[np.lexsort(theirs.numbers[right].T[::-1])]
     apart = ~_alike(ours, left, theirs, right, degrees)
     left, right = np.sort(left[apart]), right[apart]
-    if len(left) > MOST_PAIRS:
+    if len(left) > MAX_SEARCHED:
         return left
-    # Looked for along the axis on which they are spread most.
+    # The others are searched for along the axis with the most distinct coordinates.
     axis = int(np.argmax([len(np.unique(theirs.numbers[right, axis])) for axis in range(3)]))
     free = right[np.argsort(theirs.numbers[right, axis], kind="stable")]
     along = theirs.numbers[free, axis]
@@ -121,16 +122,16 @@ def _unpaired(ours: _Coded, theirs: _Coded, degrees: float) -> NDArray[np.intp]:
 def _alike(
     ours: _Coded, left: NDArray[np.intp], theirs: _Coded, right: NDArray[np.intp], degrees: float
 ) -> NDArray[np.bool_]:
-    """Whether splats of ours and of theirs, pair by pair, lie within a step of each other in everything."""
+    """Whether pairs of splats of ours and theirs lie within a step of each other in every code."""
     most = np.full(ours.numbers.shape[1], STEPS)
-    most[10:] = SH_STEPS  # behind three of the centre, one of opacity, three of colour and three of scale
+    most[10:] = SH_STEPS  # after 3 of centre, 1 of opacity, 3 of colour and 3 of scale
     near = (np.abs(theirs.numbers[right] - ours.numbers[left]) <= most).all(axis=1)
     cosine = np.abs(np.einsum("ij,ij->i", theirs.quat_xyzw[right], ours.quat_xyzw[left], dtype=np.float64))
     return near & (np.degrees(2 * np.arccos(np.minimum(cosine, 1))) <= degrees)
 
 
 def _not_equal(ours: NDArray[np.void], theirs: NDArray[np.void]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Ascending indices of ours and of theirs that are left when equal rows have been taken away in pairs."""
+    """Ascending indices of ours and of theirs that remain when pairs of equal rows are removed."""
     count = len(ours)
     rows = np.concatenate([ours, theirs])
     order = np.argsort(rows, kind="stable")  # of equal rows ours come first

@@ -1,4 +1,4 @@
-"""`inspect`: what is in a file, what it is like, and what is wrong with it, as one report."""
+"""`inspect`, which reports on a splat file: contents, statistics and findings."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from ..support.progress import Progress, silent
 from . import tree, values
 from .findings import Finding
 
-#: Counts up when a field of the report changes its meaning or goes away; schema.json describes this one.
+#: Version of the report: counts up when a field changes its meaning or is removed. schema.json describes this one.
 SCHEMA_VERSION = 1
 
-#: Columns that the facts of a tree are made of.
+#: Columns that the facts of a tree are computed from.
 TREE_COLUMNS = ("scale", "opacity")
 
 
 @dataclass(frozen=True)
 class Wanted:
-    """What to look at, beside the header and the tree.
+    """What to report beside the header and the tree.
 
     Attributes:
-        values: the numbers of the splats.
-        all_quantities: every quantity of them.
-        check: what is wrong.
+        values: statistics of the splats.
+        all_quantities: all of their quantities, instead of the main ones.
+        check: findings.
     """
 
     values: bool = False
@@ -41,21 +41,21 @@ class Wanted:
 
 @dataclass(frozen=True)
 class Report:
-    """What is in a file. `as_dict` is what `--json` prints, and what `schema.json` describes.
+    """The report on a file. `--json` prints `as_dict`, which `schema.json` describes.
 
     Attributes:
-        file: as it was named.
-        bytes: on disk; of an unpacked SOG, of all its files.
-        format: for people; None where it could not be read.
-        splats: or nodes of the tree.
+        file: path, as it was given.
+        bytes: size on disk; of an unpacked SOG, that of all its files.
+        format: name for people; None if the file could not be read.
+        splats: number of splats, or nodes of a tree.
         sh_degree, antialiased: of the splats.
-        header: numbers of the header that belong to the format.
-        bytes_per_splat: of the file.
-        compression_ratio: of the decoded splats, in 4-byte floats, to the file.
-        notes: what the reader left out.
-        tree: where the file is a Level-of-Detail tree.
-        values: where they were wanted.
-        findings: where they were wanted, or the file could not be read.
+        header: fields of the header, which depend on the format.
+        bytes_per_splat: size over splats.
+        compression_ratio: size of the decoded splats, as 4-byte floats, over that of the file.
+        notes: data that the reader left out.
+        tree: facts of the Level-of-Detail tree; None without one.
+        values: statistics of the splats; None if not asked for.
+        findings: None if not asked for, unless the file could not be read.
     """
 
     file: str
@@ -73,7 +73,7 @@ class Report:
     findings: list[Finding] | None = None
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values, as JSON has them."""
+        """The report as plain values, for JSON."""
         plain = {"schema_version": SCHEMA_VERSION} | dataclasses.asdict(self)
         if self.findings is not None:
             plain["findings"] = [{"severity": found.severity} | dataclasses.asdict(found) for found in self.findings]
@@ -83,7 +83,16 @@ class Report:
 def inspect(
     path: Path, wanted: Wanted, *, threads: int = 1, progress: Progress = silent
 ) -> tuple[Report, Scene | None]:
-    """Looks at a file; what cannot be read is a finding, not an error. Also gives what was read of the scene."""
+    """The report on a file, and its scene as far as it was read.
+
+    A file that cannot be read gives a finding, not an error, and None for the scene.
+
+    Args:
+        path: of the file, or of the folder of an unpacked SOG.
+        wanted: what to report.
+        threads: to read with.
+        progress: called while the file is read.
+    """
     columns = COLUMNS if wanted.values or wanted.check else TREE_COLUMNS
     size = size_of_input(path)
     try:
@@ -122,7 +131,7 @@ def _container_findings(scene: Scene) -> list[Finding]:
     findings = [Finding("container.left-out", note) for note in scene.notes]
     unknown = header.get("flags", 0) & ~KNOWN_FLAGS
     if unknown:
-        findings.append(Finding("container.flags", f"the header has flags {unknown:#04x}, which mean nothing"))
+        findings.append(Finding("container.flags", f"the header sets flags {unknown:#04x}, which have no meaning"))
     if header.get("reserved", 0):
         findings.append(Finding("container.flags", "reserved bytes of the header are not 0"))
     if header.get("trailing_members"):

@@ -1,4 +1,4 @@
-"""What the numbers of splats are like, and what is wrong with them."""
+"""Statistics of the values of splats, and findings about them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from ..model.splats import FloatArray, Splats
 from ..tables.histograms import Histogram, histogram
 from .findings import Finding
 
-#: The quantities that are looked at, by name; each makes (N,) numbers of N splats. `SH_QUANTITIES` join them.
+#: The quantities of a splat by name, as functions of N splats to (N,) numbers. Splats with SH have `SH_QUANTITIES` too.
 QUANTITIES: dict[str, Callable[[Splats], FloatArray]] = {
     "x": lambda splats: splats.center[:, 0],
     "y": lambda splats: splats.center[:, 1],
@@ -32,12 +32,13 @@ QUANTITIES: dict[str, Callable[[Splats], FloatArray]] = {
     "green": lambda splats: splats.rgb[:, 1],
     "blue": lambda splats: splats.rgb[:, 2],
 }
-SH_QUANTITIES = ("sh1", "sh2", "sh3")  # root mean square of a splat's coefficients of a degree
+#: Root mean square of a splat's SH coefficients of degree 1, 2 and 3.
+SH_QUANTITIES = ("sh1", "sh2", "sh3")
 
 #: Quantities whose histograms have bins of equal width, however many decades the numbers span.
 LINEAR = ("x", "y", "z", "opacity", "red", "green", "blue")
 
-#: The codes of what makes a splat invalid (`splats.INVALID`), and what is said of it.
+#: Code and message of each reason that makes a splat invalid (`splats.INVALID`).
 OF_INVALID = {
     "non_finite": ("values.non-finite", "a number is not finite, or the rotation has length 0"),
     "bad_rotation": ("values.rotation", "the length of the rotation is not 1"),
@@ -45,21 +46,22 @@ OF_INVALID = {
     "negative_opacity": ("values.opacity", "the opacity is below 0"),
 }
 
-#: Those that a report has without --stats.
+#: The quantities of a report without --stats.
 MAIN = ("scale", "opacity", "anisotropy")
+#: Percentiles of a quantity, by name.
 PERCENTILES = {"p1": 1, "p25": 25, "p50": 50, "p75": 75, "p99": 99}
 
-#: The shares of scales at the end of what SPZ holds, and of splats that cannot be drawn, from which on it is said: of
-#: many a good file's splats some are rounded to that.
+#: Shares of splats above which clamped scales and invisible splats are findings: a few of either are the rounding of
+#: good files.
 MANY_CLAMPED, MANY_INVISIBLE = 0.01, 0.1
 
-#: Coordinates from here on become infinite as float16, which Spark's PackedSplats have.
+#: Coordinates from this on become infinite in float16, which Spark's PackedSplats use.
 FLOAT16_END = 65_520
 
 
 @dataclass(frozen=True)
 class Box:
-    """An axis-aligned box, world units."""
+    """An axis-aligned box: (3,) lowest and highest corner, world units."""
 
     min: list[float]
     max: list[float]
@@ -67,16 +69,16 @@ class Box:
 
 @dataclass(frozen=True)
 class ValueFacts:
-    """What the numbers are like; invalid splats (`splats.INVALID`) are counted and left out.
+    """Statistics of splats; invalid ones (`splats.INVALID`) are counted but left out of the rest.
 
     Attributes:
-        box: of the centres.
-        box_98: between the 1 % and the 99 % quantiles of each coordinate.
+        box: of all centres; None if no splat is valid.
+        box_98: from the 1 % to the 99 % quantile of each coordinate.
         non_finite: splats with a number that is not finite.
         negative_scale: splats with a scale below 0.
         zero_opacity, zero_scale: splats that cannot be drawn.
         more_than_opaque: splats with an opacity above 1.
-        quantities: min, mean, max and percentiles of `QUANTITIES`, by their names.
+        quantities: min, mean, max and percentiles of each quantity, by name.
     """
 
     box: Box | None
@@ -90,12 +92,12 @@ class ValueFacts:
 
 
 def names_of(splats: Splats) -> list[str]:
-    """The quantities that these splats have."""
+    """The names of the quantities of these splats: those of SH by their degree."""
     return [*QUANTITIES, *SH_QUANTITIES[: splats.sh_degree]]
 
 
 def quantity(splats: Splats, name: str) -> FloatArray:
-    """(N,) a quantity by its name; may have numbers that are not finite."""
+    """(N,) a quantity by its name; some numbers may not be finite."""
     with np.errstate(all="ignore"):
         if name in QUANTITIES:
             return QUANTITIES[name](splats)
@@ -111,11 +113,11 @@ def histogram_of(splats: Splats, name: str, *, bins: int = 40) -> Histogram:
 
 
 def examine(splats: Splats, *, all_quantities: bool = False) -> ValueFacts:
-    """The facts of N splats.
+    """Statistics of N splats.
 
     Args:
-        splats: N of them.
-        all_quantities: all of `QUANTITIES`, not only those of `MAIN`.
+        splats: N splats.
+        all_quantities: compute all quantities, not only those of `MAIN`.
     """
     invalid = splats.invalid()
     good = splats.take(splats.is_valid()) if invalid else splats
@@ -138,7 +140,7 @@ def examine(splats: Splats, *, all_quantities: bool = False) -> ValueFacts:
 
 
 def _summary(values: FloatArray) -> dict[str, float | None]:
-    values = values[np.isfinite(values)].astype(np.float64)  # in which the span of no float32s overflows
+    values = values[np.isfinite(values)].astype(np.float64)  # float32 would overflow where numbers span its range
     if not len(values):
         return dict.fromkeys(("min", *PERCENTILES, "max", "mean"))
     levels = _numbers(np.percentile(values, [0, *PERCENTILES.values(), 100]))
@@ -155,7 +157,7 @@ def _numbers(values: NDArray[Any]) -> list[float]:
 
 
 def scale_ends(scene: Scene) -> tuple[float, float]:
-    """The least and the largest scale that the file's format holds, world units; 0 and infinite for floats."""
+    """Smallest and largest scale that the format of the file holds, world units; 0 and infinity for floats."""
     if "fractional_bits" not in scene.header:
         return 0.0, math.inf
     low, high = quantize.decode_log_scale(np.array([0, 255], np.uint8))
@@ -163,7 +165,7 @@ def scale_ends(scene: Scene) -> tuple[float, float]:
 
 
 def check(scene: Scene) -> list[Finding]:
-    """What is wrong with the numbers of a scene."""
+    """Findings about the values of a scene."""
     splats = scene.splats
     if not len(splats):
         return [Finding("values.empty", "there are no splats")]
@@ -184,25 +186,25 @@ def check(scene: Scene) -> list[Finding]:
     if scene.tree is None:
         report("values.opacity", valid & (splats.opacity > 1), "the opacity is above 1")
     invisible = (splats.opacity == 0) | (splats.scale.max(axis=1) == 0)
-    looked_at = len(splats)
-    if scene.tree is not None:  # where thin splats are far apart, what is merged of them is fainter than a code holds
+    checked = len(splats)
+    if scene.tree is not None:  # merged splats of thin leaves far apart may be fainter than any code
         invisible &= scene.tree.is_leaf
-        looked_at = int(np.count_nonzero(scene.tree.is_leaf))
-    if np.count_nonzero(invisible) > MANY_INVISIBLE * looked_at:
-        report("values.invisible", valid & invisible, "cannot be drawn, opacity or scale is 0")
+        checked = int(np.count_nonzero(scene.tree.is_leaf))
+    if np.count_nonzero(invisible) > MANY_INVISIBLE * checked:
+        report("values.invisible", valid & invisible, "cannot be drawn, as its opacity or scale is 0")
     header = scene.header
     if header.get("version", 0) >= 2 and "fractional_bits" in header:  # SPZ version 1 has floats
         most = quantize.FIXED24_MAX * 2.0 ** -int(header["fractional_bits"])
         clamped = valid & (np.abs(splats.center) >= most).any(axis=1)
-        report("values.center-clamped", clamped, f"a coordinate is {most:g}, the most that its code holds")
+        report("values.center-clamped", clamped, f"a coordinate is {most:g}, the end of the range of its code")
     if "fractional_bits" in header:
         low, high = scale_ends(scene)
-        most = splats.scale.max(axis=1)  # that a thin splat is not quite as thin is not seen
+        most = splats.scale.max(axis=1)  # a smallest scale that was clamped is not visible
         clamped = (most <= low) | (most >= high)
-        if scene.tree is not None:  # what is merged of leaves that are far apart can be larger than a code holds
+        if scene.tree is not None:  # merged splats of leaves far apart may be larger than any code
             clamped &= scene.tree.is_leaf
-        if np.count_nonzero(clamped) > MANY_CLAMPED * looked_at:
-            report("values.scale-clamped", clamped, f"a scale is {low:.2g} or {high:.0f}, the ends of what SPZ holds")
+        if np.count_nonzero(clamped) > MANY_CLAMPED * checked:
+            report("values.scale-clamped", clamped, f"a scale is {low:.2g} or {high:.0f}, the ends of the range of SPZ")
     far = valid & (np.abs(splats.center) >= FLOAT16_END).any(axis=1)
     report("values.center-far", far, f"a coordinate is {FLOAT16_END:,} or more, which float16 cannot hold")
     return found

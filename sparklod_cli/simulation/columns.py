@@ -1,4 +1,4 @@
-"""The columns of the table of a traversal, a row for each frame: names, units, precision and meaning."""
+"""The columns of the table of a traversal, which has a row for each frame: names, units, precision and meaning."""
 
 from __future__ import annotations
 
@@ -10,66 +10,86 @@ from ..tables.files import near
 
 COLUMNS = (
     *FRAME,
-    Column("instance", str, "", "", "name of an instance, or `total` for all of them together"),
-    Column("position_x", float, ".6f", "world units", "where the camera is"),
-    Column("position_y", float, ".6f", "world units", "where the camera is"),
-    Column("position_z", float, ".6f", "world units", "where the camera is"),
+    Column("instance", str, "", "", "name of the instance, or `total` for all together"),
+    Column("position_x", float, ".6f", "world units", "position of the camera"),
+    Column("position_y", float, ".6f", "world units", "position of the camera"),
+    Column("position_z", float, ".6f", "world units", "position of the camera"),
     Column("forward_x", float, ".6f", "", "unit vector along the optical axis"),
     Column("forward_y", float, ".6f", "", "unit vector along the optical axis"),
     Column("forward_z", float, ".6f", "", "unit vector along the optical axis"),
     Column("fov_y_deg", float, ".4f", "degrees", "vertical field of view"),
-    Column("width", int, "", "px", "of the image"),
-    Column("height", int, "", "px", "of the image"),
-    Column("budget", int, "", "splats", "the most that may be drawn, all instances together"),
-    Column("pixel_scale_limit", float, ".6g", "", "pixel scale at or below which no node is divided: a pixel's"),
-    Column("selected", int, "", "splats", "the cut: what is drawn"),
-    Column("leaves", int, "", "splats", "of them, those of full detail"),
-    Column("interior", int, "", "splats", "of them, those that stand for others"),
+    Column("width", int, "", "px", "width of the image"),
+    Column("height", int, "", "px", "height of the image"),
+    Column("budget", int, "", "splats", "largest number of splats that may be drawn, all instances together"),
+    Column(
+        "pixel_scale_limit",
+        float,
+        ".6g",
+        "",
+        "nodes at or below this pixel scale are not refined; by default the angular size of a pixel",
+    ),
+    Column("selected", int, "", "splats", "splats drawn: the nodes of the cut"),
+    Column("leaves", int, "", "splats", "leaves among them: splats of full detail"),
+    Column("interior", int, "", "splats", "merged splats among them"),
     Column("budget_used", float, ".4f", "share", "selected over budget"),
     Column(
         "stop_reason",
         str,
         "",
         "",
-        "`budget`: dividing one more node would exceed it; `pixel`: what could be divided is no larger than the limit; "
-        "`missing`: what should be divided has children that are not there; "
-        "`exhausted`: everything is drawn in full detail",
+        "why the cut is not finer: `budget`: refining one more node would exceed it; `pixel`: no node above the "
+        "pixel-scale limit is left to refine; `missing`: the children of the nodes to be refined are not resident; "
+        "`exhausted`: only leaves are left",
     ),
-    Column("pixel_scale_min", float, ".6g", "", "the pixel scale down to which everything has been divided"),
-    Column("frontier", int, "", "splats", "of the cut, those that still wait in the queue when it stops"),
-    Column("level_min", int, "", "", "fewest links from the root to a node of the cut"),
-    Column("level_mean", float, ".3f", "", "mean number of links from the root"),
-    Column("level_max", int, "", "", "most links from the root"),
-    Column("in_frustum", int, "", "splats", "of the cut, those with their centre in the picture"),
-    Column("outside", int, "", "splats", "of the cut, those in front of the camera but beside the picture"),
-    Column("behind", int, "", "splats", "of the cut, those behind the camera"),
-    Column("projected_px_p50", float, ".3f", "px", "median size on the screen of those in the picture"),
-    Column("projected_px_p95", float, ".3f", "px", "95th percentile of the same"),
+    Column("pixel_scale_min", float, ".6g", "", "pixel scale down to which all nodes have been refined"),
+    Column("frontier", int, "", "splats", "of the cut, nodes still waiting to be refined when the search stops"),
+    Column("level_min", int, "", "", "smallest depth of a node of the cut: edges from the root"),
+    Column("level_mean", float, ".3f", "", "mean depth of the nodes of the cut"),
+    Column("level_max", int, "", "", "largest depth of a node of the cut"),
+    Column("in_frustum", int, "", "splats", "of the cut, splats inside the frustum: their centre is in the image"),
+    Column("outside", int, "", "splats", "of the cut, splats in front of the camera but outside the frustum"),
+    Column("behind", int, "", "splats", "of the cut, splats behind the camera"),
+    Column("projected_px_p50", float, ".3f", "px", "median projected size of the splats inside the frustum"),
+    Column("projected_px_p95", float, ".3f", "px", "95th percentile of the projected sizes"),
     Column(
         "overdraw_estimate",
         float,
         ".3f",
         "",
-        "how many splats cover a pixel, in the mean: areas out to sqrt(8) standard deviations, over the picture's",
+        "mean number of splats on a pixel: their areas out to sqrt(8) standard deviations, over that of the image",
     ),
-    Column("chunks_touched", int, "", "chunks", "chunks of 65,536 nodes that finding the cut looks into, or wants to"),
-    Column("chunks_new", int, "", "chunks", "chunks that have arrived since the frame before"),
-    Column("bytes_new", int, "", "bytes", "of the file that those take"),
+    Column(
+        "chunks_touched",
+        int,
+        "",
+        "chunks",
+        "chunks of 65,536 nodes that the search for the cut reads, or would read if they were resident",
+    ),
+    Column("chunks_new", int, "", "chunks", "chunks that arrived since the previous frame"),
+    Column("bytes_new", int, "", "bytes", "bytes of the file that those chunks take"),
     Column("chunks_resident", int, "", "chunks", "chunks in the cache after this frame"),
     Column(
-        "missing", int, "", "splats", "nodes drawn though they should be divided, because their children are not there"
+        "missing",
+        int,
+        "",
+        "splats",
+        "nodes drawn although they should be refined, because their children are not resident",
     ),
     Column(
         "complete_in_s",
         float,
         ".4f",
         "s",
-        "with `--bandwidth`: how long until the whole cut is there, if the camera rests and all its chunks are known",
+        "with `--bandwidth`: time until the whole cut is resident, if the camera stays and the chunks are known",
     ),
-    Column("added", int, "", "splats", "of the cut, those that the frame before did not draw"),
-    Column("removed", int, "", "splats", "those that only the frame before did draw"),
+    Column("added", int, "", "splats", "nodes of the cut that the previous frame did not draw"),
+    Column("removed", int, "", "splats", "nodes that only the previous frame drew"),
     Column(
-        "churn", float, ".4f", "share", "(added + removed) over what both frames draw: 0 nothing pops, 1 everything"
+        "churn",
+        float,
+        ".4f",
+        "share",
+        "(added + removed) over the splats of both frames: 0 if nothing changes, 1 if everything does",
     ),
     Column("traverse_ms", float, ".3f", "ms", "time to find the cut, on one thread; left out with `--no-timing`"),
 )
@@ -91,18 +111,18 @@ EMPTY = {
 
 
 class UnknownColumnError(SparklodError):
-    """There is no column of such a name."""
+    """There is no column of that name."""
 
 
 def select(names: Sequence[str] = (), *, timing: bool = True) -> tuple[Column, ...]:
-    """Columns by their names, in this order; all of them, in the order of `COLUMNS`, for no names.
+    """The columns of these names, in this order; without names all columns, in the order of `COLUMNS`.
 
     Args:
-        names: of columns; one that comes twice is taken once.
-        timing: with those that differ from run to run.
+        names: of columns; a repeated one is taken once.
+        timing: include the columns that differ from run to run (`TIMING`).
 
     Raises:
-        UnknownColumnError: there is no such column; names those that come near.
+        UnknownColumnError: there is no column of that name; suggests similar ones.
     """
     every = {column.name: column for column in COLUMNS}
     for name in names:

@@ -161,7 +161,7 @@ def _plot(simulation: Simulation, path: CameraPath, target: Path, kept: _Kept, *
 
     frame = kept.shown()
     cut = simulation.scenes.cut_of(frame.cut)
-    scenery = traversal_chart.Scenery(
+    scenery = traversal_chart.PathScene(
         path.cameras,
         cut.splats,
         np.concatenate([part.depth for part in cut.parts]),

@@ -1,4 +1,4 @@
-"""`--assert`: what a column must be for a check to hold, such as `churn_p95<0.2`."""
+"""Assertions about a table, such as `churn_p95<0.2`: what `--assert` takes."""
 
 from __future__ import annotations
 
@@ -30,19 +30,19 @@ UNITS: dict[str, int | Decimal] = {"": 1, "k": 10**3, "K": 10**3, "M": 10**6, "G
 
 
 class BadAssertionError(SparklodError):
-    """An assertion cannot be understood, or not be answered."""
+    """An assertion is not well formed, or its column is empty."""
 
 
 @dataclass(frozen=True)
 class Assertion:
-    """What must hold.
+    """A comparison of a column, or of a statistic of it, with a bound.
 
     Attributes:
         text: as it was given, without spaces at its ends.
-        column: a numeric one.
-        statistic: of its cells, see `statistics`; empty where every cell must hold by itself.
+        column: a numeric column.
+        statistic: of its cells, see `statistics`; empty if every frame must hold by itself.
         sign: one of `COMPARISONS`.
-        bound: what they are compared with.
+        bound: right side of the comparison.
     """
 
     text: str
@@ -52,7 +52,7 @@ class Assertion:
     bound: Number
 
     def holds(self, value: Number) -> bool:
-        """Whether a value is on the right side of the bound."""
+        """Whether a value compares with the bound as it must."""
         return COMPARISONS[self.sign](value, self.bound)
 
 
@@ -61,12 +61,11 @@ class Outcome:
     """Whether an assertion holds.
 
     Attributes:
-        assertion: the question.
-        held: the answer.
-        value: the statistic; where every frame must hold by itself, the value of the worst one.
-        failed, frames: how many frames do not hold by themselves, of those that have a value; `failed` is 0 for a
-            statistic.
-        worst: row of the frame that is farthest on the wrong side, or nearest to it; None for a count.
+        assertion: the assertion.
+        held: whether it holds.
+        value: the statistic; without one, the value of the worst frame.
+        failed, frames: frames that fail by themselves, and frames that have a value; `failed` is 0 for a statistic.
+        worst: row of the frame that fails by most, or that comes closest to failing; None for a count.
     """
 
     assertion: Assertion
@@ -77,15 +76,11 @@ class Outcome:
     worst: Row | None
 
     def message(self) -> str:
-        """What was found, in a line."""
+        """The outcome, in a line."""
         asked = self.assertion
         where = self.worst and place_text(self.worst)
         if not asked.statistic:
-            some = (
-                f"does not hold in {self.failed:,} of {self.frames:,}"
-                if self.failed
-                else f"holds in all {self.frames:,}"
-            )
+            some = f"fails in {self.failed:,} of {self.frames:,}" if self.failed else f"holds in all {self.frames:,}"
             return f"{asked.text}: {some} frames; the worst is {where} with {number_text(self.value)}"
         found = f"{asked.text}: {asked.column.name}_{asked.statistic} is {number_text(self.value)}"
         if self.worst is None:
@@ -99,11 +94,15 @@ class Outcome:
 def parse(text: str, columns: Sequence[Column]) -> Assertion:
     """An assertion from `NAME[_STATISTIC] SIGN NUMBER`.
 
-    NAME is that of a numeric column, and the longest name that fits is taken: `pixel_scale_min<1` is about every cell
-    of the column pixel_scale_min, `pixel_scale_min_max<1` about the greatest of them. NUMBER may end in k, M, G or %.
+    NAME is that of a numeric column, the longest one that fits: `pixel_scale_min<1` is about every cell of the column
+    pixel_scale_min, `pixel_scale_min_max<1` about the largest of them. NUMBER may end in k, M, G or %.
+
+    Args:
+        text: the assertion.
+        columns: of the table.
 
     Raises:
-        BadAssertionError: it cannot be understood; in a line that says what comes near.
+        BadAssertionError: it is not well formed; suggests similar names.
     """
     found = TEXT.fullmatch(text)
     if not found or not found["left"] or not found["right"]:
@@ -115,7 +114,7 @@ def parse(text: str, columns: Sequence[Column]) -> Assertion:
 
 
 def _column(text: str, left: str, columns: Sequence[Column]) -> tuple[Column, str]:
-    """The column and the statistic that stand on the left, the latter may be empty."""
+    """The column and the statistic on the left side; the statistic may be empty."""
     every = {column.name: column for column in columns}
     fitting = [
         name for name in every if left == name or (left.startswith(f"{name}_") and is_statistic(left[len(name) + 1 :]))
@@ -124,12 +123,12 @@ def _column(text: str, left: str, columns: Sequence[Column]) -> tuple[Column, st
         raise BadAssertionError(f"{text!r}: {_unknown(left, columns)}")
     name = max(fitting, key=len)
     if every[name].kind is str:
-        raise BadAssertionError(f"{text!r}: {name} is text, and only numbers can be compared")
+        raise BadAssertionError(f"{text!r}: {name} is a text, only numbers can be compared")
     return every[name], left[len(name) + 1 :]
 
 
 def _unknown(left: str, columns: Sequence[Column]) -> str:
-    """What is wrong with a name that is neither a column nor a column with a statistic."""
+    """The error about a name that is neither a column nor a column with a statistic."""
     numeric = [column.name for column in columns if column.kind is not str]
     stem, _, last = left.rpartition("_")
     name = stem if stem and is_statistic(last) else left
@@ -145,7 +144,7 @@ def _bound(text: str, right: str) -> Number:
     found = NUMBER.fullmatch(right)
     if not found:
         raise BadAssertionError(f"{text!r}: {right!r} is not a number such as 0.2, 500k, 2M or 20%")
-    number = float(Decimal(found["number"]) * UNITS[found["unit"]])  # in decimals, so that 1.1k is 1100
+    number = float(Decimal(found["number"]) * UNITS[found["unit"]])  # decimal arithmetic, so that 1.1k is exactly 1100
     if not math.isfinite(number):
         raise BadAssertionError(f"{text!r}: {right} is too large")
     return int(number) if number.is_integer() else number
@@ -154,11 +153,11 @@ def _bound(text: str, right: str) -> Number:
 def check(
     assertions: Sequence[Assertion], rows: Iterable[Row], *, empty: Mapping[str, str] = MappingProxyType({})
 ) -> list[Outcome]:
-    """Whether assertions hold, in their order.
+    """The outcomes of assertions, in their order.
 
     Args:
-        assertions: the questions.
-        rows: of all frames; those of single instances, in a table that has any, are left out.
+        assertions: to check.
+        rows: of all frames; rows of single instances are left out.
         empty: why all cells of a column may be empty, by the column's name, for the error.
 
     Raises:
@@ -166,7 +165,7 @@ def check(
     """
     frames = totals(rows)
     if not frames:
-        raise BadAssertionError("there are no frames that an assertion could be about")
+        raise BadAssertionError("there are no frames to check")
     return [_outcome(assertion, frames, empty) for assertion in assertions]
 
 
@@ -190,7 +189,7 @@ def _outcome(assertion: Assertion, rows: Sequence[Row], empty: Mapping[str, str]
 
 
 def _badness(assertion: Assertion, value: Number) -> Number:
-    """Greater for values that are farther on the wrong side of the bound."""
+    """Larger for values that fail by more, or come closer to failing."""
     if assertion.sign in ("<", "<="):
         return value
     if assertion.sign in (">", ">="):
@@ -205,7 +204,7 @@ def number_text(value: Number) -> str:
 
 
 def place_text(row: Row) -> str:
-    """Which frame a row is of: "frame 12 at 0.400 s (door)"."""
+    """The frame of a row, for people: "frame 12 at 0.400 s (door)"."""
     at = "" if row["time_s"] is None else f" at {row['time_s']:.3f} s"
     name = "" if row["name"] is None else str(row["name"]).replace("\r", "\\r").replace("\n", "\\n")
     return f"frame {row['frame']}{at}" + (f" ({name})" if name else "")

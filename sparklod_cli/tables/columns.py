@@ -4,20 +4,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-#: What a cell holds; None where there is nothing to say, such as the churn of the first frame.
+#: The value of a cell; None for an empty one, such as the churn of the first frame.
 Cell = int | float | str | None
 
 
 @dataclass(frozen=True)
 class Column:
-    """One column.
+    """One column of a table.
 
     Attributes:
-        name: as in the header.
-        kind: the type of its cells, where they are not empty: int, float or str.
-        digits: format of a float (".6f" is fixed, ".6g" significant digits); empty otherwise.
-        unit: for people; empty for a plain number, count or text.
-        meaning: one phrase.
+        name: as the header has it.
+        kind: type of the cells that are not empty: int, float or str.
+        digits: format of a float (".6f": six decimals, ".6g": six significant digits); empty otherwise.
+        unit: as people read it; empty for a plain number or a text.
+        meaning: what the cells say, in one phrase.
     """
 
     name: str
@@ -27,13 +27,13 @@ class Column:
     meaning: str
 
     def rounded(self, value: Cell) -> Cell:
-        """A value as precise as this column is: rows hold these, so every format tells the same numbers."""
+        """A value rounded to the digits of this column. Rows hold rounded values, so that all file formats agree."""
         if not self.digits or value is None:
             return value
-        return float(format(value, self.digits)) + 0.0  # which makes -0 a 0
+        return float(format(value, self.digits)) + 0.0  # adding 0 turns -0 into 0
 
     def text(self, value: Cell) -> str:
-        """A cell of a CSV file."""
+        """The text of a cell in a CSV file."""
         if value is None:
             return ""
         return format(value, self.digits) if self.digits else str(value)
@@ -44,7 +44,7 @@ Row = dict[str, Cell]
 
 #: Which frame a row is of: the columns that every table with a row for each frame begins with.
 FRAME = (
-    Column("frame", int, "", "", "number of the frame on the path, from 0; `--every` leaves gaps"),
+    Column("frame", int, "", "", "number of the frame on the path, from 0; with `--every` some are left out"),
     Column("time_s", float, ".6f", "s", "time on the path"),
-    Column("name", str, "", "", "of the frame, where the path's file has names"),
+    Column("name", str, "", "", "name of the frame, where the path's file has names"),
 )

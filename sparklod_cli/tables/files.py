@@ -1,4 +1,4 @@
-"""Rows as files: CSV, JSON and Parquet. The same rows give the same cells in each of them, and the same bytes again."""
+"""Tables as CSV, JSON and Parquet files, with the same cells in each, and the same bytes for the same rows."""
 
 from __future__ import annotations
 
@@ -13,39 +13,39 @@ from typing import Any
 from ..support.errors import SparklodError
 from .columns import Cell, Column, Row
 
-#: Counts up when a column changes its meaning or goes away; new ones may come without that.
+#: Version of the schema: counts up when a column changes its meaning or is removed, not when one is added.
 SCHEMA_VERSION = 1
 
-#: What Table Schema calls the types of columns (specs.frictionlessdata.io/table-schema).
+#: Names of the types of columns in Table Schema (specs.frictionlessdata.io/table-schema).
 TYPES = {int: "integer", float: "number", str: "string"}
 
-#: A text with one of these is quoted in CSV (RFC 4180).
+#: Characters that make CSV quote a text (RFC 4180).
 QUOTED = ',"\r\n'
 
-#: How texts begin that spreadsheets run, or skip to what they run.
+#: First characters of texts that spreadsheets take for formulas, or skip before one.
 FORMULAS = ("=", "+", "-", "@", "\t", "\r", "\n")
 
 
 def near(name: str, known: Iterable[str], *, cutoff: float = 0.6) -> str:
-    """The end of a message about a name that is not known: ", did you mean ...?"; empty where none comes near."""
+    """The end of an error about an unknown name: ", did you mean ...?"; empty if no known name is similar."""
     found = difflib.get_close_matches(name, list(known), n=3, cutoff=cutoff)
     return f", did you mean {' or '.join(found)}?" if found else ""
 
 
 def encode(rows: Iterable[Row], columns: Sequence[Column], form: str) -> Iterator[bytes]:
-    """The pieces of a file of rows. CSV and JSON are made row by row, so that endless paths take no memory.
+    """The pieces of a file of rows. CSV and JSON are made row by row, so that long paths take no memory.
 
-    An empty text is an empty cell, as no CSV can tell them apart; what UTF-8 cannot hold becomes "?". In CSV, a text
-    that a spreadsheet would run begins with a ' more.
+    An empty text is written as an empty cell, since CSV cannot tell them apart; what UTF-8 cannot hold becomes "?". In
+    CSV a ' is put before a text that a spreadsheet would take for a formula.
 
     Args:
-        rows: with a cell for each column; cells beyond them are left out.
+        rows: with a cell for each column; other cells are ignored.
         columns: of the file, in this order.
         form: one of `FORMS`.
 
     Raises:
-        SparklodError: pyarrow is not installed, for Parquet; at once, before the first row is asked for.
-        ValueError: a number is not finite; while the pieces are taken.
+        SparklodError: pyarrow is not installed, for Parquet; raised by the call itself, before the first row.
+        ValueError: a number is not finite; raised while the pieces are taken.
     """
     if form not in FORMS:
         raise ValueError(f"form is {form}, not one of {', '.join(FORMS)}")
@@ -67,7 +67,7 @@ def load_pyarrow() -> ModuleType:
 
 
 def _cell(column: Column, row: Row) -> Cell:
-    """A cell as every format has it."""
+    """The value of a cell in every format."""
     value = row[column.name]
     if isinstance(value, str):
         return value.encode("utf-8", "replace").decode("utf-8") or None
@@ -83,13 +83,13 @@ def _csv(rows: Iterable[Row], columns: Sequence[Column]) -> Iterator[bytes]:
 
 
 def _field(column: Column, row: Row) -> str:
-    """A field of CSV; a text that a spreadsheet would take for a formula gets a mark that makes it a text."""
+    """A field of CSV; a ' before a formula makes it a text."""
     text = column.text(_cell(column, row))
     return _quoted("'" + text if column.kind is str and text.startswith(FORMULAS) else text)
 
 
 def _quoted(text: str) -> str:
-    """A field of CSV. The module csv quotes carriage returns in some versions of Python only."""
+    """A quoted field of CSV. The module csv quotes carriage returns in some versions of Python only."""
     return '"' + text.replace('"', '""') + '"' if any(mark in text for mark in QUOTED) else text
 
 
@@ -113,7 +113,7 @@ def _dumped(value: dict[str, Any]) -> str:
 
 
 def _parquet(rows: Iterable[Row], columns: Sequence[Column]) -> Iterator[bytes]:
-    return _parquet_pieces(rows, columns, load_pyarrow())  # which is missed at once, not at the first row
+    return _parquet_pieces(rows, columns, load_pyarrow())  # a missing pyarrow is an error at once, not at the first row
 
 
 def _parquet_pieces(rows: Iterable[Row], columns: Sequence[Column], pyarrow: ModuleType) -> Iterator[bytes]:
@@ -135,7 +135,7 @@ def _parquet_pieces(rows: Iterable[Row], columns: Sequence[Column], pyarrow: Mod
     yield file.getvalue()
 
 
-#: How rows become the pieces of a file, by the name that `--format` knows, and the suffix; the first is the default.
+#: The formats of tables by name, which is the suffix too, and the function that writes each; the first is the default.
 FORMS: dict[str, Callable[[Iterable[Row], Sequence[Column]], Iterator[bytes]]] = {
     "csv": _csv,
     "json": _json,

@@ -1,4 +1,4 @@
-"""Histograms of the numbers of a scene, and as bars of text."""
+"""Histograms of numbers, and their bars as text."""
 
 from __future__ import annotations
 
@@ -10,26 +10,26 @@ from numpy.typing import NDArray
 
 from ..model.splats import FloatArray
 
-#: Positive numbers that span more than this factor are counted in bins of equal ratios.
+#: Positive numbers whose largest is more than this factor above the smallest get bins of equal ratios.
 LOG_SPAN = 100
 
-#: Where all numbers span more than this many times what the inner 99 % do, the bins span these only.
+#: If all numbers span more than this many times the range of the inner 99 %, the bins cover that range only.
 FAR_SPAN = 3
 
-#: Eighths of a character, from none to seven.
+#: Blocks of zero to seven eighths of a character.
 EIGHTHS = " ▏▎▍▌▋▊▉"
 
 
 @dataclass(frozen=True)
 class Histogram:
-    """How many numbers are where.
+    """Counts of numbers in bins.
 
     Attributes:
-        edges: (B + 1,) of the bins, ascending; a bin has its lower edge, the last one both. Empty if there is none.
-        counts: (B,) of each bin.
-        log: the bins have equal ratios, not equal widths.
-        below, above: numbers beyond the bins, which are few and far out.
-        not_finite: numbers that are left out.
+        edges: (B + 1,) ascending edges; a bin includes its lower edge, the last one both. Empty without numbers.
+        counts: (B,) numbers in each bin.
+        log: the bins have equal ratios instead of equal widths.
+        below, above: numbers outside the range of the bins.
+        not_finite: numbers that are not finite, and in no bin.
     """
 
     edges: NDArray[np.float64]
@@ -41,15 +41,15 @@ class Histogram:
 
 
 def histogram(values: FloatArray, *, bins: int = 40, log: bool | None = None) -> Histogram:
-    """Counts numbers.
+    """The histogram of some numbers.
 
     Args:
-        values: (N,) of any kind; those that are not finite are counted apart.
-        bins: how many, unless all numbers are the same.
-        log: bins of equal ratios, for positive numbers; None where they are positive and span more than `LOG_SPAN`.
+        values: (N,) numbers, finite or not.
+        bins: number of bins; there is only one if all numbers are the same.
+        log: use bins of equal ratios; None does so for positive numbers that span more than `LOG_SPAN`.
 
     Raises:
-        ValueError: there are no bins, or `log` is set and a number is not positive.
+        ValueError: `bins` is less than 1, or `log` is set and a number is not positive.
     """
     if bins < 1:
         raise ValueError(f"{bins} bins")
@@ -65,13 +65,15 @@ def histogram(values: FloatArray, *, bins: int = 40, log: bool | None = None) ->
     if log:
         np.log(finite, out=finite)
     ends = _range(finite)
-    if ends[1] - ends[0] <= 1e-12 * max(abs(ends[0]), abs(ends[1])):  # one number, in a bin as wide as its step
+    if ends[1] - ends[0] <= 1e-12 * max(
+        abs(ends[0]), abs(ends[1])
+    ):  # a single value, in a bin one float wide on either side
         edges = np.array([np.nextafter(least, -np.inf), np.nextafter(most, np.inf)])
         return Histogram(edges, np.array([len(finite)]), log, not_finite=not_finite)
     counts, edges = np.histogram(finite, bins, ends)
     below, above = int(np.count_nonzero(finite < edges[0])), int(np.count_nonzero(finite > edges[-1]))
     if log:
-        edges = np.exp(edges)  # which rounds: the outermost are known
+        edges = np.exp(edges)  # exp rounds, but the outermost edges are known exactly
         edges[0], edges[-1] = edges[0] if below else least, edges[-1] if above else most
     return Histogram(edges, counts.astype(np.int64), log, below, above, not_finite)
 
@@ -84,12 +86,12 @@ def _range(values: NDArray[np.float64]) -> tuple[float, float]:
 
 
 def as_text(histogram: Histogram, *, width: int = 60, rows: int = 20) -> str:
-    """A line for each bin: where it begins, a bar and how many; and one for what is beyond the bins.
+    """A line for each bin, with its lower edge, count and bar, and lines for the numbers outside the bins.
 
     Args:
-        histogram: of which neighbouring bins are put together where there are more than `rows`.
+        histogram: whose bins are joined where there are more than `rows`.
         width: of the longest bar, in characters.
-        rows: at most, beside those for what is beyond.
+        rows: largest number of lines for bins.
     """
     lines: list[tuple[str, int, bool]] = []
     if len(histogram.counts):
@@ -114,15 +116,15 @@ def as_text(histogram: Histogram, *, width: int = 60, rows: int = 20) -> str:
 
 
 def bar(count: int, most: int, width: int) -> str:
-    """A bar of blocks, as long as `width` characters for `most`; what is not nothing is seen."""
+    """A bar of blocks, `width` characters long for `most`; any count above 0 is visible."""
     eighths = 0 if not count else max(1, round(8 * width * count / most))
     return "█" * (eighths // 8) + EIGHTHS[eighths % 8].strip()
 
 
 def edge_names(edges: NDArray[np.float64]) -> list[str]:
-    """Numbers with as few digits as tell them from each other."""
+    """The edges as text, with the fewest significant digits, from 3 on, that keep them apart."""
     gap = float(np.diff(edges).min())
-    if gap > 1e-12:  # an edge that differs from 0 by much less than a bin is 0
+    if gap > 1e-12:  # rounds edges that are 0 but for the error of float arithmetic
         edges = np.round(edges, 2 - math.floor(math.log10(gap))) + 0.0
     names = []
     for digits in range(3, 9):

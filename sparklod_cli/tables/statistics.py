@@ -1,4 +1,4 @@
-"""Statistics of the cells of a column; what a summary prints is what an assertion compares."""
+"""Statistics of the cells of a column, shared by summaries and assertions."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .columns import Row
 
 Number = int | float
 
-#: All but the percentiles, which are p0 to p100.
+#: Statistics by name; percentiles, p0 to p100, come besides.
 STATISTICS: dict[str, Callable[[Sequence[Number]], Number]] = {
     "min": min,
     "mean": lambda values: math.fsum(values) / len(values),
@@ -28,16 +28,16 @@ PERCENTILE = re.compile(r"p(100|[1-9]?[0-9])")
 
 
 def is_statistic(name: str) -> bool:
-    """Whether there is a statistic of that name: one of `STATISTICS`, or a percentile such as p95."""
+    """Whether a name is one of `STATISTICS` or a percentile such as p95."""
     return name in STATISTICS or PERCENTILE.fullmatch(name) is not None
 
 
 def statistic(name: str, values: Sequence[Number]) -> Number:
-    """A statistic of numbers that are not empty cells.
+    """A statistic of the numbers of a column.
 
     Args:
-        name: for which `is_statistic` holds; a percentile between two numbers is interpolated linearly.
-        values: in the order of the frames; at least one, unless they are counted.
+        name: one of `STATISTICS`, or a percentile such as p95, interpolated linearly.
+        values: in the order of the frames; at least one, except for "count".
     """
     if name in STATISTICS:
         return STATISTICS[name](values)
@@ -45,7 +45,7 @@ def statistic(name: str, values: Sequence[Number]) -> Number:
 
 
 def totals(rows: Iterable[Row]) -> list[Row]:
-    """The rows that stand for all instances together, one a frame; all of a table that does not tell these apart."""
+    """The rows of all instances together, one a frame; all rows of a table without a column for instances."""
     return [row for row in rows if row.get("instance", TOTAL) == TOTAL]
 
 

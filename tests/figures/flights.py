@@ -9,7 +9,7 @@ import numpy as np
 from PIL import Image
 
 from sparklod_cli.cameras.camera import Camera
-from sparklod_cli.figures.traversal_chart import Plot, Scenery, plot
+from sparklod_cli.figures.traversal_chart import PathScene, Plot, plot
 from sparklod_cli.simulation.summary import look_at
 from sparklod_cli.tables.columns import Row
 from sparklod_cli.tables.statistics import totals
@@ -35,9 +35,9 @@ def circle(count: int = 20, radius: float = 6) -> list[Camera]:
     return [looking((radius * math.cos(angle), -2, radius * math.sin(angle))) for angle in angles]
 
 
-def scenery(frame: int | None = 3) -> Scenery:
+def scenery(frame: int | None = 3) -> PathScene:
     splats = random_splats(500)
-    return Scenery(circle(), splats, np.arange(500) // 100, frame)
+    return PathScene(circle(), splats, np.arange(500) // 100, frame)
 
 
 def marked(rows: list[Row]) -> dict[str, int]:
@@ -45,7 +45,7 @@ def marked(rows: list[Row]) -> dict[str, int]:
     return {moment.what: moment.frame for moment in look_at(totals(rows))}
 
 
-def plotted(rows: list[Row], title: str = "scene.spz", scenery: Scenery | None = None) -> Plot:
+def plotted(rows: list[Row], title: str = "scene.spz", scenery: PathScene | None = None) -> Plot:
     """The plot of `traverse --plot`."""
     return plot(rows, marked(rows), title, scenery)
 

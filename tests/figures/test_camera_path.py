@@ -17,8 +17,8 @@ from tests.tables.rows import flight
 class TestPictureOfPath:
     def test_it_shows_the_scene_and_the_path(self) -> None:
         of = scenery()
-        with_frame = pixels(picture_of_path(of.cameras, of.splats, of.level, frame=3, size=SIZE))
-        without = pixels(picture_of_path(of.cameras, of.splats, of.level, size=SIZE))
+        with_frame = pixels(picture_of_path(of.cameras, of.splats, of.depth, frame=3, size=SIZE))
+        without = pixels(picture_of_path(of.cameras, of.splats, of.depth, size=SIZE))
         assert with_frame.shape == without.shape == (250, 400, 3)
         body = (slice(50, None), slice(0, 320))
         assert count_of(without[body], "#ffffff", 60) > 100
@@ -27,7 +27,7 @@ class TestPictureOfPath:
 
     def test_it_is_the_same_again(self) -> None:
         of = scenery()
-        assert len({picture_of_path(of.cameras, of.splats, of.level, size=SIZE) for _ in range(2)}) == 1
+        assert len({picture_of_path(of.cameras, of.splats, of.depth, size=SIZE) for _ in range(2)}) == 1
 
     def test_one_camera_and_one_splat(self) -> None:
         splats = random_splats(1)
@@ -46,10 +46,10 @@ class TestPictureOfPath:
     def test_splats_that_are_not_finite_are_left_out(self) -> None:
         of = scenery()
         of.splats.center[0], of.splats.scale[1] = np.nan, np.inf
-        assert picture_of_path(of.cameras, of.splats, of.level, size=SIZE)
+        assert picture_of_path(of.cameras, of.splats, of.depth, size=SIZE)
         of.splats.scale[:] = 0
         with pytest.raises(SparklodError, match="nothing to draw"):
-            picture_of_path(of.cameras, of.splats, of.level, size=SIZE)
+            picture_of_path(of.cameras, of.splats, of.depth, size=SIZE)
 
     @pytest.mark.usefixtures("charting")
     def test_it_stands_below_the_charts(self) -> None:

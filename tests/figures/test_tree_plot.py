@@ -64,32 +64,32 @@ class TestPictures:
         assert "ellipsoids" in picture.description
 
     def test_the_same_scene_gives_the_same_picture(self, scene: Scene) -> None:
-        assert plot(scene, level=3, size=SIZE) == plot(scene, level=3, size=SIZE)
+        assert plot(scene, depth=3, size=SIZE) == plot(scene, depth=3, size=SIZE)
 
     @pytest.mark.parametrize("size", [(161, 97), (400, 400), (200, 500)])
     def test_it_is_as_large_as_wanted(self, scene: Scene, size: tuple[int, int]) -> None:
-        assert pixels(plot(scene, level=2, size=size)).shape == (size[1], size[0], 3)
+        assert pixels(plot(scene, depth=2, size=size)).shape == (size[1], size[0], 3)
 
-    def test_colors_and_levels_make_other_pictures(self, scene: Scene) -> None:
-        pictures = [plot(scene, by=by, level=4, size=SIZE) for by in ("level", "opacity", "size")]
-        pictures += [plot(scene, level=level, size=SIZE) for level in (0, 2, None)]
+    def test_colors_and_depths_make_other_pictures(self, scene: Scene) -> None:
+        pictures = [plot(scene, by=by, depth=4, size=SIZE) for by in ("level", "opacity", "size")]
+        pictures += [plot(scene, depth=depth, size=SIZE) for depth in (0, 2, None)]
         assert len({picture.png for picture in pictures}) == len(pictures)
         assert len({picture.description for picture in pictures}) == len(pictures)
 
-    def test_all_levels_are_seen_from_the_same_place(self, scene: Scene) -> None:
+    def test_all_depths_are_seen_from_the_same_place(self, scene: Scene) -> None:
         corner = (slice(-60, None), slice(0, 60))
-        axes = [pixels(plot(scene, level=level, size=SIZE))[corner] for level in (4, 5)]
+        axes = [pixels(plot(scene, depth=level, size=SIZE))[corner] for level in (4, 5)]
         assert (axes[0] == axes[1]).mean() > 0.97
 
     def test_what_is_said_is_what_is_drawn(self, scene: Scene) -> None:
         assert scene.tree is not None
         depth = scene.tree.depths()
-        picture = plot(scene, level=3, size=SIZE)
+        picture = plot(scene, depth=3, size=SIZE)
         nodes = np.count_nonzero(depth == 3)
         leaves = np.count_nonzero(scene.tree.is_leaf & (depth < 3))
-        assert f"Level 3 of {depth.max()}: {nodes} node" in picture.description
+        assert f"Depth 3 of {depth.max()}: {nodes} node" in picture.description
         assert (f"grey: {leaves} leaves" in picture.description) == (leaves > 0)
-        assert "boxes: chunks of 65,536 nodes, the 1 of 1" in picture.description
+        assert "boxes: the 1 of 1 chunks of 65,536 nodes" in picture.description
 
     def test_a_plain_scene_is_coloured_by_size(self) -> None:
         picture = plot(Scene(random_splats(500)), size=SIZE)
@@ -105,7 +105,7 @@ class TestPictures:
         assert drawn(picture).any()
         monkeypatch.setattr(plotting, "MOST_POINTS", 1000)
         sample = plot(scene, size=SIZE)
-        assert "1,000 of them, evenly chosen" in sample.description
+        assert "an even sample of 1,000" in sample.description
         assert sample.png == plot(scene, size=SIZE).png != picture.png
 
     def test_huge_ones_are_points_too(self) -> None:
@@ -114,7 +114,7 @@ class TestPictures:
         assert "points" in picture.description
 
     def test_few_voxels_are_outlined_and_many_are_a_grid(self, scene: Scene) -> None:
-        assert "blue: the 1 voxel of" in plot(scene, level=0, size=SIZE).description
+        assert "blue: the 1 voxel of" in plot(scene, depth=0, size=SIZE).description
         assert "blue: on the walls, the grid of voxels of" in plot(scene, size=SIZE).description
 
     def test_a_scene_of_one_splat_is_drawn(self) -> None:
@@ -148,11 +148,11 @@ class TestPictures:
         count[2] = 65535  # past the end
         assert drawn(plot(dataclasses.replace(scene, tree=LodTree(count, start)), size=SIZE)).any()
 
-    def test_a_level_that_a_scene_does_not_have_is_an_error(self, scene: Scene) -> None:
-        with pytest.raises(SparklodError, match=r"there is no level 99 to draw: the tree has levels 0 to \d+$"):
-            plot(scene, level=99)
+    def test_a_depth_that_a_tree_does_not_have_is_an_error(self, scene: Scene) -> None:
+        with pytest.raises(SparklodError, match=r"there is no node of depth 99 to draw: the tree has depths 0 to \d+$"):
+            plot(scene, depth=99)
         with pytest.raises(SparklodError, match="not a Level-of-Detail tree"):
-            plot(Scene(scene.splats), level=1)
+            plot(Scene(scene.splats), depth=1)
 
     @pytest.mark.parametrize("count", [0, 3])
     def test_splats_of_no_size_are_an_error(self, count: int) -> None:

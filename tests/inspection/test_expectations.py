@@ -140,7 +140,10 @@ def test_leaves_can_be_those_of_another_file(tmp_path: Path, capsys: pytest.Capt
     assert run(["inspect", str(TREE), "--leaves-of", str(splats)]) == 0
     assert capsys.readouterr().out == ""
     assert run(["inspect", str(TREE), "--leaves-of", str(PLAIN)]) == 3
-    assert capsys.readouterr().out == f"{TREE}: error: expect.leaves: 6 leaves, the original has 60 splats to draw\n"
+    assert (
+        capsys.readouterr().out
+        == f"{TREE}: error: expect.leaves: 6 leaves, but the original has 60 splats that can be drawn\n"
+    )
 
 
 @pytest.mark.parametrize("original", ["missing.ply", FIXTURES / "points.ply"])
@@ -168,7 +171,7 @@ def test_options_win_over_the_file(tmp_path: Path, capsys: pytest.CaptureFixture
 def test_an_expectation_is_that_there_are_no_errors_either(capsys: pytest.CaptureFixture[str]) -> None:
     broken, warned = (FIXTURES / "faults" / f"{name}.spz" for name in ("tree-orphan", "tree-single-child"))
     assert run(["inspect", str(broken), "--require-lod"]) == 3
-    assert capsys.readouterr().out == f"{broken}: error: tree.orphan: node 9 is nobody's child\n"
+    assert capsys.readouterr().out == f"{broken}: error: tree.orphan: node 9 has no parent\n"
     assert run(["inspect", str(warned), "--require-lod", "--fail-on", "warning"]) == 0
     assert capsys.readouterr().out == ""
     assert run(["inspect", str(warned), "--require-lod", "--check", "--fail-on", "warning"]) == 3

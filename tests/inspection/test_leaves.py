@@ -157,7 +157,7 @@ def test_a_step_is_no_change() -> None:
 
 def test_a_step_is_no_change_however_many_leaves_make_it(monkeypatch: pytest.MonkeyPatch) -> None:
     """Another writer may round all colours down."""
-    monkeypatch.setattr(leaves, "MOST_PAIRS", 50, raising=False)
+    monkeypatch.setattr(leaves, "MAX_SEARCHED", 50, raising=False)
     splats = random_splats(300, sh_degree=1)
     scene = tree_of(splats)
     scene.splats.rgb[:] += 0.007
@@ -191,13 +191,13 @@ def test_a_leaf_too_few_or_too_many_is_found() -> None:
 def test_more_sh_than_the_original_has_is_found() -> None:
     splats = random_splats(100, sh_degree=2)
     (found,) = check(tree_of(splats), Scene(splats.with_max_sh(1)))
-    assert found.message == "SH degree 2, the original has 1"
+    assert found.message == "SH degree 2, but the original has 1"
 
 
 def test_a_plain_file_has_no_leaves() -> None:
     splats = random_splats(3)
     (found,) = check(Scene(splats, format="PLY"), Scene(splats))
-    assert found.message == "there is no tree whose leaves could be compared"
+    assert found.message == "the file has no tree whose leaves could be compared"
 
 
 def test_an_original_that_is_a_tree_has_leaves_of_its_own() -> None:

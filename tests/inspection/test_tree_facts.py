@@ -174,7 +174,7 @@ def test_a_finding_counts_and_names_the_first() -> None:
     _, findings = examine(sized([4.0, 2.0, 1.0, 1.0, 1.0]), tree_of([(2, 1), (0, 0), (0, 0), (0, 0), (0, 5)]))
     orphans, starts = findings
     assert (orphans.code, orphans.index, orphans.count) == ("tree.orphan", 3, 2)
-    assert orphans.message == "node 3 is nobody's child (and 1 more)"
+    assert orphans.message == "node 3 has no parent (and 1 more)"
     assert (starts.code, starts.index, starts.count, starts.severity) == ("tree.leaf-start", 4, 1, "warning")
 
 
@@ -185,7 +185,7 @@ def test_without_a_check_nothing_is_looked_for() -> None:
 
 @pytest.mark.parametrize(("size", "found"), [(0.99, True), (1.01, False), (3.0, False), (0.0, True)])
 def test_how_much_smaller_than_its_children_a_node_may_be(size: float, found: bool) -> None:
-    child = 1 / facts_of.LEAST_RATIO
+    child = 1 / facts_of.MIN_SIZE_RATIO
     splats = sized([100.0, size, child, child, 1000.0])
     splats.opacity[4] = 1e-10  # a large one that covers nearly nothing
     _, findings = examine(splats, tree_of([(2, 1), (2, 3), (0, 0), (0, 0), (0, 0)]))
@@ -193,15 +193,15 @@ def test_how_much_smaller_than_its_children_a_node_may_be(size: float, found: bo
 
 
 @pytest.mark.parametrize("rise", [0.9, 1.1])
-@pytest.mark.parametrize("nodes", [facts_of.LEAST_NODES, facts_of.LEAST_NODES + 3, 3000])
+@pytest.mark.parametrize("nodes", [facts_of.MIN_NODES, facts_of.MIN_NODES + 3, 3000])
 def test_what_counts_as_coarse_before_fine(nodes: int, rise: float) -> None:
     """Half of the leaves below a small node, and half below one that is larger by a factor, which comes behind them."""
     half = (nodes - 3) // 2
     sizes = np.ones(nodes)
-    sizes[:3] = 100, 10, 10 * facts_of.MOST_RISE * rise
+    sizes[:3] = 100, 10, 10 * facts_of.MAX_RISE * rise
     links = [(2, 1), (half, 3), (nodes - 3 - half, 3 + half), *[(0, 0)] * (nodes - 3)]
     _, findings = examine(sized(sizes.tolist()), tree_of(links))
-    if rise > 1 and nodes > facts_of.LEAST_NODES:  # the root is not counted
+    if rise > 1 and nodes > facts_of.MIN_NODES:  # the root is not counted
         (found,) = findings
         assert (found.code, found.severity) == ("tree.coarse-first", "note")
         assert found.index == pytest.approx(nodes / 2, abs=nodes / facts_of.PARTS)
@@ -231,5 +231,5 @@ def test_good_trees_are_far_from_the_bounds() -> None:
         wanted = [np.median(part) for part in np.array_split(limit[parent[1:]], facts_of.PARTS)]
         rise = max(rise, float((wanted[1:] / np.minimum.accumulate(wanted)[:-1]).max()))
         assert (design_size(nodes) > 0).all()
-    assert worst > 1.2 * facts_of.LEAST_RATIO
-    assert rise < facts_of.MOST_RISE / 1.2
+    assert worst > 1.2 * facts_of.MIN_SIZE_RATIO
+    assert rise < facts_of.MAX_RISE / 1.2

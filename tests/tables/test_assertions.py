@@ -133,8 +133,8 @@ def test_the_longest_name_wins(text: str, column: str, statistic: str) -> None:
         ("churn_p101<1", "'p101' is not a statistic of churn: min, mean, max"),
         ("churn_average<1", "'average' is not a statistic of churn: .* or a percentile such as p95"),
         ("zzz<1", "there is no column 'zzz'$"),
-        ("stop_reason==1", "stop_reason is text"),
-        ("name_max==1", "name is text"),
+        ("stop_reason==1", "stop_reason is a text"),
+        ("name_max==1", "name is a text"),
     ],
 )
 def test_what_is_not_understood(text: str, message: str) -> None:
@@ -158,7 +158,7 @@ def test_a_message_names_the_frames_and_the_worst_one() -> None:
     rows = churns(None, 0.1, 0.9, 0.5)
     rows[2]["name"] = "the\ndoor"
     worst = "the worst is frame 2 at 0.067 s (the\\ndoor) with 0.9"
-    assert asked("churn<0.2", rows).message() == f"churn<0.2: does not hold in 2 of 3 frames; {worst}"
+    assert asked("churn<0.2", rows).message() == f"churn<0.2: fails in 2 of 3 frames; {worst}"
     assert asked("churn<1", rows).message() == f"churn<1: holds in all 3 frames; {worst}"
     assert asked("churn_p50<20%", rows).message() == f"churn_p50<20%: churn_p50 is 0.5; {worst}"
     assert asked("churn_last<1", rows).message() == "churn_last<1: churn_last is 0.5, in frame 3 at 0.100 s"

@@ -16,7 +16,7 @@ def test_every_finding_is_an_annotation_for_github(capsys: Said) -> None:
     out, err = capsys.readouterr()
     lines = out.splitlines()
     assert [line.split(" ")[0] for line in lines] == ["::error", "::error", "::warning", "::notice"]
-    assert lines[1] == f"::error file={BROKEN},title=tree.orphan::node 9 is nobody's child"
+    assert lines[1] == f"::error file={BROKEN},title=tree.orphan::node 9 has no parent"
     assert err == f"{TREE}: nothing is wrong with its 9 nodes\n"
 
 

@@ -93,8 +93,8 @@ def test_a_chain_is_told_of_in_bounds(nodes: int, tmp_path: Path, capsys: Said) 
     assert len(text) < 10_000
     html = page.read_text()
     assert len(html) < 600_000
-    assert (f"{left_out:,} more levels are left out" in html) == bool(left_out)
-    assert f"<dt>Levels</dt><dd>{nodes:,}<" in html
+    assert (f"{left_out:,} greater depths are not listed" in html) == bool(left_out)
+    assert f"<dt>Depth</dt><dd>{nodes - 1:,}<" in html
     assert inspect(path, "--json") == 0
     out = capsys.readouterr().out
     tree = json.loads(out)["tree"]

@@ -119,8 +119,8 @@ def test_findings_are_data_and_what_is_good_is_talk(capsys: Said) -> None:
     out, err = capsys.readouterr()
     assert out.splitlines() == [
         f"{MISSING}: error: file.unreadable: cannot be read: no such file or directory",
-        f"{BROKEN}: error: tree.orphan: node 9 is nobody's child",
-        f"{WARNED}: warning: container.flags: the header has flags 0x0c, which mean nothing",
+        f"{BROKEN}: error: tree.orphan: node 9 has no parent",
+        f"{WARNED}: warning: container.flags: the header sets flags 0x0c, which have no meaning",
     ]
     assert err == f"{TREE}: nothing is wrong with its 9 nodes\n"
 
