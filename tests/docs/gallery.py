@@ -10,8 +10,6 @@ import sys
 import tempfile
 from pathlib import Path
 
-from PIL import Image
-
 from tests.conftest import FIXTURES, ROOT
 
 PAGE = ROOT / "docs" / "gallery.md"
@@ -19,9 +17,6 @@ FOLDER = ROOT / "docs" / "images" / "gallery"
 
 #: The scene that all commands start from.
 SCENE = "demo.ply"
-
-#: Colours that a .png is reduced to, so that the repository stays small; pictures of figures have few.
-PALETTE = 128
 
 
 def commands() -> list[list[str]]:
@@ -46,10 +41,7 @@ def main() -> None:
             subprocess.run([sys.executable, "-m", "sparklod_cli", *arguments], cwd=folder, check=True)
         FOLDER.mkdir(parents=True, exist_ok=True)
         for picture in pictures():
-            made = folder / Path(picture).name
-            if made.suffix == ".png":
-                Image.open(made).convert("RGB").quantize(PALETTE, dither=Image.Dither.NONE).save(made, optimize=True)
-            shutil.copy(made, FOLDER)
+            shutil.copy(folder / Path(picture).name, FOLDER)
 
 
 if __name__ == "__main__":

@@ -18,13 +18,13 @@ from PIL import Image
 from tests.conftest import ROOT
 
 PAGE = ROOT / "docs" / "traverse.md"
-PICTURE = ROOT / "docs" / "images" / "traverse.png"
+PICTURE = ROOT / "docs" / "images" / "traverse.webp"
 
 #: What its trees are baked from, with the quality builder.
 SCENES = ("biker.spz", "playbot.sog", "meadow.sog")
 
-#: Pixels that the picture is made narrower to, and its colours, so that the repository stays small.
-WIDTH, PALETTE = 1100, 128
+#: Pixels that the picture is made narrower to, and its WebP quality, so that the repository stays small.
+WIDTH, QUALITY = 1100, 85
 
 
 def example() -> tuple[str, list[str]]:
@@ -45,10 +45,9 @@ def main() -> None:
         bake = ["build-lod", *(str(scenes / scene) for scene in SCENES), "--method", "quality", "--output-dir", "."]
         for each in (bake, arguments):
             subprocess.run([sys.executable, "-m", "sparklod_cli", *each], cwd=folder, check=True)
-        picture = Image.open(folder / PICTURE.name).convert("RGB")
+        picture = Image.open(folder / arguments[arguments.index("--plot") + 1]).convert("RGB")
     size = (WIDTH, round(picture.height * WIDTH / picture.width))
-    small = picture.resize(size, Image.Resampling.LANCZOS)
-    small.quantize(PALETTE, dither=Image.Dither.NONE).save(PICTURE, optimize=True)
+    picture.resize(size, Image.Resampling.LANCZOS).save(PICTURE, quality=QUALITY, method=6)
 
 
 if __name__ == "__main__":
