@@ -19,6 +19,8 @@ from .paths import claim_stdout, keep_apart
 from .usage import options_of
 
 if TYPE_CHECKING:
+    from ..cameras.path import CameraPath
+    from ..scenes.loaded import Scenes
     from ..simulation.outputs import WrittenFrames
     from ..tables.assertions import Assertion
 
@@ -58,13 +60,12 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
 
     Coordinates are those of the files; --up, --world-transform and --camera-axes bring cameras into them.
     """
-    place, general = options_of(ctx, tables.Table), options_of(ctx, General)
-    where, lod, network = (
-        options_of(ctx, cameras.Cameras),
-        options_of(ctx, cut.Cut),
+    files, where, lod = options_of(ctx, inputs.Inputs), options_of(ctx, cameras.Cameras), options_of(ctx, cut.Cut)
+    network, place, general = (
         options_of(ctx, streaming.Streaming),
+        options_of(ctx, tables.Table),
+        options_of(ctx, General),
     )
-    files = options_of(ctx, inputs.Inputs)
     for group in (where, lod, network):
         group.check(ctx)
     place.check(ctx, as_json=general.as_json)
@@ -73,54 +74,37 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
     instances = files.instances()
     besides = {"scene": files.read(instances), "world_transform": where.files()}
     keep_apart(ctx, besides)
-    table = place.table(ctx, as_json=general.as_json)
+    outputs = place.outputs(ctx, as_json=general.as_json)
     asserts = place.assertions()
+    start = time.perf_counter()
     with general.console() as console:
-        from ..model.splats import COLUMNS
-        from ..scenes.reading import TRAVERSED, read_scenes
-        from ..simulation.frames import Simulation
-        from ..simulation.outputs import FrameOutputs, write_frames
+        from ..api.jobs import UnfitError, View, traverse_files
 
-        outputs = FrameOutputs(
-            table=table,
-            indices=place.indices_out,
-            padded=place.padded,
-            plot=place.plot,
-            overwrite=place.overwrite,
-        )
+        def ready(path: CameraPath, scenes: Scenes) -> None:
+            for note in path.notes:
+                console.say(note)
+            keep_apart(ctx, {**besides, "indices_out": outputs.index_files(path.numbers, len(instances))})
+
         console.announce_compiling("traverse")
-        outputs.check()
-        scenes = read_scenes(
-            instances,
-            columns=TRAVERSED if outputs.plot is None else COLUMNS,
-            trees_only=True,
-            precision=lod.precision,
-            threads=general.threads,
-            progress=console.progress,
-        )
-        path = where.read(scenes.balls)
+        screen = outputs.table.on_stdout and is_terminal(sys.stdout)
+        view = View(instances, where.where(), where.settings(), lod.precision, general.threads, console.progress)
         try:
-            simulation = Simulation(
-                scenes, lod.settings(budget.of(scenes.leaves)), network.settings(), by_instance=place.per_instance
-            )
-        except ValueError as error:
+            with where.told():
+                written = traverse_files(
+                    view,
+                    budget,
+                    lod.settings(budget=1),
+                    network.settings(),
+                    outputs,
+                    by_instance=place.per_instance,
+                    ready=ready,
+                    passed=for_screen if screen and outputs.table.form != "parquet" else None,
+                    bar=not screen,  # a bar and a table do not go together on one screen
+                )
+        except UnfitError as error:
             raise click.UsageError(str(error)) from None
-        for note in path.notes:
-            console.say(note)
-        keep_apart(ctx, {**besides, "indices_out": outputs.index_files(path.numbers, len(instances))})
-        start = time.perf_counter()
-        screen = table.on_stdout and is_terminal(sys.stdout)
-        written = write_frames(
-            simulation,
-            path,
-            outputs,
-            threads=general.threads,
-            # A bar and a table do not go together on one screen.
-            **({} if screen else {"progress": console.progress}),
-            passed=for_screen if screen and table.form != "parquet" else None,
-        )
         console.clear()
-        console.detail(f"  {len(path.cameras):,} frames of {path.format}, {time.perf_counter() - start:.2f} s")
+        console.detail(f"  {len(written.rows):,} frames, {time.perf_counter() - start:.2f} s")
         if written.note:
             console.say(f"{outputs.plot}: {written.note}")
         if written.in_front < LEAST_IN_FRONT:

@@ -19,6 +19,6 @@ def test_the_figures_of_security_are_those_of_the_code() -> None:
         f"shorten texts to {printable.MOST} characters",
     ):
         assert said in text
-    assert (tree.MOST_LEVELS, frame.MAX_FRAMES) == (1000, 1 << 20)
+    assert (tree.MAX_DEPTHS, frame.MAX_FRAMES) == (1000, 1 << 20)
     assert "a thousand levels" in text
     assert "(a million at most)" in text

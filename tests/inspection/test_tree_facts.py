@@ -15,7 +15,7 @@ from sparklod_cli.inspection import tree as facts_of
 from sparklod_cli.inspection.findings import Finding
 from sparklod_cli.inspection.tree import TreeFacts, examine
 from sparklod_cli.lod import quick
-from sparklod_cli.lod.kernels.tree_links import find_parents, walk
+from sparklod_cli.lod.kernels.tree_links import find_depths, find_parents
 from sparklod_cli.model.gaussian import design_size, spark_size
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.splats import Splats
@@ -44,7 +44,7 @@ def codes(findings: list[Finding]) -> set[str]:
 def check_facts(splats: Splats, tree: LodTree, facts: TreeFacts) -> None:
     """All but the coarse cut, node by node."""
     size = spark_size(splats).astype(np.float64)
-    depth = tree_links.walk(tree.child_count, tree.child_start, size).depth
+    depth = tree_links.follow(tree.child_count, tree.child_start, size).depth
     counts = tree.child_count.tolist()
     leaves = sum(count == 0 for count in counts)
     assert (facts.leaves, facts.inner) == (leaves, len(counts) - leaves)
@@ -126,7 +126,7 @@ def test_the_coarse_cut_is_a_cut_whatever_the_sizes(most: int, seed: int, fallin
     if falling:
         size = np.sort(size)[::-1].copy()
     tree = tree_of(links)
-    _, limit = walk(tree.child_count, tree.child_start, size)
+    _, limit = find_depths(tree.child_count, tree.child_start, size)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(facts_of, "CHUNK_NODES", most)
         cut = set(facts_of._coarse_cut(tree, limit).tolist())
@@ -226,7 +226,7 @@ def test_good_trees_are_far_from_the_bounds() -> None:
         for node in np.flatnonzero(~tree.is_leaf):
             start = int(tree.child_start[node])
             worst = min(worst, float(size[node] / size[start : start + int(tree.child_count[node])].max()))
-        _, limit = walk(tree.child_count, tree.child_start, size)
+        _, limit = find_depths(tree.child_count, tree.child_start, size)
         parent, _ = find_parents(tree.child_count, tree.child_start)
         wanted = [np.median(part) for part in np.array_split(limit[parent[1:]], facts_of.PARTS)]
         rise = max(rise, float((wanted[1:] / np.minimum.accumulate(wanted)[:-1]).max()))

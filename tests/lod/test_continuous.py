@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sparklod_cli.lod.continuous import BlendedCut, ContinuousCuts, faded, find_threshold, shares
-from sparklod_cli.lod.foveation import pixel_scales
+from sparklod_cli.lod.kernels.pixel_scale import pixel_scales
 from sparklod_cli.lod.traversal import Forest, Traversal, TreeInstance, View
 from sparklod_cli.model.foveation import Cones
 from sparklod_cli.model.gaussian import lod_opacity
@@ -150,10 +150,11 @@ def log_scales(case: Case, view: View) -> np.ndarray:
     for instance in case.instances:
         nodes = case.trees[instance.tree]
         place = Traversal(Forest(case.trees), [instance])
-        record = place.cut(view, budget=1).views[0]
         inner = np.flatnonzero(nodes.tree.child_count)
-        values = [np.ascontiguousarray(column[inner]) for column in (*nodes.center.T, nodes.size)]
-        scales.append(pixel_scales(values, record))
+        found = np.empty(len(inner), np.float32)
+        first = place.forest.node_base[instance.tree]
+        pixel_scales(place.forest.nodes[first:], inner, place.cut(view, budget=1).views, 0, found)
+        scales.append(found)
     return np.log(np.concatenate(scales).astype(np.float64))
 
 
@@ -183,9 +184,10 @@ def test_pixel_scales_are_those_of_the_traversal(case: Case) -> None:
     traversal = case.traversal()
     views = traversal.cut(case.view, budget=len(case.instances)).views
     nodes = traversal.forest.nodes
-    for view in views:
+    for number, view in enumerate(views):
         some = nodes[view["node_base"] : view["node_base"] + 20]
-        found = pixel_scales([np.ascontiguousarray(some[name]) for name in ("x", "y", "z", "size")], view)
+        found = np.empty(len(some), np.float32)
+        pixel_scales(some, np.arange(len(some)), views, number, found)
         expected = [
             budgeted_cuts.number_of(budgeted_cuts.bits_of(budgeted_cuts.pixel_scale(node, view))) for node in some
         ]

@@ -48,11 +48,11 @@ def imported(path: Path) -> set[Path]:
 
 
 def test_the_cache_is_named_by_all_that_kernels_are_made_of() -> None:
-    made_of, new = set(), {*PACKAGE.glob("*/kernels/*.py"), PACKAGE / "jit.py"}
+    made_of, new = set(), {*PACKAGE.glob("*/kernels/*.py"), PACKAGE / "support/jit.py"}
     while new:
         made_of |= new
         new = set().union(*map(imported, new)) - made_of
-    assert {PACKAGE / "tree.py", PACKAGE / "gaussian.py"} < made_of
+    assert {PACKAGE / "model/lod_tree.py", PACKAGE / "model/gaussian.py"} < made_of
     assert made_of == {path for pattern in jit.SOURCES for path in PACKAGE.glob(pattern)}
 
 
@@ -61,7 +61,7 @@ def test_a_change_of_any_kernel_or_constant_is_a_new_cache(tmp_path: Path) -> No
     shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
     code = "from sparklod_cli.support import jit; print(jit.CACHE_FOLDER)"
     folders = []
-    for name in ("tree.py", "tree.py", "lod/kernels/merge.py"):
+    for name in ("model/lod_tree.py", "model/lod_tree.py", "lod/kernels/merge.py"):
         command = [sys.executable, "-c", code]
         folders.append(subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True).stdout)
         (copy / name).write_text((copy / name).read_text() + "# changed\n")
