@@ -22,7 +22,7 @@ from sparklod_cli.model.splats import Splats
 from sparklod_cli.render.backends import BACKENDS
 from sparklod_cli.render.rasterizer import Image
 from sparklod_cli.render.settings import RasterSettings
-from sparklod_cli.render.shading import ShadedSplats, show
+from sparklod_cli.render.shading import ShadedSplats, shade
 from sparklod_cli.support import jit
 from sparklod_cli.support.errors import SparklodError
 from sparklod_cli.support.parallel import processors
@@ -92,9 +92,9 @@ def measure(
     """
     draw, seconds, images = drawer(spec), [], []
     for camera in [cameras[0], *cameras]:
-        shown = show([(splats, np.eye(4))], camera)
+        shaded = shade([(splats, np.eye(4))], camera)
         start = time.perf_counter()
-        images.append(draw(shown, camera, RasterSettings()))
+        images.append(draw(shaded, camera, RasterSettings()))
         seconds.append(time.perf_counter() - start)
     images = images[1:]
     pairs = list(zip(images, references or images, strict=True))

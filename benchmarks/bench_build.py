@@ -16,11 +16,8 @@ from pathlib import Path
 import numpy as np
 from scenes import load, tiled, write_ply
 
-from sparklod_cli.codecs import spz
-from sparklod_cli.codecs.options import WriteOptions
-from sparklod_cli.lod.builders import BUILDERS, METHODS
-from sparklod_cli.model.scene import Scene
-from sparklod_cli.support import jit
+import sparklod_cli as sparklod
+from sparklod_cli.lod.builders import METHODS
 from sparklod_cli.support.parallel import processors
 
 HERE = Path(__file__).resolve().parent
@@ -53,16 +50,14 @@ def machine() -> str:
 
 def warm_build(path: Path, method: str, runs: int) -> list[float]:
     """Seconds of each run of the builder alone, decoded splats to final order, after one that is not counted."""
-    splats = load(path)
-    builder = BUILDERS[method].load()
-    jit.use_threads(processors())
+    scene = sparklod.Scene(load(path))
     # The first touch of a page is slow on a virtual machine, which may take free pages back; a process that has run for
     # a while has its pages, and those are the builder's own costs.
     np.zeros(1 << 30, np.float64)[::512] = 1
     seconds = []
     for run in range(runs + 1):
         start = time.perf_counter()
-        builder.build(splats)
+        sparklod.build_lod(scene, method=method)
         if run:
             seconds.append(time.perf_counter() - start)
     return seconds
@@ -88,8 +83,8 @@ def whole_command(path: Path, output: Path, method: str) -> dict[str, float]:
 
 def plain_bytes(path: Path, bits: int) -> int:
     """Size of the plain SPZ of the same splats, of the same version, level and fractional bits, in their own order."""
-    pieces = spz.encode(Scene(load(path)), WriteOptions(fractional_bits=bits), threads=processors())
-    return sum(map(len, pieces))
+    with tempfile.TemporaryDirectory() as folder:
+        return sparklod.write(Path(folder, "plain.spz"), sparklod.Scene(load(path)), fractional_bits=bits).bytes
 
 
 def spark(path: Path, runs: int) -> list[float]:

@@ -19,10 +19,7 @@ from typing import Any
 from bench_build import machine
 from scenes import load, tiled
 
-from sparklod_cli.codecs import ply, splat
-from sparklod_cli.io import read_scene, write_whole
-from sparklod_cli.model.scene import Scene
-from sparklod_cli.support.parallel import processors
+import sparklod_cli as sparklod
 
 HERE = Path(__file__).resolve().parent
 
@@ -35,15 +32,14 @@ HEADINGS = (
 MEASURED = """
 import re, sys
 from pathlib import Path
+import sparklod_cli as sparklod
 from sparklod_cli.codecs.formats import FORMATS
-from sparklod_cli.io import read_scene
-from sparklod_cli.support.parallel import processors
 def memory(what):
     return int(re.search(what + r":\\s+(\\d+)", Path("/proc/self/status").read_text())[1])
 for form in FORMATS:
     form.codec()
-threads, before = processors(), memory("VmRSS")
-scene = read_scene(Path(sys.argv[1]), threads=threads)
+read, before = sparklod.read, memory("VmRSS")
+scene = read(Path(sys.argv[1]))
 print(memory("VmHWM") - before)
 """
 
@@ -83,10 +79,10 @@ class SplatTransform:
 
 
 def our_seconds(path: Path) -> float:
-    """Of one run of `read_scene`, from the file to the columns of `Splats`."""
+    """Of one run of `read`, from the file to the columns of `Splats`."""
     gc.collect()
     start = time.perf_counter()
-    read_scene(path, threads=processors())
+    sparklod.read(path)
     return time.perf_counter() - start
 
 
@@ -101,15 +97,14 @@ def made(source: Path, millions: float, folder: Path, transform: SplatTransform)
 
     Without SH for SOG: on a processor splat-transform takes hours to cluster those of a million splats.
     """
-    scene = Scene(tiled(load(source), int(millions * 1e6)))
+    splats = tiled(load(source), int(millions * 1e6))
     stem = f"tiled-{millions:g}M"
     plain, bare = folder / f"{stem}.ply", folder / f"{stem}-sh0.ply"
-    for path, codec, degree in ((plain, ply, 3), (bare, ply, 0), (folder / f"{stem}.splat", splat, 0)):
-        part = dataclasses.replace(scene, splats=scene.splats.with_max_sh(degree))
-        write_whole(path, codec.encode(part), overwrite=True)
+    for path, degree in ((plain, 3), (bare, 0), (folder / f"{stem}.splat", 0)):
+        sparklod.write(path, sparklod.Scene(splats.with_max_sh(degree)), overwrite=True)
         if path != bare:
             yield path
-    del scene, part
+    del splats
     for name, origin, options in (
         (f"{stem}.compressed.ply", plain, {}),
         (f"{stem}-v3.spz", plain, {"spzVersion": 3}),
@@ -122,7 +117,7 @@ def made(source: Path, millions: float, folder: Path, transform: SplatTransform)
 
 def row(path: Path, transform: SplatTransform, runs: int) -> None:
     """Measures one file and prints its row."""
-    scene = read_scene(path, threads=processors())
+    scene = sparklod.read(path)
     splats, degree, form = len(scene.splats), scene.splats.sh_degree, scene.format
     decoded = sum(getattr(scene.splats, field.name).nbytes for field in dataclasses.fields(scene.splats))
     del scene

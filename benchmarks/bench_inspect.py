@@ -14,13 +14,8 @@ from typing import NamedTuple
 from bench_build import MEASURED, machine
 from scenes import load, tiled
 
-from sparklod_cli.codecs import spz
-from sparklod_cli.io import write_whole
-from sparklod_cli.lod import quick
-from sparklod_cli.model.scene import Scene
-from sparklod_cli.model.splats import Splats
-from sparklod_cli.support import jit
-from sparklod_cli.support.parallel import processors
+import sparklod_cli as sparklod
+from sparklod_cli import Scene, Splats
 
 #: What no way to look at a file can do without: inflating all of it, as the codec does, and keeping nothing.
 INFLATE = """
@@ -76,10 +71,10 @@ def run_of(way: str, path: Path) -> Run:
 def bake(source: Splats, nodes: int, path: Path) -> tuple[int, int]:
     """Writes the tree of a scene that is tiled to about so many nodes; its leaves and its nodes."""
     sample = nodes // 4  # how much a tree grows over its leaves hardly depends on their number
-    growth = len(quick.build(tiled(source.with_max_sh(0), sample))[1]) / sample
+    growth = len(sparklod.build_lod(Scene(tiled(source.with_max_sh(0), sample)))) / sample
     leaves = round(nodes / growth)
-    splats, tree = quick.build(tiled(source, leaves))
-    write_whole(path, spz.encode(Scene(splats, tree), threads=processors()), overwrite=True)
+    tree = sparklod.build_lod(Scene(tiled(source, leaves)))
+    sparklod.write(path, tree, overwrite=True)
     return leaves, len(tree)
 
 
@@ -118,7 +113,6 @@ def main() -> None:
     parser.add_argument("--sh", type=int, nargs="*", default=[0, 2], help="SH degrees, none above the scene's")
     parser.add_argument("--runs", type=int, default=5, help="runs of each, in turns; medians are printed")
     arguments = parser.parse_args()
-    jit.use_threads(processors())
     print(f"Machine: {machine()}. Medians of {arguments.runs} runs.\n")
     print("| " + " | ".join(HEADINGS) + " |")
     print("|---" * len(HEADINGS) + "|")

@@ -15,14 +15,14 @@ import numpy as np
 from bench_build import machine
 from scenes import load, tiled
 
+import sparklod_cli as sparklod
 from sparklod_cli.cameras.framing import framing
 from sparklod_cli.cameras.pose import look_at
 from sparklod_cli.codecs.gpu import lod_tree
-from sparklod_cli.codecs.gpu.lod_tree import Nodes
-from sparklod_cli.lod import quick
-from sparklod_cli.lod.traversal import Forest, Instance, Traversal, View
+from sparklod_cli.lod.traversal import Forest, Traversal, TreeInstance, View
+from sparklod_cli.model.nodes import Nodes
+from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
-from sparklod_cli.support import jit
 from sparklod_cli.support.parallel import ordered_map, processors
 
 HEADINGS = (
@@ -73,9 +73,9 @@ def flight(center: np.ndarray, radius: float, frames: int) -> list[View]:
 def tree_of(source: Splats, nodes: int) -> Nodes:
     """The nodes of a scene that is tiled to about so many, as Spark holds them."""
     sample = min(nodes // 4, 500_000)  # how much a tree grows over its leaves hardly depends on their number
-    growth = len(quick.build(tiled(source, sample))[1]) / sample
-    splats, tree = quick.build(tiled(source, round(nodes / growth)))
-    return lod_tree.unpack(lod_tree.pack(splats, tree, threads=processors()))
+    growth = len(sparklod.build_lod(Scene(tiled(source, sample)))) / sample
+    tree = sparklod.build_lod(Scene(tiled(source, round(nodes / growth))))
+    return lod_tree.unpack(sparklod.pack(tree, "lodtree"))
 
 
 def seconds_of(traversal: Traversal, views: list[View], budget: int, threads: int) -> float:
@@ -88,7 +88,7 @@ def seconds_of(traversal: Traversal, views: list[View], budget: int, threads: in
 
 def first(forest: Forest, view: View, budget: int) -> float:
     """Seconds of a cut for which there is none before it to go by; its buffers are there."""
-    traversal = Traversal(forest, [Instance()])
+    traversal = Traversal(forest, [TreeInstance()])
     traversal.cut(view, budget=budget)
     traversal.forget()
     start = time.perf_counter()
@@ -105,7 +105,7 @@ def rows(nodes: Nodes, spark: Spark, budgets: list[int], frames: int, runs: int,
     words_of(nodes).tofile(words)
     spark.ask(tree=str(words))
     words.unlink()
-    traversal = Traversal(forest, [Instance()])
+    traversal = Traversal(forest, [TreeInstance()])
     for budget in budgets:
         asked = [
             {"viewToObjectCols": view.camera_to_world.T.ravel().tolist(), "maxSplats": budget, "pixelScaleLimit": 0}
@@ -155,7 +155,6 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=24, help="of the path")
     parser.add_argument("--runs", type=int, default=5, help="runs of each, in turns; medians are printed")
     arguments = parser.parse_args()
-    jit.use_threads(processors())
     print(f"Machine: {machine()}. Medians of {arguments.runs} runs of {arguments.frames} frames.\n")
     print("| " + " | ".join(HEADINGS) + " |")
     print("|---" * len(HEADINGS) + "|")

@@ -8,9 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from sparklod_cli.io import read_scene
-from sparklod_cli.model.sh import SH_C0
-from sparklod_cli.model.splats import Splats
+import sparklod_cli as sparklod
+from sparklod_cli import Splats
+
+#: The first spherical harmonic, 1 / (2 * sqrt(pi)).
+SH_C0 = 0.28209479177387814
 
 
 def tiled(splats: Splats, count: int, seed: int = 0) -> Splats:
@@ -56,5 +58,5 @@ def write_ply(path: Path, splats: Splats) -> None:
 
 def load(path: Path) -> Splats:
     """The splats of a file that can be drawn."""
-    splats = read_scene(path, threads=2).splats
+    splats = sparklod.read(path).splats
     return splats.take((splats.opacity > 0) & (splats.scale.max(axis=1) > 0))

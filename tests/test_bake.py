@@ -23,7 +23,7 @@ from sparklod_cli.codecs.gpu.table import ENCODINGS
 from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.inspection import leaves, values
 from sparklod_cli.inspection.findings import ERROR, NOTE, Finding
-from sparklod_cli.inspection.report import Wanted, inspect
+from sparklod_cli.inspection.report import ReportSettings, inspect
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod.builders import METHODS
 from sparklod_cli.model.gaussian import normalized_quat
@@ -104,7 +104,7 @@ def write(path: Path, pieces: Iterable[bytes]) -> int:
 
 def reported(source: Path) -> None:
     """Makes everything that `inspect` can say of a file."""
-    report, scene = inspect(source, Wanted(values=True, all_quantities=True, check=True))
+    report, scene = inspect(source, ReportSettings(values=True, all_quantities=True, check=True))
     json.dumps(report.as_dict(), allow_nan=False)
     assert scene is not None
     for name in values.names_of(scene.splats):
@@ -113,7 +113,7 @@ def reported(source: Path) -> None:
 
 def checked(output: Path, source: Path) -> list[Finding]:
     """What `inspect --check --leaves-of` finds."""
-    report, scene = inspect(output, Wanted(check=True))
+    report, scene = inspect(output, ReportSettings(check=True))
     assert scene is not None
     return [*(report.findings or []), *leaves.check(scene, read_scene(source))]
 

@@ -22,6 +22,7 @@ EVERY = Expectations(
     lod=True,
     max_growth=1.5,
     values={"tree.depth": 2, "tree.growth": {"min": 1, "max": 1.5}, "format": "SPZ 3 LoD"},
+    asserts=("nodes<5M", 'format=="SPZ 3 LoD"'),
 )
 AS_TOML = """
 max_bytes = 1000
@@ -30,6 +31,7 @@ max_splats = 10
 sh = 0
 lod = true
 max_growth = 1.5
+assert = ["nodes<5M", 'format=="SPZ 3 LoD"']
 
 [values]
 "tree.depth" = 2
@@ -39,7 +41,8 @@ format = "SPZ 3 LoD"
 
 
 def test_every_key_is_read_from_json_and_toml(tmp_path: Path, tree: Report) -> None:
-    as_json = written(tmp_path, json.dumps(vars(EVERY)))
+    keys = {"assert" if name == "asserts" else name: value for name, value in vars(EVERY).items()}
+    as_json = written(tmp_path, json.dumps(keys))
     as_toml = written(tmp_path, AS_TOML, "expect.TOML")
     assert read(as_json) == read(as_toml) == EVERY
     assert check(tree, EVERY) == []
@@ -51,7 +54,7 @@ def test_tables_of_toml_lead_to_values_as_dots_do(tmp_path: Path, tree: Report) 
     path = written(tmp_path, "[values]\ntree.depth = 2\ntree.growth.max = 1.5\n", "expect.toml")
     assert check(tree, read(path)) == []
     path = written(tmp_path, "[values.tree]\ndepth = 3\n", "expect.toml")
-    assert [found.message for found in check(tree, read(path))] == ["tree.depth is 2, expected 3"]
+    assert [found.message for found in check(tree, read(path))] == ["tree.depth==3: tree.depth is 2"]
 
 
 @pytest.mark.parametrize(
@@ -77,6 +80,10 @@ def test_tables_of_toml_lead_to_values_as_dots_do(tmp_path: Path, tree: Report) 
         ('{"values": {"tree.depth": {"max": true}}}', "tree.depth"),
         ('{"values": {"tree.depth": {"max": NaN}}}', "tree.depth"),
         ('{"values": ["tree.depth"]}', "values cannot be"),
+        ('{"assert": "nodes<5"}', "assert cannot be 'nodes<5'"),
+        ('{"assert": [5]}', "assert cannot hold 5"),
+        ('{"assert": ["nodes<"]}', "'nodes<' is not an assertion like 'nodes<=5M'"),
+        ('{"assert": ["node<5"]}', "there is no 'node' in a report, did you mean nodes"),
         ("[]", "is not a table of expectations"),
         ("3", "is not a table of expectations"),
         ("", "is not what it is called"),

@@ -10,7 +10,7 @@ import pytest
 
 from sparklod_cli.cli import run
 from sparklod_cli.inspection.expectations import ExpectationError, Expectations, check, value_at
-from sparklod_cli.inspection.report import Report, Wanted, inspect
+from sparklod_cli.inspection.report import Report, ReportSettings, inspect
 from tests.conftest import FIXTURES
 from tests.inspection.expected import DEPTH, LEAVES, NODES, PLAIN, TREE, written
 
@@ -50,13 +50,13 @@ def test_all_that_falls_short_is_said(tree: Report) -> None:
     expected = {"max_bytes": 1, "max_splats": 1, "sh": 3, "lod": False, "max_growth": 1, "values": {"splats": 1}}
     found = check(tree, Expectations(**expected))
     assert [each.code.removeprefix("expect.") for each in found] == ["bytes", "splats", "sh", "lod", "growth", "value"]
-    assert found[1].message == "6 leaves, expected at most 1"
-    assert "growth 1.5, expected" in found[4].message
-    assert found[5].message == "splats is 9, expected 1"
+    assert found[1].message == "leaves<=1: leaves is 6"
+    assert found[4].message == "growth<=1: growth is 1.5"
+    assert found[5].message == "splats==1: splats is 9"
 
 
 def test_of_what_cannot_be_read_nothing_is_expected() -> None:
-    report, scene = inspect(FIXTURES / "points.ply", Wanted())
+    report, scene = inspect(FIXTURES / "points.ply", ReportSettings())
     assert scene is None
     assert codes(report, min_splats=1, lod=True, values={"splats": 3}) == []
 
@@ -88,8 +88,9 @@ def test_values_of_the_report(tree: Report, way: str, holds: Any, fails: Any) ->
     assert codes(tree, values={way: holds}) == []
     (found,) = check(tree, Expectations(values={way: fails}))
     assert found.code == "expect.value"
-    assert found.message.startswith(f"{way} is ")
-    assert found.message.endswith(json.dumps(fails))
+    ends = {"min": ">=", "max": "<="}
+    asked = [f"{ends[end]}{most}" for end, most in fails.items()] if isinstance(fails, dict) else []
+    assert found.message.startswith(tuple(f"{way}{each}: {way} is " for each in asked or [f"=={json.dumps(fails)}"]))
 
 
 def test_a_minimum_of_what_is_no_number_is_not_met(tree: Report) -> None:
@@ -157,7 +158,7 @@ def test_an_original_that_cannot_be_read_is_named(original: object, capsys: pyte
 def test_a_tree_can_be_required(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["inspect", str(TREE), "--require-lod"]) == 0
     assert run(["inspect", str(TREE), str(PLAIN), "--require-lod"]) == 3
-    assert capsys.readouterr().out == f"{PLAIN}: error: expect.lod: no tree, expected one\n"
+    assert capsys.readouterr().out == f"{PLAIN}: error: expect.lod: lod==true: lod is false\n"
 
 
 def test_options_win_over_the_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -181,7 +182,8 @@ def test_an_expectation_is_that_there_are_no_errors_either(capsys: pytest.Captur
 def test_values_are_there_for_who_expects_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = written(tmp_path, '{"values": {"values.quantities.sh1.max": {"max": 9}, "values.box.min.0": {"min": 99}}}')
     assert run(["inspect", str(PLAIN), "--expect", str(path)]) == 3
-    assert capsys.readouterr().out.startswith(f"{PLAIN}: error: expect.value: values.box.min.0 is -")
+    said = "values.box.min.0>=99: values.box.min.0 is -"
+    assert capsys.readouterr().out.startswith(f"{PLAIN}: error: expect.value: {said}")
 
 
 def test_a_way_that_one_file_has_not_does_not_stop_the_others(

@@ -13,7 +13,7 @@ import pytest
 from sparklod_cli.cli import run
 from sparklod_cli.codecs import ply, splat, spz
 from sparklod_cli.inspection import values
-from sparklod_cli.inspection.report import Wanted, inspect
+from sparklod_cli.inspection.report import ReportSettings, inspect
 from sparklod_cli.inspection.values import (
     MAIN,
     PERCENTILES,
@@ -260,10 +260,10 @@ def test_the_bounds_are_said_of_scenes_as_they_are_written(tmp_path: Path) -> No
     splats.scale[:10] = 1e-6
     path = tmp_path / "scene.spz"
     path.write_bytes(b"".join(spz.encode(Scene(splats))))
-    report, _ = inspect(path, Wanted(check=True))
+    report, _ = inspect(path, ReportSettings(check=True))
     assert [(found.code, found.count) for found in report.findings or []] == [("values.scale-clamped", 10)]
     path.write_bytes(b"".join(ply.encode(Scene(splats))))
-    assert inspect(path, Wanted(check=True))[0].findings == []
+    assert inspect(path, ReportSettings(check=True))[0].findings == []
 
 
 @pytest.mark.parametrize("count", [1, 2, 1000])
@@ -271,7 +271,7 @@ def test_values_of_files_are_those_of_what_was_written(count: int, tmp_path: Pat
     splats = random_splats(count, seed=count)
     path = tmp_path / "scene.splat"
     path.write_bytes(b"".join(splat.encode(Scene(splats))))
-    report, scene = inspect(path, Wanted(values=True, all_quantities=True))
+    report, scene = inspect(path, ReportSettings(values=True, all_quantities=True))
     assert report.values is not None
     assert scene is not None
     assert report.values == examine(scene.splats, all_quantities=True)

@@ -92,7 +92,7 @@ def test_wrong_usage_of_render_is_exit_code_2(
         ([PLAIN, "--color-by", "level"], "level", "no file is a Level-of-Detail tree"),
         ([TREE, "--camera-path", FAULTS / "no.json"], FAULTS / "no.json", "no such file"),
         (["--scene", FAULTS / "no.json"], FAULTS / "no.json", "no such file"),
-        ([TREE, "-o", "no/such/folder/out.png"], "no/such/folder", "does not exist"),
+        ([TREE, "-o", TREE / "out.png"], TREE, "is a file, not a folder"),
     ],
     ids=str,
 )

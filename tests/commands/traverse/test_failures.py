@@ -115,7 +115,7 @@ def test_traverse_never_writes_over_its_inputs(tmp_path: Path, capsys: Said) -> 
         ([TREE, "--camera-path", TREE], TREE, "no format that is known"),
         (["--scene", FAULTS / "no.json"], FAULTS / "no.json", "no such file"),
         (["--scene", CAMERAS / "inria.json"], CAMERAS / "inria.json", "has no list of instances"),
-        ([TREE, "-o", "no/such/folder/out.csv"], "no/such/folder", "does not exist"),
+        ([TREE, "-o", TREE / "out.csv"], TREE, "is a file, not a folder"),
         ([TREE, "-o", FIXTURES], FIXTURES, "is a directory"),
     ],
     ids=str,
