@@ -21,7 +21,7 @@ MIN_ALPHA = 0.5 / 255
 #: No splat is drawn farther from its centre, in pixels of the picture that is shown: Spark's `maxPixelRadius`.
 MAX_PIXEL_RADIUS = 512.0
 
-#: Splats whose centres are so many times farther out than the picture's edges are not drawn: Spark's `clipXY`.
+#: A splat is drawn only if its centre is within this multiple of the picture's half width and height: Spark's `clipXY`.
 CLIP = 1.4
 
 #: How opacity falls off from the centre of a splat that is more than opaque.

@@ -92,7 +92,7 @@ def draw(
 
 
 def on_screen(splats: ShadedSplats, camera: Camera, settings: RasterSettings) -> OnScreen:
-    """The splats between near and far whose centres are in the picture, or as far beside it as splats are drawn."""
+    """The splats between near and far whose centres are inside the picture, or within `CLIP` of it."""
     local = (splats.center - camera.position.astype(np.float32)) @ camera.camera_to_world[:3, :3].astype(np.float32)
     depth = -local[:, 2]
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
