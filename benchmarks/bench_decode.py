@@ -1,4 +1,4 @@
-"""Decoding, each format beside splat-transform's library in one run: `python benchmarks/bench_decode.py --help`."""
+"""Measures decoding of each format, against splat-transform in one run: `python benchmarks/bench_decode.py --help`."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ HEADINGS = (
     *("million splats/s", "ratio", "peak / decoded"),
 )
 
-#: Decodes a file and prints its peak memory in kB, as the kernel saw it, beyond that of the interpreter and the codecs.
+#: Decodes a file and prints its peak resident memory in kB, less that of the interpreter and the codecs before.
 MEASURED = """
 import re, sys
 from pathlib import Path
@@ -45,7 +45,7 @@ print(memory("VmHWM") - before)
 
 
 class SplatTransform:
-    """Its library in a Node process; None of it where FOREIGN_DIR does not say where it is."""
+    """splat-transform's library in a Node process; answers None if FOREIGN_DIR is not set."""
 
     def __init__(self) -> None:
         self._process: subprocess.Popen[str] | None = None
@@ -56,7 +56,7 @@ class SplatTransform:
             )
 
     def ask(self, **request: Any) -> dict[str, Any] | None:
-        """The answer to a request; None, and a word on stderr, where there is none."""
+        """Returns the answer to a request; None, with a message on stderr, if it failed."""
         if self._process is None:
             return None
         assert self._process.stdin and self._process.stdout
@@ -69,7 +69,7 @@ class SplatTransform:
         return dict(answer)
 
     def seconds(self, path: Path) -> float | None:
-        """Of one run of its reader."""
+        """Seconds of one run of its reader."""
         answer = self.ask(read=str(path))
         return None if answer is None else float(answer["seconds"])
 
@@ -79,7 +79,7 @@ class SplatTransform:
 
 
 def our_seconds(path: Path) -> float:
-    """Of one run of `read`, from the file to the columns of `Splats`."""
+    """Seconds of one run of `read`, from the file to the columns of `Splats`."""
     gc.collect()
     start = time.perf_counter()
     sparklod.read(path)
@@ -87,15 +87,15 @@ def our_seconds(path: Path) -> float:
 
 
 def peak(path: Path) -> int:
-    """Bytes that a process which decodes a file needs at most, beyond what it needs to begin with."""
+    """Peak memory of a process that decodes a file, in bytes, less what it has at its start."""
     result = subprocess.run([sys.executable, "-c", MEASURED, str(path)], capture_output=True, text=True, check=True)
     return int(result.stdout) * 1024
 
 
 def made(source: Path, millions: float, folder: Path, transform: SplatTransform) -> Iterator[Path]:
-    """A scene tiled to a size, in every format that sparklod or splat-transform writes.
+    """Tiles a scene to a size and yields a file of it in every format that sparklod or splat-transform writes.
 
-    Without SH for SOG: on a processor splat-transform takes hours to cluster those of a million splats.
+    SOG is written without SH: without a GPU, splat-transform takes hours to cluster those of a million splats.
     """
     splats = tiled(load(source), int(millions * 1e6))
     stem = f"tiled-{millions:g}M"
@@ -150,9 +150,9 @@ def row(path: Path, transform: SplatTransform, runs: int) -> None:
 def main() -> None:
     """Prints a Markdown table."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("scenes", nargs="+", type=Path, help="splat files; the last is also tiled, see --millions")
-    parser.add_argument("--millions", type=float, nargs="*", default=[], help="sizes to tile to, in every format")
-    parser.add_argument("--runs", type=int, default=5, help="runs of each, in turns; medians are printed")
+    parser.add_argument("scenes", nargs="+", type=Path, help="splat files; --millions tiles the last")
+    parser.add_argument("--millions", type=float, nargs="*", default=[], help="splats to tile to, in all formats")
+    parser.add_argument("--runs", type=int, default=5, help="number of runs, in turns; medians are printed")
     arguments = parser.parse_args()
     print(f"Machine: {machine()}. Medians of {arguments.runs} runs.\n")
     print("| " + " | ".join(HEADINGS) + " |")

@@ -63,7 +63,9 @@ def test_an_interruption_leaves_nothing_and_spoils_nothing(
 
 
 @pytest.mark.parametrize("named", [False, True])
-def test_the_file_is_not_there_before_it_is_whole(named: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_file_has_the_final_name_before_it_is_whole(
+    named: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     if named:
         monkeypatch.setattr(atomic, "UNNAMED", None)
     elif not has_unnamed_files(tmp_path):
@@ -181,7 +183,7 @@ def test_a_file_that_may_not_grow_leaves_nothing(tmp_path: Path) -> None:
     assert names(tmp_path) == []
 
 
-def test_where_a_file_cannot_be(tmp_path: Path) -> None:
+def test_a_path_that_cannot_be_a_file_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_bytes(b"")
     (tmp_path / "directory").mkdir()
     refused = {
@@ -264,7 +266,7 @@ def test_a_name_that_is_taken_meanwhile_is_not_replaced(tmp_path: Path) -> None:
     assert names(tmp_path) == ["out.spz"]
 
 
-def test_what_was_private_stays_private(tmp_path: Path) -> None:
+def test_a_replaced_file_keeps_its_permissions(tmp_path: Path) -> None:
     target = tmp_path / "out.spz"
     target.write_bytes(b"old")
     target.chmod(0o600)

@@ -153,7 +153,7 @@ def test_an_interrupted_traversal_leaves_no_half_table(
     assert "interrupted" in capsys.readouterr().err
 
 
-def test_a_polite_kill_leaves_nothing_behind(tmp_path: Path) -> None:
+def test_sigterm_leaves_nothing_behind(tmp_path: Path) -> None:
     """As Ctrl-C, which whoever runs tests in the background may have turned off."""
     settings = ("--orbit", "30000", "--budget", "50k", "--threads", "2", "-q", "-o", str(tmp_path / "out.csv"))
     command = [sys.executable, "-m", "sparklod_cli", "traverse", str(TOWN), *settings]
