@@ -139,7 +139,7 @@ def refused(error: SparklodError) -> bool:
 
 @given(scenes(), st.sampled_from(METHODS), st.sampled_from(SPZ_VERSIONS), BITS)
 @settings(max_examples=300, deadline=None)
-def test_what_is_written_passes_our_own_check(splats: Splats, method: str, version: int, bits: int | None) -> None:
+def test_baked_files_pass_inspect_check(splats: Splats, method: str, version: int, bits: int | None) -> None:
     with tempfile.TemporaryDirectory() as folder:
         how = BakeSettings(method=method, spz=WriteOptions(spz_version=version, fractional_bits=bits))
         try:
@@ -268,7 +268,7 @@ def test_bakes_of_random_scenes_pass_the_recipe_for_ci(count: int, seed: int, ex
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_a_line_without_width_is_not_what_a_node_stands_for(method: str, tmp_path: Path) -> None:
+def test_splats_without_width_pass_their_check(method: str, tmp_path: Path) -> None:
     """SPZ gives it a width, after the tree is built."""
     splats = random_splats(3)
     splats.scale[:] = [[8e-5, 1e-5, 1e-6], [3e-7, 7e-4, 1e-13], [1e-24, 1e-19, 11]]

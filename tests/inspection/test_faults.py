@@ -161,7 +161,7 @@ UNPLANTED = {"values.opacity", "values.rotation"}
 
 
 @pytest.mark.parametrize("name", FAULTS)
-def test_a_fault_is_found_by_its_code_and_nothing_else_is_cried(
+def test_each_fault_is_found_by_its_code_and_no_other(
     name: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(FOLDER)
@@ -176,7 +176,7 @@ def test_a_fault_is_found_by_its_code_and_nothing_else_is_cried(
 
 
 @pytest.mark.parametrize("name", PLACES)
-def test_it_is_said_where_the_fault_is(name: str) -> None:
+def test_a_finding_says_where_the_fault_is(name: str) -> None:
     found = checked(FOLDER / name).findings or []
     place = PLACES[name]
     if isinstance(place, int):

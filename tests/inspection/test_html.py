@@ -152,7 +152,7 @@ def test_a_page_suits_light_and_dark_and_loads_nothing() -> None:
 
 
 @pytest.mark.parametrize("name", ["<script>alert(1)</script>.spz", "a\"b'c&d.spz", "\udcff\x00\n.spz", "\u202egnp.spz"])
-def test_names_are_only_text(name: str) -> None:
+def test_names_on_the_page_are_escaped(name: str) -> None:
     finding = {"severity": "error", "code": name, "message": name, "index": None, "count": None}
     report = REPORT | {"file": name, "format": name, "notes": [name], "findings": [finding]}
     picture = Picture(b"png", f"{name}; {name}")
@@ -175,7 +175,7 @@ def test_names_are_only_text(name: str) -> None:
         {"file": "x.ply", "values": {"box": None, "box_98": None, "non_finite": 3, "quantities": {"x": {"p1": None}}}},
     ],
 )
-def test_what_is_missing_is_left_out(report: dict[str, Any]) -> None:
+def test_missing_figures_are_left_out(report: dict[str, Any]) -> None:
     said(Section(report))
 
 

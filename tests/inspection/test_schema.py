@@ -91,7 +91,7 @@ def broken(path: Path) -> Iterator[tuple[str, bytes]]:
 
 @pytest.mark.parametrize("wanted", WAYS.values(), ids=WAYS.keys())
 @pytest.mark.parametrize("path", FILES, ids=name_of)
-def test_reports_of_the_fixtures(path: Path, wanted: ReportSettings) -> None:
+def test_reports_of_the_fixtures_follow_the_schema(path: Path, wanted: ReportSettings) -> None:
     assert faults(report_of(path, wanted)) == []
 
 
@@ -107,7 +107,7 @@ def test_reports_of_trees_follow_the_schema(tmp_path: Path, sh_degree: int, want
 
 @pytest.mark.parametrize("wanted", WAYS.values(), ids=WAYS.keys())
 @pytest.mark.parametrize("path", SMALL, ids=name_of)
-def test_reports_of_broken_files(tmp_path: Path, path: Path, wanted: ReportSettings) -> None:
+def test_reports_of_broken_files_follow_the_schema(tmp_path: Path, path: Path, wanted: ReportSettings) -> None:
     for name, data in broken(path):
         file = tmp_path / f"broken{path.suffix}"
         file.write_bytes(data)
@@ -116,7 +116,7 @@ def test_reports_of_broken_files(tmp_path: Path, path: Path, wanted: ReportSetti
 
 @pytest.mark.parametrize("most", [1, 3, MAX_CHILDREN])
 @pytest.mark.parametrize("count", [1, 2, 5, 300])
-def test_reports_of_broken_trees(tmp_path: Path, count: int, most: int) -> None:
+def test_reports_of_broken_trees_follow_the_schema(tmp_path: Path, count: int, most: int) -> None:
     """Links that lead anywhere, and splats that are nowhere to be seen."""
     for seed in range(20):
         rng = np.random.default_rng(seed)
@@ -140,7 +140,7 @@ def test_reports_of_unreadable_files_follow_the_schema(tmp_path: Path, path: str
     assert report["findings"][0]["code"] == "file.unreadable"
 
 
-def test_the_command_prints_it(lod: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_reports_that_the_command_prints_follow_the_schema(lod: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """With findings of expectations, too; many files give JSON lines."""
     options = ["--json", "--stats", "--check", "--sh", "0", "--max-bytes", "1", "--max-growth", "1"]
     assert run(["inspect", str(lod), "missing.spz", str(FIXTURES / "sh2.ply"), *options]) == 3
@@ -223,12 +223,12 @@ def test_an_unknown_field_is_noticed(full: Report) -> None:
 @pytest.mark.parametrize(
     "field, value", [("code", "tree.ghost"), ("severity", "fatal"), ("index", -1), ("count", 0), ("message", None)]
 )
-def test_a_finding_that_there_cannot_be_is_noticed(full: Report, field: str, value: object) -> None:
+def test_an_unknown_code_of_a_finding_is_noticed(full: Report, field: str, value: object) -> None:
     full["findings"][0][field] = value
     assert faults(full)
 
 
-def test_what_was_not_read_has_no_numbers(full: Report) -> None:
+def test_reports_of_unread_files_have_no_figures(full: Report) -> None:
     assert faults(full | {"format": None})
     report = report_of(Path("missing.spz"), ReportSettings())
     assert faults(report | {"findings": []})
@@ -253,7 +253,7 @@ def schemas(schema: Any) -> Iterator[tuple[str, Any]]:
             yield from schemas(value)
 
 
-def test_the_schema_is_one_and_tells_of_everything() -> None:
+def test_the_schema_is_valid_and_describes_every_field() -> None:
     Draft202012Validator.check_schema(SCHEMA)
     found = list(schemas(SCHEMA))
     assert len(found) > 60
@@ -263,7 +263,7 @@ def test_the_schema_is_one_and_tells_of_everything() -> None:
     assert all(schema["description"] for schema in SCHEMA["$defs"].values())
 
 
-def test_the_schema_has_what_the_code_has() -> None:
+def test_the_schema_has_the_fields_of_the_code() -> None:
     assert SCHEMA["properties"]["schema_version"]["const"] == SCHEMA_VERSION
     finding = SCHEMA["$defs"]["finding"]["properties"]
     assert finding["code"]["enum"] == list(CODES)
@@ -274,7 +274,7 @@ def test_the_schema_has_what_the_code_has() -> None:
     assert list(SCHEMA["$defs"]["summary"]["properties"]) == ["min", *values.PERCENTILES, "max", "mean"]
 
 
-def test_header_fields_are_of_files_that_there_are() -> None:
+def test_every_header_field_occurs_in_a_fixture() -> None:
     seen: set[str] = set()
     for path in FILES:
         seen |= report_of(path, ReportSettings())["header"].keys()

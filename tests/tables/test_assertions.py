@@ -108,7 +108,7 @@ def test_bounds_may_have_units_and_shares(text: str, bound: float) -> None:
         ("budget_used_max<40", "budget_used", "max"),
     ],
 )
-def test_the_longest_name_wins(text: str, column: str, statistic: str) -> None:
+def test_the_longest_column_name_is_taken(text: str, column: str, statistic: str) -> None:
     assertion = parse(text, COLUMNS)
     assert (assertion.column.name, assertion.statistic) == (column, statistic)
 
@@ -138,7 +138,7 @@ def test_the_longest_name_wins(text: str, column: str, statistic: str) -> None:
         ("name_max==1", "name is a text"),
     ],
 )
-def test_what_is_not_understood(text: str, message: str) -> None:
+def test_wrong_assertions_are_refused_with_the_reason(text: str, message: str) -> None:
     with pytest.raises(BadAssertionError, match=message) as caught:
         parse(text, COLUMNS)
     assert "\n" not in str(caught.value)
@@ -185,7 +185,7 @@ def test_a_column_without_values_cannot_be_asserted(text: str, why: str) -> None
         asked(text, flight(5, bandwidth=False, timing=False))
 
 
-def test_the_churn_of_one_frame() -> None:
+def test_churn_cannot_be_asserted_of_one_frame() -> None:
     with pytest.raises(BadAssertionError, match="there is only one frame"):
         asked("churn<1", flight(1))
     assert asked("churn_count==0", flight(1)).held
