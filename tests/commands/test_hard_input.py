@@ -217,7 +217,7 @@ FILES: dict[str, tuple[bytes, str]] = {
     "point cloud": ((FIXTURES / "points.ply").read_bytes(), "a point cloud or mesh"),
     "mesh": (MESH, "a point cloud or mesh"),
     "tree": ((FIXTURES / "golden" / "tree-v3.spz").read_bytes(), "Level-of-Detail file already"),
-    "gzip of PLY": (gzip.compress(PLY), "gzip, but not of an SPZ file"),
+    "gzip of PLY": (gzip.compress(PLY), "gzip, but not of SPZ"),
     "list properties": (PLY.replace(b"property float nx", b"property list uchar float nx"), "list properties"),
     "negative count": (PLY.replace(b"vertex 20", b"vertex -20"), "bad PLY header"),
     "one property twice": (PLY.replace(b"float ny", b"float nx"), "bad PLY header"),
