@@ -49,44 +49,40 @@ class Job:
 JOBS = {
     "quick": Job(
         (
-            *("geometry.extremes", "geometry.fill_rows", "group.level_keys", "group.split_cells"),
-            *("merge.merge_groups", "final_order.fill_columns", "final_order.fill_leaves", "final_order.merge_colors"),
-            *("final_order.places_of_merged", "sort.cell_words", "sort.sort_pass"),
+            *("geometry.find_bounds", "geometry.gather_rows", "group.level_keys", "group.split_cells"),
+            *("merge.merge_groups", "final_order.fill_geometry", "final_order.fill_leaves", "final_order.merge_colors"),
+            *("final_order.final_indices", "sort.cell_words", "sort.sort_pass"),
         ),
         ("build-lod scene.ply -o quick.spz",),
     ),
     "traverse": Job(
-        ("cut.find_cut", "cut_statistics.exchange", "cut_statistics.measure"),
+        ("cut.find_cut", "cut_statistics.measure_cut", "cut_statistics.replace_drawn"),
         ("traverse tree.spz --orbit 2 -o frames.csv",),
     ),
     "inspect": Job(
         (
-            *("tree_links.find_cycles", "tree_links.find_parents", "tree_links.sizes_below", "tree_links.sum_levels"),
-            "tree_links.walk",
+            *("tree_links.find_cycles", "tree_links.find_depths", "tree_links.find_parents"),
+            *("tree_links.mean_child_sizes", "tree_links.sum_by_depth"),
         ),
         ("inspect tree.spz --check",),
     ),
     "quality": Job(
         (
-            *("geometry.extremes", "prune.drop_nodes", "prune.levels_of", "prune.place_nodes", "prune.value_nodes"),
-            *("final_order.fill_leaves", "final_order.merge_colors", "pair_cost.cheapest", "pair_cost.pair_up"),
-            *(
-                "sort.sort_pass",
-                "node_rows.curve_keys",
-                "node_rows.fill_merged",
-                "node_rows.fill_state",
-                "pair_merge.unite_pairs",
-            ),
+            *("geometry.find_bounds", "final_order.fill_leaves", "final_order.merge_colors", "sort.sort_pass"),
+            *("node_rows.fill_leaf_rows", "node_rows.fill_merged_splats", "node_rows.morton_keys"),
+            *("pair_cost.find_partners", "pair_cost.match_pairs", "pair_merge.merge_pairs", "prune.drop_nodes"),
+            *("prune.fill_usefulness_terms", "prune.lay_out_children", "prune.size_ranks"),
         ),
         ("build-lod scene.ply --method quality -o quality.spz",),
     ),
     "render": Job(
         (
-            *("bands.count_fragments", "bands.draw_discs", "cut.find_cut", "project.arrange"),
-            *("project.project", "raster.draw_tiles", "raster.sort_into_tiles"),
+            *("bands.count_fragments", "bands.draw_discs", "cut.find_cut", "pixel_scale.pixel_scales"),
+            *("project.gather_drawn", "project.project", "raster.draw_tiles", "raster.sort_into_tiles"),
         ),
         (
             "render tree.spz --size 64x64 -o cut.png",
+            "render tree.spz --size 64x64 --continuous -o continuous.png",
             "render scene.ply --size 64x64 --style billboards -o billboards.png",
             "render scene.ply --size 64x64 --color-by overdraw -o overdraw.png",
         ),

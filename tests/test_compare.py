@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import csv
 import dataclasses
 import io
 import json
 import math
-from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +18,7 @@ from sparklod_cli import bake
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.cameras.path import CameraPath
 from sparklod_cli.cameras.pose import look_at
-from sparklod_cli.commands import render_compare
-from sparklod_cli.commands.console import Console
+from sparklod_cli.cli import run as program
 from sparklod_cli.compare import Comparison
 from sparklod_cli.images.metrics import MOST_PSNR, on_background
 from sparklod_cli.lod.budget import parse_budgets
@@ -34,6 +33,7 @@ from sparklod_cli.tables.columns import Row
 from sparklod_cli.tables.comparison import COLUMNS, rows_by_budget, summarize
 from tests.conftest import FIXTURES
 
+TREE = FIXTURES / "traverse" / "town.spz"
 LOD = LodSettings(1, Cones(), pixel_scale_limit=0.0)
 RENDER = RenderSettings()
 
@@ -73,21 +73,7 @@ def column(table: list[Row], name: str) -> list[Any]:
     return [row[name] for row in table]
 
 
-def test_budgets_are_shares_or_counts() -> None:
-    some = parse_budgets("2%, 12.5 %,500k,1000,.5%")
-    assert [budget.text for budget in some] == ["2%", "12.5 %", "500k", "1000", ".5%"]
-    assert [budget.of(8000) for budget in some] == [160, 1000, 500_000, 1000, 40]
-    assert parse_budgets("0.001%")[0].of(10) == 1  # there is always something to draw
-    assert parse_budgets("29%")[0].share == Fraction(29, 100)  # and not 28.999 %
-
-
-@pytest.mark.parametrize("text", ["", ",", "0%", "0", "-5%", "5 percent", "1%5%", "nan%", "2.5", "5%,lots"])
-def test_what_is_no_budget(text: str) -> None:
-    with pytest.raises(ValueError, match=r"budget|neither|nothing"):
-        parse_budgets(text)
-
-
-def test_all_splats_are_full_detail(twice: Scenes) -> None:
+def test_a_budget_of_all_splats_is_full_detail(twice: Scenes) -> None:
     for row in rows(twice, "100%,150%,1M"):
         assert row["psnr_black"] == row["psnr_white"] == row["psnr"] == row["worst_tile_psnr"] == MOST_PSNR
         assert row["ssim_black"] == row["ssim_white"] == row["ssim"] == 1
@@ -95,7 +81,7 @@ def test_all_splats_are_full_detail(twice: Scenes) -> None:
         assert (row["psnr"], row["ssim"]) == (MOST_PSNR, 1)
 
 
-def test_more_splats_come_nearer_to_it(twice: Scenes) -> None:
+def test_larger_budgets_come_nearer_to_full_detail(twice: Scenes) -> None:
     table = rows(twice, "5%,15%,40%,80%")
     for name in ("psnr", "ssim"):
         means = [np.mean(column(group, name)) for group in rows_by_budget(table, 4)]
@@ -122,7 +108,7 @@ def test_rows_tell_what_was_drawn(twice: Scenes, width: float | None) -> None:
         assert row["worst_tile_x"] in (0, 64) and row["worst_tile_y"] in (0, 64)
 
 
-def test_the_same_for_any_number_of_threads(twice: Scenes) -> None:
+def test_threads_do_not_change_a_comparison(twice: Scenes) -> None:
     assert rows(twice, "10%,50%", threads=1) == rows(twice, "10%,50%", threads=3)
 
 
@@ -139,7 +125,7 @@ def test_a_pixel_limit_ends_cuts_early(twice: Scenes) -> None:
     assert row["psnr"] < 60  # type: ignore[operator]
 
 
-def test_a_budget_holds_the_roots(twice: Scenes) -> None:
+def test_a_budget_smaller_than_the_number_of_instances_is_refused(twice: Scenes) -> None:
     with pytest.raises(SparklodError, match="a budget of 1 is less than one splat for each of 2 instances"):
         Comparison(twice, LOD, parse_budgets("50%,1"), RENDER)
 
@@ -163,21 +149,16 @@ def test_summaries_are_by_budget(twice: Scenes) -> None:
         assert (each.worst_frame, each.worst_tile_x) == (worst["frame"], worst["worst_tile_x"])
 
 
-def run(
-    twice: Scenes, capsys: pytest.CaptureFixture[str], budgets: str = "10%,50%", **given: Any
-) -> tuple[int, str, str]:
-    settings = {"asserts": (), "plot": None, "overwrite": False, "output": None, "as_json": False} | given
-    wanted = render_compare.wanted_from(
-        settings, parse_budgets(budgets), output=settings["output"], as_json=settings["as_json"]
-    )
-    with Console(quiet=False, verbose=False) as console:
-        status = render_compare.run(console, twice, LodSettings(1, Cones()), path_of(2), RENDER, wanted, threads=1)
+def run(capsys: pytest.CaptureFixture[str], *arguments: object, budgets: str = "10%,50%") -> tuple[int, str, str]:
+    """Exit status and texts of a command that compares cuts of a small tree with full detail."""
+    cameras = ("--orbit", 2, "--distance", 6, "--size", "96x70")
+    status = program([*map(str, ("render", TREE, *cameras, "--compare", "--budget", budgets, *arguments))])
     said = capsys.readouterr()
     return status, said.out, said.err
 
 
-def test_the_table_goes_to_standard_output(twice: Scenes, capsys: pytest.CaptureFixture[str]) -> None:
-    status, out, err = run(twice, capsys)
+def test_the_table_of_a_comparison_goes_to_standard_output(capsys: pytest.CaptureFixture[str]) -> None:
+    status, out, err = run(capsys)
     lines = out.splitlines()
     assert status == 0
     assert lines[0] == ",".join(column.name for column in COLUMNS)
@@ -186,9 +167,10 @@ def test_the_table_goes_to_standard_output(twice: Scenes, capsys: pytest.Capture
     assert max(map(len, err.splitlines())) <= 100
 
 
-def test_json_is_the_summary(twice: Scenes, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_json_is_the_summary_of_a_comparison(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     target = tmp_path / "table.json"
-    status, out, _ = run(twice, capsys, as_json=True, output=target, asserts=("psnr_min>1", "50%: ssim_min > 2"))
+    asserts = ("--assert", "psnr_min>1", "--assert", "50%: ssim_min > 2")
+    status, out, _ = run(capsys, "--json", "-o", target, *asserts)
     summary = json.loads(out)
     assert status == 3
     assert [each["text"] for each in summary["budgets"]] == ["10%", "50%"]
@@ -196,14 +178,15 @@ def test_json_is_the_summary(twice: Scenes, capsys: pytest.CaptureFixture[str], 
     assert len(json.loads(target.read_text())["data"]) == 4
 
 
-def test_assertions_are_of_all_budgets_or_of_one(twice: Scenes, capsys: pytest.CaptureFixture[str]) -> None:
-    table = rows(twice, "10%,50%", count=2)
-    coarse, fine = (min(column(group, "psnr")) for group in rows_by_budget(table, 2))
+def test_assertions_are_of_all_budgets_or_of_one(capsys: pytest.CaptureFixture[str]) -> None:
+    table = list(csv.DictReader(io.StringIO(run(capsys)[1])))
+    coarse, fine = (min(float(row["psnr"]) for row in table[at::2]) for at in (0, 1))
     between = (coarse + fine) / 2
-    assert run(twice, capsys, asserts=(f"50%:psnr_min>{between}",))[0] == 0
-    status, _, err = run(twice, capsys, asserts=(f"psnr_min>{between}",))
+    assert run(capsys, "--assert", f"50%:psnr_min>{between}")[0] == 0
+    status, _, err = run(capsys, "--assert", f"psnr_min>{between}")
     assert status == 3
-    assert "psnr_min is" in err and f"at a budget of {table[0]['budget']}" in err
+    assert "psnr_min is" in err
+    assert f"at a budget of {int(table[0]['budget']):,}" in err
 
 
 @pytest.mark.parametrize(
@@ -214,23 +197,20 @@ def test_assertions_are_of_all_budgets_or_of_one(twice: Scenes, capsys: pytest.C
         ("churn<1", "no column 'churn'"),
     ],
 )
-def test_assertions_about_what_is_not_there(
-    twice: Scenes, capsys: pytest.CaptureFixture[str], text: str, message: str
+def test_assertions_about_missing_columns_or_budgets_are_refused(
+    capsys: pytest.CaptureFixture[str], text: str, message: str
 ) -> None:
-    import click
+    status, out, err = run(capsys, "--assert", text)
+    assert (status, out) == (2, "")
+    assert message in err
 
-    with pytest.raises(click.UsageError, match=message):
-        run(twice, capsys, asserts=(text,))
 
-
-def test_a_chart_of_a_comparison_is_a_picture(
-    twice: Scenes, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_a_chart_of_a_comparison_is_a_picture(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     pytest.importorskip("matplotlib", reason="charts need the extra `render`")
     target = tmp_path / "plot.png"
-    assert run(twice, capsys, "5%,20%,500k", plot=target)[0] == 0
+    assert run(capsys, "--plot", target, budgets="5%,20%,500k")[0] == 0
     image = Image.open(io.BytesIO(target.read_bytes()))
     assert image.size[0] == 1600
     assert len(set(np.asarray(image.convert("RGB")).reshape(-1, 3)[::7].sum(axis=1).tolist())) > 20
-    run(twice, capsys, "5%,20%,500k", plot=target, overwrite=True)
+    run(capsys, "--plot", target, "-f", budgets="5%,20%,500k")
     assert image.tobytes() == Image.open(target).tobytes()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..model.gaussian import rotation_matrix
 from .axes import Axes
 from .camera import Matrix
 
@@ -117,10 +118,4 @@ def rotation_of(quat_wxyz: ArrayLike) -> Matrix:
     w, x, y, z = unit = normalized(quat_wxyz)
     if not np.isfinite(unit).all():
         raise ValueError("has a quaternion of length 0")
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    return np.array(rotation_matrix(x, y, z, w)).reshape(3, 3)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import time
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -16,14 +18,14 @@ from .command import COMMON, Command
 from .options import appearance, cameras, comparison, cut, inputs, pictures
 from .options.common import General, common_options
 from .paths import claim_stdout, keep_apart
-from .usage import exclude, given, is_given, options_of
+from .usage import exclude, given, options_of
 
 if TYPE_CHECKING:
+    from ..api.jobs import View
     from ..cameras.path import CameraPath
     from ..images.output import Output
+    from ..images.sequence import PictureSettings
     from ..model.instances import Instance
-    from ..render.settings import RenderSettings
-    from ..scenes.finder import CutFinder
     from ..scenes.loaded import Scenes
     from .console import Console
 
@@ -118,147 +120,131 @@ def render(ctx: click.Context, /, **_: Any) -> None:
 def _draw(ctx: click.Context, asked: Asked) -> None:
     """Draws pictures."""
     start = time.perf_counter()
-    budget = asked.cut.one_budget()
+    look, general = asked.appearance, asked.general
+    budget = None if asked.cut.full else asked.cut.one_budget()
     instances = asked.inputs.instances()
-    _place(ctx, asked, instances, asked.cameras.least())  # before much is read, what is wrong with the output already
-    with asked.general.console() as console:
-        from ..images.sequence import PictureSettings, write_pictures
-        from ..scenes.finder import CutFinder
+    _output(ctx, asked, instances, asked.cameras.least())  # before much is read, what is wrong with the output already
+    with general.console() as console:
+        from ..api.jobs import draw_files
         from .render_text import report
 
         console.announce_compiling("render")
 
-        @functools.cache
-        def scenes() -> Scenes:
-            return read(asked, instances, console, through=asked.appearance.through)
+        def place(path: CameraPath) -> tuple[Output, PictureSettings]:
+            return _place(ctx, asked, instances, path)
 
-        path, settings = seen(ctx, asked, scenes)
-        output = _place(ctx, asked, instances, len(path.cameras))
-        background = _check_output(ctx, asked, instances, path, output)
-        notes = [*path.notes, *scenes().notes]
-        unused = given(ctx, cut.CUTS)
-        if unused and not scenes().trees:
-            notes.append(f"no file is a Level-of-Detail tree, so all splats are drawn, whatever {' and '.join(unused)}")
-        for note in notes:
-            console.say(note)
-        console.detail(f"  read in {time.perf_counter() - start:.2f} s")
+        def ready(path: CameraPath, scenes: Scenes) -> None:
+            notes = [*path.notes, *scenes.notes, *_upside_down(asked, scenes)]
+            unused = given(ctx, cut.CUTS)
+            if unused and not scenes.trees:
+                whatever = " and ".join(unused)
+                notes.append(f"no file is a Level-of-Detail tree, so all splats are drawn, whatever {whatever}")
+            for note in notes:
+                console.say(note)
+            console.detail(f"  read in {time.perf_counter() - start:.2f} s")
 
-        def finder(of: Scenes) -> CutFinder:
-            lod = None if asked.cut.full else asked.cut.settings(budget.of(of.leaves))
-            try:
-                return CutFinder(of, lod)
-            except ValueError as error:
-                raise click.UsageError(str(error)) from None
-
-        written = write_pictures(
-            finder(scenes()),
-            path,
-            output,
-            settings,
-            PictureSettings(
-                background=background,
-                bar=not asked.appearance.no_bar,
-                gain=asked.comparison.gain,
-                jpeg_quality=asked.pictures.jpeg_quality,
-                jobs=asked.pictures.jobs,
-                threads=asked.general.threads,
-            ),
-            reference=None if asked.comparison.diff is None else finder(_reference(asked, console)),
-            overwrite=asked.pictures.overwrite,
-            progress=console.progress,
-        )
+        with told(asked):
+            drawn = draw_files(
+                view(asked, instances, console),
+                budget,
+                asked.cut.settings(budget=1),
+                look.settings(),
+                place,
+                fitted=fitted(ctx),
+                through=look.through,
+                reference=asked.comparison.diff,
+                overwrite=asked.pictures.overwrite,
+                ready=ready,
+            )
         console.clear()
-        report(console, written, output, path, settings, time.perf_counter() - start, as_json=asked.general.as_json)
+        report(console, drawn, time.perf_counter() - start, as_json=general.as_json)
 
 
-def _reference(asked: Asked, console: Console) -> Scenes:
-    """The file that --diff names, as it is."""
-    from ..model.instances import instances_of
+def view(asked: Asked, instances: list[Instance], console: Console) -> View:
+    """The files and the cameras that look at them."""
+    from ..api.jobs import View
 
-    assert asked.comparison.diff is not None
-    return read(asked, instances_of([asked.comparison.diff]), console)
-
-
-def read(
-    asked: Asked,
-    instances: list[Instance],
-    console: Console,
-    *,
-    through: str | None = None,
-    trees_only: bool = False,
-) -> Scenes:
-    """Reads the files of instances.
-
-    Args:
-        asked: on the command line.
-        instances: of them.
-        console: shows how much is read.
-        through: what splats are rounded by.
-        trees_only: refuse files without trees.
-    """
-    from ..scenes.reading import read_scenes
-
-    return read_scenes(
+    return View(
         instances,
-        trees_only=trees_only,
-        through=through,
-        precision=asked.cut.precision,
-        threads=asked.general.threads,
-        progress=console.progress,
+        asked.cameras.where(),
+        asked.cameras.settings(),
+        asked.cut.precision,
+        asked.general.threads,
+        console.progress,
     )
 
 
-def seen(ctx: click.Context, asked: Asked, scenes: Callable[[], Scenes]) -> tuple[CameraPath, RenderSettings]:
-    """The cameras, and how pictures are drawn.
+def fitted(ctx: click.Context) -> bool:
+    """Whether near and far may be moved apart, so that nothing of a scene is left out that cameras are chosen for."""
+    return not given(ctx, ["near", "far"])
 
-    Near and far have the whole scene between them where the cameras are chosen for it.
 
-    Args:
-        ctx: of the command.
-        asked: on its command line.
-        scenes: gives what is looked at; called only where cameras are chosen for it.
+@contextlib.contextmanager
+def told(asked: Asked) -> Iterator[None]:
+    """Errors about what was asked for are errors of usage."""
+    from ..api.jobs import UnfitError
+
+    try:
+        with asked.cameras.told():
+            yield
+    except UnfitError as error:
+        raise click.UsageError(str(error)) from None
+
+
+def _upside_down(asked: Asked, scenes: Scenes) -> list[str]:
+    """Notes on files whose y is up by their format, for cameras that take it to be down.
+
+    No other up is taken for them: SPZ files converted from trained PLY often keep its axes, and so do our own.
     """
-    from ..cameras.framing import reach
+    if asked.cameras.up is not None or asked.cameras.camera_path is not None:
+        return []
+    plain = (loaded for loaded in scenes.loaded if loaded.scene.format.startswith("SPZ") and not loaded.is_tree)
+    return [
+        f"{loaded.name}: y is up in SPZ by its specification, and down in scenes as training leaves them; give"
+        " --up 0,1,0 if this one stands on its head"
+        for loaded in plain
+    ]
 
-    settings = asked.appearance.settings(max_sh=asked.comparison.max_sh)
-    balls = functools.cache(lambda: scenes().balls())
-    path = asked.cameras.read(balls)
-    if not asked.cameras.where().fits_scene or is_given(ctx, "near") or is_given(ctx, "far"):
-        return path, settings
-    near, far = reach(settings.raster.near, settings.raster.far, path.cameras, balls())
-    return path, dataclasses.replace(settings, raster=dataclasses.replace(settings.raster, near=near, far=far))
 
-
-def _place(ctx: click.Context, asked: Asked, instances: list[Instance], cameras: int) -> Output:
+def _output(ctx: click.Context, asked: Asked, instances: list[Instance], cameras: int) -> Output:
     """Where the pictures of some cameras go."""
     scene = asked.inputs.scene or instances[0].file
     assert scene is not None
     return asked.pictures.place(ctx, scene, cameras, sheet=asked.pictures.sheet or len(asked.cameras.views) > 1)
 
 
-def _check_output(ctx: click.Context, asked: Asked, instances: list[Instance], path: CameraPath, output: Output) -> Any:
-    """The background of pictures that can be written.
+def _place(
+    ctx: click.Context, asked: Asked, instances: list[Instance], path: CameraPath
+) -> tuple[Output, PictureSettings]:
+    """Where the pictures of a path go, and how they become files.
 
     Raises:
         click.UsageError: they do not fit into the output, or it would replace an input.
         SparklodError: a file cannot be written, before work goes into it.
     """
     from ..images import animation
-    from ..images.sequence import frame_rate
+    from ..images.sequence import PictureSettings, frame_rate
 
-    look = asked.appearance
+    look, output = asked.appearance, _output(ctx, asked, instances, len(path.cameras))
     if output.form == "npy":
         exclude(ctx, look.of_pictures(), "a .npy, which holds numbers")
-    background = look.behind(ctx, output.form)
-    bar = (look.color_by is not None or asked.comparison.diff is not None) and not look.no_bar
+    settings = PictureSettings(
+        background=look.behind(ctx, output.form),
+        bar=not look.no_bar,
+        gain=asked.comparison.gain,
+        jpeg_quality=asked.pictures.jpeg_quality,
+        jobs=asked.pictures.jobs,
+        threads=asked.general.threads,
+    )
+    bar = (look.color_by is not None or asked.comparison.diff is not None) and settings.bar
     pictures.check_sizes(output, path.cameras, look.supersample, bar=bar)
     keep_apart(ctx, {**read_besides(asked, instances), "output": output.paths(path.numbers)})
     output.check(path.numbers, overwrite=asked.pictures.overwrite)
     if output.kind == "animation":
         animation.check(output.form, frame_rate(path))
-    return background
+    return output, settings
 
 
-def read_besides(asked: Asked, instances: list[Instance]) -> dict[str, Any]:
+def read_besides(asked: Asked, instances: list[Instance]) -> dict[str, list[Path]]:
     """For `keep_apart`, the files that are read without being parameters themselves."""
     return {"scene": asked.inputs.read(instances), "world_transform": asked.cameras.files()}

@@ -6,7 +6,7 @@ import dataclasses
 import json
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING
 
 import click
@@ -17,12 +17,10 @@ from .options.common import table_form
 from .paths import keep_apart
 
 if TYPE_CHECKING:
+    from ..api.jobs import Compared
     from ..cameras.path import CameraPath
-    from ..compare import Comparison
-    from ..lod.budget import Budget
     from ..lod.settings import LodSettings
-    from ..tables.assertions import Assertion
-    from ..tables.columns import Row
+    from ..scenes.loaded import Scenes
     from ..tables.comparison import BudgetSummary
     from ..tables.output import TableOutput
     from .render import Asked
@@ -34,33 +32,39 @@ def compare(ctx: click.Context, asked: Asked) -> int:
     asserts = asked.comparison.assertions(budgets)
     table = _table(asked)
     instances = asked.inputs.instances()
-    from ..compare import Comparison, write_charts
-    from .render import read, read_besides, seen
+    from ..api.jobs import compare_files
+    from .render import fitted, read_besides, told, view
 
     keep_apart(ctx, read_besides(asked, instances))
     with asked.general.console() as console:
         console.announce_compiling("render")
-        scenes = read(asked, instances, console, trees_only=True)
-        path, settings = seen(ctx, asked, lambda: scenes)
-        for note in path.notes:
-            console.say(note)
-        table.check()
-        plot = asked.comparison.plot
-        if plot is not None:
-            from ..figures.charts import load_matplotlib
-            from ..io import check_writable
-
-            check_writable(plot, overwrite=asked.pictures.overwrite)
-            load_matplotlib()
         start = time.perf_counter()
-        comparison = Comparison(scenes, _limited(asked), budgets, settings)
-        rows = list(comparison.run(path, threads=asked.general.threads, progress=console.progress))
-        console.clear()  # a bar and a table do not go together on one screen
-        table.write(rows, passed=for_screen if is_terminal(sys.stdout) and table.form != "parquet" else None)
-        console.detail(f"  {len(rows):,} pictures, {time.perf_counter() - start:.2f} s")
-        if plot is not None:
-            write_charts(plot, rows, budgets, scenes.title, overwrite=asked.pictures.overwrite)
-        return _report(console, asked, comparison, path, budgets, asserts, rows)
+
+        def ready(path: CameraPath, scenes: Scenes) -> None:
+            for note in path.notes:
+                console.say(note)
+
+        def passed(pieces: Iterable[bytes]) -> Iterable[bytes]:
+            console.clear()  # a bar and a table do not go together on one screen
+            return for_screen(pieces) if is_terminal(sys.stdout) and table.form != "parquet" else pieces
+
+        with told(asked):
+            compared = compare_files(
+                view(asked, instances, console),
+                budgets,
+                _limited(asked),
+                asked.appearance.settings(max_sh=asked.comparison.max_sh),
+                table,
+                fitted=fitted(ctx),
+                asserts=asserts,
+                plot=asked.comparison.plot,
+                overwrite=asked.pictures.overwrite,
+                ready=ready,
+                passed=passed,
+            )
+        console.clear()
+        console.detail(f"  {compared.pictures:,} pictures, {time.perf_counter() - start:.2f} s")
+        return _report(console, asked, compared, [at for at, _ in asserts])
 
 
 def _table(asked: Asked) -> TableOutput:
@@ -69,13 +73,18 @@ def _table(asked: Asked) -> TableOutput:
     from ..tables.output import TableOutput
 
     output = asked.pictures.output
-    nowhere = output is None and (asked.general.as_json or is_terminal(sys.stdout))
+    nowhere = _on_screen(asked) or (output is None and asked.general.as_json)
     return TableOutput(
         path=None if output == DASH else output,
         form=None if nowhere else table_form("--output", output),
         columns=COLUMNS,
         overwrite=asked.pictures.overwrite,
     )
+
+
+def _on_screen(asked: Asked) -> bool:
+    """Whether the summary takes the place of a table that would scroll by on a terminal, and nobody asked for."""
+    return asked.pictures.output is None and not asked.general.as_json and is_terminal(sys.stdout)
 
 
 def _limited(asked: Asked) -> LodSettings:
@@ -86,31 +95,29 @@ def _limited(asked: Asked) -> LodSettings:
     return settings
 
 
-def _report(
-    console: Console,
-    asked: Asked,
-    comparison: Comparison,
-    path: CameraPath,
-    budgets: Sequence[Budget],
-    asserts: Sequence[tuple[int | None, Assertion]],
-    rows: Sequence[Row],
-) -> int:
-    from ..tables.assertions import check
-    from ..tables.comparison import rows_by_budget, summarize
+def _report(console: Console, asked: Asked, compared: Compared, about: Sequence[int | None]) -> int:
+    """Says what the comparison comes to; the exit status.
 
-    groups = rows_by_budget(rows, len(budgets))
-    outcomes = [
-        outcome for at, assertion in asserts for outcome in check([assertion], rows if at is None else groups[at])
-    ]
-    summary = summarize(rows, [budget.text for budget in budgets])
+    Args:
+        console: says it.
+        asked: on the command line.
+        compared: what was found.
+        about: of each assertion, the place of the budget that it is about; None for all of them.
+    """
+    summary, outcomes = compared.summary, compared.outcomes
     if asked.general.as_json:
         held = [{"assert": each.assertion.text, "held": each.held, "value": each.value} for each in outcomes]
         figures = [each.as_dict() for each in summary]
-        whole = {"frames": len(path.cameras), "leaves": comparison.leaves, "budgets": figures, "asserts": held}
+        frames = len(compared.path.cameras)
+        whole = {"frames": frames, "leaves": compared.leaves, "budgets": figures, "asserts": held}
         click.echo(json.dumps(whole, allow_nan=False))
-    for line in lines(summary, path, comparison.leaves):
-        console.say(line)
-    for (at, _), outcome in zip(asserts, outcomes, strict=True):
+    told = lines(summary, compared.path, compared.leaves)
+    if _on_screen(asked):
+        click.echo("\n".join(told))
+    else:
+        for line in told:
+            console.say(line)
+    for at, outcome in zip(about, outcomes, strict=True):
         of = f", at a budget of {outcome.worst['budget']:,}" if at is None and outcome.worst is not None else ""
         if outcome.held:
             console.detail(f"  holds: {outcome.message()}{of}")

@@ -10,33 +10,20 @@ import click
 from .console import Console, count_of, size_of
 
 if TYPE_CHECKING:
-    from ..cameras.path import CameraPath
-    from ..images.output import Output
+    from ..api.jobs import Drawn
     from ..images.sequence import Pictures
-    from ..render.settings import RenderSettings
 
 
-def report(
-    console: Console,
-    written: Pictures,
-    output: Output,
-    path: CameraPath,
-    settings: RenderSettings,
-    seconds: float,
-    *,
-    as_json: bool,
-) -> None:
+def report(console: Console, drawn: Drawn, seconds: float, *, as_json: bool) -> None:
     """A line, or one JSON object as well, and a warning where nothing is to be seen.
 
     Args:
         console: says it.
-        written: what was drawn.
-        output: where it went.
-        path: the cameras.
-        settings: how it was drawn.
+        drawn: what was drawn.
         seconds: of the whole command.
         as_json: print an object on standard output.
     """
+    written, output, settings = drawn.pictures, drawn.output, drawn.render
     if written.empty:
         console.say(
             "warning: nothing is in view; cameras and scene may not share their axes (--camera-axes,"
@@ -55,7 +42,7 @@ def report(
     name = "standard output" if output.name is None else output.name
     console.say(f"{name}  {_told(written)}, {seconds:.2f} s")
     console.detail(
-        f"  {path.format}, {size_of(written.bytes)} of {output.form}; {settings.style} by {settings.backend},"
+        f"  {drawn.path.format}, {size_of(written.bytes)} of {output.form}; {settings.style} by {settings.backend},"
         f" from {settings.raster.near:g} to {settings.raster.far:g} units away"
     )
 

@@ -19,8 +19,9 @@ from .paths import claim_stdout, keep_apart
 from .usage import options_of
 
 if TYPE_CHECKING:
-    from ..simulation.outputs import WrittenFrames
-    from ..tables.assertions import Assertion
+    from ..api.jobs import Traversed
+    from ..cameras.path import CameraPath
+    from ..scenes.loaded import Scenes
 
 #: Below this share of splats in front of the cameras, path and scene probably do not share their axes.
 LEAST_IN_FRONT = 0.05
@@ -58,13 +59,12 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
 
     Coordinates are those of the files; --up, --world-transform and --camera-axes bring cameras into them.
     """
-    place, general = options_of(ctx, tables.Table), options_of(ctx, General)
-    where, lod, network = (
-        options_of(ctx, cameras.Cameras),
-        options_of(ctx, cut.Cut),
+    files, where, lod = options_of(ctx, inputs.Inputs), options_of(ctx, cameras.Cameras), options_of(ctx, cut.Cut)
+    network, place, general = (
         options_of(ctx, streaming.Streaming),
+        options_of(ctx, tables.Table),
+        options_of(ctx, General),
     )
-    files = options_of(ctx, inputs.Inputs)
     for group in (where, lod, network):
         group.check(ctx)
     place.check(ctx, as_json=general.as_json)
@@ -73,54 +73,39 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
     instances = files.instances()
     besides = {"scene": files.read(instances), "world_transform": where.files()}
     keep_apart(ctx, besides)
-    table = place.table(ctx, as_json=general.as_json)
+    outputs = place.outputs(ctx, as_json=general.as_json)
     asserts = place.assertions()
+    start = time.perf_counter()
     with general.console() as console:
-        from ..model.splats import COLUMNS
-        from ..scenes.reading import TRAVERSED, read_scenes
-        from ..simulation.frames import Simulation
-        from ..simulation.outputs import FrameOutputs, write_frames
+        from ..api.jobs import UnfitError, View, traverse_files
 
-        outputs = FrameOutputs(
-            table=table,
-            indices=place.indices_out,
-            padded=place.padded,
-            plot=place.plot,
-            overwrite=place.overwrite,
-        )
+        def ready(path: CameraPath, scenes: Scenes) -> None:
+            for note in path.notes:
+                console.say(note)
+            keep_apart(ctx, {**besides, "indices_out": outputs.index_files(path.numbers, len(instances))})
+
         console.announce_compiling("traverse")
-        outputs.check()
-        scenes = read_scenes(
-            instances,
-            columns=TRAVERSED if outputs.plot is None else COLUMNS,
-            trees_only=True,
-            precision=lod.precision,
-            threads=general.threads,
-            progress=console.progress,
-        )
-        path = where.read(scenes.balls)
+        screen = outputs.table.on_stdout and is_terminal(sys.stdout)
+        view = View(instances, where.where(), where.settings(), lod.precision, general.threads, console.progress)
         try:
-            simulation = Simulation(
-                scenes, lod.settings(budget.of(scenes.leaves)), network.settings(), by_instance=place.per_instance
-            )
-        except ValueError as error:
+            with where.told():
+                traversed = traverse_files(
+                    view,
+                    budget,
+                    lod.settings(budget=1),
+                    network.settings(),
+                    outputs,
+                    by_instance=place.per_instance,
+                    asserts=asserts,
+                    ready=ready,
+                    passed=for_screen if screen and outputs.table.form != "parquet" else None,
+                    bar=not screen,  # a bar and a table do not go together on one screen
+                )
+        except UnfitError as error:
             raise click.UsageError(str(error)) from None
-        for note in path.notes:
-            console.say(note)
-        keep_apart(ctx, {**besides, "indices_out": outputs.index_files(path.numbers, len(instances))})
-        start = time.perf_counter()
-        screen = table.on_stdout and is_terminal(sys.stdout)
-        written = write_frames(
-            simulation,
-            path,
-            outputs,
-            threads=general.threads,
-            # A bar and a table do not go together on one screen.
-            **({} if screen else {"progress": console.progress}),
-            passed=for_screen if screen and table.form != "parquet" else None,
-        )
+        written, cameras_read = traversed.frames, len(traversed.path.cameras)
         console.clear()
-        console.detail(f"  {len(path.cameras):,} frames of {path.format}, {time.perf_counter() - start:.2f} s")
+        console.detail(f"  {cameras_read:,} frames of {traversed.path.format}, {time.perf_counter() - start:.2f} s")
         if written.note:
             console.say(f"{outputs.plot}: {written.note}")
         if written.in_front < LEAST_IN_FRONT:
@@ -129,35 +114,22 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
                 " not share their axes (--camera-axes, --world-transform, --up)"
             )
         on_stdout = place.summary_on_stdout(ctx, as_json=general.as_json)
-        ctx.exit(_report(console, written, asserts, place.summary, as_json=general.as_json, on_stdout=on_stdout))
+        ctx.exit(_report(console, traversed, place.summary, as_json=general.as_json, on_stdout=on_stdout))
 
 
-def _report(
-    console: Console,
-    written: WrittenFrames,
-    asserts: list[Assertion],
-    summary: bool | None,
-    *,
-    as_json: bool,
-    on_stdout: bool,
-) -> int:
+def _report(console: Console, traversed: Traversed, summary: bool | None, *, as_json: bool, on_stdout: bool) -> int:
     """Says what is asked for; the exit status.
 
     Args:
         console: says it.
-        written: the frames.
-        asserts: what must hold.
+        traversed: what was found.
         summary: whether to print it; None where a person reads standard error.
         as_json: print it as JSON on standard output.
         on_stdout: print it on standard output, in place of the table.
     """
-    from ..simulation.columns import EMPTY
-    from ..simulation.summary import summarize
-    from ..tables.assertions import check
     from .traverse_text import lines
 
-    outcomes = check(asserts, written.rows, empty=EMPTY)
-    whole = summarize(written.rows)
+    whole, outcomes = traversed.summary, traversed.outcomes
     if as_json:
         held = [{"assert": each.assertion.text, "held": each.held, "value": each.value} for each in outcomes]
         click.echo(json.dumps(whole.as_dict() | {"asserts": held}, allow_nan=False))

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..model.gaussian import rotation_matrix
 from ..model.splats import FloatArray, Splats
 from ..support.defaults import DEFAULT_BASE
 
@@ -56,12 +57,7 @@ def sphere(rounds: int) -> Mesh:
 
 def rotation(quat_xyzw: FloatArray) -> FloatArray:
     """(N, 4) unit quaternions to (N, 3, 3) matrices: splat, world axis, local axis."""
-    x, y, z, w = quat_xyzw.T
-    axes = np.empty((len(quat_xyzw), 3, 3), np.float32)
-    axes[:, 0] = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], 1)
-    axes[:, 1] = np.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], 1)
-    axes[:, 2] = np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], 1)
-    return axes
+    return np.stack(rotation_matrix(*quat_xyzw.T), axis=1).reshape(-1, 3, 3)
 
 
 def ellipsoids(splats: Splats, deviations: float, of: Mesh, thinnest: float) -> Mesh:

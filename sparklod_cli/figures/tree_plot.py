@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..images.text import BACKGROUND
-from ..lod.kernels.tree_links import walk
+from ..lod.kernels.tree_links import find_depths
 from ..lod.traversal import CHUNK_NODES
 from ..model.gaussian import spark_size
 from ..model.scene import Scene
@@ -118,7 +118,7 @@ def _subject(scene: Scene, depth: int | None, drawable: NDArray[np.bool_]) -> _S
         index, others, depths = np.flatnonzero(drawable), none, None
         title = _counted(len(index), "splat")
     else:
-        depths = walk(scene.tree.child_count, scene.tree.child_start, spark_size(scene.splats))[0]
+        depths = find_depths(scene.tree.child_count, scene.tree.child_start, spark_size(scene.splats))[0]
         leaf = scene.tree.is_leaf & drawable & (depths >= 0)
         if depth is None:
             index, others = np.flatnonzero(leaf), none

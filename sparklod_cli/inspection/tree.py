@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..lod.kernels.tree_links import find_cycles, find_parents, sizes_below, sum_levels, walk
+from ..lod.kernels.tree_links import find_cycles, find_depths, find_parents, mean_child_sizes, sum_by_depth
 from ..lod.traversal import CHUNK_NODES
 from ..model.gaussian import spark_size
 from ..model.lod_tree import LodTree
@@ -88,9 +88,9 @@ def examine(
             clamped.
     """
     size = spark_size(splats)
-    depth, limit = walk(tree.child_count, tree.child_start, size)
+    depth, limit = find_depths(tree.child_count, tree.child_start, size)
     with np.errstate(divide="ignore", invalid="ignore"):
-        nodes, ends, logs, children = sum_levels(depth, tree.child_count, size)
+        nodes, ends, logs, children = sum_by_depth(depth, tree.child_count, size)
         means = np.exp(logs / nodes)
     leaves = int(children[0])
     facts = TreeFacts(
@@ -171,7 +171,7 @@ def _node_findings(
     splats: Splats, tree: LodTree, parent: NDArray[np.int32], size: FloatArray, scale_ends: tuple[float, float]
 ) -> list[Finding]:
     findings = _found("tree.leaf-opacity", tree.is_leaf & (splats.opacity > 1), "is a leaf with D > 1")
-    smaller = size < MIN_SIZE_RATIO * sizes_below(parent, size, splats.scale, splats.opacity)
+    smaller = size < MIN_SIZE_RATIO * mean_child_sizes(parent, size, splats.scale, splats.opacity)
     # Where the format cannot hold a scale that small, the width of a line, and so its area, is unknown; where it cannot
     # hold one that large, so is the size that the node was meant to have.
     least, largest = scale_ends

@@ -1,4 +1,4 @@
-"""What a builder cannot build a tree of."""
+"""Checks the input of a builder."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from numpy.typing import NDArray
 from ..model.splats import Splats, describe_invalid
 from ..support.errors import InvalidSplatsError
 from ..support.jit import threads_for
-from .kernels.geometry import extremes
+from .kernels.geometry import find_bounds
 
 
 @dataclass(frozen=True)
-class Extremes:
-    """How far splats reach.
+class Bounds:
+    """Bounds of a scene's splats.
 
     Attributes:
-        low, high: (3,) float64, the box of their centres.
-        smallest, largest: size, 2 * max(scale).
+        low, high: (3,) float64 corners of the box of their centres, world units.
+        smallest, largest: range of their sizes, 2 * max(scale), world units.
     """
 
     low: NDArray[np.float64]
@@ -28,18 +28,18 @@ class Extremes:
     largest: float
 
 
-def check(splats: Splats) -> Extremes:
-    """How far splats reach that a tree can be built of.
+def check(splats: Splats) -> Bounds:
+    """Checks that a tree can be built of splats, and returns their bounds.
 
     Raises:
-        InvalidSplatsError: there is none, or one that is invalid or cannot be seen.
+        InvalidSplatsError: there is no splat, or one is invalid or cannot be seen.
     """
     if len(splats) == 0:
         raise InvalidSplatsError("no splat is left to build a tree of")
     if invalid := splats.invalid():
         raise InvalidSplatsError(f"{describe_invalid(invalid)}: see Selection.apply")
     with threads_for(len(splats)) as threads:
-        low, high, smallest, largest = extremes(splats.center, splats.scale, threads)
+        low, high, smallest, largest = find_bounds(splats.center, splats.scale, threads)
     if not (smallest > 0 and splats.opacity.min() > 0):
         raise InvalidSplatsError("a splat is without opacity or scale: see Selection.apply")
-    return Extremes(low, high, smallest, largest)
+    return Bounds(low, high, smallest, largest)

@@ -33,7 +33,7 @@ from ..model.gaussian import linear_opacity, lod_opacity
 from ..model.lod_tree import LodTree
 from ..model.splats import FloatArray
 from ..support.defaults import BLEND
-from .foveation import pixel_scales
+from .kernels.pixel_scale import pixel_scales
 from .traversal import Traversal, View, views_of
 
 #: Halvings of the interval in which the threshold is, which is no longer than the width.
@@ -86,7 +86,7 @@ class ContinuousCuts:
         """
         views = views_of(self._forest, self._instances, view)
         inner = [self._inner[instance.tree] for instance in self._instances]
-        limits = [each.limits(record) for each, record in zip(inner, views, strict=True)]
+        limits = [each.limits(views, number) for number, each in enumerate(inner)]
         more = np.concatenate([each.more for each in inner])
         threshold = max(find_threshold(np.concatenate(limits), more, budget - len(views), width), smallest)
         parts = [each.blended(shares(limit, threshold, width)) for each, limit in zip(inner, limits, strict=True)]
@@ -168,11 +168,12 @@ class _Inner:
         self._above = above[self._node]
         ends = np.cumsum(np.bincount(depth[self._node]))
         self._levels = [slice(a, b) for a, b in itertools.pairwise(ends)]
-        self._values = [np.ascontiguousarray(nodes[name][self._node]) for name in ("x", "y", "z", "size")]
+        self._nodes = nodes
 
-    def limits(self, view: np.void) -> Shares:
-        """(M,) the least pixel scale on the way from the root to each."""
-        limit = pixel_scales(self._values, view)
+    def limits(self, views: NDArray[np.void], number: int) -> Shares:
+        """(M,) the least pixel scale on the way from the root to each, as one of the views has it."""
+        limit = np.empty(len(self._node), np.float32)
+        pixel_scales(self._nodes, self._node, views, number, limit)
         for level in self._levels:
             limit[level] = np.minimum(limit[level], limit[self._above[level]])
         return np.minimum(limit, np.finfo(np.float32).max).astype(np.float64)

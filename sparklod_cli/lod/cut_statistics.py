@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .kernels import cut_statistics as kernels
+from .kernels.cut_arrays import CutNodes
 from .settings import pixel_limit
 from .traversal import Forest, TreeCut, TreeInstance, View
 
@@ -63,23 +64,17 @@ def measure(
     width, height = size
     counts = np.empty((len(cut.views), kernels.COUNTS), np.int64)
     sizes = np.empty(len(cut), np.float32)
-    kernels.measure(
-        forest.nodes,
-        level,
-        cut.views,
-        cut.node,
-        cut.limit.view(np.int32),
-        cut.instance,
+    screen = kernels.Screen(
         np.float32(math.tan(view.fov_x / 2)),
         np.float32(math.tan(view.fov_y / 2)),
         np.float32(pixel_limit(view.fov_y, height)),
         float(width * height),
-        counts,
-        sizes,
     )
+    nodes = CutNodes(cut.node, cut.limit.view(np.int32), cut.instance)
+    kernels.measure_cut(forest.nodes, level, cut.views, nodes, screen, counts, sizes)
     total = counts.sum(axis=0)
-    total[kernels.LEVEL_MIN] = counts[:, kernels.LEVEL_MIN].min()
-    total[kernels.LEVEL_MAX] = counts[:, kernels.LEVEL_MAX].max()
+    total[kernels.DEPTH_MIN] = counts[:, kernels.DEPTH_MIN].min()
+    total[kernels.DEPTH_MAX] = counts[:, kernels.DEPTH_MAX].max()
     whole = _measured(total, sizes, width * height)
     if not by_instance:
         return whole, []
@@ -99,9 +94,9 @@ def _measured(row: NDArray[np.int64], sizes: NDArray[np.float32], pixels: int) -
         in_frustum=count[kernels.IN_FRUSTUM],
         outside=count[kernels.OUTSIDE],
         behind=count[kernels.BEHIND],
-        level_min=count[kernels.LEVEL_MIN] if selected else None,
-        level_mean=count[kernels.LEVEL_SUM] / selected if selected else None,
-        level_max=count[kernels.LEVEL_MAX] if selected else None,
+        level_min=count[kernels.DEPTH_MIN] if selected else None,
+        level_mean=count[kernels.DEPTH_SUM] / selected if selected else None,
+        level_max=count[kernels.DEPTH_MAX] if selected else None,
         px_p50=_percentile(seen, 0.50),
         px_p95=_percentile(seen, 0.95),
         overdraw=count[kernels.AREA] / kernels.AREA_PARTS / pixels,
@@ -143,7 +138,7 @@ class Changes:
         """
         kept = np.zeros(len(self._base), np.int64)
         old = self._last or (cut.node[:0], cut.instance[:0])
-        kernels.exchange(self._drawn, self._base, cut.node, cut.instance, *old, kept)
+        kernels.replace_drawn(self._drawn, self._base, cut.node, cut.instance, *old, kept)
         counts = np.bincount(cut.instance, minlength=len(self._base))
         first = self._last is None
         result = [

@@ -1,13 +1,13 @@
-"""The quality builder: a binary tree of the cheapest pairs, of which the useful nodes are kept.
+"""The quality builder: a binary tree made by merging the cheapest pairs, pruned to its most useful nodes.
 
-1. Leaves join from small to large. Those that are there, and what came of them, lie along a Morton curve; each looks
-   for its cheapest partner among its neighbours on the curve (`kernels/pairs.py`). Of the pairs that chose each other
-   the cheaper ones merge, all at once. The curve moves from round to round, so that its seams do.
-2. A merged node covers what its two cover together (`kernels/union.py`), and is drawn with the profile that covers as
-   much (`kernels/profile.py`).
-3. Of the binary tree's nodes those are dropped that are of little use (`kernels/keep.py`).
+1. Leaves join level by level, from small to large. The active nodes are sorted along a Morton curve, and each finds its
+   cheapest partner among its neighbours on it (`kernels/pair_cost.py`). Of the pairs that chose each other, the cheaper
+   half are merged, all at once. The curve is shifted from round to round, and its seams with it.
+2. A merged node covers the union of its two nodes (`kernels/pair_merge.py`), and is drawn with the opacity profile that
+   has this coverage (`kernels/profile.py`).
+3. The binary tree's least useful nodes are dropped (`kernels/prune.py`).
 
-Why so, and what else was tried: docs/decisions/2026-11-21-fidelity.md.
+docs/decisions/2026-11-21-fidelity.md has the reasons, and what else was tried.
 """
 
 from __future__ import annotations
@@ -24,50 +24,62 @@ from ..model.splats import COLUMNS, FloatArray, Splats
 from ..support.defaults import DEFAULT_GROWTH, MAX_GROWTH, MIN_GROWTH
 from ..support.jit import threads_for
 from ..support.progress import Progress, silent
-from .check import Extremes, check
+from .check import Bounds, check
 from .kernels import node_rows, pair_cost, pair_merge, prune
 from .kernels.final_order import fill_leaves, merge_colors
+from .kernels.geometry import SplatColumns
 from .kernels.sort import Nodes, sort_by_key
 
-#: Growth from level to level of the size up to which leaves have joined, and nodes merge.
+#: Growth, from level to level, of the size up to which leaves join and nodes merge. Chosen.
 BASE = 2.0
 
-#: How far apart on the curve two may be that merge.
+#: Largest distance on the curve of two nodes that merge. Measured: 8 loses 0.1 to 0.2 dB to 16; 16 and 24 gain nothing
+#: over 12 (docs/decisions/2026-11-21-fidelity.md).
 WINDOW = 12
 
-#: In a round those pairs merge that cost no more than this share of the costs, so that the cheapest of all come first.
+#: Quantile of the costs of pairs up to which pairs merge in a round, which comes close to merging the cheapest first.
+#: Measured: gains up to 0.6 dB over merging all (docs/decisions/2026-11-21-fidelity.md).
 CHEAP = 0.5
 
-#: So many costs are looked at to tell.
+#: Sample size for the quantile of pair costs, and for the scene's middle, unit and box. Chosen.
 SAMPLE = 1 << 14
 
-#: Where there are no more nodes, all pairs merge.
+#: With no more costs than this in the sample, all pairs merge. Chosen.
 FEW = 1000
 
-#: A level ends when a round merges no more than this share of its nodes, or after so many rounds.
+#: A level ends when a round merges no more than this share of its nodes, or after this many rounds. Chosen; 8 rounds
+#: were measured against 12 that merge all pairs.
 LEAST, MOST_ROUNDS = 0.02, 8
 
-#: The share of the leaves that the curve's box leaves out on each side: scenes have a few that are far away.
+#: Quantile of the leaves' log sizes at which the first level is: the few smaller leaves, down to any size, would only
+#: add rounds. Chosen.
+SMALLEST = 0.01
+
+#: Share of the leaves outside the curve's box on either side of an axis, as scenes have a few far away. Chosen.
 OUTSIDE = 0.005
 
-#: The curve's box is wider than the scene by this; so far it moves, by the golden section of it from round to round.
+#: How much wider the curve's box is than the scene, as a share of its edge, which leaves room to shift it. From round
+#: to round it is shifted by the golden section, so that no two rounds have the same seams. Chosen.
 SLACK, GOLDEN = 0.3, 0.6180339887
 
-
-#: Nothing is farther away, nor larger, than so many units: float32 holds its square.
+#: Largest coordinate and size, units: float32 holds its square. Chosen.
 FARTHEST = 1e15
 
 
 @dataclass
-class _Growing:
-    """The binary tree while it grows from its leaves: rows, leaves first.
+class _BinaryTree:
+    """The binary tree of N leaves while it is built; leaves come first, then merged nodes in the order they are made.
 
     Attributes:
-        state: (2N - 1, WIDTH) float32. children: (2N - 1, 2) uint32. size, error: (2N - 1,) float32.
-        used: rows that are filled.
+        rows: (2N - 1, WIDTH) float32 node rows, see `kernels/pair_cost.py`.
+        children: (2N - 1, 2) uint32.
+        size: (2N - 1,) float32 feature sizes, units.
+        error: (2N - 1,) float32, `kernels.pair_merge.picture_error`.
+        used: number of nodes so far.
+        rounds: number of rounds of merging so far.
     """
 
-    state: FloatArray
+    rows: FloatArray
     children: NDArray[np.uint32]
     size: FloatArray
     error: FloatArray
@@ -76,12 +88,14 @@ class _Growing:
 
 
 @dataclass(frozen=True)
-class _Space:
-    """Where rows of state are, and the curve through them.
+class _Curve:
+    """The coordinates of node rows, and the box of the Morton curve.
 
     Attributes:
-        middle: (3,) of the scene, world units. unit: of length, world units.
-        low: (3,) corner of what the curve goes through, in units. extent: its edge.
+        middle: (3,) origin, near the middle of the scene, world units.
+        unit: length of a unit, world units.
+        low: (3,) lowest corner of the box, in units.
+        extent: edge of the box, in units.
     """
 
     middle: NDArray[np.float64]
@@ -90,85 +104,90 @@ class _Space:
     extent: float
 
     @classmethod
-    def of(cls, splats: Splats, found: Extremes) -> _Space:
-        """Around most of the splats, in a unit that is a power of two near their size, if what is far away allows."""
+    def of(cls, splats: Splats, bounds: Bounds) -> _Curve:
+        """Around most of the splats; the unit is a power of two near their median scale, or as FARTHEST requires."""
         some = slice(None, None, max(1, len(splats) // SAMPLE))
         center = splats.center[some].astype(np.float64)
         middle = np.median(center, axis=0)
-        reach = max(float((found.high - found.low).max()), found.largest) / FARTHEST
+        reach = max(float((bounds.high - bounds.low).max()), bounds.largest) / FARTHEST
         unit = 2.0 ** round(math.log2(max(float(np.median(splats.scale[some].max(axis=1).astype(np.float64))), reach)))
         low, high = np.quantile((center - middle) / unit, [OUTSIDE, 1 - OUTSIDE], axis=0)
         return cls(middle, unit, low, float(max((high - low).max(), 1.0)))
 
+    @property
+    def space(self) -> node_rows.Space:
+        """The coordinates, for kernels."""
+        return node_rows.Space(self.middle, self.unit)
+
     def centers(self, splats: Splats) -> FloatArray:
-        """(N, 3) where splats are, in units from the middle: the first columns of their rows of state."""
+        """(N, 3) float32 centres in units from the middle: the first columns of node rows."""
         return ((splats.center.astype(np.float64) - self.middle) / self.unit).astype(np.float32)
 
     def sort(self, rows: FloatArray, nodes: Nodes, turn: int, threads: int) -> Nodes:
-        """Nodes along the curve, which moves from turn to turn."""
-        _, nodes = sort_by_key(self.places(rows, nodes, turn), nodes.copy(), 3 * node_rows.CURVE_BITS, threads)
+        """Sorts nodes along the curve of a round."""
+        _, nodes = sort_by_key(self.keys(rows, nodes, turn), nodes.copy(), 3 * node_rows.CURVE_BITS, threads)
         return nodes
 
-    def places(self, rows: FloatArray, nodes: Nodes, turn: int) -> NDArray[np.uint64]:
-        """Where nodes are on the curve."""
-        moved = np.modf(np.array([1, 2, 3]) * GOLDEN * turn)[0] * SLACK * self.extent
+    def keys(self, rows: FloatArray, nodes: Nodes, turn: int) -> NDArray[np.uint64]:
+        """(n,) Morton codes of nodes on the curve of a round."""
+        shift = np.modf(np.array([1, 2, 3]) * GOLDEN * turn)[0] * SLACK * self.extent
         step = (1 + SLACK) * self.extent / (1 << node_rows.CURVE_BITS)
-        return node_rows.curve_keys(rows, nodes, self.low - moved, step)
+        return node_rows.morton_keys(rows, nodes, self.low - shift, step)
 
 
 def build(splats: Splats, growth: float = DEFAULT_GROWTH, *, progress: Progress = silent) -> tuple[Splats, LodTree]:
     """Builds a Level-of-Detail tree whose cuts are close to full detail.
 
-    The result does not depend on the number of threads (`jit.use_threads`). Every input splat is one leaf, bit for bit.
-    Nodes come in an order in which the root is 0, children are consecutive and after their parent, and a prefix is a
-    coarser scene: larger nodes' children come first, along a Morton curve inside a step of size.
+    The result does not depend on the number of threads (`jit.use_threads`). Each input splat is one leaf, bit for bit.
+    The root is node 0, siblings are consecutive and come after their parent. Any prefix of the nodes is a coarser
+    scene: the children of larger nodes come first, and along a Morton curve within a step of size.
 
     Args:
         splats: N splats, finite, with positive opacity and at least one positive scale each.
-        growth: the tree has at most so many nodes a leaf, 1.05 to 2.
-        progress: told of three stages, building, pruning and ordering, how many nodes are done.
+        growth: most nodes of the tree per leaf, 1.05 to 2.
+        progress: is told the number of nodes done in each of the stages building, pruning and ordering.
 
     Returns:
         M >= N splats and their tree.
 
     Raises:
-        InvalidSplatsError: there is no splat, or one that cannot be drawn.
+        InvalidSplatsError: there is no splat, or one is invalid or cannot be seen.
         ValueError: the growth is out of range.
     """
     if not MIN_GROWTH <= growth <= MAX_GROWTH:
         raise ValueError(f"growth {growth} is not within {MIN_GROWTH} to {MAX_GROWTH}")
-    found = check(splats)
+    bounds = check(splats)
     n = len(splats)
     if n == 1:
         return splats, LodTree(np.zeros(1, np.uint16), np.zeros(1, np.uint32))
-    space = _Space.of(splats, found)
+    curve = _Curve.of(splats, bounds)
     with threads_for(n) as threads:
-        growing, index = _leaves(splats, space, threads)
-        _grow(growing, n, space, progress)
-        return _in_final_order(growing, index, splats, growth, space, progress)
+        binary, index = _leaves(splats, curve, threads)
+        _merge_all(binary, n, curve, progress)
+        return _in_final_order(binary, index, splats, growth, curve, progress)
 
 
-def _leaves(splats: Splats, space: _Space, threads: int) -> tuple[_Growing, Nodes]:
-    """Rows of the leaves along the curve, and the splat of each."""
+def _leaves(splats: Splats, curve: _Curve, threads: int) -> tuple[_BinaryTree, Nodes]:
+    """A tree of leaves alone, in the order of the curve, and the splat of each."""
     n = len(splats)
-    rows = 2 * n - 1
-    growing = _Growing(
-        np.empty((rows, pair_cost.WIDTH), np.float32),
-        np.empty((rows, 2), np.uint32),
-        np.empty(rows, np.float32),
-        np.zeros(rows, np.float32),
+    nodes = 2 * n - 1
+    binary = _BinaryTree(
+        np.empty((nodes, pair_cost.WIDTH), np.float32),
+        np.empty((nodes, 2), np.uint32),
+        np.empty(nodes, np.float32),
+        np.zeros(nodes, np.float32),
         n,
     )
-    index = space.sort(space.centers(splats), np.arange(n, dtype=np.uint32), 0, threads)
-    columns = splats.center, splats.scale, splats.quat_xyzw, splats.opacity, splats.rgb
-    node_rows.fill_state(index, *columns, space.middle, space.unit, growing.state, growing.size)
-    return growing, index
+    index = curve.sort(curve.centers(splats), np.arange(n, dtype=np.uint32), 0, threads)
+    columns = SplatColumns(splats.center, splats.scale, splats.quat_xyzw, splats.opacity)
+    node_rows.fill_leaf_rows(index, columns, splats.rgb, curve.space, binary.rows, binary.size)
+    return binary, index
 
 
-def _grow(growing: _Growing, leaves: int, space: _Space, progress: Progress) -> None:
-    """Merges pairs, up to one root."""
-    level_of = np.ceil(np.log(growing.size[:leaves].astype(np.float64)) / math.log(BASE)).astype(np.int32)
-    lowest = int(np.quantile(level_of, 0.01))
+def _merge_all(binary: _BinaryTree, leaves: int, curve: _Curve, progress: Progress) -> None:
+    """Merges pairs, level by level, up to one root."""
+    level_of = np.ceil(np.log(binary.size[:leaves].astype(np.float64)) / math.log(BASE)).astype(np.int32)
+    lowest = int(np.quantile(level_of, SMALLEST))
     level_of = np.maximum(level_of, lowest)
     by_level = np.argsort(level_of, kind="stable").astype(np.uint32)
     ends = np.cumsum(np.bincount(level_of - lowest))
@@ -176,80 +195,89 @@ def _grow(growing: _Growing, leaves: int, space: _Space, progress: Progress) -> 
     joined = 0
     for level in range(len(ends)):
         active, joined = np.concatenate([active, by_level[joined : ends[level]]]), int(ends[level])
-        # A node's size is about twice the root of a third of its covariance's trace.
+        # A node's size is about 2 * sqrt(trace of its covariance / 3).
         size = BASE ** (lowest + level + 1)
-        active = _merge(growing, active, space, 3 * size * size / 4, MOST_ROUNDS, progress)
-    _merge(growing, active, space, math.inf, None, progress)
+        active = _merge(binary, active, curve, 3 * size * size / 4, MOST_ROUNDS, progress)
+    _merge(binary, active, curve, math.inf, None, progress)
 
 
 def _merge(
-    growing: _Growing, active: Nodes, space: _Space, largest: float, rounds: int | None, progress: Progress
+    binary: _BinaryTree, active: Nodes, curve: _Curve, largest: float, rounds: int | None, progress: Progress
 ) -> Nodes:
-    """Rounds of merging; returns what is left, which is one node if `rounds` is None."""
-    done, leaves = 0, (len(growing.state) + 1) // 2
+    """Merges active nodes in rounds; returns those that are left, which is one if `rounds` is None.
+
+    Args:
+        binary: the tree.
+        active: (n,) uint32 nodes without a parent.
+        curve: they are sorted along.
+        largest: of the trace of a covariance, units squared; no larger node is made.
+        rounds: at most; None for as many as it takes.
+        progress: as for `build`.
+    """
+    done, leaves = 0, (len(binary.rows) + 1) // 2
     while len(active) > 1 and (rounds is None or done < rounds):
         with threads_for(len(active)) as threads:
-            active = space.sort(growing.state, active, growing.rounds, threads)
-            partner, cost = pair_cost.cheapest(growing.state, active, WINDOW, np.float32(largest))
+            active = curve.sort(binary.rows, active, binary.rounds, threads)
+            partner, cost = pair_cost.find_partners(binary.rows, active, WINDOW, np.float32(largest))
             before = len(active)
-            found, rest = pair_cost.pair_up(active, partner, cost, _limit(cost), growing.used)
-            if rounds is None and not len(found):  # no cost is a number: what is left is too far apart for float32
+            pairs, rest = pair_cost.match_pairs(active, partner, cost, _largest_cost(cost), binary.used)
+            if rounds is None and not len(pairs):  # no cost is a number: the nodes are too far apart for float32
                 partner = np.arange(before, dtype=np.int32) ^ 1
                 partner[partner >= before] = -1
-                found, rest = pair_cost.pair_up(active, partner, np.zeros_like(cost), np.float32(0), growing.used)
+                pairs, rest = pair_cost.match_pairs(active, partner, np.zeros_like(cost), np.float32(0), binary.used)
             active = rest
-            pair_merge.unite_pairs(found, growing.used, growing.state, growing.children, growing.size, growing.error)
-        growing.used += len(found)
-        growing.rounds += 1
-        progress("building", growing.used - leaves, leaves - 1, "node")
+            pair_merge.merge_pairs(pairs, binary.used, binary.rows, binary.children, binary.size, binary.error)
+        binary.used += len(pairs)
+        binary.rounds += 1
+        progress("building", binary.used - leaves, leaves - 1, "node")
         done += 1
-        if rounds is not None and len(found) <= LEAST * before:
+        if rounds is not None and len(pairs) <= LEAST * before:
             break
     return active
 
 
-def _limit(cost: FloatArray) -> np.float32:
-    """What a merge may cost this round."""
+def _largest_cost(cost: FloatArray) -> np.float32:
+    """The largest cost of a pair that merges this round."""
     some = cost[:: max(1, len(cost) // SAMPLE)]
     some = some[np.isfinite(some)]
     return np.float32(np.quantile(some, CHEAP)) if len(some) > FEW else np.float32(np.inf)
 
 
 def _in_final_order(
-    growing: _Growing, index: Nodes, splats: Splats, growth: float, space: _Space, progress: Progress
+    binary: _BinaryTree, index: Nodes, splats: Splats, growth: float, curve: _Curve, progress: Progress
 ) -> tuple[Splats, LodTree]:
-    """Keeps the useful nodes, and puts them and their colours in place."""
-    n, rows = len(index), growing.used
-    progress("pruning", 0, rows, "node")
-    log_size, weight, lost = (np.empty(rows, np.float32) for _ in range(3))
-    parent = prune.value_nodes(growing.children, n, growing.size, growing.error, log_size, weight, lost)
-    saved = np.empty(rows, np.int32)
+    """Prunes the tree, and writes it and its colours in final order."""
+    n, nodes = len(index), binary.used
+    progress("pruning", 0, nodes, "node")
+    log_size, weight, lost = (np.empty(nodes, np.float32) for _ in range(3))
+    parent = prune.fill_usefulness_terms(binary.children, n, binary.size, binary.error, log_size, weight, lost)
+    saved = np.empty(nodes, np.int32)
     prune.drop_nodes(n, max(int(growth * n) - n, 1), parent, log_size, weight, lost, saved)
-    inner, ends = _by_level(growing, prune.levels_of(n, parent, log_size, saved), space)
+    inner, ends = _by_rank(binary, prune.size_ranks(n, parent, log_size, saved), curve)
     total = n + len(inner)
     progress("ordering", 0, total, "node")
     order = np.empty(total, np.uint32)
     tree = LodTree(np.zeros(total, np.uint16), np.zeros(total, np.uint32))
-    place = prune.place_nodes(inner, parent, saved, order, tree.child_start, tree.child_count)
+    final = prune.lay_out_children(inner, parent, saved, order, tree.child_start, tree.child_count)
     out = Splats.empty(total, degree_of(splats.sh.shape[1]))
     for name in COLUMNS:
         fill_leaves(order, index, getattr(splats, name).reshape(n, -1), getattr(out, name).reshape(total, -1))
     geometry = out.center, out.scale, out.quat_xyzw, out.opacity
-    node_rows.fill_merged(order, n, growing.state, space.middle, space.unit, *geometry)
-    weights = growing.state[:, pair_cost.WEIGHT].astype(np.float64)
+    node_rows.fill_merged_splats(order, n, binary.rows, curve.space, *geometry)
+    weights = binary.rows[:, pair_cost.WEIGHT].astype(np.float64)
     for begin, end in zip(ends[-2::-1], ends[:0:-1], strict=True):
         with threads_for(int(end - begin)) as threads:
             for color in (out.rgb, out.sh.reshape(total, -1)):
-                merge_colors(place[begin:end], tree.child_start, tree.child_count, order, weights, color, threads)
+                merge_colors(final[begin:end], tree.child_start, tree.child_count, order, weights, color, threads)
         progress("ordering", total - int(begin), total, "node")
     return out, tree
 
 
-def _by_level(growing: _Growing, level: NDArray[np.int32], space: _Space) -> tuple[Nodes, NDArray[np.int64]]:
-    """The merged nodes that are kept, level by level along the curve, and where each level ends, from 0."""
-    inner = np.flatnonzero(level >= 0).astype(np.uint32)
-    own = level[inner]
-    keys = space.places(growing.state, inner, 0) | (own.astype(np.uint64) << np.uint64(3 * node_rows.CURVE_BITS))
+def _by_rank(binary: _BinaryTree, rank: NDArray[np.int32], curve: _Curve) -> tuple[Nodes, NDArray[np.int64]]:
+    """The merged nodes that are kept, by rank and then along the curve, and where each rank ends, 0 first."""
+    inner = np.flatnonzero(rank >= 0).astype(np.uint32)
+    own = rank[inner]
+    keys = curve.keys(binary.rows, inner, 0) | (own.astype(np.uint64) << np.uint64(3 * node_rows.CURVE_BITS))
     with threads_for(len(inner)) as threads:
         _, inner = sort_by_key(keys, inner, 3 * node_rows.CURVE_BITS + int(own.max()).bit_length(), threads)
     return inner, np.concatenate([[0], np.cumsum(np.bincount(own))]).astype(np.int64)

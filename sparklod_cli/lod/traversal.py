@@ -12,13 +12,14 @@ from numpy.typing import NDArray
 from ..model.foveation import Cones, Foveation
 from ..model.nodes import Nodes
 from .foveation import set_foveation
-from .kernels import cut as kernels
-from .kernels import pixel_scale
+from .kernels import cut_arrays, pixel_scale
+from .kernels.cut import find_cut
 
 Matrix = NDArray[np.float64]
 
-#: Nodes of a chunk, as Spark streams them.
-CHUNK_NODES = 1 << kernels.CHUNK_BITS
+#: Nodes of a chunk, as Spark streams them; as a power of 2.
+CHUNK_BITS = 16
+CHUNK_NODES = 1 << CHUNK_BITS
 
 #: Nodes that are visited for each node of a cut, at most, where every node that is refined has two children or more; in
 #: other trees the buffers grow.
@@ -30,10 +31,10 @@ GUESS = 0.97
 
 #: Why a cut has no more nodes, by the number that the kernel tells.
 REASONS = {
-    kernels.BUDGET: "budget",
-    kernels.PIXEL: "pixel",
-    kernels.MISSING: "missing",
-    kernels.EXHAUSTED: "exhausted",
+    cut_arrays.BUDGET: "budget",
+    cut_arrays.PIXEL: "pixel",
+    cut_arrays.MISSING: "missing",
+    cut_arrays.EXHAUSTED: "exhausted",
 }
 
 
@@ -172,34 +173,27 @@ class Traversal:
         work = self._work(VISITS * budget + CHUNK_NODES)
         wanted = np.empty(self.forest.chunks, np.float32)
         length = min(budget, self._most) + 1
-        cut = np.empty(length, np.uint32), np.empty(length, np.int32), np.empty(length, np.uint16)
+        cut = cut_arrays.CutNodes(np.empty(length, np.uint32), np.empty(length, np.int32), np.empty(length, np.uint16))
+        trees = cut_arrays.Trees(self.forest.nodes, views, present, CHUNK_BITS)
+        stop = cut_arrays.Stop(np.float32(smallest).view(np.int32), budget)
         while True:
-            selected, reason, missing, least, stop = kernels.find_cut(
-                self.forest.nodes,
-                views,
-                present,
-                np.float32(smallest).view(np.int32),
-                budget,
-                np.float32(work.guess),
-                *work.slots,
-                work.sums,
-                wanted,
-                cut,
+            selected, reason, missing, least, last = find_cut(
+                trees, stop, np.float32(work.guess), work.slots, wanted, cut
             )
-            if reason != kernels.FULL:
+            if reason != cut_arrays.FULL:
                 break
-            work = self._work(2 * len(work.slots[0]))
+            work = self._work(2 * len(work.slots.node))
         # The next cut will be much like this one.
-        work.guess = GUESS * least if reason == kernels.BUDGET else smallest
+        work.guess = GUESS * least if reason == cut_arrays.BUDGET else smallest
         return TreeCut(
             views=views,
-            node=cut[0][:selected],
-            instance=cut[2][:selected],
-            limit=cut[1][:selected].view(np.float32),
+            node=cut.node[:selected],
+            instance=cut.instance[:selected],
+            limit=cut.limit[:selected].view(np.float32),
             reason=REASONS[reason],
             missing=missing,
             least=float(least),
-            stop=None if stop < 0 else work.slot(stop),
+            stop=None if last < 0 else work.slot(last),
             wanted=wanted,
         )
 
@@ -213,7 +207,7 @@ class Traversal:
         """Buffers of this thread, at least so long as is asked for or as could be needed."""
         slots = min(slots, 2 * self._most)  # a node is looked at by its threshold, and once more by the queue
         work: _Work | None = getattr(self._local, "work", None)
-        if work is None or len(work.slots[0]) < slots:
+        if work is None or len(work.slots.node) < slots:
             work = self._local.work = _Work(slots)
         return work
 
@@ -222,15 +216,22 @@ class _Work:
     """Buffers to find a cut with, and where the last one ended."""
 
     def __init__(self, slots: int) -> None:
-        kinds = (np.uint32, np.int32, np.uint16, np.int32, np.int32, np.int32, np.int32)
-        self.slots = [np.empty(slots + 1, kind) for kind in kinds]
-        self.sums = np.empty(kernels.BUCKETS, np.int32)
+        self.slots = cut_arrays.Slots(
+            node=np.empty(slots + 1, np.uint32),
+            limit=np.empty(slots + 1, np.int32),
+            instance=np.empty(slots + 1, np.uint16),
+            first=np.empty(slots + 1, np.int32),
+            queue=np.empty(slots + 1, np.int32),
+            pending=np.empty(slots + 1, np.int32),
+            heap=np.empty(slots + 1, np.int32),
+            sums=np.empty(cut_arrays.BUCKETS, np.int32),
+        )
         self.guess = 0.0
 
     def slot(self, at: int) -> tuple[float, int, int]:
         """The pixel scale, instance and index of the node in a slot."""
-        node, limit, instance, *_ = self.slots
-        return float(limit.view(np.float32)[at]), int(instance[at]), int(node[at])
+        slots = self.slots
+        return float(slots.limit.view(np.float32)[at]), int(slots.instance[at]), int(slots.node[at])
 
 
 def views_of(forest: Forest, instances: Sequence[TreeInstance], view: View) -> NDArray[np.void]:

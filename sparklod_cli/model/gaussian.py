@@ -1,28 +1,53 @@
-"""The mathematics of one splat: quaternions, covariance, opacity and size, over whole arrays."""
+"""The formulas of one splat: rotation, covariance, opacity and size.
+
+Those of scalars or arrays alike are compiled into kernels, too. They are given their constants in the type that is
+computed with, for a compiled float32 plus a literal is a float64.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .splats import FloatArray, Splats
 
-#: Linear opacity of a merged splat is clamped to this range; 1000 is D = 4.45 of the 5 that the format holds.
+#: Linear opacity A of a merged splat is clamped to this range; 1000 is D = 4.45 of the 5 that Spark's encodings hold.
 MIN_OPACITY, MAX_OPACITY = 1e-6, 1e3
 
-#: Lengths of a quaternion between which the squares of its components are exact enough in float32.
+#: Range of a quaternion's length in which float32 holds the squares of its components: 1e-30 to 1e30.
 MIN_LENGTH, MAX_LENGTH = 1e-15, 1e15
 
-#: Rows and columns of the six elements that tell a covariance: xx xy xz yy yz zz.
+#: Row and column of the six elements of a covariance: xx xy xz yy yz zz.
 _ROW, _COLUMN = np.array([0, 0, 0, 1, 1, 2]), np.array([0, 1, 2, 1, 2, 2])
 
-#: How much larger Spark's traversal takes a splat to be for each that its D is above 1.
+#: Rise of the feature size per unit of D above 1, as a share; found in Spark 2.2.0's output, see `spark_size`.
 SIZE_PER_D = 0.7
 
-#: Exponent of Knud Thomsen's approximation of an ellipsoid's surface, within 1.061 % of the true area.
+#: Exponent of Knud Thomsen's approximation (2004) of an ellipsoid's surface area, within 1.061 % of it.
 THOMSEN_P = 1.6075
+
+
+def rotation_matrix(x: Any, y: Any, z: Any, w: Any, one: Any = 1.0) -> tuple[Any, ...]:
+    """The 9 elements, row by row, of the rotation by a unit quaternion, local to world; `one` is of the type of x."""
+    two = one + one
+    return (
+        *(one - two * (y * y + z * z), two * (x * y - w * z), two * (x * z + w * y)),
+        *(two * (x * y + w * z), one - two * (x * x + z * z), two * (y * z - w * x)),
+        *(two * (x * z - w * y), two * (y * z + w * x), one - two * (x * x + y * y)),
+    )
+
+
+def lod_opacity_above_1(opacity: Any, one: Any, e: Any) -> Any:
+    """D of linear opacity A above 1: sqrt(1 + e * ln A) (Spark's LoD design); `one` and `e` of the type of A."""
+    return np.sqrt(one + e * np.log(opacity))
+
+
+def linear_opacity_above_1(lod_opacity: Any, one: Any, e: Any) -> Any:
+    """Linear opacity A of D above 1: exp((D ** 2 - 1) / e), the inverse of `lod_opacity_above_1`."""
+    return np.exp((lod_opacity * lod_opacity - one) / e)
 
 
 def normalized_quat(quat: FloatArray) -> FloatArray:
@@ -41,9 +66,9 @@ def normalized_quat(quat: FloatArray) -> FloatArray:
 
 
 def covariance(scale: FloatArray, quat_xyzw: FloatArray) -> NDArray[np.float64]:
-    """(N, 3) scales and (N, 4) unit quaternions, local to world, to (N, 6) covariances A diag(scale ** 2) A^T.
+    """(N, 6) covariances R diag(scale ** 2) R^T, xx xy xz yy yz zz, of (N, 3) scales and (N, 4) unit quaternions.
 
-    In float64, because what is left of the elements of a thin splat are small differences of large numbers.
+    In float64, because elements of a thin splat's covariance are small differences of large numbers.
     """
     axes = rotation_matrices(quat_xyzw)
     axes *= scale.T
@@ -52,12 +77,7 @@ def covariance(scale: FloatArray, quat_xyzw: FloatArray) -> NDArray[np.float64]:
 
 def rotation_matrices(quat_xyzw: FloatArray) -> NDArray[np.float64]:
     """(3, 3, N) rotations, world axis by local axis, of (N, 4) unit quaternions, local to world."""
-    x, y, z, w = quat_xyzw.T.astype(np.float64)
-    axes = np.empty((3, 3, len(quat_xyzw)))
-    axes[0] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
-    axes[1] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
-    axes[2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
-    return axes
+    return np.array(rotation_matrix(*quat_xyzw.T.astype(np.float64))).reshape(3, 3, -1)
 
 
 def moved(points: FloatArray, matrix: NDArray[np.float64]) -> FloatArray:
@@ -100,41 +120,46 @@ def quat_of_rotation(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def lod_opacity(opacity: FloatArray) -> FloatArray:
-    """Spark's opacity parameter D from linear opacity A: A up to 1, sqrt(1 + e * ln A) above (Spark's LoD design)."""
+    """(N,) LoD opacity D, Spark's parameter, of linear opacity A: A up to 1, sqrt(1 + e * ln A) above."""
     d = np.array(opacity, np.float32)
     above = d > 1  # few are
-    d[above] = np.sqrt(1 + np.float32(np.e) * np.log(d[above]))
+    d[above] = lod_opacity_above_1(d[above], np.float32(1), np.float32(np.e))
     return d
 
 
 def linear_opacity(lod_opacity: FloatArray) -> FloatArray:
-    """Linear opacity A from Spark's D, the inverse of `lod_opacity`: exp((D ** 2 - 1) / e) above 1."""
+    """(N,) linear opacity A of LoD opacity D, the inverse of `lod_opacity`: D up to 1, exp((D ** 2 - 1) / e) above."""
     linear = np.array(lod_opacity, np.float32)
     above = linear > 1
-    linear[above] = np.exp((linear[above] * linear[above] - 1) / np.float32(np.e))
+    linear[above] = linear_opacity_above_1(linear[above], np.float32(1), np.float32(np.e))
     return linear
 
 
-def spark_size(splats: Splats) -> FloatArray:
-    """(N,) 2 * mean(scale) * (1 + 0.7 * max(0, D - 1)): what Spark 2.2.0 writes into its nodes.
+def size_factor(lod_opacity: FloatArray, out: FloatArray | None = None) -> FloatArray:
+    """(N,) 1 + 0.7 * max(0, D - 1), by which a splat's feature size exceeds 2 * mean(scale); into `out` if given."""
+    factor: FloatArray = np.subtract(lod_opacity, np.float32(1), out=out)
+    np.maximum(factor, 0, out=factor)
+    factor *= np.float32(SIZE_PER_D)
+    factor += 1
+    return factor
 
-    Found in its output, see docs/decisions/2026-11-20-what-spark-does.md; its `encode_lod_tree` has it so.
+
+def spark_size(splats: Splats) -> FloatArray:
+    """(N,) feature size, 2 * mean(scale) * (1 + 0.7 * max(0, D - 1)): what Spark 2.2.0 writes into its nodes.
+
+    Found in its output, see docs/decisions/2026-11-20-what-spark-does.md; its `encode_lod_tree` computes the same.
     """
     x, y, z = splats.scale.T
     mean = x + y
     mean += z
     mean /= np.float32(3)
-    # 2 * (1 + 0.7 * beyond) * mean, in place: there may be tens of millions.
-    factor = lod_opacity(splats.opacity)
-    factor -= 1
-    np.maximum(factor, 0, out=factor)
-    factor *= np.float32(SIZE_PER_D)
-    factor += 1
+    d = lod_opacity(splats.opacity)
+    factor = size_factor(d, out=d)  # in place: there may be tens of millions
     factor *= 2
     factor *= mean
     return factor
 
 
 def design_size(splats: Splats) -> FloatArray:
-    """(N,) 2 * max(scale) * max(1, D): what the pages on Spark's LoD design say, and its quick builder sorts by."""
+    """(N,) 2 * max(scale) * max(1, D): feature size in Spark's LoD design, by which its quick builder sorts."""
     return 2 * splats.scale.max(axis=1) * np.maximum(lod_opacity(splats.opacity), 1)

@@ -38,25 +38,14 @@ def draw(splats: ShadedSplats, camera: Camera, settings: RasterSettings) -> Imag
 def seen(splats: ShadedSplats, camera: Camera, settings: RasterSettings) -> NDArray[np.float32]:
     """The splats on the screen, (M, `project.COLUMNS`) from near to far; a buffer, which the next call overwrites."""
     screen, arranged, keys = _buffers(len(splats))
-    project.project(
-        splats.center,
-        splats.scale,
-        splats.quat_xyzw,
-        splats.lod_opacity,
-        splats.rgb,
-        world_to_camera(camera),
-        np.array([*camera.focal, *camera.principal, camera.width, camera.height], np.float32),
-        np.array(
-            [settings.near, settings.far, CLIP, BLUR, MIN_ALPHA, MAX_STD_DEV, STD_DEV_PER_D, settings.max_radius],
-            np.float32,
-        ),
-        settings.sort == "radial",
-        screen,
-        keys,
-    )
-    keys = np.sort(keys[keys != project.NOWHERE])
+    columns = project.ShadedColumns(splats.center, splats.scale, splats.quat_xyzw, splats.lod_opacity, splats.rgb)
+    lens = project.Lens(*map(np.float32, (*camera.focal, *camera.principal, camera.width, camera.height)))
+    near, far, radius = settings.near, settings.far, settings.max_radius
+    limits = project.Limits(*map(np.float32, (near, far, CLIP, BLUR, MIN_ALPHA, MAX_STD_DEV, STD_DEV_PER_D, radius)))
+    project.project(columns, world_to_camera(camera), lens, limits, settings.sort == "radial", screen, keys)
+    keys = np.sort(keys[keys != project.NOT_DRAWN])
     arranged = arranged[: len(keys)]
-    project.arrange(screen, keys, arranged)
+    project.gather_drawn(screen, keys, arranged)
     return arranged
 
 

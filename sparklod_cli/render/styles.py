@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cameras.camera import Camera
+from ..model.gaussian import size_factor
 from . import rasterizer
 from .backends import BACKENDS
 from .kernels import bands
@@ -19,9 +20,6 @@ from .shading import ShadedSplats
 
 #: How opaque a billboard is.
 BILLBOARD_ALPHA = 0.5
-
-#: How much larger a merged splat is, for each that its D is above 1; as in Spark's feature size.
-SIZE_PER_D = 0.7
 
 
 @dataclass(frozen=True)
@@ -79,7 +77,7 @@ def draw(
     if style == "sorted-billboards":
         order = np.argsort(-(seen.distance if settings.sort == "radial" else seen.depth), kind="stable")
     index, depth = seen.index[order], seen.depth[order]
-    width = splats.scale[index].mean(axis=1) * (1 + SIZE_PER_D * np.maximum(splats.lod_opacity[index] - 1, 0))
+    width = splats.scale[index].mean(axis=1) * size_factor(splats.lod_opacity[index])
     radius = np.clip(width * np.float32(camera.focal[1]) / depth, 0.5, settings.max_radius)
     rgb = np.minimum(splats.rgb[index], 1)
     bands.draw_discs(

@@ -80,20 +80,22 @@ def test_a_frame_lasts_as_long_as_its_format_can_say(form: str, longest: float) 
             animation.check(form, fps)
 
 
+@pytest.mark.parametrize("form", ["mp4", "webm"])
 @pytest.mark.parametrize("size", [(64, 48), (33, 21)])
-def test_a_video_has_the_frames(size: tuple[int, int]) -> None:
+def test_a_video_has_the_frames(size: tuple[int, int], form: str) -> None:
     pytest.importorskip("imageio_ffmpeg", reason="the extra video is not installed")
     import imageio.v3
 
-    data = animation.animate(frames(*size), "mp4", 10.0)
-    video = imageio.v3.imread(data, extension=".mp4")
+    data = animation.animate(frames(*size), form, 10.0)
+    video = imageio.v3.imread(data, extension=f".{form}")
     assert video.shape == (4, size[1] + size[1] % 2, size[0] + size[0] % 2, 3)
     assert np.abs(video[:, 10, 10].astype(int) - COLORS).max() <= 24
-    assert imageio.v3.immeta(data, extension=".mp4")["fps"] == pytest.approx(10)
+    assert imageio.v3.immeta(data, extension=f".{form}")["fps"] == pytest.approx(10)
 
 
-def test_without_imageio_it_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("form", ["mp4", "webm"])
+def test_a_missing_imageio_is_named(form: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "imageio", None)
-    with pytest.raises(SparklodError, match=r"pip install 'sparklod\[video\]'"):
-        animation.check("mp4", 30)
+    with pytest.raises(SparklodError, match=rf"^\.{form} is written by imageio: pip install 'sparklod\[video\]'"):
+        animation.check(form, 30)
     animation.check("gif", 30)

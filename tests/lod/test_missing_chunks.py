@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib.util
 import math
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,7 +13,6 @@ from hypothesis import strategies as st
 
 from sparklod_cli.lod import traversal
 from sparklod_cli.lod.traversal import Forest, TreeInstance, View
-from sparklod_cli.support import jit
 from tests.lod.forests import Case, ancestors_drawn, cases, check, random_tree, transform
 
 #: Nodes of a chunk in tests of small trees, as a power of 2; so large that no node's children are in three.
@@ -23,20 +20,10 @@ SMALL = 4
 
 
 @pytest.fixture(scope="class")
-def small_chunks(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """The kernel with small chunks, compiled once more, so that small trees have many."""
-    source = Path(traversal.kernels.__file__).read_text(encoding="utf-8")
-    constant = f"CHUNK_BITS = {traversal.kernels.CHUNK_BITS}"
-    assert source.count(constant) == 1
-    path = tmp_path_factory.mktemp("kernels") / "small_chunks.py"
-    path.write_text(source.replace(constant, f"CHUNK_BITS = {SMALL}"), encoding="utf-8")
-    spec = importlib.util.spec_from_file_location("sparklod_cli.lod.kernels.small_chunks", path)
-    assert spec and spec.loader
-    module = importlib.util.module_from_spec(spec)
+def small_chunks() -> Iterator[None]:
+    """Small chunks, so that small trees have many."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(jit, "CACHE_FOLDER", None)
-        spec.loader.exec_module(module)
-        patch.setattr(traversal, "kernels", module)
+        patch.setattr(traversal, "CHUNK_BITS", SMALL)
         patch.setattr(traversal, "CHUNK_NODES", 1 << SMALL)
         yield
 
@@ -75,7 +62,7 @@ class TestSmallChunks:
             assert there[chunks].all()  # what is drawn is there
 
     @given(cases(60), st.data())
-    def test_what_is_wanted_in_turn_comes_to_the_whole_cut(self, case: Case, data: st.DataObject) -> None:
+    def test_loading_the_wanted_chunks_in_turn_gives_the_whole_cut(self, case: Case, data: st.DataObject) -> None:
         """As a viewer fetches it: the roots, then always the most wanted chunk that is missing."""
         found = case.traversal()
         whole = case.find(found)

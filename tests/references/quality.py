@@ -19,14 +19,14 @@ from sparklod_cli.lod.kernels.pair_cost import (
 )
 from tests.references import gaussians
 
-#: Where the elements of a covariance are in a row of state.
+#: Where the elements of a covariance are in a node row.
 ELEMENTS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
 def row(
     center: np.ndarray, covariance: np.ndarray, density: float = 1.0, color: tuple[float, ...] = (0.5, 0.5, 0.5)
 ) -> np.ndarray:
-    """A row of state."""
+    """A node row."""
     filled = np.empty(WIDTH, np.float32)
     filled[CENTER : CENTER + 3] = center
     filled[COVARIANCE : COVARIANCE + 6] = [covariance[i, j] for i, j in ELEMENTS]
@@ -38,7 +38,7 @@ def row(
 
 
 def matrix(row: np.ndarray) -> np.ndarray:
-    """The covariance of a row of state."""
+    """The covariance of a node row."""
     full = np.empty((3, 3))
     for element, (i, j) in enumerate(ELEMENTS):
         full[i, j] = full[j, i] = row[COVARIANCE + element]
@@ -46,7 +46,7 @@ def matrix(row: np.ndarray) -> np.ndarray:
 
 
 def random_rows(count: int, seed: int, spread: float = 2.0) -> np.ndarray:
-    """Rows of state whose covariances are well conditioned."""
+    """Node rows whose covariances are well conditioned."""
     rng = np.random.default_rng(seed)
     turn = np.linalg.qr(rng.normal(size=(count, 3, 3)))[0]
     variance = np.exp(rng.normal(0, 1, (count, 3)))

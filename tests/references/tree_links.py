@@ -10,7 +10,7 @@ import numpy as np
 
 
 @dataclass
-class Walked:
+class Followed:
     """What the links of a tree lead to, however broken they are."""
 
     parents: list[list[int]]  # the nodes that have each as a child
@@ -24,7 +24,7 @@ def links_of(child_count: np.ndarray, child_start: np.ndarray) -> list[range]:
     return [range(start, min(len(starts), start + count)) for start, count in zip(starts, counts, strict=True)]
 
 
-def walk(child_count: np.ndarray, child_start: np.ndarray, size: np.ndarray) -> Walked:
+def follow(child_count: np.ndarray, child_start: np.ndarray, size: np.ndarray) -> Followed:
     """Breadth first, with sets."""
     links = links_of(child_count, child_start)
     every = range(len(links))
@@ -37,7 +37,7 @@ def walk(child_count: np.ndarray, child_start: np.ndarray, size: np.ndarray) -> 
             if child not in depth:
                 depth[child], limit[child] = depth[node] + 1, min(limit[node], float(size[child]))
                 waiting.append(child)
-    return Walked(parents, [depth.get(node, -1) for node in every], [limit.get(node, 0.0) for node in every])
+    return Followed(parents, [depth.get(node, -1) for node in every], [limit.get(node, 0.0) for node in every])
 
 
 def on_cycles(parent: list[int], depth: list[int]) -> list[bool]:

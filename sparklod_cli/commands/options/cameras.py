@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -25,9 +26,7 @@ from .views import Size, View, Views
 if TYPE_CHECKING:
     from ...cameras.camera import Matrix
     from ...cameras.frame import Settings
-    from ...cameras.path import CameraPath
     from ...cameras.sources import CameraSource
-    from ...model.balls import Balls
 
 HEADING = "Cameras"
 
@@ -172,18 +171,11 @@ class Cameras:
             up=self.up,
         )
 
-    def read(self, scene: Callable[[], Balls]) -> CameraPath:
-        """The cameras.
-
-        Args:
-            scene: gives what the splats cover; called only where cameras are chosen for it.
-
-        Raises:
-            click.UsageError: too many cameras are asked for.
-            CameraPathError: a file cannot be read, or a camera makes no sense.
-        """
+    @contextlib.contextmanager
+    def told(self) -> Iterator[None]:
+        """Raises a `click.UsageError` that names the option where it asks for too many cameras."""
         try:
-            return self.where().cameras(self.settings(), scene)
+            yield
         except TooManyCamerasError as error:
             if self.camera_path is not None:
                 raise

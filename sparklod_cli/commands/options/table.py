@@ -19,8 +19,8 @@ from ..usage import exclude, given, require
 from .common import Command, overwrite_option, table_form
 
 if TYPE_CHECKING:
+    from ...simulation.outputs import FrameOutputs
     from ...tables.assertions import Assertion
-    from ...tables.output import TableOutput
 
 HEADING = "Output"
 
@@ -68,22 +68,24 @@ class Table:
         asked = self.output is not None or as_json or self.summary is False or given(ctx, OF_TABLES)
         return not asked and is_terminal(sys.stdout)
 
-    def table(self, ctx: click.Context, *, as_json: bool) -> TableOutput:
-        """Where the table goes.
+    def outputs(self, ctx: click.Context, *, as_json: bool) -> FrameOutputs:
+        """Where the table and all else that is made of the frames goes.
 
         Raises:
             click.UsageError: the suffix of --output promises something else.
         """
         from ...simulation import columns
+        from ...simulation.outputs import FrameOutputs
         from ...tables.output import TableOutput
 
         nowhere = self.output is None and (as_json or self.summary_on_stdout(ctx, as_json=as_json))
-        return TableOutput(
+        table = TableOutput(
             path=None if self.output == DASH else self.output,
             form=None if nowhere else table_form("--output", self.output, self.form),
             columns=columns.select(timing=not self.no_timing),
             overwrite=self.overwrite,
         )
+        return FrameOutputs(table, self.indices_out, self.padded, self.plot, self.overwrite)
 
     def assertions(self) -> list[Assertion]:
         """What must hold.
@@ -93,10 +95,11 @@ class Table:
         """
         from ...simulation.columns import COLUMNS
         from ...tables import assertions
+        from ...tables.conditions import BadAssertionError
 
         try:
             return [assertions.parse(text, COLUMNS) for text in self.asserts]
-        except assertions.BadAssertionError as error:
+        except BadAssertionError as error:
             raise click.UsageError(f"--assert {error}") from None
 
 

@@ -1,8 +1,8 @@
 """Eigen-decomposition of many symmetric 3x3 matrices at once, by cyclic Jacobi rotations.
 
-Unlike the closed form, Jacobi's method keeps the eigenvectors of flat, needle-like and spherical matrices. The vectors
-come as the quaternion of the product of its rotations, so they are right-handed by construction. Matrices lie side by
-side, one row an element, and every step is free of branches, so that the compiler works on several at a time.
+Unlike the closed form, Jacobi's method keeps the eigenvectors of flat, needle-like and spherical matrices. Eigenvectors
+are returned as the quaternion of the product of its rotations, so they are right-handed by construction. Matrices lie
+side by side, one row per element, and every step is branch-free, so that LLVM vectorizes over matrices.
 """
 
 from __future__ import annotations
@@ -13,9 +13,15 @@ import numpy as np
 
 from ...support.jit import kernel
 
-MAX_SWEEPS = 16  # 4 suffice as a rule
-CONVERGED = 1e-18  # sum of squares of the off-diagonal, relative to the largest diagonal
-ROWS = 10  # xx yy zz, xy xz yz, and x y z w of the quaternion
+#: Sweeps over the three off-diagonal elements at most; 4 suffice as a rule, as Jacobi's method converges quadratically.
+MAX_SWEEPS = 16
+
+#: Converged: sum of squares of the off-diagonal elements, of a matrix whose largest diagonal element is 1. An error of
+#: 1e-9 is far below float32's 6e-8, which eigenvalues and vectors are rounded to. Chosen.
+CONVERGED = 1e-18
+
+#: Rows of the array of matrices: xx yy zz, xy xz yz, and x y z w of the quaternion.
+ROWS = 10
 
 
 @kernel()
@@ -23,9 +29,9 @@ def decompose(m, count):
     """Eigenvalues and eigenvectors of the first `count` columns of `m`, in place.
 
     Args:
-        m: (10, at least count) float64. Rows 0 to 5 are xx, yy, zz, xy, xz, yz; after it, rows 0 to 2 are the
-            eigenvalues and 6 to 9 the rotation from their axes to the world's, a unit quaternion x, y, z, w.
-        count: columns.
+        m: (ROWS, at least count) float64. On entry, rows 0 to 5 are xx, yy, zz, xy, xz, yz. On return, rows 0 to 2
+            are the eigenvalues, and rows 6 to 9 the rotation from their axes to the world's, a unit quaternion x y z w.
+        count: number of matrices.
     """
     scale = np.empty(count, np.float64)
     for i in range(count):
@@ -40,7 +46,7 @@ def decompose(m, count):
             off = max(off, m[3, i] * m[3, i] + m[4, i] * m[4, i] + m[5, i] * m[5, i])
         if off <= CONVERGED:
             break
-        sweep(m[0], m[1], m[2], m[3], m[4], m[5], m[6], m[7], m[8], m[9], count)
+        sweep(m, count)
     for i in range(count):
         unit = 1 / math.sqrt(m[6, i] * m[6, i] + m[7, i] * m[7, i] + m[8, i] * m[8, i] + m[9, i] * m[9, i])
         for row in range(6, 10):
@@ -50,8 +56,10 @@ def decompose(m, count):
 
 
 @kernel()
-def sweep(xx, yy, zz, xy, xz, yz, qx, qy, qz, qw, count):
-    """One Jacobi rotation in each of the planes xy, xz and yz; arguments are the rows of `decompose`."""
+def sweep(m, count):
+    """One Jacobi rotation in each of the planes xy, xz and yz; arguments as for `decompose`."""
+    xx, yy, zz, xy, xz, yz = m[0], m[1], m[2], m[3], m[4], m[5]
+    qx, qy, qz, qw = m[6], m[7], m[8], m[9]
     for i in range(count):
         a, b, c, d, e, f = xx[i], yy[i], zz[i], xy[i], xz[i], yz[i]
         x, y, z, w = qx[i], qy[i], qz[i], qw[i]
@@ -70,10 +78,13 @@ def sweep(xx, yy, zz, xy, xz, yz, qx, qy, qz, qw, count):
 
 @kernel()
 def rotation(p, q, off):
-    """The rotation of at most 45 degrees that clears the off-diagonal element between diagonals p and q.
+    """The rotation by at most 45 degrees that makes the off-diagonal element 0.
+
+    Args:
+        p, q: the two diagonal elements. off: the element between them.
 
     Returns:
-        tan, cos and sin of its angle, cos and sin of half its angle.
+        tan, cos and sin of the angle, then cos and sin of half the angle.
     """
     x, y = q - p, 2 * off
     length = math.sqrt(x * x + y * y)

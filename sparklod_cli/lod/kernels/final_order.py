@@ -1,4 +1,4 @@
-"""Final order: copying leaves and merged nodes to their place, and merging colours there."""
+"""Writes a tree in its final order: copies leaves and merged nodes to their indices, and averages colours there."""
 
 from __future__ import annotations
 
@@ -10,20 +10,33 @@ from .geometry import CENTER, OPACITY, QUAT, SCALE
 
 
 @kernel(parallel=True)
-def places_of_merged(order, leaves):
-    """(M - leaves,) uint32: the final index of each merged node, by (M,) `order`, the node of each final index."""
-    place = np.empty(len(order) - leaves, np.uint32)
+def final_indices(order, leaves):
+    """The final index of each merged node.
+
+    Args:
+        order: (M,) uint32, the node of each final index.
+        leaves: number of leaves; they are the nodes below it.
+
+    Returns:
+        (M - leaves,) uint32, of node `leaves` onwards.
+    """
+    index = np.empty(len(order) - leaves, np.uint32)
     for i in prange(len(order)):
         if order[i] >= leaves:
-            place[order[i] - leaves] = i
-    return place
+            index[order[i] - leaves] = i
+    return index
 
 
 @kernel(parallel=True)
-def fill_columns(order, geometry, leaves, shrink, center, scale, quat, opacity):
-    """Columns of splats (arguments after `shrink`) in final order: row i from geometry[order[i]].
+def fill_geometry(order, geometry, leaves, shrink, center, scale, quat, opacity):
+    """Fills the geometry of splats in final order: splat i from geometry[order[i]].
 
-    Rows from `leaves` on are merged nodes, whose scales are multiplied by `shrink`, float32.
+    Args:
+        order: (M,) uint32, the node of each final index.
+        geometry: rows of `geometry.py`.
+        leaves: number of leaves; rows from there on are merged nodes.
+        shrink: float32, factor for the scales of merged nodes.
+        center, scale, quat, opacity: columns of M splats, filled.
     """
     for i in prange(len(order)):
         j = order[i]
@@ -38,7 +51,14 @@ def fill_columns(order, geometry, leaves, shrink, center, scale, quat, opacity):
 
 @kernel(parallel=True)
 def fill_leaves(order, index, column, out):
-    """A column of the leaves in final order: row i from splat index[order[i]]; rows of merged nodes are left alone."""
+    """Fills the leaves of a column in final order; rows of merged nodes are left as they are.
+
+    Args:
+        order: (M,) uint32, the node of each final index; those below n are leaves.
+        index: (n,) uint32, the input splat of each leaf.
+        column: (n, J) float32 of the input splats.
+        out: (M, J) float32.
+    """
     for i in prange(len(order)):
         if order[i] < len(index):
             j = index[order[i]]
@@ -47,21 +67,22 @@ def fill_leaves(order, index, column, out):
 
 
 @kernel(parallel=True)
-def merge_colors(place, child_start, child_count, order, weight, color, chunks):
-    """Weighted mean colour of the children of nodes, whose children's colours are in place.
+def merge_colors(parents, child_start, child_count, order, weight, color, blocks):
+    """Fills the colours of nodes with the weighted mean of their children's, which must be filled already.
 
     Args:
-        place: (G,) final indices of the nodes.
+        parents: (G,) final indices of the nodes.
         child_start, child_count: of the whole tree.
-        order, weight: node of each final index, and weight of each node, float64.
-        color: (M, J) float32 in final order, rows `place` are filled.
-        chunks: how many pieces to work in.
+        order: (M,) uint32, the node of each final index.
+        weight: (nodes,) float64, of each node.
+        color: (M, J) float32 in final order; rows `parents` are filled.
+        blocks: ranges of nodes to process in parallel; the result does not depend on it.
     """
-    n, width = len(place), color.shape[1]
-    for c in prange(chunks):
+    n, width = len(parents), color.shape[1]
+    for block in prange(blocks):
         total = np.empty(width, np.float64)
-        for g in range(n * c // chunks, n * (c + 1) // chunks):
-            node = place[g]
+        for g in range(n * block // blocks, n * (block + 1) // blocks):
+            node = parents[g]
             total_weight = 0.0
             for k in range(width):
                 total[k] = 0.0

@@ -1,12 +1,13 @@
-"""The row a builder works on, and what fills it from splats.
+"""The quick builder's node rows, and surfaces and bounds of splats.
 
-A builder touches centre, scale, rotation and opacity of a node together, so they lie together: one row of 11 float32 a
-node. Leaves come first, sorted so that neighbours in space are neighbours in memory; merged nodes follow.
+The quick builder reads centre, scale, rotation and opacity of a node together, so they are stored together: one row of
+11 float32 per node. Leaves come first, sorted so that neighbours in space are so in memory; merged nodes follow.
 """
 
 from __future__ import annotations
 
 import math
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import prange
@@ -16,20 +17,39 @@ from ...support.jit import kernel
 
 CENTER, SCALE, QUAT, OPACITY, WIDTH = 0, 3, 6, 10, 11  # first column of each, and the number of columns
 
-BLOCK = 256  # rows that are gathered before they are computed with, so that their cache misses overlap
-#: What float32 holds: a merged splat of others that are farther apart is as large as that.
+#: Rows gathered before their areas are computed, so that cache misses overlap; results do not depend on it.
+BLOCK = 256
+
+#: The largest float32, world units: centres and scales of merged splats are clamped to it.
 LARGEST = float(np.finfo(np.float32).max)
 
+#: Least semi-axis of `ellipsoid_area`, as a share of the longest: far below any needle in a file, and its power is a
+#: float32 above 0. Chosen.
 AXIS_FLOOR = np.float32(1e-20)
 THOMSEN_P32, THOMSEN_ROOT, THIRD = np.float32(THOMSEN_P), np.float32(1 / THOMSEN_P), np.float32(1 / 3)
 
 
+class SplatColumns(NamedTuple):
+    """Geometry of N splats, float32 columns as in `Splats`, for a kernel to read.
+
+    Arrays that a parallel kernel fills must be arguments of their own: numba 0.68 takes writes to arrays out of a tuple
+    for dead code and removes them.
+
+    Attributes:
+        center: (N, 3). scale: (N, 3). quat_xyzw: (N, 4). opacity: (N,).
+    """
+
+    center: Any
+    scale: Any
+    quat_xyzw: Any
+    opacity: Any
+
+
 @kernel()
 def ellipsoid_area(a, b, c):
-    """Surface of an ellipsoid with semi-axes a, b, c (Knud Thomsen's formula).
+    """Surface area of an ellipsoid with semi-axes a, b, c, by Knud Thomsen's formula.
 
-    Any of them may be 0, but not all: an axis counts as at least AXIS_FLOOR of the longest, so that a needle weighs
-    something.
+    Not all of them may be 0. A semi-axis counts as at least AXIS_FLOOR of the longest, so that needles have an area.
     """
     largest = max(a, b, c)
     smallest = min(a, b, c)
@@ -42,21 +62,30 @@ def ellipsoid_area(a, b, c):
 
 
 @kernel(parallel=True)
-def extremes(center, scale, chunks):
-    """Lowest and highest centre on each axis, (3,) float64 each, and the smallest and largest size, 2 * max(scale)."""
+def find_bounds(center, scale, blocks):
+    """The box of the centres, and the range of sizes.
+
+    Args:
+        center, scale: (N, 3) float32.
+        blocks: ranges of splats to process in parallel; the result does not depend on it.
+
+    Returns:
+        low, high: (3,) float64 corners of the box.
+        smallest, largest: size, 2 * max(scale).
+    """
     n = len(center)
-    low = np.full((chunks, 4), np.inf)
-    high = np.full((chunks, 4), -np.inf)
-    for c in prange(chunks):
+    low = np.full((blocks, 4), np.inf)
+    high = np.full((blocks, 4), -np.inf)
+    for c in prange(blocks):
         x0 = y0 = z0 = s0 = np.float32(np.inf)
         x1 = y1 = z1 = s1 = np.float32(-np.inf)
-        for i in range(n * c // chunks, n * (c + 1) // chunks):
+        for i in range(n * c // blocks, n * (c + 1) // blocks):
             x, y, z, s = center[i, 0], center[i, 1], center[i, 2], max(scale[i, 0], scale[i, 1], scale[i, 2])
             x0, y0, z0, s0 = min(x0, x), min(y0, y), min(z0, z), min(s0, s)
             x1, y1, z1, s1 = max(x1, x), max(y1, y), max(z1, z), max(s1, s)
         low[c, 0], low[c, 1], low[c, 2], low[c, 3] = x0, y0, z0, s0
         high[c, 0], high[c, 1], high[c, 2], high[c, 3] = x1, y1, z1, s1
-    for c in range(1, chunks):
+    for c in range(1, blocks):
         for k in range(4):
             low[0, k] = min(low[0, k], low[c, k])
             high[0, k] = max(high[0, k], high[c, k])
@@ -64,8 +93,16 @@ def extremes(center, scale, chunks):
 
 
 @kernel(parallel=True)
-def fill_rows(index, center, scale, quat, opacity, geometry, weight):
-    """Row i of geometry and weight from splat index[i]; a weight is opacity * area, float64."""
+def gather_rows(index, splats, geometry, weight):
+    """Fills row i of geometry, and weight[i], from splat index[i].
+
+    Args:
+        index: (n,) uint32.
+        splats: `SplatColumns`.
+        geometry: (at least n, WIDTH) float32, the first n rows are filled.
+        weight: (at least n,) float64, opacity * area; the first n are filled.
+    """
+    center, scale, quat, opacity = splats
     n = len(index)
     for block in prange((n + BLOCK - 1) // BLOCK):
         begin, end = block * BLOCK, min(n, block * BLOCK + BLOCK)

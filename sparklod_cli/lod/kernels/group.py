@@ -1,4 +1,4 @@
-"""Levels and cells: which splats belong where, and which share a cell."""
+"""Levels and cells of the quick builder: the sort keys of splats, and the cells with more than one node."""
 
 from __future__ import annotations
 
@@ -13,18 +13,19 @@ from .sort import morton_code
 
 @kernel(parallel=True)
 def level_keys(center, scale, steps, grid, low, cell_bits):
-    """Sort keys that order splats by natural level and, inside a level, along a Morton curve.
+    """Sort keys that order splats by level and, within a level, along a Morton curve.
 
     Args:
         center, scale: (n, 3) float32.
-        steps: (L,) float64 ascending, a geometric series; the last is not below the largest size; what is smaller than
-            the first belongs to it.
+        steps: (L,) float64, the cell edge of each level, a rising geometric series. The last is at least the largest
+            size; splats smaller than the first belong to it.
         grid: edge of the cells of the curve, float64.
-        low: (3,) int64 lowest cell of `grid`.
-        cell_bits: bits of the curve, below the level's bits.
+        low: (3,) int64, the lowest cell of the curve.
+        cell_bits: number of bits for the curve; the level's bits are above them.
 
     Returns:
-        keys (n,) uint64, and levels (n,) int32 into `steps`.
+        keys: (n,) uint64.
+        levels: (n,) int32, indices into `steps`.
     """
     n = len(scale)
     keys = np.empty(n, np.uint64)
@@ -34,7 +35,7 @@ def level_keys(center, scale, steps, grid, low, cell_bits):
     for i in prange(n):
         size = 2 * np.float64(max(scale[i, 0], scale[i, 1], scale[i, 2]))
         level = min(max(np.int64(math.ceil((math.log(size) - start) * per_level)), 0), len(steps) - 1)
-        # The logarithm rounds; the table of steps is what the level is defined by.
+        # The logarithm is rounded; the table of steps defines the level.
         while level > 0 and size <= steps[level - 1]:
             level -= 1
         while size > steps[level]:
@@ -47,16 +48,17 @@ def level_keys(center, scale, steps, grid, low, cell_bits):
 
 @kernel()
 def split_cells(nodes, is_first, next_node):
-    """Separates the cells that hold one node from those that hold more.
+    """Separates cells with one node from cells with more, whose nodes will be merged.
 
     Args:
         nodes: (n,) uint32, sorted by cell.
         is_first: (n,) bool, true where a cell begins.
-        next_node: the node that will be made of the first cell with more than one, counted up from there.
+        next_node: the node that the first cell with more than one will be merged into; the next cell's is one more.
 
     Returns:
-        members (C,) uint32: the nodes of all cells with more than one; first (G + 1,) int64: where each such cell
-        starts in members; survivors (S,) uint32: the one node of each cell, in order.
+        members: (C,) uint32, the nodes of all cells with more than one.
+        first: (G + 1,) int64, where each such cell begins in `members`.
+        survivors: (S,) uint32, the node that each cell has afterwards, in order.
     """
     n = len(nodes)
     members = np.empty(n, np.uint32)

@@ -1,7 +1,7 @@
-"""Merging Gaussians: moment matching.
+"""Merges groups of splats by moment matching: the merged splat has their weighted mean and covariance.
 
-Weights, moments and the eigen-decomposition are in float64: a mean of float32 centres 1e7 units from the origin, or
-squares of scales near 1e-30, would not survive float32.
+Weights, moments and the eigen-decomposition are in float64, as float32 has too few digits for a mean of centres 1e7
+units from the origin, and too small a range for squares of scales near 1e-30.
 """
 
 from __future__ import annotations
@@ -11,22 +11,26 @@ import math
 import numpy as np
 from numba import prange
 
+from ...model import gaussian
 from ...model.gaussian import MAX_OPACITY, MIN_OPACITY
 from ...support.jit import kernel
 from .eigen import ROWS, decompose
 from .geometry import CENTER, LARGEST, OPACITY, QUAT, SCALE, WIDTH, ellipsoid_area
 
+#: Least scale of a merged splat, world units: a scale of 0 has no logarithm, which PLY and SPZ store. Chosen.
 SCALE_FLOOR = 1e-30
-BLOCK = 64  # groups that are merged together: gathered, summed, then decomposed side by side
+
+#: Groups merged together: gathered, summed, then decomposed side by side; results do not depend on it.
+BLOCK = 64
+
+rotation_matrix = kernel(inline=True)(gaussian.rotation_matrix)
 
 
 @kernel()
 def covariance(a, b, c, x, y, z, w):
-    """xx, yy, zz, xy, xz, yz of R S S^T R^T, from scales a, b, c and a unit quaternion."""
+    """xx, yy, zz, xy, xz, yz of R diag(a^2, b^2, c^2) R^T, of scales a, b, c and a unit quaternion in float64."""
     a, b, c = a * a, b * b, c * c
-    r00, r01, r02 = 1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)
-    r10, r11, r12 = 2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)
-    r20, r21, r22 = 2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)
+    r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation_matrix(x, y, z, w, 1.0)
     return (
         r00 * r00 * a + r01 * r01 * b + r02 * r02 * c,
         r10 * r10 * a + r11 * r11 * b + r12 * r12 * c,
@@ -39,14 +43,14 @@ def covariance(a, b, c, x, y, z, w):
 
 @kernel()
 def sum_moments(row, weight, begin, end, merged, moments, column):
-    """Weighted mean and covariance of rows begin to end.
+    """Weighted mean and covariance of the rows `begin` to `end`.
 
     Args:
         row, weight: rows of `geometry.py` and their weights.
-        begin, end: which of them.
-        merged: a row of geometry, whose centre is set to the mean.
-        moments: (6 or more, columns) float64, whose `column` is set to xx, yy, zz, xy, xz, yz.
-        column: which.
+        begin, end: the range of rows.
+        merged: a row of geometry; its centre is set to the mean.
+        moments: (6 or more, columns) float64; rows 0 to 5 of `column` are set to xx, yy, zz, xy, xz, yz.
+        column: index of the group in `moments`.
 
     Returns:
         the sum of the weights.
@@ -86,20 +90,22 @@ def sum_moments(row, weight, begin, end, merged, moments, column):
 
 @kernel(parallel=True)
 def merge_groups(nodes, first, geometry, weight, base):
-    """One merged node for each group of nodes, by moments weighted with opacity * area.
+    """Merges each group of nodes into one, by moments weighted with opacity * area.
+
+    A merged node's opacity is the sum of the weights over its area, so that it covers about as much as the group.
 
     Args:
         nodes: (C,) uint32 rows of geometry, the members of all groups.
-        first: (G + 1,) where each group starts in `nodes`.
-        geometry: rows of `geometry.py`; base .. base + G are filled.
-        weight: (len(geometry),) float64 opacity * area of each row; the same are filled.
+        first: (G + 1,) where each group begins in `nodes`.
+        geometry: rows of `geometry.py`; rows base .. base + G are filled.
+        weight: (len(geometry),) float64, opacity * area of each row; the same rows are filled.
         base: the first row to fill.
     """
     groups = len(first) - 1
     for block in prange((groups + BLOCK - 1) // BLOCK):
         block_begin, block_end = block * BLOCK, min(groups, block * BLOCK + BLOCK)
         offset = first[block_begin]
-        # Copying the members first lets their cache misses overlap; the arithmetic below would wait for each in turn.
+        # Members are copied first so that their cache misses overlap; the arithmetic below would wait for each in turn.
         row = np.empty((first[block_end] - offset, WIDTH), np.float32)
         row_weight = np.empty(len(row), np.float64)
         for k in range(len(row)):

@@ -1,8 +1,9 @@
-"""Splats into rows of state, rows of state into splats, and the order of rows along a curve."""
+"""The quality builder's node rows from splats, splats from node rows, and Morton codes of nodes."""
 
 from __future__ import annotations
 
 import math
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import prange
@@ -10,41 +11,59 @@ from numba import prange
 from ...support.jit import kernel
 from .eigen import ROWS, decompose
 from .geometry import LARGEST, ellipsoid_area
-from .merge import covariance
+from .merge import SCALE_FLOOR, covariance
 from .pair_cost import CENTER, COLOR, COVARIANCE, COVERED, DENSITY, LOG_DET, WEIGHT, log_det
 from .profile import profile_of
 from .sort import interleave
 
-#: Bits an axis of the curve.
+#: Bits per axis of a node's Morton code: 39 bits are sorted in four passes. Chosen.
 CURVE_BITS = 13
 
+#: Merged splats decomposed side by side; results do not depend on it.
 BLOCK = 64
 
-#: Colours count for the choice of pairs no further than this, and nothing is smaller than LEAST, so that float32 holds
-#: what they make.
-BRIGHTEST, LEAST = np.float32(1e3), np.float32(1e-30)
+#: Bound of colours in the cost of pairs, so that float32 holds their squares times a coverage. Chosen; far beyond any
+#: display.
+MAX_COLOR = np.float32(1e3)
+
+#: Least coverage and least size of a leaf, in the builder's unit (squared), so that both have logarithms. Chosen.
+LEAST = np.float32(1e-30)
+
+
+class Space(NamedTuple):
+    """The builder's coordinates: (world - middle) / unit.
+
+    Attributes:
+        middle: (3,) float64, world units. unit: float64, world units.
+    """
+
+    middle: Any
+    unit: Any
 
 
 @kernel(parallel=True)
-def fill_state(index, center, scale, quat, opacity, rgb, middle, unit, state, size):
-    """Row i of state from splat index[i].
+def fill_leaf_rows(index, splats, rgb, space, rows, size):
+    """Fills row i from splat index[i].
 
     Args:
         index: (n,) uint32.
-        center, scale, quat, opacity, rgb: columns of the splats.
-        middle: (3,) float64 of the scene. unit: of length, float64.
-        state: rows of `pairs.py`, the first n are filled.
-        size: (rows,) float32, the first n are filled: how large the traversal sees them, in units.
+        splats: `SplatColumns`.
+        rgb: (N, 3) float32 of the splats.
+        space: `Space`.
+        rows: node rows, see `pair_cost.py`; the first n are filled.
+        size: (nodes,) float32; the first n are filled with the feature size, in units.
     """
+    center, scale, quat, opacity = splats
+    middle, unit = space
     for i in prange(len(index)):
         splat = index[i]
-        row = state[i]
+        row = rows[i]
         a, b, c = scale[splat, 0] / unit, scale[splat, 1] / unit, scale[splat, 2] / unit
         x, y, z = np.float64(quat[splat, 0]), np.float64(quat[splat, 1]), np.float64(quat[splat, 2])
         xx, yy, zz, xy, xz, yz = covariance(a, b, c, x, y, z, np.float64(quat[splat, 3]))
         for k in range(3):
             row[CENTER + k] = (np.float64(center[splat, k]) - middle[k]) / unit
-            row[COLOR + k] = min(max(rgb[splat, k], -BRIGHTEST), BRIGHTEST)
+            row[COLOR + k] = min(max(rgb[splat, k], -MAX_COLOR), MAX_COLOR)
         row[COVARIANCE], row[COVARIANCE + 1], row[COVARIANCE + 2] = xx, yy, zz
         row[COVARIANCE + 3], row[COVARIANCE + 4], row[COVARIANCE + 5] = xy, xz, yz
         row[LOG_DET] = log_det(
@@ -57,12 +76,14 @@ def fill_state(index, center, scale, quat, opacity, rgb, middle, unit, state, si
 
 
 @kernel(parallel=True)
-def curve_keys(state, nodes, low, step):
-    """Places of nodes on a Morton curve of CURVE_BITS an axis; what is outside of it is at its edge.
+def morton_keys(rows, nodes, low, step):
+    """Morton codes of nodes, of CURVE_BITS per axis; centres outside the curve's box are clamped to it.
 
     Args:
-        state: rows of `pairs.py`. nodes: (n,) uint32 of it.
-        low: (3,) float64 corner of its box. step: edge of its cells, float64.
+        rows: node rows.
+        nodes: (n,) uint32 indices of rows.
+        low: (3,) float64, the lowest corner of the box, units.
+        step: edge of a cell, float64, units.
 
     Returns:
         (n,) uint64.
@@ -70,7 +91,7 @@ def curve_keys(state, nodes, low, step):
     keys = np.empty(len(nodes), np.uint64)
     most = float((1 << CURVE_BITS) - 1)
     for i in prange(len(nodes)):
-        row = state[nodes[i]]
+        row = rows[nodes[i]]
         x = np.uint64(min(max((row[CENTER] - low[0]) / step, 0.0), most))
         y = np.uint64(min(max((row[CENTER + 1] - low[1]) / step, 0.0), most))
         z = np.uint64(min(max((row[CENTER + 2] - low[2]) / step, 0.0), most))
@@ -79,14 +100,17 @@ def curve_keys(state, nodes, low, step):
 
 
 @kernel(parallel=True)
-def fill_merged(order, leaves, state, middle, unit, center, scale, quat, opacity):
-    """Columns of the merged nodes, in final order; rows of leaves are left alone.
+def fill_merged_splats(order, leaves, rows, space, center, scale, quat, opacity):
+    """Fills the geometry of merged splats in final order; leaves are left as they are.
 
     Args:
-        order: (M,) uint32 row of state of each final index; those from `leaves` on are merged.
-        state, middle, unit: see `fill_state`.
-        center, scale, quat, opacity: of M splats.
+        order: (M,) uint32, the node of each final index.
+        leaves: number of leaves; nodes from there on are merged.
+        rows: node rows.
+        space: `Space`.
+        center, scale, quat, opacity: columns of M splats.
     """
+    middle, unit = space
     n = len(order)
     for block in prange((n + BLOCK - 1) // BLOCK):
         begin, end = block * BLOCK, min(n, block * BLOCK + BLOCK)
@@ -96,18 +120,18 @@ def fill_merged(order, leaves, state, middle, unit, center, scale, quat, opacity
         for i in range(begin, end):
             if order[i] >= leaves:
                 for element in range(6):
-                    moments[element, count] = state[order[i], COVARIANCE + element]
+                    moments[element, count] = rows[order[i], COVARIANCE + element]
                 found[count] = i
                 count += 1
-        decompose(moments, np.int64(count))  # not as the literal 0, for which it would be compiled as well
+        decompose(moments, np.int64(count))  # a literal 0 would be compiled as a type of its own
         for k in range(count):
             i = found[k]
-            row = state[order[i]]
+            row = rows[order[i]]
             linear, spread = profile_of(np.float64(row[DENSITY]))
             opacity[i] = linear
             for axis in range(3):
                 place = np.float64(row[CENTER + axis]) * unit + middle[axis]
                 center[i, axis] = min(max(place, -LARGEST), LARGEST)
-                scale[i, axis] = min(max(math.sqrt(max(moments[axis, k], 0.0) / spread) * unit, 1e-30), LARGEST)
+                scale[i, axis] = min(max(math.sqrt(max(moments[axis, k], 0.0) / spread) * unit, SCALE_FLOOR), LARGEST)
             for part in range(4):
                 quat[i, part] = moments[6 + part, k]

@@ -1,7 +1,7 @@
-"""Who merges with whom: the cost of pairs of neighbours along a curve through space, and each one's cheapest.
+"""Which nodes the quality builder merges: costs of pairs of neighbours along a curve, and the cheapest pairs.
 
-A row of state is a cache line: what is known of a node while the tree grows. Lengths are in a unit near the median
-scale, from the middle of the scene, so that float32 holds squares and products of them.
+The quality builder's node row is one cache line: 16 float32 for each node of the growing tree. Lengths are in a unit
+near the median scale, with the origin in the middle of the scene, so that float32 holds their squares and products.
 """
 
 from __future__ import annotations
@@ -16,31 +16,37 @@ from ...support.jit import kernel
 
 f32 = np.float32
 
-#: First column of a row of state: centre, covariance of the profile (xx yy zz xy xz yz), colour, logarithm of the
-#: covariance's determinant, what it covers (opacity * area), the density of that (see `profile.py`), and the weight of
-#: its colour, which is the sum of its leaves'.
+#: First columns of a node row: centre, covariance of the profile (xx yy zz xy xz yz), colour, logarithm of the
+#: covariance's determinant, coverage (opacity * area), density of the coverage (see `profile.py`), and the weight of
+#: the colour, which is the sum of the leaves' weights; then the number of columns.
 CENTER, COVARIANCE, COLOR, LOG_DET, COVERED, DENSITY, WEIGHT, WIDTH = 0, 3, 9, 12, 13, 14, 15, 16
 
-#: What the cost reads of a row: all but the last two, side by side for a whole block.
+#: Columns that the cost reads: all but the last two, side by side for a whole block.
 LANES = 14
 
-#: Nodes of a block; its columns stay in the first-level cache.
+#: Nodes in a block: its columns, 30 KB, stay in the first-level cache. Results do not depend on it.
 BLOCK = 512
 
-#: How much a squared difference of colour (0..1 a channel) costs beside one nat of shape.
+#: Cost of a squared colour difference of 1 (channels are 0..1), in nats of shape. Between 3 and 10 it matters little
+#: (docs/decisions/2026-11-21-fidelity.md).
 COLOR_COST = f32(4)
 
-#: An axis of an ellipsoid counts as at least this share of the trace, squared: flatter is not cheaper to merge.
+#: Least variance along an axis in the cost, as a share of the trace: flatter splats are not cheaper to merge. Chosen.
 FLATTEST = f32(1e-5)
 
+#: Least trace of a covariance in the cost, units squared, so that a node without extent has a logarithm. Chosen.
+LEAST_TRACE = f32(1e-30)
+
 LN2 = f32(math.log(2))
+
+#: The cost of a pair that must not be merged.
 NEVER = f32(np.inf)
 
 
 @kernel(inline=True)
 def log_det(xx, yy, zz, xy, xz, yz):
-    """Logarithm of the determinant of a covariance, float32, from its pivots, none below FLATTEST of the trace."""
-    trace = xx + yy + zz + f32(1e-30)
+    """Natural logarithm of a covariance's determinant, float32, from its pivots, none below FLATTEST of the trace."""
+    trace = xx + yy + zz + LEAST_TRACE
     least = FLATTEST * trace
     inverse = f32(1) / trace
     first = max(xx, least)
@@ -53,18 +59,17 @@ def log_det(xx, yy, zz, xy, xz, yz):
 
 
 @kernel()
-def block_costs(lanes, step, count, largest, cost):
-    """Cost of merging node i with i + step: Runnalls' bound on the Kullback-Leibler divergence, times what both cover.
+def pair_costs(lanes, step, count, largest, cost):
+    """Cost of merging node i with i + step: Runnalls' bound on the Kullback-Leibler divergence, weighted by coverage.
 
-    With w for what they cover and P for covariances it is ((w_i + w_j) ln|P_ij| - w_i ln|P_i| - w_j ln|P_j|) / 2
-    (Runnalls 2007), and Ward's variance for their colours. Free of branches, so that the compiler works on several at
-    a time.
+    With coverages w and covariances P it is ((w_i + w_j) ln|P_ij| - w_i ln|P_i| - w_j ln|P_j|) / 2 (Runnalls 2007),
+    plus COLOR_COST times Ward's variance of the colours. Branch-free, so that LLVM vectorizes over pairs.
 
     Args:
-        lanes: (LANES, at least count + step) float32 columns of state.
-        step: how far apart.
-        count: how many pairs.
-        largest: trace of the covariance above which nothing is merged, float32.
+        lanes: (LANES, at least count + step) float32 columns of node rows.
+        step: distance between the nodes of a pair.
+        count: number of pairs.
+        largest: float32, units squared; a pair is never merged if its covariance has a larger trace.
         cost: (at least count,) float32, filled.
     """
     x, y, z = lanes[0], lanes[1], lanes[2]
@@ -91,16 +96,18 @@ def block_costs(lanes, step, count, largest, cost):
 
 
 @kernel(parallel=True)
-def cheapest(state, nodes, window, largest):
-    """For each node its cheapest partner among those that are near it in a list.
+def find_partners(rows, nodes, window, largest):
+    """The cheapest partner of each node among its neighbours in a list.
 
     Args:
-        state: rows as above. nodes: (n,) uint32 rows of it, in the order of a curve.
-        window: how far a partner may be in the list.
-        largest: see `block_costs`.
+        rows: node rows, see above.
+        nodes: (n,) uint32 indices of rows, in the order of the curve.
+        window: largest distance of a partner in the list.
+        largest: see `pair_costs`.
 
     Returns:
-        partner: (n,) int32 place in the list, -1 for none. cost: (n,) float32.
+        partner: (n,) int32 index into `nodes`, -1 for none.
+        cost: (n,) float32, of merging with it.
     """
     n = len(nodes)
     partner, lowest = np.full(n, -1, np.int32), np.full(n, NEVER, np.float32)
@@ -112,27 +119,34 @@ def cheapest(state, nodes, window, largest):
         best, at = np.full(BLOCK + 2 * window, NEVER, np.float32), np.full(BLOCK + 2 * window, -1, np.int32)
         for i in range(low, high):
             for column in range(LANES):
-                lanes[column, i - low] = state[nodes[i], column]
+                lanes[column, i - low] = rows[nodes[i], column]
         for step in range(1, window + 1):
-            # Pairs with at least one in the block; the first of them may lie before it.
+            # Pairs with at least one node in the block; the first node may lie before it.
             first = max(low, begin - step) - low
             count = min(end - low, high - low - step) - first
             if count <= 0:
                 continue
-            block_costs(lanes[:, first:], step, count, largest, cost)
-            take_lower(cost, count, best[first:], at[first:], low + first, low + first + step)
-            take_lower(cost, count, best[first + step :], at[first + step :], low + first + step, low + first)
+            pair_costs(lanes[:, first:], step, count, largest, cost)
+            keep_cheaper(cost, count, best[first:], at[first:], low + first, low + first + step)
+            keep_cheaper(cost, count, best[first + step :], at[first + step :], low + first + step, low + first)
         for i in range(begin, end):
             partner[i], lowest[i] = at[i - low], best[i - low]
     return partner, lowest
 
 
 @kernel()
-def take_lower(cost, count, best, at, here, there):
-    """Where cost[i] is lower than best[i], takes it, and there + i for the partner of here + i.
+def keep_cheaper(cost, count, best, at, here, there):
+    """Where cost[i] is less than best[i], sets best[i] to it, and at[i], the partner of here + i, to there + i.
 
-    Of equal costs the partner wins whose place differs in lower bits: one for which it is the same, so that among many
-    equal splats half find each other.
+    Among equal costs, that partner wins whose index differs from the node's in the lowest bits. That relation is
+    symmetric, so among many equal splats half choose each other.
+
+    Args:
+        cost: (at least count,) float32, of pairs (here + i, there + i).
+        count: number of pairs.
+        best: (at least count,) float32, updated.
+        at: (at least count,) int32, updated.
+        here, there: indices of the first pair's node and its partner.
     """
     for i in range(count):
         own, new = np.int32(here + i), np.int32(there + i)
@@ -142,16 +156,18 @@ def take_lower(cost, count, best, at, here, there):
 
 
 @kernel()
-def pair_up(nodes, partner, cost, limit, made):
-    """Pairs of nodes that are each other's cheapest, and the list without them but with what they become.
+def match_pairs(nodes, partner, cost, limit, made):
+    """Pairs of nodes that are each other's cheapest partner, and the list in which merged nodes replace them.
 
     Args:
-        nodes: (n,) uint32. partner, cost: of `cheapest`.
-        limit: what a pair may cost.
-        made: the node that the first pair becomes, counted up from there.
+        nodes: (n,) uint32.
+        partner, cost: of `find_partners`.
+        limit: largest cost of a pair, float32.
+        made: the node that the first pair is merged into; the next pair's is one more.
 
     Returns:
-        pairs (P, 2) uint32, and the list (n - P,) uint32 in its order, what a pair becomes in the place of its first.
+        pairs: (P, 2) uint32.
+        rest: (n - P,) uint32, the list in its order; a merged node replaces the first of its pair.
     """
     n = len(nodes)
     mutual = 0

@@ -1,13 +1,14 @@
-"""Merging two nodes into one that covers what they cover together.
+"""Merges pairs of nodes into nodes that cover what the two cover together.
 
-What the two cover (coverage: opacity summed over the plane of projection) is what each covers, less what both do. The
-same holds for its first and second moments. How much both cover is a product of Gaussians, on the planes of the three
-axes; the moments of it are those of the product in space.
+Coverage is opacity integrated over the plane of projection. The coverage of a union is the sum of the two coverages
+less that of the overlap, and the same holds for first and second moments. The overlap's coverage is the integral of a
+product of Gaussians, on the planes of the three axes; its moments are those of the product in space.
 """
 
 from __future__ import annotations
 
 import math
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import prange
@@ -17,26 +18,61 @@ from .geometry import ellipsoid_area
 from .pair_cost import CENTER, COLOR, COVARIANCE, COVERED, DENSITY, LOG_DET, WEIGHT, log_det
 from .profile import profile_of, size_factor
 
-#: How much opacity counts in the error of a picture beside each channel of colour: on black and on white.
-ALPHA = 1.0
+#: Weight of opacity beside each channel of colour in the error of a picture, which may have any background. Chosen.
+ALPHA_WEIGHT = 1.0
 
-#: Rows and columns of a matrix for xx yy zz xy xz yz.
+#: Row and column of the elements xx yy zz xy xz yz.
 ROW, COLUMN = (0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2)
 
-#: Places among xx yy zz xy xz yz, for the planes xy, xz and yz: first, second, mixed; and their axes.
+#: For the planes xy, xz and yz: indices of the two variances and the covariance among xx yy zz xy xz yz; the two axes.
 PLANES = ((0, 1, 3, 0, 1), (0, 2, 4, 0, 2), (1, 2, 5, 1, 2))
 
-#: No semi-axis is shorter, in the unit of the state.
+#: Least semi-axis of a merged node, in the builder's unit, so that it has an area. Chosen.
 SHORTEST = 1e-20
+
+#: A covariance whose eigenvalues differ by less, as a share of their mean, is a sphere: the difference is float64's
+#: rounding. Chosen.
+SPHERICAL = 1e-12
+
+#: Two Gaussians do not overlap on a plane from this exponent on: e^-30 is 1e-13, and coverage is stored as a float32,
+#: whose precision is 6e-8. Chosen.
+MAX_EXPONENT = 30
+
+#: Added to the diagonal of P + Q, so that flat splats in one plane can be inverted: a share of its trace, which widens
+#: an axis to a thousandth of the longest; and variance in units squared, where both have no extent. Chosen.
+RIDGE, LEAST_RIDGE = 1e-6, 1e-30
+
+#: Least trace of a union's covariance, as a share of that of its two nodes without the overlap's part; with less, the
+#: product in space is not where they overlap (docs/decisions/2026-11-21-sizes-of-parents.md).
+LEAST_UNION = 0.5
+
+
+class Pair(NamedTuple):
+    """Two nodes that are merged, in float64, and the product of their Gaussians.
+
+    Attributes:
+        share, other: each node's share of the sum of their coverages.
+        offset: (3,) from the first centre to the second.
+        middle: (3,) from the mean of the two to the centre of their product.
+        p, q: (3, 3) covariances P and Q. gain: (3, 3) P (P + Q)^-1.
+    """
+
+    share: Any
+    other: Any
+    offset: Any
+    middle: Any
+    p: Any
+    q: Any
+    gain: Any
 
 
 @kernel()
 def semi_axes(xx, yy, zz, xy, xz, yz):
-    """Square roots of the eigenvalues of a covariance, the largest first (Smith 1961, in float64)."""
+    """Square roots of a covariance's eigenvalues, the largest first (Smith 1961), in float64."""
     mean = (xx + yy + zz) / 3
     a, b, c = xx - mean, yy - mean, zz - mean
     spread = math.sqrt((a * a + b * b + c * c + 2 * (xy * xy + xz * xz + yz * yz)) / 6)
-    if not spread > 1e-12 * mean:
+    if not spread > SPHERICAL * mean:
         root = max(math.sqrt(max(mean, 0.0)), SHORTEST)
         return root, root, root
     half_det = (a * (b * c - yz * yz) - xy * (xy * c - yz * xz) + xz * (xy * yz - b * xz)) / (2 * spread**3)
@@ -52,11 +88,15 @@ def semi_axes(xx, yy, zz, xy, xz, yz):
 
 
 @kernel(inline=True)
-def product(a, b, plane):
-    """Integral of the product of two Gaussians of height 1 over a plane, over 2 pi, and of each with itself.
+def overlap_on_plane(a, b, plane):
+    """Integrals over a plane, divided by 2 pi, of Gaussians of height 1 that are projected onto it.
 
     Args:
-        a, b: rows of state. plane: one of PLANES.
+        a, b: node rows.
+        plane: one of PLANES.
+
+    Returns:
+        of the product of the two, of the first, and of the second.
     """
     first, second, mixed, across, along = plane
     axx, ayy, axy = (
@@ -76,18 +116,18 @@ def product(a, b, plane):
     both = 0.0
     if det > 0:
         power = 0.5 * (yy * x * x - 2 * xy * x * y + xx * y * y) / det
-        if power < 30:
+        if power < MAX_EXPONENT:
             both = math.sqrt(a_det * b_det / det) * math.exp(-power)
     return both, math.sqrt(a_det), math.sqrt(b_det)
 
 
 @kernel()
-def shared_share(a, b):
-    """The share of what two nodes cover by themselves that both cover."""
+def overlap_share(a, b):
+    """The coverage of two nodes' overlap, as a share of the sum of their coverages; over the three planes."""
     shared = alone = 0.0
     density_a, density_b = np.float64(a[DENSITY]), np.float64(b[DENSITY])
     for plane in PLANES:
-        both, area_a, area_b = product(a, b, plane)
+        both, area_a, area_b = overlap_on_plane(a, b, plane)
         area_a, area_b = density_a * area_a, density_b * area_b
         shared += min(density_a * density_b * both, min(area_a, area_b))
         alone += area_a + area_b
@@ -96,15 +136,21 @@ def shared_share(a, b):
 
 @kernel()
 def picture_error(a, b, merged):
-    """How far a merged node's picture is from that of its two, squared: over red, green, blue and opacity, 3 planes."""
+    """Squared difference between the picture of a merged node and that of its two nodes.
+
+    It is summed over red, green, blue and opacity, and over the three planes.
+
+    Args:
+        a, b, merged: node rows.
+    """
     high_a, high_b, high = min(a[DENSITY], 1.0), min(b[DENSITY], 1.0), min(merged[DENSITY], 1.0)
     aa = bb = mm = ab = am = bm = 0.0
     for plane in PLANES:
-        both, area_a, area_b = product(a, b, plane)
+        both, area_a, area_b = overlap_on_plane(a, b, plane)
         ab += both
-        both, _, area = product(a, merged, plane)
+        both, _, area = overlap_on_plane(a, merged, plane)
         am += both
-        both, _, _ = product(b, merged, plane)
+        both, _, _ = overlap_on_plane(b, merged, plane)
         bm += both
         aa, bb, mm = aa + area_a / 2, bb + area_b / 2, mm + area / 2
     total = 0.0
@@ -112,37 +158,38 @@ def picture_error(a, b, merged):
         if channel < 3:
             p, q, r = high_a * a[COLOR + channel], high_b * b[COLOR + channel], high * merged[COLOR + channel]
         else:
-            root = math.sqrt(ALPHA)
+            root = math.sqrt(ALPHA_WEIGHT)
             p, q, r = high_a * root, high_b * root, high * root
         total += p * p * aa + q * q * bb + r * r * mm + 2 * (p * q * ab - p * r * am - q * r * bm)
     return max(total, 0.0)
 
 
 @kernel()
-def unite(a, b, merged):
-    """Centre, covariance and coverage of what two nodes cover together.
+def merge_pair(a, b, merged):
+    """Fills the centre, covariance and coverage of the union of two nodes.
 
-    The product of two Gaussians with covariances P and Q at 0 and d is one with P - P (P + Q)^-1 P at P (P + Q)^-1 d.
-    Needles side by side, or flat splats nearly in one plane, may have it far away from both, where the lines or planes
-    that they lie in cross; they overlap in projection only. That is no place of what both cover: its moments are then
-    left alone, or the variance of the two would come out too small, or negative.
+    The product of two Gaussians with covariances P and Q at 0 and d is a Gaussian with covariance P - P (P + Q)^-1 P at
+    P (P + Q)^-1 d. That of needles side by side, or of flat splats nearly in one plane, may be far away from both,
+    where their lines or planes cross; they overlap in projection only. The overlap is then not there, and subtracting
+    its moments would make the union's variance too small, or negative: they are left out.
 
     Args:
-        a, b: rows of state. merged: the row to fill; but for its density.
+        a, b: node rows.
+        merged: the row to fill.
     """
     total = np.float64(a[COVERED]) + np.float64(b[COVERED])
     share, other = np.float64(a[COVERED]) / total, np.float64(b[COVERED]) / total
-    hidden = shared_share(a, b)
+    hidden = overlap_share(a, b)
     offset, p, q, joint = np.empty(3), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     for i in range(3):
         offset[i] = np.float64(b[CENTER + i]) - np.float64(a[CENTER + i])
-    fill_matrix(a, p)
-    fill_matrix(b, q)
+    fill_covariance_matrix(a, p)
+    fill_covariance_matrix(b, q)
     trace = p[0, 0] + p[1, 1] + p[2, 2] + q[0, 0] + q[1, 1] + q[2, 2]
     for i in range(3):
         for j in range(3):
             joint[i, j] = p[i, j] + q[i, j]
-        joint[i, i] += 1e-6 * trace + 1e-30  # flat splats in one plane
+        joint[i, i] += RIDGE * trace + LEAST_RIDGE
     # gain = P (P + Q)^-1
     gain, inverse = np.empty((3, 3)), np.empty((3, 3))
     det = 0.0
@@ -156,7 +203,7 @@ def unite(a, b, merged):
         for j in range(3):
             gain[i, j] = (p[i, 0] * inverse[0, j] + p[i, 1] * inverse[1, j] + p[i, 2] * inverse[2, j]) / det
     merged[COVERED] = total * (1 - hidden)
-    # Of the product's centre from the mean of the two; moments are about that mean, so that nothing cancels.
+    # The product's centre from the mean of the two; moments are about that mean, so that nothing cancels.
     middle = np.empty(3)
     from_a = from_b = reach = 0.0
     for i in range(3):
@@ -165,25 +212,27 @@ def unite(a, b, merged):
         from_a += of_a * of_a
         from_b += (of_a - offset[i]) * (of_a - offset[i])
         reach += offset[i] * offset[i]
-    if not max(from_a, from_b) <= reach + trace or not fill_moments(
-        share, other, hidden, offset, middle, gain, p, q, merged
-    ):
-        fill_moments(share, other, 0.0, offset, middle, gain, p, q, merged)
+    pair = Pair(share, other, offset, middle, p, q, gain)
+    if not max(from_a, from_b) <= reach + trace or not fill_covariance(pair, hidden, merged):
+        fill_covariance(pair, 0.0, merged)
         hidden = 0.0
     for i in range(3):
         merged[CENTER + i] = a[CENTER + i] + (other * offset[i] - hidden * middle[i] / (1 - hidden))
 
 
 @kernel()
-def fill_moments(share, other, hidden, offset, middle, gain, p, q, merged):
-    """The covariance of two, less what they share; tells whether it can be one: not below 0 nor half of theirs.
+def fill_covariance(pair, hidden, merged):
+    """Fills the covariance of a union: that of its two nodes, less that of their overlap.
 
     Args:
-        share, other: of each of the two in what they cover. hidden: the share that both cover.
-        offset: (3,) from the first to the second. middle: (3,) from their mean to the centre of their product.
-        gain: (3, 3) P (P + Q)^-1. p, q: (3, 3) P and Q.
-        merged: the row whose covariance is filled.
+        pair: `Pair`.
+        hidden: the overlap's coverage, as a share of the sum of the two.
+        merged: the node row whose covariance is filled.
+
+    Returns:
+        whether it is a covariance: no variance is negative, and the trace is at least LEAST_UNION of the two nodes'.
     """
+    share, other, offset, middle, p, q, gain = pair
     left = 1 - hidden
     of_two = trace = 0.0
     sound = True
@@ -200,12 +249,12 @@ def fill_moments(share, other, hidden, offset, middle, gain, p, q, merged):
             of_two += plain
             trace += united
             sound = sound and united >= 0
-    return sound and trace >= 0.5 * of_two
+    return sound and trace >= LEAST_UNION * of_two
 
 
 @kernel(inline=True)
-def fill_matrix(row, matrix):
-    """The covariance of a row of state, (3, 3) float64."""
+def fill_covariance_matrix(row, matrix):
+    """Fills a (3, 3) float64 matrix with the covariance of a node row."""
     matrix[0, 0], matrix[1, 1], matrix[2, 2] = row[COVARIANCE], row[COVARIANCE + 1], row[COVARIANCE + 2]
     matrix[0, 1] = matrix[1, 0] = row[COVARIANCE + 3]
     matrix[0, 2] = matrix[2, 0] = row[COVARIANCE + 4]
@@ -213,21 +262,21 @@ def fill_matrix(row, matrix):
 
 
 @kernel(parallel=True)
-def unite_pairs(pairs, made, state, children, size, error):
-    """Makes one node of each pair.
+def merge_pairs(pairs, made, rows, children, size, error):
+    """Merges each pair of nodes into one.
 
     Args:
-        pairs: (P, 2) uint32 rows of state.
-        made: the first row to fill.
-        state: rows of `pairs.py`.
-        children: (rows, 2) uint32, filled.
-        size: (rows,) float32, filled: how large the traversal sees the node that will be drawn.
-        error: (rows,) float32, filled: `picture_error`.
+        pairs: (P, 2) uint32 nodes.
+        made: the first node to fill; the next pair's is one more.
+        rows: node rows, see `pair_cost.py`; those from `made` on are filled.
+        children: (nodes, 2) uint32, filled.
+        size: (nodes,) float32, filled with the feature size of the splat that will be drawn, in units.
+        error: (nodes,) float32, filled with `picture_error`.
     """
     for pair in prange(len(pairs)):
-        a, b, merged = state[pairs[pair, 0]], state[pairs[pair, 1]], state[made + pair]
+        a, b, merged = rows[pairs[pair, 0]], rows[pairs[pair, 1]], rows[made + pair]
         children[made + pair, 0], children[made + pair, 1] = pairs[pair, 0], pairs[pair, 1]
-        unite(a, b, merged)
+        merge_pair(a, b, merged)
         weight = np.float64(a[WEIGHT]) + np.float64(b[WEIGHT])
         for channel in range(3):
             merged[COLOR + channel] = (a[WEIGHT] * a[COLOR + channel] + b[WEIGHT] * b[COLOR + channel]) / weight

@@ -1,4 +1,4 @@
-"""How large a camera sees a node: what the traversal goes by."""
+"""The pixel scale of a node, its angular size: the number that the traversal orders nodes by."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import numpy as np
 
 from ...support.jit import kernel
 
-#: A node as the traversal reads it, its links relative to its own tree. Children lie side by side, so that a node's
-#: are in one or two cache lines.
+#: A node as the traversal reads it; links are relative to its own tree. Siblings are adjacent, so that a node's
+#: children are in a few cache lines.
 NODE = np.dtype(
     [
         ("x", "<f4"),  # centre, object space
@@ -19,7 +19,7 @@ NODE = np.dtype(
     ]
 )
 
-#: An instance as one camera sees it; vectors in object space.
+#: A camera in the object space of one instance, and how the instance's pixel scales are weighted.
 VIEW = np.dtype(
     [
         *((f"origin_{axis}", "<f4") for axis in "xyz"),  # of the camera
@@ -27,34 +27,35 @@ VIEW = np.dtype(
         *((f"up_{axis}", "<f4") for axis in "xyz"),
         *((f"forward_{axis}", "<f4") for axis in "xyz"),
         ("lod_scale", "<f4"),
-        ("behind", "<f4"),  # foveation behind the camera
-        ("side", "<f4"),  # at the outer cone, or outside the frustum
-        ("inner", "<f4"),  # cosine of the inner cone's half angle, or the tangent of half the horizontal field of view
-        ("outer", "<f4"),  # cosine of the outer cone's, or the tangent of half the vertical one
-        ("kind", "<u4"),  # of foveation
-        ("node_base", "<i8"),  # where its tree's nodes begin
-        ("chunk_base", "<i8"),  # where its tree's chunks begin
+        ("behind", "<f4"),  # foveation weight behind the camera
+        ("side", "<f4"),  # foveation weight at the outer cone, or outside the frustum
+        ("inner", "<f4"),  # cosine of the inner cone's half angle, or tangent of half the horizontal field of view
+        ("outer", "<f4"),  # cosine of the outer cone's half angle, or tangent of half the vertical field of view
+        ("kind", "<u4"),  # NO_FOVEATION, CONE or FRUSTUM
+        ("node_base", "<i8"),  # index of its tree's first node
+        ("chunk_base", "<i8"),  # index of its tree's first chunk
     ]
 )
 
 #: Kinds of foveation.
 NO_FOVEATION, CONE, FRUSTUM = 0, 1, 2
 
+#: Least distance to a node, in object space: nearer ones count as at this distance, as in Spark 2.2.0's traversal.
 NEAREST = np.float32(1e-6)
-ZERO, ONE = np.float32(0), np.float32(1)
+ZERO, ONE, INFINITE = np.float32(0), np.float32(1), np.float32(np.inf)
 
 
 @kernel(inline=True)
 def foveation_at(view, dx, dy, dz, inverse):
-    """How much a node's pixel scale counts.
+    """The foveation weight of a node's pixel scale.
 
-    Cones: 1 inside the inner one, linear in the cosine to `side` at the outer one, then to `behind` at 90 degrees.
-    Frustum: 1 inside, `side` outside, `behind` behind.
+    Cones: 1 inside the inner one, falling linearly in the cosine to `side` at the outer one, and on to `behind` at 90
+    degrees. Frustum: 1 inside, `side` outside, `behind` behind the camera.
 
     Args:
         view: a record of `VIEW`.
         dx, dy, dz: from the camera to the node, object space.
-        inverse: of their length.
+        inverse: 1 / distance.
     """
     ahead = (dx * view.forward_x + dy * view.forward_y) + dz * view.forward_z
     if ahead <= ZERO:
@@ -74,7 +75,7 @@ def foveation_at(view, dx, dy, dz, inverse):
 
 @kernel(inline=True)
 def pixel_scale(node, view):
-    """The angular size of a node, size / distance, times its weights; in float32, operation by operation as Spark's.
+    """Size over distance, times `lod_scale` and the foveation weight; float32, operation by operation as Spark's.
 
     Args:
         node: a record of `NODE`.
@@ -89,3 +90,20 @@ def pixel_scale(node, view):
     if view.kind != NO_FOVEATION:
         scale = foveation_at(view, dx, dy, dz, inverse) * scale
     return scale
+
+
+@kernel(nogil=True)
+def pixel_scales(nodes, index, views, number, scales):
+    """Pixel scales of some nodes, without sign; NaN becomes infinite. Cuts order them so, too.
+
+    Args:
+        nodes: `NODE` of one tree.
+        index: (n,) int64 nodes of it.
+        views: (instances,) `VIEW`.
+        number: of the instance.
+        scales: (n,) float32, filled.
+    """
+    view = views[number]
+    for i in range(len(index)):
+        scale = abs(pixel_scale(nodes[index[i]], view))
+        scales[i] = scale if scale >= ZERO else INFINITE

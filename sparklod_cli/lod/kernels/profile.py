@@ -1,12 +1,12 @@
-"""What a merged splat covers on the screen: the moments of its opacity's profile, and the profile from the moments.
+"""Opacity profiles of merged splats: their coverage and variance on the screen, and the profile that has given ones.
 
-Spark draws a splat of linear opacity A > 1 with the opacity 1 - (1 - exp(-t)) ** A, t = z^2 / 2, which is what A equal
-splats on top of each other make. Over the plane it sums to 2 pi sigma^2 * H(A), where H(A) is the harmonic number,
-1 + 1/2 + ... + 1/A, and its variance on an axis is sigma^2 * (H(A) + H2(A) / H(A)) / 2, with H2(A) = 1 + 1/4 + ... +
-1/A^2. Both come from integrating by parts; for A up to 1 they are 2 pi sigma^2 * A and sigma^2.
+Spark draws a splat of linear opacity A > 1 with the alpha 1 - (1 - exp(-t)) ** A, t = z^2 / 2, which is that of A equal
+splats on top of each other. Its coverage, the integral over the plane, is 2 pi sigma^2 * H(A), where H(A) is the
+harmonic number 1 + 1/2 + ... + 1/A. Its variance along an axis is sigma^2 * (H(A) + H2(A) / H(A)) / 2, with H2(A) = 1 +
+1/4 + ... + 1/A^2. Both follow from integration by parts; for A up to 1 they are 2 pi sigma^2 * A and sigma^2.
 
-So a splat that is to cover so much with such a variance has an A that follows from the *density* alone, coverage over
-2 pi * variance: A itself up to 1, H / spread above, which tends to 2, that of a disc with a sharp edge.
+The A of a splat of given coverage and variance therefore depends on the *density* alone, coverage / (2 pi * variance).
+The density is A itself up to 1, and H / spread above, which tends to 2, the density of a disc with a sharp edge.
 """
 
 from __future__ import annotations
@@ -16,32 +16,33 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from ...model import gaussian
 from ...model.gaussian import MIN_OPACITY, SIZE_PER_D, linear_opacity
 from ...support.jit import kernel
 
-#: The sharpest profile that a merged splat gets, D; more gains nothing (docs/decisions/2026-11-21-fidelity.md). What
-#: covers more than it can is drawn larger.
-SHARPEST = 2.5
+#: The largest D of a merged splat; a sharper profile gains nothing (docs/decisions/2026-11-21-fidelity.md). A splat
+#: whose density is higher than that of this profile is drawn larger instead.
+MAX_D = 2.5
 
-#: Entries of the table of profiles by density.
+#: Entries of the table of profiles by density, between which it is interpolated linearly. Chosen.
 ENTRIES = 256
 
-#: Terms of the sums that are added one by one; the rest is an integral.
+#: Terms of the harmonic sums that are added one by one; the rest is an integral. With 64 the sums are exact to 1e-7.
 TERMS = 64
 
 
 def harmonic(a: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """H and H2 of real numbers of at least 1, to 1e-7: sums of 1/k - 1/(k + a), and of their squares' differences."""
+    """H(a) and H2(a) of real numbers a >= 1, to 1e-7: the sums of 1/k - 1/(k + a) and of 1/k^2 - 1/(k + a)^2."""
     k = np.arange(1, TERMS + 1, dtype=np.float64)[:, None]
-    start = TERMS + 0.5  # midpoint rule for the terms that are left
+    start = TERMS + 0.5  # midpoint rule for the remaining terms
     first = (1 / k - 1 / (k + a)).sum(axis=0) + np.log((start + a) / start)
     second = (1 / k**2 - 1 / (k + a) ** 2).sum(axis=0) + 1 / start - 1 / (start + a)
     return first, second
 
 
 def _table() -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-    """Linear opacity and spread (variance over sigma^2) at `ENTRIES` densities from 1 to the largest, which is last."""
-    a = linear_opacity(np.linspace(1, SHARPEST, 4096, dtype=np.float32)).astype(np.float64)
+    """Linear opacity, and spread (variance / sigma^2), at ENTRIES densities from 1 to that of MAX_D, which is third."""
+    a = linear_opacity(np.linspace(1, MAX_D, 4096, dtype=np.float32)).astype(np.float64)
     first, second = harmonic(a)
     spread = (first + second / first) / 2
     density = first / spread
@@ -49,20 +50,22 @@ def _table() -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
     return np.interp(even, density, a), np.interp(even, density, spread), float(density[-1])
 
 
-OPACITIES, SPREADS, DENSEST = _table()
+OPACITIES, SPREADS, MAX_DENSITY = _table()
+
+lod_opacity_above_1 = kernel(inline=True)(gaussian.lod_opacity_above_1)
 
 
 @kernel(inline=True)
 def profile_of(density):
-    """Linear opacity and spread of a splat of a density: its variance is spread * sigma^2.
+    """Linear opacity and spread of a splat of a density; its variance is spread * sigma^2.
 
-    Where it is denser than a profile can be, sigma is larger than the variance asks for, so that it covers as much.
+    Above MAX_DENSITY the spread is smaller than the profile's, which makes sigma larger, so that the coverage is kept.
     """
     if density <= 1:
         return max(density, MIN_OPACITY), 1.0
-    if density >= DENSEST:
-        return OPACITIES[-1], SPREADS[-1] * DENSEST / density
-    at = (density - 1) * ((ENTRIES - 1) / (DENSEST - 1))
+    if density >= MAX_DENSITY:
+        return OPACITIES[-1], SPREADS[-1] * MAX_DENSITY / density
+    at = (density - 1) * ((ENTRIES - 1) / (MAX_DENSITY - 1))
     low = min(int(at), ENTRIES - 2)
     part = at - low
     return (
@@ -73,5 +76,5 @@ def profile_of(density):
 
 @kernel(inline=True)
 def size_factor(opacity):
-    """How much larger the traversal sees a splat of a linear opacity than one of 1, see `gaussian.spark_size`."""
-    return 1 + SIZE_PER_D * (math.sqrt(1 + math.e * math.log(opacity)) - 1) if opacity > 1 else 1.0
+    """Feature size over 2 * mean(scale) of a splat of linear opacity, float64; see `gaussian.size_factor`."""
+    return 1 + SIZE_PER_D * (lod_opacity_above_1(opacity, 1.0, math.e) - 1) if opacity > 1 else 1.0

@@ -1,4 +1,4 @@
-"""A queue of slots, those first that are divided first: a binary heap in an array."""
+"""The traversal's priority queue: a binary heap of slots, in an array."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from ...support.jit import kernel
 
 @kernel(inline=True)
 def comes_before(node, limit, instance, a, b):
-    """Whether slot `a` is divided before slot `b`: by pixel scale, then instance, then index, the greatest first."""
+    """Whether slot `a` is refined before slot `b`: by pixel scale, then instance, then index, the greatest first."""
     if limit[a] != limit[b]:
         return limit[a] > limit[b]
     if instance[a] != instance[b]:
@@ -16,8 +16,8 @@ def comes_before(node, limit, instance, a, b):
 
 
 @kernel(nogil=True)
-def rise(node, limit, instance, heap, at):
-    """Moves the heap's entry at `at` up to its place."""
+def sift_up(node, limit, instance, heap, at):
+    """Moves the heap's entry at `at` up to where the heap is in order."""
     while at > 0:
         above = (at - 1) >> 1
         if not comes_before(node, limit, instance, heap[at], heap[above]):
@@ -27,8 +27,8 @@ def rise(node, limit, instance, heap, at):
 
 
 @kernel(nogil=True)
-def sink(node, limit, instance, heap, length):
-    """Moves the heap's first entry down to its place."""
+def sift_down(node, limit, instance, heap, length):
+    """Moves the heap's first entry down to where the heap is in order."""
     at = 0
     while True:
         child = 2 * at + 1

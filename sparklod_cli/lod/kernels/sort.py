@@ -1,4 +1,4 @@
-"""Voxel keys and a parallel, stable radix sort."""
+"""Morton codes of cells, and a parallel, stable radix sort by them."""
 
 from __future__ import annotations
 
@@ -15,13 +15,17 @@ from .geometry import CENTER
 Keys = NDArray[np.uint64]
 Nodes = NDArray[np.uint32]
 
-AXIS_BITS = 21  # bits of a cell coordinate that one 64-bit Morton word holds
-DIGIT_BITS = 11  # 2048 counters fit the first-level cache; measured against 8, 9 and 12
+#: Bits per axis in one 64-bit Morton word: 3 x 21 = 63.
+AXIS_BITS = 21
+
+#: Bits that one pass of the radix sort sorts by: 2048 counters fit the first-level cache. Measured against 8, 9 and 12;
+#: results do not depend on it.
+DIGIT_BITS = 11
 
 
 @kernel()
 def spread_bits(x):
-    """The low 21 bits of a uint64 with two zero bits between each."""
+    """The low 21 bits of a uint64, each followed by two zero bits."""
     x &= np.uint64(0x1FFFFF)
     x = (x | (x << np.uint64(32))) & np.uint64(0x1F00000000FFFF)
     x = (x | (x << np.uint64(16))) & np.uint64(0x1F0000FF0000FF)
@@ -32,13 +36,13 @@ def spread_bits(x):
 
 @kernel()
 def interleave(i, j, k):
-    """Bits of three uint64 in turn, the first's lowest; 21 of each."""
+    """The Morton code of three uint64 coordinates of 21 bits; the lowest bit is of `i`."""
     return spread_bits(i) | (spread_bits(j) << np.uint64(1)) | (spread_bits(k) << np.uint64(2))
 
 
 @kernel()
 def morton_code(x, y, z, step, low, shift):
-    """Interleaved bits shift .. shift + 20 of floor(centre / step) - low on each axis."""
+    """The Morton code of bits shift .. shift + 20 of floor(centre / step) - low on each axis."""
     i = np.uint64(np.int64(math.floor(x / step)) - low[0]) >> shift
     j = np.uint64(np.int64(math.floor(y / step)) - low[1]) >> shift
     k = np.uint64(np.int64(math.floor(z / step)) - low[2]) >> shift
@@ -47,14 +51,14 @@ def morton_code(x, y, z, step, low, shift):
 
 @kernel(parallel=True)
 def cell_words(geometry, nodes, step, low, word):
-    """Morton words of the cells of nodes.
+    """One 63-bit word of the Morton code of each node's cell.
 
     Args:
         geometry: rows of `geometry.py`.
         nodes: (n,) uint32 rows of it.
         step: edge of a cell, float64.
         low: (3,) int64, the lowest cell on each axis, so that offsets from it are not negative.
-        word: which 21 bits of the offsets.
+        word: index of the word, the lowest first; each has AXIS_BITS bits per axis.
 
     Returns:
         (n,) uint64.
@@ -68,24 +72,24 @@ def cell_words(geometry, nodes, step, low, word):
 
 
 @kernel(parallel=True)
-def sort_pass(keys, values, keys_out, values_out, shift, bits, chunks):
-    """One stable counting pass of a radix sort over `bits` bits at `shift`; the result is the same for any `chunks`."""
+def sort_pass(keys, values, keys_out, values_out, shift, bits, blocks):
+    """One stable pass of a radix sort, by `bits` bits at `shift`; the result is the same for any number of `blocks`."""
     n = len(keys)
     buckets = 1 << bits
     mask = np.uint64(buckets - 1)
     shift = np.uint64(shift)
-    count = np.zeros((chunks, buckets), np.int64)
-    for c in prange(chunks):
-        for i in range(n * c // chunks, n * (c + 1) // chunks):
+    count = np.zeros((blocks, buckets), np.int64)
+    for c in prange(blocks):
+        for i in range(n * c // blocks, n * (c + 1) // blocks):
             count[c, (keys[i] >> shift) & mask] += 1
     total = 0
     for b in range(buckets):
-        for c in range(chunks):
+        for c in range(blocks):
             here = count[c, b]
             count[c, b] = total
             total += here
-    for c in prange(chunks):
-        for i in range(n * c // chunks, n * (c + 1) // chunks):
+    for c in prange(blocks):
+        for i in range(n * c // blocks, n * (c + 1) // blocks):
             b = (keys[i] >> shift) & mask
             to = count[c, b]
             count[c, b] = to + 1
@@ -93,42 +97,50 @@ def sort_pass(keys, values, keys_out, values_out, shift, bits, chunks):
             values_out[to] = values[i]
 
 
-def sort_by_key(keys: Keys, values: Nodes, key_bits: int, chunks: int) -> tuple[Keys, Nodes]:
-    """Sorts (n,) uint64 keys below 2 ** key_bits, stable, carrying (n,) uint32 values along.
+def sort_by_key(keys: Keys, values: Nodes, key_bits: int, blocks: int) -> tuple[Keys, Nodes]:
+    """Sorts values by their keys, stably; overwrites its inputs.
 
-    Works in `chunks` pieces and overwrites its inputs.
+    Args:
+        keys: (n,) uint64 below 2 ** key_bits.
+        values: (n,) uint32.
+        key_bits: number of bits to sort by.
+        blocks: ranges to process in parallel; the result does not depend on it.
+
+    Returns:
+        the (n,) keys and (n,) values, sorted.
     """
     passes = max(1, -(-key_bits // DIGIT_BITS))
     bits = max(1, -(-key_bits // passes))
     other_keys, other_values = np.empty_like(keys), np.empty_like(values)
     for k in range(passes):
-        sort_pass(keys, values, other_keys, other_values, k * bits, bits, chunks)
+        sort_pass(keys, values, other_keys, other_values, k * bits, bits, blocks)
         keys, other_keys = other_keys, keys
         values, other_values = other_values, values
     return keys, values
 
 
 def sort_by_cell(
-    geometry: FloatArray, nodes: Nodes, step: float, low: NDArray[np.int64], axis_bits: int, chunks: int
+    geometry: FloatArray, nodes: Nodes, step: float, low: NDArray[np.int64], axis_bits: int, blocks: int
 ) -> tuple[Nodes, NDArray[np.bool_]]:
-    """Nodes in the Morton order of their cells, and where a new cell begins.
+    """Sorts nodes in the Morton order of their cells.
 
     Args:
-        geometry, nodes, step, low: as in `cell_words`.
-        axis_bits: bits that the largest cell offset needs; any number up to 63.
-        chunks: pieces to work in.
+        geometry, nodes, step, low: as for `cell_words`.
+        axis_bits: number of bits of the largest cell offset, up to 63.
+        blocks: ranges to process in parallel; the result does not depend on it.
 
     Returns:
-        the (n,) nodes sorted, and (n,) bool, true at the first node of each cell.
+        nodes: (n,) uint32, sorted.
+        is_first: (n,) bool, true at the first node of each cell.
     """
     words = max(1, -(-axis_bits // AXIS_BITS))
     is_first = np.zeros(len(nodes), np.bool_)
     is_first[:1] = True
     for word in range(words):
         keys = cell_words(geometry, nodes, step, low, word)
-        keys, nodes = sort_by_key(keys, nodes.copy(), 3 * min(axis_bits - AXIS_BITS * word, AXIS_BITS), chunks)
+        keys, nodes = sort_by_key(keys, nodes.copy(), 3 * min(axis_bits - AXIS_BITS * word, AXIS_BITS), blocks)
     for word in range(words):
-        if words > 1:  # the last word's order is not the order of the others
+        if words > 1:  # `keys` holds the last word only
             keys = cell_words(geometry, nodes, step, low, word)
         is_first[1:] |= keys[1:] != keys[:-1]
     return nodes, is_first

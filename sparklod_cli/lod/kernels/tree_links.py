@@ -1,4 +1,4 @@
-"""Follows the links of a tree that may be broken."""
+"""Facts about the links of a tree that may be broken, in linear time."""
 
 from __future__ import annotations
 
@@ -7,16 +7,19 @@ import numpy as np
 from ...support.jit import kernel
 from .geometry import ellipsoid_area
 
-#: A tree has fewer links than nodes; of a broken one so many times as many are followed.
-STEPS = 4
+#: Links followed per node at most. A tree has fewer than one; in a broken tree nodes may share children, so that links
+#: are up to the square of the nodes. Chosen.
+MAX_LINKS = 4
+
+#: Least surface area of a child, so that children whose areas are not float64 numbers above 0 count equally. Chosen.
+LEAST_AREA = 1e-300
 
 
 @kernel()
-def walk(child_count, child_start, size):
-    """Visits every node that the root leads to, once.
+def find_depths(child_count, child_start, size):
+    """Depths of the nodes that can be reached from the root.
 
-    In linear time whatever the links are: those of a broken tree, where nodes share children, are followed so often and
-    no further.
+    Takes linear time whatever the links are: at most MAX_LINKS per node are followed.
 
     Args:
         child_count: (N,) of any unsigned type; N is at least 1.
@@ -24,15 +27,15 @@ def walk(child_count, child_start, size):
         size: (N,) of each node, any unit.
 
     Returns:
-        depth: (N,) int32, edges from the root by the first way found; -1 where none leads there.
-        limit: (N,) float32, the least size from the root to the node on that way; 0 where none leads there.
+        depth: (N,) int32, edges from the root on the first path found; -1 if there is none.
+        limit: (N,) float32, the least size on that path, the node's included; 0 if there is none.
     """
     count = len(child_count)
     depth = np.full(count, -1, np.int32)
     limit = np.zeros(count, np.float32)
     depth[0], limit[0] = 0, size[0]
     sound = True
-    for node in range(count):  # in order, which is enough for a tree whose nodes come after their parents
+    for node in range(count):  # in order, which suffices for a tree whose nodes come after their parents
         start = np.int64(child_start[node])
         end = start + np.int64(child_count[node])
         if start == end:
@@ -53,7 +56,7 @@ def walk(child_count, child_start, size):
     queue = np.empty(count, np.int32)
     queue[0] = 0
     first, last, steps = 0, 1, 0
-    while first < last and steps <= STEPS * count:
+    while first < last and steps <= MAX_LINKS * count:
         node = queue[first]
         first += 1
         start = np.int64(child_start[node])
@@ -70,20 +73,20 @@ def walk(child_count, child_start, size):
 
 @kernel()
 def find_parents(child_count, child_start):
-    """Who has each node as a child, in linear time.
+    """Parents of all nodes.
 
     Args:
         child_count: (N,) of any unsigned type.
         child_start: (N,) of any unsigned type.
 
     Returns:
-        parent: (N,) int32, a node that has it as a child; -1 where there is none, or where links are too broken to be
-            followed all.
-        references: (N,) int64, how many nodes have it as a child.
+        parent: (N,) int32, the last node that has it as a child; -1 if none has, or none of the MAX_LINKS per node that
+            are followed.
+        references: (N,) int64, the number of nodes that have it as a child.
     """
     count = len(child_count)
     parent = np.full(count, -1, np.int32)
-    references = np.zeros(count + 1, np.int64)  # first how many runs of children begin here, less those that end
+    references = np.zeros(count + 1, np.int64)  # at first: ranges of children that begin here, less those that end
     steps = 0
     for node in range(count):
         start = np.int64(child_start[node])
@@ -93,7 +96,7 @@ def find_parents(child_count, child_start):
         references[start] += 1
         references[end] -= 1
         steps += end - start
-        if steps <= STEPS * count:
+        if steps <= MAX_LINKS * count:
             for child in range(start, end):
                 parent[child] = node
     for node in range(1, count):
@@ -102,8 +105,8 @@ def find_parents(child_count, child_start):
 
 
 @kernel()
-def sizes_below(parent, size, scale, opacity):
-    """How large the children of each node are, in the mean by what they cover, in linear time.
+def mean_child_sizes(parent, size, scale, opacity):
+    """The mean size of each node's children, weighted with opacity times surface area.
 
     Args:
         parent: (N,) int32, of `find_parents`.
@@ -112,13 +115,13 @@ def sizes_below(parent, size, scale, opacity):
         opacity: (N,) float32, linear.
 
     Returns:
-        (N,) float64: the mean of the children's sizes by opacity times surface; 0 where no child covers anything.
+        (N,) float64; 0 where no child has a positive opacity and a positive, finite size.
     """
     means, weights = np.zeros(len(parent)), np.zeros(len(parent))
     for node in range(len(parent)):
         if parent[node] >= 0 and opacity[node] > 0 and 0 < size[node] < np.inf:
             area = ellipsoid_area(scale[node, 0], scale[node, 1], scale[node, 2])
-            weight = opacity[node] * max(area, 1e-300)
+            weight = opacity[node] * max(area, LEAST_AREA)
             weights[parent[node]] += weight
             means[parent[node]] += weight * size[node]
     for node in range(len(parent)):
@@ -129,14 +132,14 @@ def sizes_below(parent, size, scale, opacity):
 
 @kernel()
 def find_cycles(parent, depth):
-    """Nodes that the root does not lead to, and that have no topmost node above them either, in linear time.
+    """Nodes on a cycle or below one: parents lead from them neither to the root nor to a node without a parent.
 
     Args:
         parent: (N,) int32, of `find_parents`.
-        depth: (N,) int32, of `walk`.
+        depth: (N,) int32, of `find_depths`.
 
     Returns:
-        (N,) bool: the node is on a cycle, or below one.
+        (N,) bool.
     """
     unknown, ends, cycle, passed = 0, 1, 2, 3
     state = np.zeros(len(parent), np.uint8)
@@ -156,8 +159,8 @@ def find_cycles(parent, depth):
 
 
 @kernel()
-def sum_levels(depth, child_count, size):
-    """Counts and sizes of the nodes of each depth, in linear time; those of depth -1 are left out.
+def sum_by_depth(depth, child_count, size):
+    """Numbers of nodes and sums of their sizes by depth; nodes of depth -1 are left out of both.
 
     Args:
         depth: (N,) int32.
@@ -165,14 +168,14 @@ def sum_levels(depth, child_count, size):
         size: (N,) of each node, any unit.
 
     Returns:
-        nodes, leaves: (levels,) int64, how many.
-        logs: (levels,) float64, the sum of the logarithms of their sizes.
-        children: (65536,) int64, how many nodes, of any depth, have so many children.
+        nodes, leaves: (depths,) int64 numbers.
+        logs: (depths,) float64, sums of ln(size).
+        children: (65536,) int64, the number of nodes, of any depth, by number of children.
     """
-    levels = depth.max() + 1
-    nodes = np.zeros(levels, np.int64)
-    leaves = np.zeros(levels, np.int64)
-    logs = np.zeros(levels, np.float64)
+    depths = depth.max() + 1
+    nodes = np.zeros(depths, np.int64)
+    leaves = np.zeros(depths, np.int64)
+    logs = np.zeros(depths, np.float64)
     children = np.zeros(1 << 16, np.int64)
     for node in range(len(depth)):
         children[child_count[node]] += 1

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..kernels.project import MOST_OPAQUE
+from ..kernels.project import MAX_D
 from ..settings import BLUR, CLIP, MAX_STD_DEV, MIN_ALPHA, STD_DEV_PER_D
 
 
@@ -25,7 +25,7 @@ _CONSTANTS = "\n".join(
         "E": np.e,
         "MAX_STD_DEV": MAX_STD_DEV,
         "MIN_ALPHA": MIN_ALPHA,
-        "MOST_OPAQUE": float(MOST_OPAQUE),
+        "MAX_D": float(MAX_D),
         "STD_DEV_PER_D": STD_DEV_PER_D,
     }.items()
 )
@@ -109,7 +109,7 @@ void main() {
     fetch(ivec2((i & ((1 << ROW_BITS) - 1)) * TEXELS, i >> ROW_BITS));
     mat4x3 m = world_to_camera;
     precise vec3 place = m[0] * center.x + m[1] * center.y + m[2] * center.z + m[3];
-    float d = min(lod_opacity, MOST_OPAQUE);
+    float d = min(lod_opacity, MAX_D);
     if (!(place.z > range.x && place.z < range.y && d >= MIN_ALPHA)) return;
     precise float inverse = 1.0 / place.z;
     precise vec2 offset = focal * place.xy * inverse;

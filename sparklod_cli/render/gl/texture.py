@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ...codecs.gpu import data_texture
 from ...model.sh import COEFFICIENTS
 from ...model.splats import FloatArray, Splats
-from ..kernels.project import BRIGHTEST
+from ..kernels.project import MAX_COLOR
 from ..shading import ShadedSplats
 
 #: How exactly splats are held: as they are, or as antimatter15's viewer holds them.
@@ -142,7 +142,7 @@ def data_texture_of(precision: str) -> DataTexture:
 
 def _shown_colors(shown: ShadedSplats) -> FloatArray:
     """(N, 3) colours in the range that the rasterizer draws; 0 for what is no number."""
-    rgb: FloatArray = np.where(shown.rgb > 0, np.minimum(shown.rgb, BRIGHTEST), np.float32(0))
+    rgb: FloatArray = np.where(shown.rgb > 0, np.minimum(shown.rgb, MAX_COLOR), np.float32(0))
     return rgb
 
 

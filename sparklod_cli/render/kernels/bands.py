@@ -1,4 +1,4 @@
-"""Goes through splats in bands of a picture's rows, each of which one thread owns: discs, and counts of fragments."""
+"""Draws discs, and counts fragments, in bands of rows, each of which one thread owns."""
 
 from __future__ import annotations
 
@@ -8,24 +8,25 @@ import numpy as np
 from numba import prange
 
 from ...support.jit import kernel
+from .falloff import alpha_at
 from .project import END, HALF_HEIGHT, HALF_WIDTH, OPACITY, POWER, A, B, C, X, Y
 
 f32 = np.float32
 
-#: Rows of a band: few enough that all threads have some, and that those with more to do do not hold up the others.
+#: Rows of a band: few, so that threads have equal work. Results do not depend on it.
 ROWS = 8
 
 
 @kernel(parallel=True)
 def draw_discs(x, y, radius, rgb, alpha, image):
-    """Blends discs in the order that they have, each over those before it.
+    """Blends discs in their order, each over those before it.
 
     Args:
         x, y: (N,) float32 centres, pixels from the upper left corner.
         radius: (N,) float32, pixels.
         rgb: (N, 3) float32.
-        alpha: float32, of all of them.
-        image: (height, width, 4) float32 to draw on: red, green and blue, multiplied by alpha, and alpha.
+        alpha: float32, of all discs.
+        image: (height, width, 4) float32 to draw on: red, green and blue, premultiplied by alpha, and alpha.
     """
     height, width = image.shape[:2]
     for band in prange((height + ROWS - 1) // ROWS):
@@ -50,13 +51,13 @@ def draw_discs(x, y, radius, rgb, alpha, image):
 
 
 @kernel(parallel=True)
-def count_fragments(screen, shifted, least, counts):
-    """How many splats are blended into each pixel, hidden ones too.
+def count_fragments(screen, design, least, counts):
+    """Counts the splats that cover each pixel, hidden ones included.
 
     Args:
-        screen: (N, COLUMNS) of `project`, those that are on the screen, in any order.
-        shifted: D above 1 falls off as in Spark's LoD design.
-        least: less alpha than this is not drawn, float32.
+        screen: (N, COLUMNS) of `project`, splats that are drawn, in any order.
+        design: merged splats have the falloff `shifted`, that of Spark's LoD design.
+        least: float32, least alpha that is drawn.
         counts: (height, width) int32, added to.
     """
     height, width = counts.shape
@@ -79,12 +80,5 @@ def count_fragments(screen, shifted, least, counts):
                     z2 = row[A] * dx * dx + f32(2) * row[B] * dx * dy + row[C] * dy * dy
                     if z2 > row[END]:
                         continue
-                    if d <= 1:
-                        alpha = d * math.exp(f32(-0.5) * z2)
-                    elif shifted:
-                        beyond = max(math.sqrt(max(z2, f32(0))) - (d - f32(1)), f32(0))
-                        alpha = math.exp(f32(-0.5) * d * beyond * beyond)
-                    else:
-                        alpha = f32(1) - (f32(1) - math.exp(f32(-0.5) * z2)) ** row[POWER]
-                    if alpha >= least:
+                    if alpha_at(z2, d, row[POWER], design) >= least:
                         counts[line, column] += 1

@@ -1,73 +1,135 @@
-"""Puts splats onto the screen: the ellipse that each covers there."""
+"""Projects splats onto the screen, where each covers an ellipse."""
 
 from __future__ import annotations
+
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import prange
 
+from ...model import gaussian
 from ...support.jit import kernel
 
 f32 = np.float32
 
-#: Columns of a splat on the screen, float32: its centre in pixels from the upper left corner; z^2 = A dx^2 + 2 B dx dy
-#: + C dy^2, how many standard deviations a pixel is away, squared; where that ends; D; exp((D^2 - 1) / e) above 1;
-#: colour; half the sides of its box.
+#: Columns of a splat on the screen, float32: centre, in pixels from the upper left corner; A, B and C of z^2 = A dx^2 +
+#: 2 B dx dy + C dy^2, the squared distance of a pixel in standard deviations; z^2 up to which the splat is drawn; D;
+#: the exponent of the falloff, linear opacity above D = 1 and 1 up to it; colour; half the sides of its box, pixels.
 X, Y, A, B, C, END, OPACITY, POWER, RED, GREEN, BLUE, HALF_WIDTH, HALF_HEIGHT = range(13)
 COLUMNS = 13
 
-#: D has no more, and colours have none brighter: what Spark's own numbers can be.
-MOST_OPAQUE, BRIGHTEST = f32(5), f32(65504)
+#: Largest D, as in Spark's encodings, and largest colour value, that of the float16 that Spark keeps colours in.
+MAX_D, MAX_COLOR = f32(5), f32(65504)
 
-#: A key that is sorted behind all others: not on the screen.
-NOWHERE = np.uint64(0xFFFFFFFFFFFFFFFF)
-#: The largest index that a key has room for.
-LAST = 0xFFFFFFFF
+#: The key of a splat that is not drawn; it is sorted behind all others.
+NOT_DRAWN = np.uint64(0xFFFFFFFFFFFFFFFF)
+
+#: The largest index in a key, whose lower half it is.
+MAX_INDEX = 0xFFFFFFFF
+
+#: Largest variance on the screen, pixels squared, so that float32 holds determinants. Chosen, far beyond any picture.
+MAX_VARIANCE = f32(1e18)
+
+#: Least covariance on the screen, pixels squared, from which the direction of the longer axis is computed; below it the
+#: axes are those of the screen. Spark's shader has the same.
+LEAST_COVARIANCE = f32(1e-3)
+
+rotation_matrix = kernel(inline=True)(gaussian.rotation_matrix)
+linear_opacity_above_1 = kernel(inline=True)(gaussian.linear_opacity_above_1)
+
+
+class ShadedColumns(NamedTuple):
+    """Columns of `ShadedSplats`, float32.
+
+    Attributes:
+        center: (N, 3). scale: (N, 3). quat_xyzw: (N, 4). lod_opacity: (N,). rgb: (N, 3).
+    """
+
+    center: Any
+    scale: Any
+    quat_xyzw: Any
+    lod_opacity: Any
+    rgb: Any
+
+
+class Lens(NamedTuple):
+    """A camera's picture; pixels, float32.
+
+    Attributes:
+        focal_x, focal_y: focal lengths. principal_x, principal_y: principal point. width, height: of the picture.
+    """
+
+    focal_x: Any
+    focal_y: Any
+    principal_x: Any
+    principal_y: Any
+    width: Any
+    height: Any
+
+
+class Limits(NamedTuple):
+    """What is drawn of splats; float32, see `RasterSettings` and the constants beside it.
+
+    Attributes:
+        near, far: range of depths, world units.
+        clip: largest distance of a centre from the picture's, in half pictures.
+        blur: variance added to a splat's on the screen, pixels squared.
+        min_alpha: least alpha.
+        std_devs: radius of a splat, in standard deviations. std_devs_per_d: added to it per unit of D above 1.
+        max_radius: pixels.
+    """
+
+    near: Any
+    far: Any
+    clip: Any
+    blur: Any
+    min_alpha: Any
+    std_devs: Any
+    std_devs_per_d: Any
+    max_radius: Any
 
 
 @kernel(parallel=True)
-def project(center, scale, quat, lod_opacity, rgb, world_to_camera, lens, limits, radial, screen, keys):
-    """Splats on the screen, as Spark's vertex shader puts them there.
+def project(splats, world_to_camera, lens, limits, radial, screen, keys):
+    """Splats on the screen, as Spark's vertex shader projects them.
 
     Args:
-        center, scale, quat, lod_opacity, rgb: columns of `ShadedSplats`.
+        splats: `ShadedColumns`.
         world_to_camera: (3, 4) float32; the camera looks along z, with y down.
-        lens: (6,) float32: focal x and y, principal x and y, width, height; pixels.
-        limits: (8,) float32: near, far, clip, blur, least alpha, standard deviations, more of them for each D, largest
-            radius.
-        radial: keys are by distance, not by depth.
-        screen: (N, COLUMNS) float32, filled where a key is.
-        keys: (N,) uint64, filled: distance and index, so that they sort from near to far, and of those at the same
-            distance, as in Spark, the last is in front; NOWHERE for what is not seen.
+        lens: `Lens`.
+        limits: `Limits`.
+        radial: splats are sorted by distance from the camera, not by depth.
+        screen: (N, COLUMNS) float32, filled for splats that are drawn.
+        keys: (N,) uint64, filled with distance and index, so that they sort from near to far, and among equal
+            distances the last splat is in front, as in Spark; NOT_DRAWN for splats that are not drawn.
     """
+    center, scale, quat, lod_opacity, rgb = splats
     m = world_to_camera
     for i in prange(len(center)):
-        keys[i] = NOWHERE
-        d = min(lod_opacity[i], MOST_OPAQUE)
+        keys[i] = NOT_DRAWN
+        d = min(lod_opacity[i], MAX_D)
         x, y, z = center[i, 0], center[i, 1], center[i, 2]
         u = m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]
         v = m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]
         w = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
-        if not (w > limits[0] and w < limits[1] and d >= limits[4]):
+        if not (w > limits.near and w < limits.far and d >= limits.min_alpha):
             continue
         inverse = f32(1) / w
-        dx, dy = lens[0] * u * inverse, lens[1] * v * inverse
-        half_width, half_height = f32(0.5) * lens[4], f32(0.5) * lens[5]
-        if abs(lens[2] + dx - half_width) > limits[2] * half_width or (
-            abs(lens[3] + dy - half_height) > limits[2] * half_height
+        dx, dy = lens.focal_x * u * inverse, lens.focal_y * v * inverse
+        half_width, half_height = f32(0.5) * lens.width, f32(0.5) * lens.height
+        if abs(lens.principal_x + dx - half_width) > limits.clip * half_width or (
+            abs(lens.principal_y + dy - half_height) > limits.clip * half_height
         ):
             continue
-        # Rows of the Jacobian of the projection, times the rotation into the camera, times that of the splat, times its
-        # scale: the square of that is the covariance on the screen.
-        jx, jy = lens[0] * inverse, lens[1] * inverse
+        # T: Jacobian of the projection, times the rotation into the camera. With the splat's rotation R and scales S,
+        # the covariance on the screen is (T R S) (T R S)^T; p and q are the rows of T R S.
+        jx, jy = lens.focal_x * inverse, lens.focal_y * inverse
         kx, ky = -dx * inverse, -dy * inverse
         t00, t01, t02 = jx * m[0, 0] + kx * m[2, 0], jx * m[0, 1] + kx * m[2, 1], jx * m[0, 2] + kx * m[2, 2]
         t10, t11, t12 = jy * m[1, 0] + ky * m[2, 0], jy * m[1, 1] + ky * m[2, 1], jy * m[1, 2] + ky * m[2, 2]
         qx, qy, qz, qw = quat[i, 0], quat[i, 1], quat[i, 2], quat[i, 3]
-        two = f32(2)
         one = f32(1)
-        r00, r01, r02 = one - two * (qy * qy + qz * qz), two * (qx * qy - qw * qz), two * (qx * qz + qw * qy)
-        r10, r11, r12 = two * (qx * qy + qw * qz), one - two * (qx * qx + qz * qz), two * (qy * qz - qw * qx)
-        r20, r21, r22 = two * (qx * qz - qw * qy), two * (qy * qz + qw * qx), one - two * (qx * qx + qy * qy)
+        r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation_matrix(qx, qy, qz, qw, one)
         sx, sy, sz = scale[i, 0], scale[i, 1], scale[i, 2]
         p0, p1, p2 = (
             (t00 * r00 + t01 * r10 + t02 * r20) * sx,
@@ -80,28 +142,28 @@ def project(center, scale, quat, lod_opacity, rgb, world_to_camera, lens, limits
             (t10 * r02 + t11 * r12 + t12 * r22) * sz,
         )
         a, b, c = p0 * p0 + p1 * p1 + p2 * p2, p0 * q0 + p1 * q1 + p2 * q2, q0 * q0 + q1 * q1 + q2 * q2
-        # Determinants before and after the blur as sums of what is not negative: a * c - b * b would leave nothing of
-        # those of needles.
+        # Determinants before and after the blur as sums of terms >= 0: for needles, a * c - b * b would cancel.
         before = (p0 * q1 - p1 * q0) ** 2 + (p0 * q2 - p2 * q0) ** 2 + (p1 * q2 - p2 * q1) ** 2
-        det = before + limits[3] * (a + c) + limits[3] * limits[3]
-        a += limits[3]
-        c += limits[3]
-        if not (det > 0 and a < f32(1e18) and c < f32(1e18)):
+        det = before + limits.blur * (a + c) + limits.blur * limits.blur
+        a += limits.blur
+        c += limits.blur
+        if not (det > 0 and a < MAX_VARIANCE and c < MAX_VARIANCE):
             continue
-        deviations = limits[5] + limits[6] * max(d - one, f32(0))
+        deviations = limits.std_devs + limits.std_devs_per_d * max(d - one, f32(0))
         d *= np.sqrt(before / det)
-        if not d >= limits[4]:
+        if not d >= limits.min_alpha:
             continue
         screen[i, END] = deviations * deviations
         mean = f32(0.5) * (a + c)
         spread = np.sqrt(max(mean * mean - det, f32(0)))
         longest = deviations * np.sqrt(mean + spread)
-        if longest > limits[7]:  # squeezed, each axis by itself
-            ax, ay = (b, mean + spread - a) if abs(b) > f32(1e-3) else ((one, f32(0)) if a >= c else (f32(0), one))
+        if longest > limits.max_radius:  # each axis is shortened by itself
+            is_turned = abs(b) > LEAST_COVARIANCE
+            ax, ay = (b, mean + spread - a) if is_turned else ((one, f32(0)) if a >= c else (f32(0), one))
             norm = one / np.sqrt(ax * ax + ay * ay)
             ax, ay = ax * norm, ay * norm
-            # The lesser eigenvalue is what the determinant leaves: mean - spread cancels where a splat is thin.
-            first = (limits[7] / deviations) ** f32(2)
+            # The smaller eigenvalue is determinant / larger one: mean - spread cancels for thin splats.
+            first = (limits.max_radius / deviations) ** f32(2)
             second = min(first, det / (mean + spread))
             a, b, c = (
                 first * ax * ax + second * ay * ay,
@@ -111,39 +173,39 @@ def project(center, scale, quat, lod_opacity, rgb, world_to_camera, lens, limits
             det = first * second
             if not det > 0:
                 continue
-        screen[i, X] = lens[2] + dx
-        screen[i, Y] = lens[3] + dy
+        screen[i, X] = lens.principal_x + dx
+        screen[i, Y] = lens.principal_y + dy
         screen[i, A] = c / det
         screen[i, B] = -b / det
         screen[i, C] = a / det
         screen[i, OPACITY] = d
-        screen[i, POWER] = np.exp((d * d - one) / f32(np.e)) if d > one else one
+        screen[i, POWER] = linear_opacity_above_1(d, one, f32(np.e)) if d > one else one
         for channel in range(3):
             value = rgb[i, channel]
-            screen[i, RED + channel] = min(value, BRIGHTEST) if value > 0 else f32(0)
+            screen[i, RED + channel] = min(value, MAX_COLOR) if value > 0 else f32(0)
         screen[i, HALF_WIDTH] = deviations * np.sqrt(a)
         screen[i, HALF_HEIGHT] = deviations * np.sqrt(c)
         if (
             screen[i, X] + screen[i, HALF_WIDTH] < 0
-            or screen[i, X] - screen[i, HALF_WIDTH] > lens[4]
+            or screen[i, X] - screen[i, HALF_WIDTH] > lens.width
             or screen[i, Y] + screen[i, HALF_HEIGHT] < 0
-            or screen[i, Y] - screen[i, HALF_HEIGHT] > lens[5]
+            or screen[i, Y] - screen[i, HALF_HEIGHT] > lens.height
         ):
             continue
         depth = np.sqrt(u * u + v * v + w * w) if radial else w
-        keys[i] = (np.uint64(np.float32(depth).view(np.uint32)) << np.uint64(32)) | np.uint64(LAST - i)
+        keys[i] = (np.uint64(np.float32(depth).view(np.uint32)) << np.uint64(32)) | np.uint64(MAX_INDEX - i)
 
 
 @kernel(parallel=True)
-def arrange(screen, keys, arranged):
-    """Puts the splats that are seen side by side, from near to far.
+def gather_drawn(screen, keys, drawn):
+    """Copies the splats that are drawn, from near to far.
 
     Args:
         screen: (N, COLUMNS) of `project`.
-        keys: (M,) uint64 of it, sorted, without NOWHERE.
-        arranged: (M, COLUMNS) float32, filled.
+        keys: (M,) uint64 of it, sorted, without NOT_DRAWN.
+        drawn: (M, COLUMNS) float32, filled.
     """
     for i in prange(len(keys)):
-        at = LAST - np.int64(keys[i] & np.uint64(LAST))
+        at = MAX_INDEX - np.int64(keys[i] & np.uint64(MAX_INDEX))
         for column in range(COLUMNS):
-            arranged[i, column] = screen[at, column]
+            drawn[i, column] = screen[at, column]

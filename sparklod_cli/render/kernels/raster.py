@@ -1,4 +1,4 @@
-"""Splats in tiles, and tiles into pixels."""
+"""Sorts splats into tiles, and draws the tiles."""
 
 from __future__ import annotations
 
@@ -7,22 +7,25 @@ import math
 import numpy as np
 from numba import prange
 
-from ...support.fast_math import exp2, log2
 from ...support.jit import kernel
+from .falloff import merged, plain, shifted
 from .project import BLUE, END, GREEN, HALF_HEIGHT, HALF_WIDTH, OPACITY, POWER, RED, A, B, C, X, Y
 
 f32 = np.float32
 
-#: Sides of a tile, pixels, and how many of a row are blended at once: a vector of AVX2.
+#: Side of a tile, pixels, and pixels of a row that are blended at once: the float32 of one AVX2 vector.
 TILE, LANES = 16, 8
 
-#: A tile is done when no pixel lets through more than this; it is looked at after so many splats.
-OPAQUE, PATIENCE = f32(1e-4), 16
+#: A tile is finished when no pixel has a transmittance of this or more, a fortieth of an 8-bit step. Chosen.
+OPAQUE = f32(1e-4)
+
+#: Splats after which a tile is checked for that. Chosen.
+CHECK_EVERY = 16
 
 
 @kernel(inline=True)
 def tiles_of(row, across, down):
-    """First and last tile on each axis that the box of a splat touches."""
+    """First and last tile on each axis that overlap the box of a splat."""
     left = max(0, math.floor((row[X] - row[HALF_WIDTH]) / TILE))
     right = min(across - 1, math.floor((row[X] + row[HALF_WIDTH]) / TILE))
     top = max(0, math.floor((row[Y] - row[HALF_HEIGHT]) / TILE))
@@ -31,77 +34,53 @@ def tiles_of(row, across, down):
 
 
 @kernel(parallel=True)
-def sort_into_tiles(screen, across, down, chunks):
-    """Which splats each tile has, in their order.
+def sort_into_tiles(screen, across, down, blocks):
+    """Lists the splats of each tile, in their order.
 
     Args:
         screen: (N, COLUMNS) of `project`, from near to far.
-        across, down: how many tiles there are.
-        chunks: pieces to work in; the result does not depend on it.
+        across, down: numbers of tiles.
+        blocks: ranges of splats to process in parallel; the result does not depend on it.
 
     Returns:
         start: (tiles + 1,) int64, where the splats of each tile begin.
         splats: (total,) int32 rows of `screen`.
     """
     tiles = across * down
-    count = np.zeros((chunks, tiles), np.int32)
+    count = np.zeros((blocks, tiles), np.int32)
     n = len(screen)
-    for chunk in prange(chunks):
-        for i in range(n * chunk // chunks, n * (chunk + 1) // chunks):
+    for block in prange(blocks):
+        for i in range(n * block // blocks, n * (block + 1) // blocks):
             left, right, top, bottom = tiles_of(screen[i], across, down)
             for y in range(top, bottom + 1):
                 for x in range(left, right + 1):
-                    count[chunk, y * across + x] += 1
+                    count[block, y * across + x] += 1
     start = np.empty(tiles + 1, np.int64)
-    at = np.empty((chunks, tiles), np.int64)
+    at = np.empty((blocks, tiles), np.int64)
     total = 0
     for tile in range(tiles):
         start[tile] = total
-        for chunk in range(chunks):
-            at[chunk, tile] = total
-            total += count[chunk, tile]
+        for block in range(blocks):
+            at[block, tile] = total
+            total += count[block, tile]
     start[tiles] = total
     splats = np.empty(total, np.int32)
-    for chunk in prange(chunks):
-        for i in range(n * chunk // chunks, n * (chunk + 1) // chunks):
+    for block in prange(blocks):
+        for i in range(n * block // blocks, n * (block + 1) // blocks):
             left, right, top, bottom = tiles_of(screen[i], across, down)
             for y in range(top, bottom + 1):
                 for x in range(left, right + 1):
                     tile = y * across + x
-                    splats[at[chunk, tile]] = i
-                    at[chunk, tile] += 1
+                    splats[at[block, tile]] = i
+                    at[block, tile] += 1
     return start, splats
-
-
-HALF_LOG2E = f32(-0.7213475204444817)
-LOG2E = f32(1.4426950408889634)
-
-
-@kernel(inline=True)
-def plain(z2, opacity):
-    """Alpha of a splat with D up to 1: D * exp(-z^2 / 2)."""
-    return opacity * exp2(HALF_LOG2E * z2)
-
-
-@kernel(inline=True)
-def merged(z2, power):
-    """Alpha of a splat with D above 1: 1 - (1 - exp(-z^2 / 2)) ** power."""
-    rest = max(f32(1) - exp2(HALF_LOG2E * z2), f32(1e-30))
-    return f32(1) - exp2(max(power * log2(rest), f32(-120)))
-
-
-@kernel(inline=True)
-def shifted(z2, opacity):
-    """Alpha of a splat with D above 1 in Spark's LoD design: exp(-D / 2 * max(0, z - (D - 1)) ** 2)."""
-    beyond = max(np.sqrt(max(z2, f32(0))) - (opacity - f32(1)), f32(0))
-    return exp2(HALF_LOG2E * opacity * beyond * beyond)
 
 
 @kernel(inline=True)
 def blend(pixels, i, alpha, inside, least, red, green, blue):
-    """Puts a splat behind what a pixel has; without branches, so that a row of pixels is one vector.
+    """Blends a splat behind what a pixel has so far; branch-free, so that LLVM vectorizes over the pixels of a row.
 
-    Colours are cut where a picture of 8 bits cuts them, after they are multiplied by alpha.
+    Colours are clamped to 1 after they are multiplied by alpha, as in an 8-bit picture.
     """
     alpha = alpha if inside & (alpha >= least) else f32(0)
     through = pixels[0, i]
@@ -113,15 +92,15 @@ def blend(pixels, i, alpha, inside, least, red, green, blue):
 
 @kernel(inline=True)
 def blend_lanes(pixels, row, x, dy, design, least):
-    """Blends a splat into pixels side by side.
+    """Blends a splat into adjacent pixels of a row.
 
     Args:
-        pixels: (4, LANES) float32: what is let through, then red, green and blue.
-        row: of `screen`.
-        x: its centre from the middle of the first pixel.
-        dy: from its centre to the pixels.
-        design: D above 1 falls off as in Spark's LoD design.
-        least: less alpha than this is not drawn.
+        pixels: (4, LANES) float32: transmittance, red, green and blue.
+        row: the splat, a row of `screen`.
+        x: its centre from the middle of the first pixel, pixels.
+        dy: from its centre to the row of pixels, pixels.
+        design: merged splats have the falloff `shifted`, that of Spark's LoD design.
+        least: float32, least alpha that is drawn.
     """
     a, b, c, edge, d, power = row[A], f32(2) * row[B] * dy, row[C] * dy * dy, row[END], row[OPACITY], row[POWER]
     red, green, blue = row[RED], row[GREEN], row[BLUE]
@@ -144,7 +123,7 @@ def blend_lanes(pixels, row, x, dy, design, least):
 
 @kernel(inline=True)
 def is_opaque(pixels, rows, columns):
-    """Whether nothing that comes behind can be seen."""
+    """Whether no pixel of a tile has a transmittance of OPAQUE or more."""
     most = f32(0)
     for line in range(rows):
         for i in range(columns):
@@ -158,10 +137,10 @@ def draw_tiles(screen, start, splats, across, down, design, least, image):
 
     Args:
         screen, start, splats: of `sort_into_tiles`.
-        across, down: how many tiles there are.
-        design: D above 1 falls off as in Spark's LoD design.
-        least: less alpha than this is not drawn, float32.
-        image: (height, width, 4) float32, filled: red, green and blue, multiplied by alpha, and alpha.
+        across, down: numbers of tiles.
+        design: merged splats have the falloff `shifted`, that of Spark's LoD design.
+        least: float32, least alpha that is drawn.
+        image: (height, width, 4) float32, filled: red, green and blue, premultiplied by alpha, and alpha.
     """
     height, width = image.shape[:2]
     for tile in prange(across * down):
@@ -180,7 +159,7 @@ def draw_tiles(screen, start, splats, across, down, design, least, image):
             for line in range(first, last):
                 for block in range(begin, end):
                     blend_lanes(pixels[line, block], row, x - f32(LANES * block), f32(line) - y, design, least)
-            if (entry - start[tile]) % PATIENCE == PATIENCE - 1 and is_opaque(pixels, rows, columns):
+            if (entry - start[tile]) % CHECK_EVERY == CHECK_EVERY - 1 and is_opaque(pixels, rows, columns):
                 break
         for line in range(rows):
             for i in range(columns):

@@ -1,4 +1,4 @@
-"""Spherical harmonics: the colour that a splat has from one direction."""
+"""Spherical harmonics: the colour of a splat from one direction."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ C1, C2, C3 = f32(SH_C1), tuple(map(f32, SH_C2)), tuple(map(f32, SH_C3))
 
 @kernel(parallel=True)
 def add_sh(center, sh, eye, degree, rgb):
-    """Adds spherical harmonics to colours.
+    """Adds the terms of degree 1 and above to colours.
 
     Args:
         center: (N, 3) float32.
-        sh: (N, K, 3) float32 coefficients of degree 1 and above.
-        eye: (3,) float32, where they are seen from.
+        sh: (N, K, 3) float32 coefficients of degree 1 and above, K = 3, 8 or 15.
+        eye: (3,) float32 position of the camera.
         degree: 1 to 3.
         rgb: (N, 3) float32, added to.
     """

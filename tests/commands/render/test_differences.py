@@ -13,7 +13,7 @@ from sparklod_cli.images.metrics import psnr
 from tests.commands.render.runs import AT, DEMO, PLAIN, SIZE, Said, floats, pixels, render
 
 
-def test_a_difference_and_its_psnr(built: Path, tmp_path: Path, capsys: Said) -> None:
+def test_a_difference_is_drawn_and_its_psnr_said(built: Path, tmp_path: Path, capsys: Said) -> None:
     how = (*SIZE, *AT)
     assert render(DEMO, *how, "--diff", DEMO, "-o", tmp_path / "same.png", "--json", "-q") == 0
     assert json.loads(capsys.readouterr().out)["frames"][0]["psnr_db"] == 100
@@ -36,7 +36,7 @@ def test_a_difference_says_what_it_shows(built: Path, tmp_path: Path, capsys: Sa
     assert render(*how, "-o", tmp_path / "bar.png") == 0
     out, err = capsys.readouterr()
     report = json.loads(out)
-    assert f"differences {report['gain']:g} times as strong" in err
+    assert f"differences times {report['gain']:g}" in err
     bar = pixels(tmp_path / "bar.png")
     assert report["frames"][0]["width"] == bar.shape[1] > 400
     assert render(*how, "-o", tmp_path / "same.png", "--gain", report["gain"], "--no-bar") == 0

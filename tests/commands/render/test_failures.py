@@ -15,47 +15,56 @@ from tests.commands.render.runs import CAMERAS, FAULTS, PLAIN, SIZE, TREE, Said,
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ([], "a FILE is missing, or --scene"),
-        ([TREE, "--scene", "s.json"], "--scene names the files; leave out FILE"),
+        ([], "a FILE is missing; name one, or an instances file with --scene"),
+        ([TREE, "--scene", "s.json"], "FILE cannot be used with --scene"),
         ([TREE, "--budget", "many"], "--budget"),
-        ([TREE, "--budget", "5k", "--preset", "quest"], "--budget and --preset exclude each other"),
+        ([TREE, "--budget", "5k", "--preset", "quest"], "--preset cannot be used with --budget"),
         ([TREE, "--far", "1e308"], "--far"),
         ([TREE, "--full", "--budget", "5k"], "--budget cannot be used with --full"),
         ([TREE, TREE, "--budget", "1"], "a budget of 1 splat is less than one for each of 2 instances"),
-        ([TREE, "--chunk-cache", "5"], "there is no option --"),
-        ([TREE, "--bandwidth", "5Mbit"], "there is no option --"),
-        ([TREE, "--view", "0,0,9:0,0,0", "--orbit", "3"], "--view and --orbit cannot go together"),
-        ([TREE, "--view", "0,0,0:0,0,0"], "looks at the point where it is"),
-        ([TREE, "--orbit", "3", "--dolly"], "--orbit and --dolly cannot go together"),
+        ([TREE, "--chunk-cache", "5"], "there is no option --chunk-cache"),
+        ([TREE, "--bandwidth", "5Mbit"], "there is no option --bandwidth"),
+        ([TREE, "--view", "0,0,9:0,0,0", "--orbit", "3"], "--orbit and --view cannot be used together"),
+        ([TREE, "--view", "0,0,0:0,0,0"], "looks at its own eye"),
+        ([TREE, "--orbit", "3", "--dolly"], "--orbit and --dolly cannot be used together"),
         ([TREE, "--background", "red"], "'red' is not a colour"),
         ([TREE, "--background", "#12345"], "is not a colour"),
-        ([TREE, "--alpha", "--background", "white"], "--alpha keeps what --background would fill"),
+        ([TREE, "--alpha", "--background", "white"], "--alpha cannot be used with --background"),
         ([TREE, "--alpha", "-o", "x.gif"], ".gif has no alpha"),
         ([TREE, "--alpha", "-o", "x.mp4"], ".mp4 has no alpha"),
+        ([TREE, "--alpha", "-o", "x.webm"], ".webm has no alpha"),
+        ([TREE, "--alpha", "-o", "x.jpg"], ".jpg has no alpha; write .png or .webp, or name a --background"),
+        ([TREE, "--jpeg-quality", "50"], "--jpeg-quality can only be used with a .jpg"),
+        ([TREE, "--jpeg-quality", "0", "-o", "x.jpg"], "--jpeg-quality"),
+        ([TREE, "--thumbnail", "--size", "64x64"], "--size cannot be used with --thumbnail"),
+        ([TREE, "--thumbnail", "--orbit", "3"], "--orbit cannot be used with --thumbnail"),
+        ([TREE, "--thumbnail", "--compare"], "--thumbnail cannot be used with --compare"),
+        ([TREE, "--fps", "3"], "--fps cannot be used with a camera that does not move"),
+        ([TREE, "--budget", "5%,10%"], "--budget 5%,10% names several, which only render --compare takes"),
         ([TREE, "--supersample", "5"], "--supersample"),
         ([TREE, "--supersample", "0"], "--supersample"),
-        ([TREE, "--size", "65536x65536"], "are more than 134,217,728; see --size"),
+        ([TREE, "--size", "65536x65536"], "are more than 134,217,728; give a smaller --size"),
         ([TREE, "--size", "9000x9000", "--supersample", "2"], "9,000 x 9,000 pixels x 4 (--supersample 2)"),
         ([TREE, "--size", "17000x10", "-o", "x.webp"], "more than 16,383 a side"),
-        ([TREE, "--near", "5", "--far", "5"], "--near 5 is not less than --far 5"),
+        ([TREE, "--near", "5", "--far", "5"], "--near 5 must be less than --far 5"),
         ([TREE, "--near", "0"], "--near"),
         ([TREE, "--style", "cubes"], "--style"),
-        ([TREE, "--style", "points", "--backend", "numba"], "has no --style points"),
+        ([TREE, "--style", "points", "--backend", "numba"], "--backend cannot be used with --style points"),
         ([TREE, "--color-by", "opacity"], "--color-by"),
-        ([TREE, "--color-by", "overdraw", "--style", "points"], "--color-by overdraw counts splats"),
-        ([TREE, "--no-bar"], "--no-bar only means something with --color-by or --diff"),
-        ([TREE, "--gain", "3"], "--gain only means something with --diff"),
-        ([TREE, "--diff", TREE, "--color-by", "level"], "leave out --color-by"),
-        ([TREE, "--diff", TREE, "--alpha"], "--diff is between pictures without alpha"),
+        ([TREE, "--color-by", "overdraw", "--style", "points"], "--style cannot be used with --color-by overdraw"),
+        ([TREE, "--no-bar"], "--no-bar can only be used with --color-by or --diff"),
+        ([TREE, "--gain", "3"], "--gain can only be used with --diff"),
+        ([TREE, "--diff", TREE, "--color-by", "level"], "--color-by cannot be used with --diff"),
+        ([TREE, "--diff", TREE, "--alpha"], "--diff compares pictures without alpha; name a --background"),
         ([TREE, "--through", "ply"], "--through"),
         ([TREE, "--backend", "cuda"], "--backend"),
-        ([TREE, "-o", "x.jpg"], "--output x.jpg is none of .png, .webp, .npy, .gif, .mp4"),
-        ([TREE, "-o", "x"], "--output x is none of .png"),
+        ([TREE, "-o", "x.tif"], "--output x.tif does not end in .png, .jpg, .webp, .npy, .gif, .mp4 or .webm"),
+        ([TREE, "-o", "x"], "--output x does not end in .png"),
         ([TREE, "--orbit", "3", "-o", "x.png"], "there are 3 cameras: write frames (x.%04d.png)"),
         ([TREE, "--orbit", "3", "-o", "-"], "standard output takes one picture, not 3"),
         ([TREE, "--orbit", "3", "-o", "%d.%d.png"], "does not name frames"),
         ([TREE, "--orbit", "3", "-o", "%d.mp4"], "does not name frames"),
-        ([TREE, "--sheet", "-o", "x.npy"], "a contact sheet is one .png or .webp"),
+        ([TREE, "--sheet", "-o", "x.npy"], "a contact sheet is one .png, .jpg or .webp"),
         ([TREE, "--json", "-o", "-"], "--output - and --json cannot both go to standard output"),
         ([TREE, "--jobs", "0"], "--jobs"),
         ([TREE, "--threads", "0"], "--threads"),
@@ -83,7 +92,7 @@ def test_wrong_usage_of_render_is_exit_code_2(
         ([PLAIN, "--color-by", "level"], "level", "no file is a Level-of-Detail tree"),
         ([TREE, "--camera-path", FAULTS / "no.json"], FAULTS / "no.json", "no such file"),
         (["--scene", FAULTS / "no.json"], FAULTS / "no.json", "no such file"),
-        ([TREE, "-o", "no/such/folder/out.png"], "no/such/folder", "does not exist"),
+        ([TREE, "-o", TREE / "out.png"], TREE, "is a file, not a folder"),
     ],
     ids=str,
 )
@@ -152,13 +161,13 @@ def test_an_interrupted_render_leaves_no_half_picture(
     assert "interrupted" in capsys.readouterr().err
 
 
-def test_cameras_that_see_nothing_are_wondered_at(tmp_path: Path, capsys: Said) -> None:
+def test_cameras_that_see_nothing_give_a_warning(tmp_path: Path, capsys: Said) -> None:
     assert render(PLAIN, *SIZE, "--look-at", "0,0,50:0,0,99", "-o", tmp_path / "x.png") == 0
     assert capsys.readouterr().err.startswith("warning: nothing is in view")
     assert render(PLAIN, *SIZE, "--look-at", "0,0,50:0,0,99", "-o", tmp_path / "x.png", "--overwrite", "-q") == 0
     assert capsys.readouterr().err == ""
 
 
-def test_a_budget_for_files_without_a_tree_is_wondered_at(tmp_path: Path, capsys: Said) -> None:
+def test_a_budget_for_files_without_a_tree_gives_a_warning(tmp_path: Path, capsys: Said) -> None:
     assert render(PLAIN, *SIZE, "--budget", 50, "-o", tmp_path / "x.png") == 0
     assert "no file is a Level-of-Detail tree, so all splats are drawn" in capsys.readouterr().err

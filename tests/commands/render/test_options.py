@@ -86,6 +86,8 @@ GIVEN: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "diff": ((), ("--diff", "other.ply")),
     "gain": (("--diff", "other.ply"), ("--gain", "0.5")),
     "output": ((), ("-o", "other.webp")),
+    "thumbnail": ((), ("--thumbnail",)),
+    "jpeg_quality": (("-o", "other.jpg"), ("--jpeg-quality", "10")),
 }
 
 #: Where the tree lies in its own space.
@@ -106,6 +108,7 @@ MODES: dict[str, tuple[str, ...]] = {
     "a camera path": ("--camera-path", str(CAMERAS / "splat-transform.json"), "-o", "out.%d.webp"),
     "keyframes": ("--keyframes", "1,0,-2:0,0,0 1,0,2:0,0,0", "--every", "15", "-o", "out.%d.png"),
     "floats": (*AT, "-o", "out.npy"),
+    "a JPEG": (*AT, "-o", "out.jpg"),
     "points": (*AT, "--style", "points", "-o", "out.png"),
     "billboards": (*AT, "--style", "billboards", "-o", "out.png"),
     "sorted billboards": (*AT, "--style", "sorted-billboards", "-o", "out.png"),

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from sparklod_cli.lod.kernels import node_rows, pair_cost, profile
+from sparklod_cli.lod.kernels.geometry import SplatColumns
 from sparklod_cli.lod.kernels.pair_cost import CENTER, COLOR, COVERED, DENSITY, WEIGHT
 from sparklod_cli.model.gaussian import spark_size
 from tests.references import gaussians
@@ -18,9 +19,9 @@ def test_rows_of_leaves_are_their_splats_in_units() -> None:
     index = np.random.default_rng(1).permutation(100).astype(np.uint32)
     rows = np.zeros((120, pair_cost.WIDTH), np.float32)
     middle, unit = np.array([0.5, -1.0, 2.0]), 2.0**-6
-    columns = splats.center, splats.scale, splats.quat_xyzw, splats.opacity, splats.rgb
+    columns = SplatColumns(splats.center, splats.scale, splats.quat_xyzw, splats.opacity)
     size = np.zeros(120, np.float32)
-    node_rows.fill_state(index, *columns, middle, unit, rows, size)
+    node_rows.fill_leaf_rows(index, columns, splats.rgb, node_rows.Space(middle, unit), rows, size)
     assert not rows[100:].any() and not size[100:].any()
     np.testing.assert_allclose(size[:100] * unit, spark_size(splats)[index], rtol=1e-5)
     for row, i in zip(rows, index, strict=False):
@@ -40,7 +41,8 @@ def test_merged_nodes_are_drawn_with_the_variance_and_coverage_of_their_rows() -
     middle, unit = np.array([0.5, -1.0, 2.0]), 2.0**-6
     out = random_splats(100, seed=11)
     before = out.take(np.arange(100))
-    node_rows.fill_merged(order, 40, rows, middle, unit, out.center, out.scale, out.quat_xyzw, out.opacity)
+    space, geometry = node_rows.Space(middle, unit), (out.center, out.scale, out.quat_xyzw, out.opacity)
+    node_rows.fill_merged_splats(order, 40, rows, space, *geometry)
     for i, node in enumerate(order):
         if node < 40:  # a leaf
             assert np.array_equal(out.center[i], before.center[i])
@@ -69,4 +71,4 @@ def test_keys_are_places_on_a_morton_curve_and_what_is_outside_is_at_its_edge() 
         )
         for cell in cells
     ]
-    assert node_rows.curve_keys(rows, nodes, low, step).tolist() == expected
+    assert node_rows.morton_keys(rows, nodes, low, step).tolist() == expected

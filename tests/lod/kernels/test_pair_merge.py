@@ -42,11 +42,11 @@ def test_products_on_planes_are_integrals(seed: int) -> None:
     a, b = twin.random_rows(2, seed, spread=0.7)
     for axes, plane in PLANES.items():
         expected = np.array(twin.integrals(a, b, axes)) / (2 * math.pi)
-        np.testing.assert_allclose(pair_merge.product(a, b, plane), expected, rtol=1e-5)
+        np.testing.assert_allclose(pair_merge.overlap_on_plane(a, b, plane), expected, rtol=1e-5)
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_the_shared_share_is_that_of_integrals(seed: int) -> None:
+def test_the_overlap_is_that_of_integrals(seed: int) -> None:
     a, b = twin.random_rows(2, seed + 10, spread=0.7)
     shared = alone = 0.0
     for axes in PLANES:
@@ -54,7 +54,7 @@ def test_the_shared_share_is_that_of_integrals(seed: int) -> None:
         area_a, area_b = a[DENSITY] * area_a, b[DENSITY] * area_b
         shared += min(a[DENSITY] * b[DENSITY] * both, area_a, area_b)
         alone += area_a + area_b
-    assert pair_merge.shared_share(a, b) == pytest.approx(shared / alone, rel=1e-5)
+    assert pair_merge.overlap_share(a, b) == pytest.approx(shared / alone, rel=1e-5)
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -82,24 +82,24 @@ def test_a_merged_node_that_looks_as_its_two_is_without_error() -> None:
 
 def united(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     merged = np.zeros_like(a)
-    pair_merge.unite(a, b, merged)
+    pair_merge.merge_pair(a, b, merged)
     return merged
 
 
-def test_a_quarter_of_what_two_equals_cover_both_do() -> None:
+def test_two_equal_splats_overlap_by_a_quarter() -> None:
     """A Gaussian's square sums to half of it, so two opaque equals cover 3/2 of one, with (2 - 1/4) / (3/2) of V."""
     a = twin.random_rows(1, seed=6)[0]
     a[COVERED] /= a[DENSITY]
     a[DENSITY] = 1
     merged = united(a, a)
-    assert pair_merge.shared_share(a, a) == pytest.approx(1 / 4)
+    assert pair_merge.overlap_share(a, a) == pytest.approx(1 / 4)
     assert merged[COVERED] == pytest.approx(1.5 * a[COVERED], rel=1e-6)
     np.testing.assert_allclose(merged[CENTER : CENTER + 3], a[CENTER : CENTER + 3], atol=1e-6)
     expected = 7 / 6 * twin.matrix(a)
     np.testing.assert_allclose(twin.matrix(merged), expected, atol=1e-5 * np.trace(expected))
 
 
-def test_two_that_share_nothing_are_merged_by_their_moments() -> None:
+def test_splats_that_do_not_overlap_are_merged_by_their_moments() -> None:
     a, b = twin.random_rows(2, seed=7)
     b[CENTER : CENTER + 3] += np.float32([60, -50, 40])
     merged = united(a, b)
@@ -112,7 +112,7 @@ def test_two_that_share_nothing_are_merged_by_their_moments() -> None:
 
 
 @pytest.mark.parametrize("spread", [0.0, 0.5, 3.0])
-def test_a_union_is_of_two_whichever_is_first(spread: float) -> None:
+def test_a_union_does_not_depend_on_the_order(spread: float) -> None:
     for seed in range(20):
         a, b = twin.random_rows(2, seed, spread)
         one, other = united(a, b), united(b, a)
@@ -168,7 +168,7 @@ def test_pairs_become_rows_that_cover_as_much_and_are_as_large_as_they_are_drawn
     joined = np.arange(20, dtype=np.uint32).reshape(10, 2)[::-1].copy()
     children = np.zeros((30, 2), np.uint32)
     size, error = np.zeros(30, np.float32), np.zeros(30, np.float32)
-    pair_merge.unite_pairs(joined, 20, rows, children, size, error)
+    pair_merge.merge_pairs(joined, 20, rows, children, size, error)
     assert np.array_equal(children[20:], joined)
     for (a, b), row, seen, off in zip(rows[joined], rows[20:], size[20:], error[20:], strict=True):
         expected = united(a, b)

@@ -22,7 +22,7 @@ def test_harmonic_numbers_of_integers_are_sums(a: int) -> None:
     assert second[0] == pytest.approx(math.fsum(1 / k**2 for k in range(1, a + 1)), rel=1e-5)
 
 
-@pytest.mark.parametrize("density", [0.01, 0.3, 1.0, 1.0001, 1.1, 1.3, 1.5, float(profile.DENSEST) * 0.9999])
+@pytest.mark.parametrize("density", [0.01, 0.3, 1.0, 1.0001, 1.1, 1.3, 1.5, float(profile.MAX_DENSITY) * 0.9999])
 def test_a_profile_has_the_density_and_the_variance_that_are_asked_for(density: float) -> None:
     opacity, spread = profile.profile_of(density)
     coverage, variance = twin.moments_of_profile(opacity)
@@ -32,9 +32,9 @@ def test_a_profile_has_the_density_and_the_variance_that_are_asked_for(density: 
 
 @pytest.mark.parametrize("density", [1.0, 1.2, 1.9, 2.5, 40.0])
 def test_what_is_denser_than_a_profile_can_be_is_larger_and_covers_as_much(density: float) -> None:
-    density = max(density, float(profile.DENSEST))
+    density = max(density, float(profile.MAX_DENSITY))
     opacity, spread = profile.profile_of(density)
-    assert lod_opacity(np.float32([opacity]))[0] == pytest.approx(profile.SHARPEST, rel=1e-5)
+    assert lod_opacity(np.float32([opacity]))[0] == pytest.approx(profile.MAX_D, rel=1e-5)
     assert twin.moments_of_profile(opacity)[0] / spread == pytest.approx(density, rel=1e-4)
 
 

@@ -37,7 +37,7 @@ class Binary:
                 self.size[node] = self.size[self.children[node]].max() * rng.uniform(1, 2)
         self.log_size, self.weight, self.lost = (np.empty(total, np.float32) for _ in range(3))
         self.saved = np.empty(total, np.int32)
-        self.parent = prune.value_nodes(
+        self.parent = prune.fill_usefulness_terms(
             self.children, leaves, self.size, self.error, self.log_size, self.weight, self.lost
         )
 
@@ -48,13 +48,13 @@ class Binary:
 
     def place(self) -> tuple[np.ndarray, LodTree, np.ndarray, np.ndarray]:
         """The node of each final index, the tree, inner nodes and their places."""
-        level = prune.levels_of(self.leaves, self.parent, self.log_size, self.saved)
+        level = prune.size_ranks(self.leaves, self.parent, self.log_size, self.saved)
         inner = np.flatnonzero(level >= 0).astype(np.uint32)
         inner = inner[np.argsort(level[inner], kind="stable")]
         total = self.leaves + len(inner)
         order = np.full(total, UNUSED)
         tree = LodTree(np.zeros(total, np.uint16), np.zeros(total, np.uint32))
-        places = prune.place_nodes(inner, self.parent, self.saved, order, tree.child_start, tree.child_count)
+        places = prune.lay_out_children(inner, self.parent, self.saved, order, tree.child_start, tree.child_count)
         return order, tree, inner, places
 
 
@@ -98,7 +98,7 @@ def test_no_more_are_kept_than_asked_for_and_their_parents_are_nearest_of_them(b
     assert np.array_equal(binary.saved[inner] + 1, children[inner])
 
 
-def test_what_saves_most_for_its_error_is_kept() -> None:
+def test_the_most_useful_nodes_are_kept() -> None:
     """Of two inner nodes under a root, equal but for their errors, the one with less of it."""
     children = np.array([[0, 0]] * 4 + [[0, 1], [2, 3], [4, 5]], np.uint32)
     for worse in (4, 5):
@@ -107,7 +107,7 @@ def test_what_saves_most_for_its_error_is_kept() -> None:
         error[worse] = 0.4
         log_size, weight, lost = (np.empty(7, np.float32) for _ in range(3))
         saved = np.empty(7, np.int32)
-        parent = prune.value_nodes(children, 4, size, error, log_size, weight, lost)
+        parent = prune.fill_usefulness_terms(children, 4, size, error, log_size, weight, lost)
         prune.drop_nodes(4, 2, parent, log_size, weight, lost, saved)
         assert saved[worse] == -1
         assert saved[9 - worse] == 1
@@ -117,7 +117,7 @@ def test_what_saves_most_for_its_error_is_kept() -> None:
 @given(BINARIES, st.floats(0, 1))
 def test_levels_rise_along_every_path(binary: Binary, share: float) -> None:
     kept = binary.drop(max(1, int(share * (binary.leaves - 1))))
-    level = prune.levels_of(binary.leaves, binary.parent, binary.log_size, binary.saved)
+    level = prune.size_ranks(binary.leaves, binary.parent, binary.log_size, binary.saved)
     inner = kept[kept >= binary.leaves]
     assert level[inner[-1]] == 0
     assert (level[inner[:-1]] > level[binary.parent[inner[:-1]]]).all()
@@ -128,7 +128,7 @@ def test_levels_rise_along_every_path(binary: Binary, share: float) -> None:
 
 
 @given(BINARIES, st.floats(0, 1))
-def test_placing_makes_a_tree_of_what_is_kept(binary: Binary, share: float) -> None:
+def test_kept_nodes_become_a_valid_tree(binary: Binary, share: float) -> None:
     kept = binary.drop(max(1, int(share * (binary.leaves - 1))))
     order, tree, inner, places = binary.place()
     tree.validate()
@@ -154,7 +154,7 @@ def test_with_nothing_dropped_the_tree_is_the_binary_one(binary: Binary) -> None
 
 
 @given(st.lists(st.floats(width=32, allow_nan=False), min_size=2, max_size=30))
-def test_keys_are_in_the_order_of_what_they_are_of(values: list[float]) -> None:
-    keys = [prune.key_of(value) for value in sorted(values)]
+def test_sort_keys_have_the_order_of_their_values(values: list[float]) -> None:
+    keys = [prune.usefulness_key(value) for value in sorted(values)]
     assert keys == sorted(keys)
     assert min(keys) >= 0 and max(keys) < 1 << prune.KEY_BITS

@@ -11,7 +11,14 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from sparklod_cli.lod.kernels.tree_links import STEPS, find_cycles, find_parents, sizes_below, sum_levels, walk
+from sparklod_cli.lod.kernels.tree_links import (
+    MAX_LINKS,
+    find_cycles,
+    find_depths,
+    find_parents,
+    mean_child_sizes,
+    sum_by_depth,
+)
 from sparklod_cli.model.gaussian import spark_size
 from tests.conftest import ROOT
 from tests.references import gaussians, tree_links
@@ -66,9 +73,9 @@ ANY = st.one_of(trees(), broken_trees(), ANY_LINKS)
 @example([(2, 1), (65535, 2**32 - 1), (2, 3), (0, 0), (0, 0)])
 def test_every_node_is_visited_once_by_the_shortest_way(links: Links) -> None:
     count, start, size = arrays(links)
-    depth, limit = walk(count, start, size)
-    expected = tree_links.walk(count, start, size)
-    if followed(links) <= STEPS * len(links):
+    depth, limit = find_depths(count, start, size)
+    expected = tree_links.follow(count, start, size)
+    if followed(links) <= MAX_LINKS * len(links):
         assert depth.tolist() == expected.depth
         assert limit.tolist() == expected.limit
     else:  # nodes share so many children that some of them are not looked at
@@ -83,15 +90,15 @@ def test_every_node_is_visited_once_by_the_shortest_way(links: Links) -> None:
 def test_parents_are_those_that_have_a_node_as_a_child(links: Links) -> None:
     count, start, size = arrays(links)
     parent, references = find_parents(count, start)
-    expected = tree_links.walk(count, start, size).parents
+    expected = tree_links.follow(count, start, size).parents
     assert references.tolist() == [len(parents) for parents in expected]
     for found, parents in zip(parent.tolist(), expected, strict=True):
         assert found in parents or found == -1
-        assert found != -1 or not parents or followed(links) > STEPS * len(links)
+        assert found != -1 or not parents or followed(links) > MAX_LINKS * len(links)
 
 
 @given(st.lists(st.tuples(st.integers(-1, 29), st.sampled_from([-1, -1, -1, 0, 2])), min_size=1, max_size=30))
-def test_cycles_are_what_one_never_leaves_upwards(nodes: Links) -> None:
+def test_cycles_are_found_by_following_parents(nodes: Links) -> None:
     parent = [above if above < len(nodes) else -1 for above, _ in nodes]
     depth = [edges for _, edges in nodes]
     found = find_cycles(np.array(parent, np.int32), np.array(depth, np.int32))
@@ -106,7 +113,7 @@ def test_children_count_by_what_they_cover(links: Links, seed: int) -> None:
     for column in (splats.opacity, splats.scale, splats.scale[:, 1:]):
         column[rng.random(len(links)) < 0.2] = 0
     parent, size = find_parents(count, start)[0], spark_size(splats)
-    found = sizes_below(parent, size, splats.scale, splats.opacity)
+    found = mean_child_sizes(parent, size, splats.scale, splats.opacity)
     for node in range(len(links)):
         below = np.flatnonzero((parent == node) & (splats.opacity > 0) & (size > 0))
         if len(below):
@@ -121,8 +128,8 @@ def test_children_count_by_what_they_cover(links: Links, seed: int) -> None:
 @given(ANY)
 def test_sums_over_levels_count_every_node_once(links: Links) -> None:
     count, start, size = arrays(links)
-    depth, _ = walk(count, start, size)
-    nodes, leaves, logs, children = sum_levels(depth, count, size)
+    depth, _ = find_depths(count, start, size)
+    nodes, leaves, logs, children = sum_by_depth(depth, count, size)
     for level in range(int(depth.max()) + 1):
         there = depth == level
         assert nodes[level] == there.sum()
@@ -133,11 +140,11 @@ def test_sums_over_levels_count_every_node_once(links: Links) -> None:
 
 
 @pytest.mark.parametrize("start", [0, 1, 100_000])
-def test_links_to_nearly_everything_take_no_longer(start: int) -> None:
+def test_overlapping_children_take_no_longer(start: int) -> None:
     """Followed one by one these were 2 * 10 ** 11."""
     nodes = 3_000_000
     count, begin = np.full(nodes, 65535, np.uint16), np.full(nodes, start, np.uint32)
-    depth, _ = walk(count, begin, np.ones(nodes, np.float32))
+    depth, _ = find_depths(count, begin, np.ones(nodes, np.float32))
     assert depth[0] == 0
     assert depth[max(1, start)] == 1
     _, references = find_parents(count, begin)
@@ -145,24 +152,24 @@ def test_links_to_nearly_everything_take_no_longer(start: int) -> None:
     assert references.max() == nodes
 
 
-def test_a_tree_as_deep_as_it_has_nodes() -> None:
+def test_a_tree_that_is_a_chain_is_followed_to_its_end() -> None:
     nodes = 200_000
     count = np.ones(nodes, np.uint16)
     count[-1] = 0
     start = np.arange(1, nodes + 1, dtype=np.uint32)
-    depth, limit = walk(count, start, np.arange(nodes, 0, -1, dtype=np.float32))
+    depth, limit = find_depths(count, start, np.arange(nodes, 0, -1, dtype=np.float32))
     assert np.array_equal(depth, np.arange(nodes))
     assert np.array_equal(limit, np.arange(nodes, 0, -1))
-    nodes_of, *_ = sum_levels(depth, count, np.ones(nodes, np.float32))
+    nodes_of, *_ = sum_by_depth(depth, count, np.ones(nodes, np.float32))
     assert (nodes_of == 1).all()
 
 
-def test_it_runs_as_python() -> None:
+def test_the_kernels_give_the_same_without_compilation() -> None:
     """A kernel that is debugged wraps no integers that the compiled one does not."""
     twins = (
         test_every_node_is_visited_once_by_the_shortest_way,
         test_parents_are_those_that_have_a_node_as_a_child,
-        test_cycles_are_what_one_never_leaves_upwards,
+        test_cycles_are_found_by_following_parents,
         test_sums_over_levels_count_every_node_once,
     )
     tests = [f"{__file__}::{test.__name__}" for test in twins]

@@ -1,0 +1,310 @@
+"""Whole-file jobs of the commands: pictures, comparisons and traversals of files, from reading to writing.
+
+Each reads files and cameras, asks its caller where the results go as soon as that can be told, and does the work.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ..cameras.framing import reach
+from ..model.instances import instances_of
+from ..model.splats import COLUMNS
+from ..scenes.finder import CutFinder
+from ..scenes.reading import TRAVERSED, read_scenes
+from ..support.progress import Progress, silent
+from ..support.threads import on_threads
+
+if TYPE_CHECKING:
+    from ..cameras.frame import Settings
+    from ..cameras.path import CameraPath
+    from ..cameras.sources import CameraSource
+    from ..images.output import Output
+    from ..images.sequence import Pictures, PictureSettings
+    from ..lod.budget import Budget
+    from ..lod.settings import LodSettings
+    from ..model.instances import Instance
+    from ..render.settings import RenderSettings
+    from ..scenes.loaded import Scenes
+    from ..simulation.outputs import FrameOutputs, WrittenFrames
+    from ..simulation.streaming import StreamingSettings
+    from ..simulation.summary import Summary
+    from ..tables.assertions import Assertion, Outcome
+    from ..tables.comparison import BudgetSummary
+    from ..tables.output import Filter, TableOutput
+
+
+class UnfitError(ValueError):
+    """What is asked for does not fit the scenes: a budget, or a chunk cache, too small for their roots."""
+
+
+@dataclass(frozen=True)
+class View:
+    """Files, and the cameras that look at them.
+
+    Attributes:
+        instances: at least one.
+        cameras: where they come from.
+        settings: what is said over what their file says.
+        precision: one of `PRECISIONS`, of the nodes that cuts are found with.
+        threads: to work on.
+        progress: is told how much is done.
+    """
+
+    instances: Sequence[Instance]
+    cameras: CameraSource
+    settings: Settings
+    precision: str
+    threads: int
+    progress: Progress = silent
+
+    def read(self, *, trees_only: bool = False, through: str | None = None, plain: bool = True) -> Scenes:
+        """The scenes, with all columns if `plain`."""
+        return read_scenes(
+            self.instances,
+            columns=COLUMNS if plain else TRAVERSED,
+            trees_only=trees_only,
+            through=through,
+            precision=self.precision,
+            threads=self.threads,
+            progress=self.progress,
+        )
+
+    def path(self, scenes: Callable[[], Scenes]) -> CameraPath:
+        """The cameras; scenes are asked for only where cameras are chosen for them."""
+        return self.cameras.cameras(self.settings, lambda: scenes().balls())
+
+    def reaching(self, render: RenderSettings, path: CameraPath, scenes: Callable[[], Scenes]) -> RenderSettings:
+        """Settings with near and far moved apart for cameras that are as far away as the scenes ask for."""
+        if not self.cameras.fits_scene:
+            return render
+        near, far = reach(render.raster.near, render.raster.far, path.cameras, scenes().balls())
+        return dataclasses.replace(render, raster=dataclasses.replace(render.raster, near=near, far=far))
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """What was drawn.
+
+    Attributes:
+        pictures: what was written.
+        path: the cameras.
+        output: where the pictures went.
+        render: how they were drawn.
+    """
+
+    pictures: Pictures
+    path: CameraPath
+    output: Output
+    render: RenderSettings
+
+
+def draw_files(
+    view: View,
+    budget: Budget | None,
+    lod: LodSettings,
+    render: RenderSettings,
+    place: Callable[[CameraPath], tuple[Output, PictureSettings]],
+    *,
+    fitted: bool,
+    through: str | None = None,
+    reference: Path | None = None,
+    overwrite: bool = False,
+    ready: Callable[[CameraPath, Scenes], None] = lambda path, scenes: None,
+) -> Drawn:
+    """Draws files and writes the pictures.
+
+    Args:
+        view: files and cameras.
+        budget: of the cuts; None draws full detail.
+        lod: settings of the cuts, but for the budget.
+        render: how pictures are drawn.
+        place: tells where the pictures of some cameras go and how they become files; is asked before a file is read,
+            if the cameras do not depend on one.
+        fitted: move near and far apart where cameras are chosen for the scenes.
+        through: one of `rounding.ROUND_TRIPS`, after which splats are drawn.
+        reference: the file whose pictures are compared with these: the difference is written.
+        overwrite: replace files that exist.
+        ready: is told of cameras and scenes before the first picture is drawn.
+
+    Raises:
+        UnfitError: the budget is too small for the roots.
+        SparklodError: a file cannot be read or written, or a picture cannot be drawn.
+    """
+    from ..images.sequence import write_pictures
+
+    scenes = functools.cache(lambda: view.read(through=through))
+    path = view.path(scenes)
+    if fitted:
+        render = view.reaching(render, path, scenes)
+    output, settings = place(path)
+    ready(path, scenes())
+    other = None
+    source = _finder(scenes(), budget, lod)
+    if reference is not None:
+        plain = dataclasses.replace(view, instances=instances_of([reference]))
+        other = _finder(plain.read(), budget, lod)
+    pictures = write_pictures(
+        source, path, output, render, settings, reference=other, overwrite=overwrite, progress=view.progress
+    )
+    return Drawn(pictures, path, output, render)
+
+
+def _finder(scenes: Scenes, budget: Budget | None, lod: LodSettings) -> CutFinder:
+    settings = None if budget is None else dataclasses.replace(lod, budget=budget.of(scenes.leaves))
+    try:
+        return CutFinder(scenes, settings)
+    except ValueError as error:
+        raise UnfitError(str(error)) from None
+
+
+@dataclass(frozen=True)
+class Compared:
+    """What a comparison found.
+
+    Attributes:
+        pictures: how many were compared.
+        path: the cameras.
+        leaves: splats of full detail, all instances together.
+        summary: what the pictures come to, for each budget.
+        outcomes: whether each assertion held.
+    """
+
+    pictures: int
+    path: CameraPath
+    leaves: int
+    summary: list[BudgetSummary]
+    outcomes: list[Outcome]
+
+
+@dataclass(frozen=True)
+class Traversed:
+    """What a traversal found.
+
+    Attributes:
+        frames: what was written of them.
+        path: the cameras.
+        summary: what the frames come to.
+        outcomes: whether each assertion held.
+    """
+
+    frames: WrittenFrames
+    path: CameraPath
+    summary: Summary
+    outcomes: list[Outcome]
+
+
+def compare_files(
+    view: View,
+    budgets: Sequence[Budget],
+    lod: LodSettings,
+    render: RenderSettings,
+    table: TableOutput,
+    *,
+    fitted: bool,
+    asserts: Sequence[tuple[int | None, Assertion]] = (),
+    plot: Path | None = None,
+    overwrite: bool = False,
+    ready: Callable[[CameraPath, Scenes], None] = lambda path, scenes: None,
+    passed: Filter | None = None,
+) -> Compared:
+    """Measures how far cuts of files are from full detail, and writes the table and the charts.
+
+    Args:
+        view: files and cameras.
+        budgets: at least one.
+        lod: settings of the cuts, but for the budget.
+        render: how pictures are drawn.
+        table: where the rows go, at once when all are known.
+        fitted: move near and far apart where cameras are chosen for the scenes.
+        asserts: what must hold, each with the place of the budget that it is about; None for all of them.
+        plot: file of the charts; None for none.
+        overwrite: replace files that exist.
+        ready: is told of cameras and scenes before the first picture is drawn.
+        passed: what the bytes of the table are passed through on their way to standard output.
+
+    Raises:
+        SparklodError: a file cannot be read or written, is no tree, or a picture cannot be drawn.
+    """
+    from ..compare import Comparison, write_charts
+    from ..tables.assertions import check
+    from ..tables.comparison import rows_by_budget, summarize
+
+    scenes = view.read(trees_only=True)
+    path = view.path(lambda: scenes)
+    if fitted:
+        render = view.reaching(render, path, lambda: scenes)
+    table.check()
+    if plot is not None:
+        from ..figures.charts import load_matplotlib
+        from ..io import check_writable
+
+        check_writable(plot, overwrite=overwrite)
+        load_matplotlib()
+    ready(path, scenes)
+    with on_threads(view.threads):
+        comparison = Comparison(scenes, lod, budgets, render)
+        rows = list(comparison.run(path, threads=view.threads, progress=view.progress))
+    table.write(rows, passed=passed)
+    if plot is not None:
+        write_charts(plot, rows, budgets, scenes.title, overwrite=overwrite)
+    groups = rows_by_budget(rows, len(budgets))
+    outcomes = [each for at, what in asserts for each in check([what], rows if at is None else groups[at])]
+    summary = summarize(rows, [budget.text for budget in budgets])
+    return Compared(len(rows), path, comparison.leaves, summary, outcomes)
+
+
+def traverse_files(
+    view: View,
+    budget: Budget,
+    lod: LodSettings,
+    streaming: StreamingSettings,
+    outputs: FrameOutputs,
+    *,
+    by_instance: bool = False,
+    asserts: Sequence[Assertion] = (),
+    ready: Callable[[CameraPath, Scenes], None] = lambda path, scenes: None,
+    passed: Filter | None = None,
+    bar: bool = True,
+) -> Traversed:
+    """Simulates what a viewer draws of files along a path, and writes what is made of the frames.
+
+    Args:
+        view: files and cameras.
+        budget: of the cuts.
+        lod: settings of the cuts, but for the budget.
+        streaming: how chunks get to the viewer.
+        outputs: where the frames go.
+        by_instance: make rows of single instances, too.
+        asserts: what must hold.
+        ready: is told of cameras and scenes before the first frame.
+        passed: what the bytes of the table are passed through on their way to standard output.
+        bar: tell how many frames are done.
+
+    Raises:
+        UnfitError: the budget, or the chunk cache, is too small for the roots.
+        SparklodError: a file cannot be read or written, or is no tree.
+    """
+    from ..simulation.columns import EMPTY
+    from ..simulation.frames import Simulation
+    from ..simulation.outputs import write_frames
+    from ..simulation.summary import summarize
+    from ..tables.assertions import check
+
+    outputs.check()
+    scenes = view.read(trees_only=True, plain=outputs.plot is not None)
+    path = view.path(lambda: scenes)
+    settings = dataclasses.replace(lod, budget=budget.of(scenes.leaves))
+    try:
+        simulation = Simulation(scenes, settings, streaming, by_instance=by_instance)
+    except ValueError as error:
+        raise UnfitError(str(error)) from None
+    ready(path, scenes)
+    progress = view.progress if bar else silent
+    frames = write_frames(simulation, path, outputs, threads=view.threads, progress=progress, passed=passed)
+    return Traversed(frames, path, summarize(frames.rows), check(asserts, frames.rows, empty=EMPTY))

@@ -1,0 +1,133 @@
+"""What the kernels that find a cut share: their arrays, limits as bits, and chunks."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ...support.jit import kernel
+from .pixel_scale import INFINITE, pixel_scale
+
+#: Buckets of pixel scales: the upper half of a float32's bits. A bucket is at most 0.8 % wide, and any number has one.
+BUCKET_BITS = 16
+BUCKETS = 1 << (31 - BUCKET_BITS)
+
+#: Pixel scales are compared as the bits of a float32 >= 0, which are in the order of the numbers. NaN is the largest,
+#: as in Spark. The sign bit marks leaves, which makes them less than any threshold.
+INFINITE_BITS = INFINITE.view(np.int32)
+LEAF = np.int32(-(1 << 31))
+
+#: Why a cut has no more nodes. FULL: the slots did not suffice, and there is no cut.
+BUDGET, PIXEL, MISSING, EXHAUSTED, FULL = 0, 1, 2, 3, 4
+
+
+class Trees(NamedTuple):
+    """Instances of trees as one camera sees them.
+
+    Attributes:
+        nodes: `NODE` of all trees, one after the other.
+        views: (instances,) `VIEW`.
+        resident: (chunks,) bool, of all trees: the chunk's nodes are there. A node is not refined unless its children
+            are.
+        chunk_bits: a chunk has 2 ** chunk_bits nodes.
+    """
+
+    nodes: Any
+    views: Any
+    resident: Any
+    chunk_bits: Any
+
+
+class Stop(NamedTuple):
+    """Where refinement stops.
+
+    Attributes:
+        smallest: int32 bits of a pixel scale; nodes up to it are not refined.
+        budget: int64, number of nodes of a cut; at least one for each instance.
+    """
+
+    smallest: Any
+    budget: Any
+
+
+class CutNodes(NamedTuple):
+    """The nodes of a cut.
+
+    Attributes:
+        node: uint32 indices in their trees.
+        limit: int32 bits of their limits, see `find_cut`; LEAF marks those that the queue took out, which are not all
+            leaves.
+        instance: uint16.
+    """
+
+    node: Any
+    limit: Any
+    instance: Any
+
+
+class Slots(NamedTuple):
+    """Working memory for nodes that have been visited: of roots, then of the children of each refined node, run by run.
+
+    Attributes:
+        node: (slots,) uint32 index in its tree.
+        limit: (slots,) int32, see `limit_bits`.
+        instance: (slots,) uint16.
+        first: (slots + 1,) int32, the first slot of each run.
+        queue: (slots,) int32 slots that have been refined, one for each run, then those that will be.
+        pending: (slots,) int32 slots below the threshold.
+        heap: (slots,) int32.
+        sums: (BUCKETS,) int32, for each bucket of limits the number of nodes that refining its nodes adds to the cut.
+    """
+
+    node: Any
+    limit: Any
+    instance: Any
+    first: Any
+    queue: Any
+    pending: Any
+    heap: Any
+    sums: Any
+
+
+@kernel(inline=True)
+def to_bits(value):
+    """The bits of a float32 >= 0 as int32; NaN may have either sign."""
+    return np.float32(value).view(np.int32) & ~LEAF
+
+
+@kernel(inline=True)
+def from_bits(bits):
+    """The float32 of these bits, without the mark of a leaf."""
+    return np.int32(bits & ~LEAF).view(np.float32)
+
+
+@kernel(inline=True)
+def limit_bits(node, view, above):
+    """The bits of a node's limit, the least pixel scale from the root to it; `above` are those of its parent."""
+    limit = min(to_bits(pixel_scale(node, view)), above)
+    return limit if node.child_count else limit | LEAF
+
+
+@kernel(inline=True)
+def is_resident(trees, view, start, children):
+    """Whether children are resident; they are in one chunk or two."""
+    last = start + children - 1
+    return (
+        trees.resident[view.chunk_base + (start >> trees.chunk_bits)]
+        and trees.resident[view.chunk_base + (last >> trees.chunk_bits)]
+    )
+
+
+@kernel(inline=True)
+def request_chunks(wanted, trees, view, start, children, limit):
+    """Raises the priority of the chunks of a node's children to the node's limit."""
+    for chunk in (start >> trees.chunk_bits, (start + children - 1) >> trees.chunk_bits):
+        at = view.chunk_base + chunk
+        wanted[at] = max(wanted[at], limit)
+
+
+@kernel(inline=True)
+def put(cut, at, node, limit, instance):
+    """Writes a node of the cut."""
+    cut.node[at], cut.limit[at], cut.instance[at] = node, limit, instance
