@@ -66,6 +66,9 @@ class Job:
         except SparklodError as error:
             self.console.error(f"{name}: {error}")
             status = 1
+        if self.output.plot is not None and scene is None and report.format is not None:
+            self.console.error(f"{name}: it does not hold all of its splats, so --plot cannot draw them")
+            status = max(status, 1)
         self._draw(name, report, scene)
         self.console.detail(f"  {name}: {report.format or 'not read'}, {time.perf_counter() - start:.2f} s")
         return status

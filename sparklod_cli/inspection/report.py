@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from ..codecs.spz_layout import KNOWN_FLAGS
-from ..io import examine_scene, size_of_input
+from ..io import examine_scene, read_arrays, size_of_input
 from ..model.scene import Scene
 from ..model.sh import COEFFICIENTS
 from ..model.splats import COLUMNS
 from ..support.errors import FormatError
 from ..support.progress import Progress, silent
-from . import tree, values
+from . import arrays, tree, values
 from .findings import Finding
 
 #: Version of the report: counts up when a field changes its meaning or is removed. schema.json describes this one.
@@ -96,6 +96,10 @@ def inspect(
     columns = COLUMNS if settings.values or settings.check else TREE_COLUMNS
     size = size_of_input(path)
     try:
+        held = read_arrays(path)
+        if held is not None:
+            facts_of_arrays, scene_of_arrays = arrays.examine(held, settings, threads=threads)
+            return Report(**arrays.as_report_fields(facts_of_arrays, path, size, settings)), scene_of_arrays
         scene = examine_scene(path, columns=columns, threads=threads, progress=progress)
     except FormatError as error:
         return Report(str(path), size, findings=[Finding(error.code, str(error))]), None

@@ -141,7 +141,8 @@ def _whole(by: str, source: CutSource, cameras: Sequence[Camera], progress: Prog
     ends = ends or [(0, 0)]
     low, high = min(low for low, _ in ends), max(high for _, high in ends)
     beyond = int(every > 1)
-    return Scale(whole_numbers(by, np.arange(low - beyond, high + 1 + beyond), low, high), low, high)
+    title = "tree depth" if by == "level" else by
+    return Scale(whole_numbers(title, np.arange(low - beyond, high + 1 + beyond), low, high), low, high)
 
 
 def numbers_of(by: str, scene: LoadedScene, index: Index) -> NDArray[np.int64]:

@@ -143,7 +143,7 @@ def test_leaves_can_be_those_of_another_file(tmp_path: Path, capsys: pytest.Capt
     assert run(["inspect", str(TREE), "--leaves-of", str(PLAIN)]) == 3
     assert (
         capsys.readouterr().out
-        == f"{TREE}: error: expect.leaves: 6 leaves, but the original has 60 splats that can be drawn\n"
+        == f"{TREE}: error: expect.leaves: 6 leaves, but 60 splats of the original can be drawn\n"
     )
 
 

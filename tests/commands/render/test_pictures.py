@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -29,13 +30,22 @@ def test_a_tree_is_drawn_to_a_png(built: Path, tmp_path: Path, capsys: Said) -> 
     assert [path.name for path in tmp_path.iterdir()] == ["preview.png"]
 
 
-def test_the_default_output_is_named_after_the_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert render(PLAIN, *SIZE, "-q") == 0
-    assert render(TOWN, *SIZE, "-q", "--orbit", 2, "--budget", "1k") == 0
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["sh2.png", "town.0000.png", "town.0001.png"]
-    assert render(PLAIN, *SIZE, "-q") == 1
-    assert render(PLAIN, *SIZE, "-q", "--overwrite") == 0
+def test_without_a_name_the_picture_is_beside_the_scene_and_has_its_name(tmp_path: Path) -> None:
+    plain, town = tmp_path / "plain.ply", tmp_path / "town 100%.spz"
+    shutil.copy(PLAIN, plain)
+    shutil.copy(TOWN, town)
+    assert render(plain, *SIZE, "-q") == 0
+    assert render(town, plain, *SIZE, "-q", "--orbit", 2, "--budget", "1k") == 0
+    made = {"plain.png", "town 100_.0000.png", "town 100_.0001.png"}
+    assert {path.name for path in tmp_path.glob("*.png")} == made
+    assert render(plain, *SIZE, "-q") == 1
+    assert render(plain, *SIZE, "-q", "--overwrite") == 0
+    folder = tmp_path / "unpacked"
+    with zipfile.ZipFile(FIXTURES / "golden" / "sh2-v1.sog") as archive:
+        archive.extractall(folder)
+    assert render(folder, *SIZE, "-q") == render(folder / "meta.json", *SIZE, "-q") == 0
+    assert (tmp_path / "unpacked.png").is_file()
+    assert (folder / "unpacked.png").is_file()
 
 
 @pytest.mark.parametrize(
