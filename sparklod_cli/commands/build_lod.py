@@ -28,7 +28,7 @@ from .options.baking import (
     write_options,
 )
 from .options.common import General, common_options, overwrite_option
-from .paths import InputPath, OutputPath, claim_stdout, keep_apart
+from .paths import InputPath, OutputPath, claim_stdout, keep_apart, stem_of
 from .reports import report_baked, report_extracted
 from .usage import options_of, refuse
 
@@ -91,8 +91,7 @@ class Outputs:
         return self.output or (self.output_dir or source.parent) / self._name(source)
 
     def _name(self, source: Path) -> str:
-        # The meta.json of an unpacked SOG has the name of its folder.
-        stem = source.absolute().parent.name if source.name == "meta.json" else source.stem
+        stem = stem_of(source)
         if self.unlod:
             return f"{stem.removesuffix('-lod')}-unlod{SPZ}"
         return f"{stem}-lod{NPZ if self.encoding else SPZ}"
