@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ...codecs.rounding import ROUND_TRIPS
+from ...render.backends import BACKENDS
 from ...render.settings import PROFILES, SORTS, RasterSettings, RenderSettings
 from ...support import defaults
 from ...support.defaults import OF_PIXELS
@@ -73,7 +74,7 @@ class Appearance:
         through: a key of `rounding.ROUND_TRIPS`.
         profile: one of `PROFILES`.
         sort: one of `SORTS`.
-        backend: one of `defaults.BACKENDS`.
+        backend: one of `backends.BACKENDS`.
         sorting, sort_throttle: of the backend osmesa.
     """
 
@@ -222,8 +223,8 @@ def appearance_options(command: Command) -> Command:
             ),
             add(
                 "--backend",
-                type=click.Choice(defaults.BACKENDS),
-                default=defaults.BACKENDS[0],
+                type=click.Choice(list(BACKENDS)),
+                default=next(iter(BACKENDS)),
                 help="Renderer: numba is the reference, osmesa is OpenGL in software, open3d is a quick look.",
             ),
             add(

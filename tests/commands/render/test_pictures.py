@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from sparklod_cli.images.metrics import psnr
-from sparklod_cli.render.backends import BACKENDS
 from sparklod_cli.support import defaults
 from tests.commands.render.runs import AT, DEMO, PLAIN, SIZE, TOWN, TREE, Said, floats, pixels, render
 from tests.conftest import FIXTURES
@@ -161,7 +160,3 @@ def test_other_backends_draw_or_say_what_is_missing(backend: str, tmp_path: Path
         assert err.startswith("error: ")
         assert err.count("\n") == 1
         assert list(tmp_path.iterdir()) == []
-
-
-def test_names_are_those_of_the_backends() -> None:
-    assert tuple(BACKENDS) == defaults.BACKENDS
