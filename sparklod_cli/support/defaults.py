@@ -1,40 +1,33 @@
 """Ranges and defaults that the command line names and the library checks; imports nothing, so `--help` stays quick."""
 
-#: Base of the quick builder: growth of its voxel grid from one level to the next.
+#: Growth of the voxel grid from level to level.
 MIN_BASE, MAX_BASE, DEFAULT_BASE = 1.1, 2.0, 1.5
 
-#: Growth of the quality builder: largest number of nodes per leaf. 2 would keep every node of its binary tree.
+#: Nodes for each leaf that the quality builder may make. Two would keep every node of its binary tree.
 MIN_GROWTH, MAX_GROWTH, DEFAULT_GROWTH = 1.05, 2.0, 1.4
 
-#: Highest degree of spherical harmonics that is read and written.
+#: Highest degree of spherical harmonics that is kept.
 MAX_SH_DEGREE = 3
 
-#: Most threads that can be asked for.
+#: Threads to work on.
 MAX_THREADS = 256
 
-#: SPZ versions that can be written, and the default; docs/decisions has the measurement.
+#: SPZ versions that can be written, and the one that is; docs/decisions has the measurement.
 SPZ_VERSIONS, DEFAULT_SPZ_VERSION = (2, 3), 3
 
-#: Most fractional bits of an SPZ position, all of its 24.
+#: Bits after the binary point of an SPZ position.
 MAX_FRACTIONAL_BITS = 24
 
-#: Deflate levels of SPZ files, and the default; docs/decisions has the measurement.
+#: Deflate levels, and the one that is used; docs/decisions has the measurement.
 MIN_COMPRESSION, MAX_COMPRESSION, DEFAULT_COMPRESSION = 1, 9, 5
 
-#: Quantities that colours can show in a picture of `inspect`; "level" is the depth of a node.
+#: What colours can mean in a picture of `inspect`.
 PLOT_BY = ("level", "opacity", "size", "chunk")
 
-#: Shapes that `render` draws splats as, and quantities that colours can show instead of the splats' own.
-STYLES = ("splats", "points", "billboards", "sorted-billboards")
-COLOR_BY = ("level", "lod-opacity", "size", "chunk", "overdraw", "depth")
-
-#: The quantities among these that are computed for pixels instead of splats.
-OF_PIXELS = ("overdraw", "depth")
-
-#: Most samples along each side of a pixel.
+#: Pixels a pixel along a side.
 MAX_SUPERSAMPLE = 4
 
-#: Budgets, in splats, of viewers: Spark 2's defaults by device, then those of its LoD design.
+#: How many splats viewers draw by default: Spark 2's, by device, then those of its LoD design.
 PRESETS = {
     "desktop": 2_500_000,
     "ios": 1_500_000,
@@ -45,23 +38,19 @@ PRESETS = {
     "mobile": 500_000,
 }
 
-#: Precision of the centres and sizes of nodes: that of the file, or that of Spark's traversal.
+#: Numbers that nodes can be read in: as the file has them, or as Spark's traversal holds them in memory.
 PRECISIONS = ("float32", "float16")
 
-#: Spark 2's foveation: full angles of the inner and the outer cone in degrees, and weights at the outer cone and behind
-#: the camera.
+#: Spark 2's foveation: full angles of its cones in degrees, weights at the outer one and behind the camera.
 CONE_FOV0, CONE_FOV, CONE_FOVEATE, BEHIND_FOVEATE = 90.0, 120.0, 0.4, 0.2
 
-#: Chunks that Spark fetches at the same time.
+#: Chunks that Spark fetches at a time.
 FETCHERS = 3
 
-#: Ratio of the pixel scales between which continuous cuts blend a node with its children.
+#: Ratio of the pixel scales between which continuous cuts blend a node and its children.
 BLEND = 1.25
 
-#: Ways in which the backend osmesa can sort splats.
-SORTINGS = ("exact", "counting16")
-
-#: Largest distance of a far plane, world units: a float32 holds it with room for products.
+#: No far plane is farther away, world units, so that it is a float32.
 FARTHEST = 1e37
 
 #: Axes of a file that can point up, for splats that are turned to have y up.

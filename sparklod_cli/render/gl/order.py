@@ -18,7 +18,7 @@ class Order:
     """Which splats to draw, from near to far, for a camera that moves.
 
     Args:
-        sorting: one of `defaults.SORTINGS`: by the distance itself, or by 65,536 steps of it.
+        sorting: one of `settings.SORTINGS`.
         throttle: splats are not sorted again while the cosine between where the camera looked when they were and where
             it looks now is above 1 - throttle; antimatter15's viewer has 0.01, an angle of 8.1 degrees. 0 sorts for
             each camera. With `RasterSettings.sort` "radial", where what counts is the camera's place, they are also
