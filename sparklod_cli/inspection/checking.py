@@ -71,8 +71,3 @@ def read_original(path: Path, *, threads: int = 1, progress: Progress = silent) 
         return read_scene(path, threads=threads, progress=progress)
     except FormatError as error:
         raise FormatError(f"{path}: {error}") from None
-
-
-def fails(found: Report, severity: str) -> bool:
-    """Whether a report has an error, or a finding of that severity."""
-    return any(each.severity in ("error", severity) for each in found.findings or [])

@@ -12,8 +12,10 @@ from ..io import examine_scene, read_arrays, size_of_input
 from ..model.scene import Scene
 from ..model.sh import COEFFICIENTS
 from ..model.splats import COLUMNS
-from ..support.errors import FormatError
+from ..support.errors import FormatError, SparklodError
+from ..support.printable import printable
 from ..support.progress import Progress, silent
+from ..support.untrusted import QUOTED
 from . import arrays, tree, values
 from .findings import Finding
 
@@ -22,6 +24,10 @@ SCHEMA_VERSION = 1
 
 #: Columns that the facts of a tree are computed from.
 TREE_COLUMNS = ("scale", "opacity")
+
+
+class NoFieldError(SparklodError):
+    """A report has no such field."""
 
 
 @dataclass(frozen=True)
@@ -72,12 +78,35 @@ class Report:
     values: values.ValueFacts | None = None
     findings: list[Finding] | None = None
 
+    def fails(self, severity: str) -> bool:
+        """Whether it has a finding of this severity, or an error."""
+        return any(found.severity in ("error", severity) for found in self.findings or [])
+
+    def value_at(self, name: str) -> Any:
+        """The value of a field, see `value_at`."""
+        return value_at(self.as_dict(), name)
+
     def as_dict(self) -> dict[str, Any]:
         """The report as plain values, for JSON."""
         plain = {"schema_version": SCHEMA_VERSION} | dataclasses.asdict(self)
         if self.findings is not None:
             plain["findings"] = [{"severity": found.severity} | dataclasses.asdict(found) for found in self.findings]
         return plain
+
+
+def value_at(plain: dict[str, Any], name: str) -> Any:
+    """The value of a field of a report as JSON: keys and indices with dots between ("tree.levels.0.nodes").
+
+    Raises:
+        NoFieldError: there is none.
+    """
+    value: Any = plain
+    try:
+        for key in name.split("."):
+            value = value[int(key)] if isinstance(value, list) else value[key]
+    except (KeyError, IndexError, TypeError, ValueError):
+        raise NoFieldError(f"the report has no {printable(name, QUOTED)}") from None
+    return value
 
 
 def inspect(

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from sparklod_cli.images.metrics import psnr
+from sparklod_cli.render import settings
 from sparklod_cli.render.backends import BACKENDS
-from sparklod_cli.support import defaults
 from tests.commands.render.runs import AT, DEMO, PLAIN, SIZE, TOWN, TREE, Said, floats, pixels, render
 from tests.conftest import FIXTURES
 
@@ -113,7 +113,7 @@ def test_two_renders_give_the_same_bytes(tmp_path: Path) -> None:
     assert len(made) == 1
 
 
-@pytest.mark.parametrize("by", defaults.COLOR_BY)
+@pytest.mark.parametrize("by", settings.COLOR_BY)
 def test_color_by_draws_a_color_scale(by: str, tmp_path: Path) -> None:
     how = (TOWN, "--budget", "4k", "--size", "480x270", "-q", "--color-by", by)
     assert render(*how, "-o", tmp_path / "bar.png") == 0
@@ -127,7 +127,7 @@ def test_color_by_draws_a_color_scale(by: str, tmp_path: Path) -> None:
     assert image.shape == ((270, 480) if by in ("overdraw", "depth") else (270, 480, 4))
 
 
-@pytest.mark.parametrize("style", defaults.STYLES)
+@pytest.mark.parametrize("style", settings.STYLES)
 def test_every_style_draws_something(style: str, tmp_path: Path) -> None:
     assert render(TOWN, "--budget", "4k", *SIZE, "-q", "--style", style, "-o", tmp_path / "x.png") == 0
     assert pixels(tmp_path / "x.png").any()
@@ -173,5 +173,7 @@ def test_other_backends_draw_or_say_what_is_missing(backend: str, tmp_path: Path
         assert list(tmp_path.iterdir()) == []
 
 
-def test_names_are_those_of_the_backends() -> None:
-    assert tuple(BACKENDS) == defaults.BACKENDS
+def test_every_backend_can_be_named(capsys: Said) -> None:
+    assert render("--help") == 0
+    said = capsys.readouterr().out
+    assert f"[{'|'.join(BACKENDS)}]" in said
