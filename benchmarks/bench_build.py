@@ -1,4 +1,4 @@
-"""Baking, stage by stage, beside Spark's own builder in the same run: `python benchmarks/bench_build.py --help`."""
+"""Measures `build-lod` by stages, against Spark's own builder in one run: `python benchmarks/bench_build.py --help`."""
 
 from __future__ import annotations
 
@@ -16,11 +16,8 @@ from pathlib import Path
 import numpy as np
 from scenes import load, tiled, write_ply
 
-from sparklod_cli.codecs import spz
-from sparklod_cli.codecs.options import WriteOptions
-from sparklod_cli.lod.builders import BUILDERS, METHODS
-from sparklod_cli.model.scene import Scene
-from sparklod_cli.support import jit
+import sparklod_cli as sparklod
+from sparklod_cli.lod.builders import METHODS
 from sparklod_cli.support.parallel import processors
 
 HERE = Path(__file__).resolve().parent
@@ -30,8 +27,8 @@ HEADINGS = (
     *("LoD / plain", "warm build s", "million splats/s (min to max)", "Spark's build s", "ratio"),
 )
 
-
-#: The command, and then its peak memory in kB as the kernel saw it: what the parent is told counts the parent's too.
+#: Runs a command and prints the peak of its resident memory in kB. It asks the kernel itself, since the figure that a
+#: parent process gets includes the parent's own memory before exec.
 MEASURED = """
 import re, sys
 from pathlib import Path
@@ -43,7 +40,7 @@ sys.exit(code)
 
 
 def machine() -> str:
-    """A name for this machine, for tables."""
+    """Describes this machine, for tables."""
     info = Path("/proc/cpuinfo")
     models = [line.split(":")[1].strip() for line in info.read_text().splitlines() if line.startswith("model name")]
     return (
@@ -52,24 +49,22 @@ def machine() -> str:
 
 
 def warm_build(path: Path, method: str, runs: int) -> list[float]:
-    """Seconds of each run of the builder alone, decoded splats to final order, after one that is not counted."""
-    splats = load(path)
-    builder = BUILDERS[method].load()
-    jit.use_threads(processors())
-    # The first touch of a page is slow on a virtual machine, which may take free pages back; a process that has run for
-    # a while has its pages, and those are the builder's own costs.
+    """Times the builder alone, from decoded splats to final order; returns the seconds of each run after the first."""
+    scene = sparklod.Scene(load(path))
+    # Touch memory first: on a virtual machine the first touch of a page is slow, since the host may take free pages
+    # back. That would be measured as a cost of the builder, which in a long-running process it is not.
     np.zeros(1 << 30, np.float64)[::512] = 1
     seconds = []
     for run in range(runs + 1):
         start = time.perf_counter()
-        builder.build(splats)
+        sparklod.build_lod(scene, method=method)
         if run:
             seconds.append(time.perf_counter() - start)
     return seconds
 
 
 def whole_command(path: Path, output: Path, method: str) -> dict[str, float]:
-    """One run of the command: its stages, wall time and peak memory of the process."""
+    """Runs the command once; returns the seconds of its stages, its wall time, and the peak memory of the process."""
     options = ["--method", method, "-o", str(output), "--overwrite", "--json"]
     command = [sys.executable, "-c", MEASURED, "build-lod", str(path), *options]
     start = time.perf_counter()
@@ -87,13 +82,13 @@ def whole_command(path: Path, output: Path, method: str) -> dict[str, float]:
 
 
 def plain_bytes(path: Path, bits: int) -> int:
-    """Size of the plain SPZ of the same splats, of the same version, level and fractional bits, in their own order."""
-    pieces = spz.encode(Scene(load(path)), WriteOptions(fractional_bits=bits), threads=processors())
-    return sum(map(len, pieces))
+    """Size in bytes of a plain SPZ file of the same splats in their own order, with the same fractional bits."""
+    with tempfile.TemporaryDirectory() as folder:
+        return sparklod.write(Path(folder, "plain.spz"), sparklod.Scene(load(path)), fractional_bits=bits).bytes
 
 
 def spark(path: Path, runs: int) -> list[float]:
-    """Seconds of Spark's builder alone; empty where it cannot be run."""
+    """Seconds of Spark's builder alone, for each run; empty if it cannot run."""
     if "SPARK_DIR" not in os.environ:
         return []
     command = ["node", str(HERE / "spark_build.mjs"), str(path), str(runs)]
@@ -107,13 +102,13 @@ def spark(path: Path, runs: int) -> list[float]:
 def main() -> None:
     """Prints Markdown tables."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("scenes", nargs="+", type=Path, help="splat files; the last is also tiled")
+    parser.add_argument("scenes", nargs="+", type=Path, help="splat files; the last is also tiled to larger sizes")
     parser.add_argument(
-        "--method", choices=METHODS, default=METHODS[0], help="the builder; Spark's is always its tiny one"
+        "--method", choices=METHODS, default=METHODS[0], help="sparklod's builder; Spark's is always its tiny one"
     )
-    parser.add_argument("--millions", type=float, nargs="*", default=[0.1, 0.5, 1, 2, 5], help="sizes to tile to")
-    parser.add_argument("--runs", type=int, default=5, help="runs of each; medians are printed")
-    parser.add_argument("--spark-up-to", type=float, default=2, help="millions of splats that Spark is tried on")
+    parser.add_argument("--millions", type=float, nargs="*", default=[0.1, 0.5, 1, 2, 5], help="splats to tile to")
+    parser.add_argument("--runs", type=int, default=5, help="number of runs; medians are printed")
+    parser.add_argument("--spark-up-to", type=float, default=2, help="splats that Spark builds at most, in millions")
     arguments = parser.parse_args()
     print(f"Machine: {machine()}. Medians of {arguments.runs} runs.\n")
     print("| " + " | ".join(HEADINGS) + " |")
@@ -133,7 +128,7 @@ def main() -> None:
 
 def row(path: Path, output: Path, arguments: argparse.Namespace) -> None:
     """Measures one scene and prints its row."""
-    whole_command(path, output, arguments.method)  # fills caches, the operating system's and numba's
+    whole_command(path, output, arguments.method)  # fills the caches of the operating system and of numba
     commands = [whole_command(path, output, arguments.method) for _ in range(arguments.runs)]
     median = {key: statistics.median(run[key] for run in commands) for key in commands[0]}
     warm = warm_build(path, arguments.method, arguments.runs)

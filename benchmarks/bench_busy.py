@@ -1,9 +1,9 @@
-"""Baking on an idle and on a busy machine, by how threads wait for one another.
+"""Measures baking on an idle and on a busy machine, by how OpenMP's threads wait for each other.
 
     python benchmarks/bench_busy.py playbot.sog [--rounds 3] [--method quality]
 
-For each way of waiting, in turn and round after round: one bake by itself, one beside a process that keeps a processor
-busy, four one after another, and four at once. Whole processes, from file to file, with a warm cache; medians.
+Every round measures each way of waiting: one bake alone, one beside a process that keeps a processor busy, four one
+after another, and four at once. Bakes are whole processes, from file to file, with a warm cache; medians are printed.
 """
 
 from __future__ import annotations
@@ -20,20 +20,21 @@ from pathlib import Path
 from sparklod_cli.lod.builders import METHODS
 from sparklod_cli.support.jit import WAITING
 
-#: What OpenMP does by itself, what sparklod asks of it, and what else could be asked; one thread for comparison.
+#: Environment variables and options of each way of waiting, by its name in the table: OpenMP's default, what sparklod
+#: sets, two others, and one thread for comparison.
 WAYS: dict[str, tuple[dict[str, str], list[str]]] = {
-    "OpenMP's default": ({"GOMP_SPINCOUNT": "300000"}, []),  # what libgomp takes where nobody says anything
+    "OpenMP's default": ({"GOMP_SPINCOUNT": "300000"}, []),  # libgomp's default
     "as shipped": ({}, []),
     "10,000 looks": ({"GOMP_SPINCOUNT": "10000"}, []),
     "passive": ({"OMP_WAIT_POLICY": "PASSIVE"}, []),
     "one thread": ({}, ["--threads", "1"]),
 }
 
-AT_ONCE = 4
+AT_ONCE = 4  # bakes at once
 
 
 class Bakes:
-    """Starts bakes of a scene."""
+    """Starts bakes of a scene, each as a process."""
 
     def __init__(self, scene: Path, method: str, folder: Path) -> None:
         self._line = [sys.executable, "-m", "sparklod_cli", "build-lod", str(scene), "--method", method, "-q"]
@@ -48,7 +49,7 @@ class Bakes:
         return subprocess.Popen([*self._line, *options, "-o", output], env={**clean, **settings})
 
     def run(self, way: str, count: int, *, at_once: bool) -> float:
-        """Seconds that `count` bakes take."""
+        """Seconds that `count` bakes take, at once or one after the other."""
         start = time.perf_counter()
         running = []
         for _ in range(count):
@@ -76,7 +77,7 @@ def beside_a_busy_process(bakes: Bakes, way: str) -> float:
 
 
 def main() -> None:
-    """Prints a table."""
+    """Prints a Markdown table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scene", type=Path)
     parser.add_argument("--method", choices=METHODS, default="quality")
@@ -85,7 +86,7 @@ def main() -> None:
     seconds: dict[str, list[tuple[float, ...]]] = {way: [] for way in WAYS}
     with tempfile.TemporaryDirectory() as folder:
         bakes = Bakes(arguments.scene, arguments.method, Path(folder))
-        bakes.run("as shipped", 1, at_once=False)  # compiles, and reads the file into the system's cache
+        bakes.run("as shipped", 1, at_once=False)  # compiles kernels and fills the system's file cache
         for _ in range(arguments.rounds):
             for way, rows in seconds.items():
                 rows.append(

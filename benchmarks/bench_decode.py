@@ -1,4 +1,4 @@
-"""Decoding, each format beside splat-transform's library in one run: `python benchmarks/bench_decode.py --help`."""
+"""Measures decoding of each format, against splat-transform in one run: `python benchmarks/bench_decode.py --help`."""
 
 from __future__ import annotations
 
@@ -19,10 +19,7 @@ from typing import Any
 from bench_build import machine
 from scenes import load, tiled
 
-from sparklod_cli.codecs import ply, splat
-from sparklod_cli.io import read_scene, write_whole
-from sparklod_cli.model.scene import Scene
-from sparklod_cli.support.parallel import processors
+import sparklod_cli as sparklod
 
 HERE = Path(__file__).resolve().parent
 
@@ -31,25 +28,24 @@ HEADINGS = (
     *("million splats/s", "ratio", "peak / decoded"),
 )
 
-#: Decodes a file and prints its peak memory in kB, as the kernel saw it, beyond that of the interpreter and the codecs.
+#: Decodes a file and prints its peak resident memory in kB, less that of the interpreter and the codecs before.
 MEASURED = """
 import re, sys
 from pathlib import Path
+import sparklod_cli as sparklod
 from sparklod_cli.codecs.formats import FORMATS
-from sparklod_cli.io import read_scene
-from sparklod_cli.support.parallel import processors
 def memory(what):
     return int(re.search(what + r":\\s+(\\d+)", Path("/proc/self/status").read_text())[1])
 for form in FORMATS:
     form.codec()
-threads, before = processors(), memory("VmRSS")
-scene = read_scene(Path(sys.argv[1]), threads=threads)
+read, before = sparklod.read, memory("VmRSS")
+scene = read(Path(sys.argv[1]))
 print(memory("VmHWM") - before)
 """
 
 
 class SplatTransform:
-    """Its library in a Node process; None of it where FOREIGN_DIR does not say where it is."""
+    """splat-transform's library in a Node process; answers None if FOREIGN_DIR is not set."""
 
     def __init__(self) -> None:
         self._process: subprocess.Popen[str] | None = None
@@ -60,7 +56,7 @@ class SplatTransform:
             )
 
     def ask(self, **request: Any) -> dict[str, Any] | None:
-        """The answer to a request; None, and a word on stderr, where there is none."""
+        """Returns the answer to a request; None, with a message on stderr, if it failed."""
         if self._process is None:
             return None
         assert self._process.stdin and self._process.stdout
@@ -73,7 +69,7 @@ class SplatTransform:
         return dict(answer)
 
     def seconds(self, path: Path) -> float | None:
-        """Of one run of its reader."""
+        """Seconds of one run of its reader."""
         answer = self.ask(read=str(path))
         return None if answer is None else float(answer["seconds"])
 
@@ -83,33 +79,32 @@ class SplatTransform:
 
 
 def our_seconds(path: Path) -> float:
-    """Of one run of `read_scene`, from the file to the columns of `Splats`."""
+    """Seconds of one run of `read`, from the file to the columns of `Splats`."""
     gc.collect()
     start = time.perf_counter()
-    read_scene(path, threads=processors())
+    sparklod.read(path)
     return time.perf_counter() - start
 
 
 def peak(path: Path) -> int:
-    """Bytes that a process which decodes a file needs at most, beyond what it needs to begin with."""
+    """Peak memory of a process that decodes a file, in bytes, less what it has at its start."""
     result = subprocess.run([sys.executable, "-c", MEASURED, str(path)], capture_output=True, text=True, check=True)
     return int(result.stdout) * 1024
 
 
 def made(source: Path, millions: float, folder: Path, transform: SplatTransform) -> Iterator[Path]:
-    """A scene tiled to a size, in every format that sparklod or splat-transform writes.
+    """Tiles a scene to a size and yields a file of it in every format that sparklod or splat-transform writes.
 
-    Without SH for SOG: on a processor splat-transform takes hours to cluster those of a million splats.
+    SOG is written without SH: without a GPU, splat-transform takes hours to cluster those of a million splats.
     """
-    scene = Scene(tiled(load(source), int(millions * 1e6)))
+    splats = tiled(load(source), int(millions * 1e6))
     stem = f"tiled-{millions:g}M"
     plain, bare = folder / f"{stem}.ply", folder / f"{stem}-sh0.ply"
-    for path, codec, degree in ((plain, ply, 3), (bare, ply, 0), (folder / f"{stem}.splat", splat, 0)):
-        part = dataclasses.replace(scene, splats=scene.splats.with_max_sh(degree))
-        write_whole(path, codec.encode(part), overwrite=True)
+    for path, degree in ((plain, 3), (bare, 0), (folder / f"{stem}.splat", 0)):
+        sparklod.write(path, sparklod.Scene(splats.with_max_sh(degree)), overwrite=True)
         if path != bare:
             yield path
-    del scene, part
+    del splats
     for name, origin, options in (
         (f"{stem}.compressed.ply", plain, {}),
         (f"{stem}-v3.spz", plain, {"spzVersion": 3}),
@@ -122,7 +117,7 @@ def made(source: Path, millions: float, folder: Path, transform: SplatTransform)
 
 def row(path: Path, transform: SplatTransform, runs: int) -> None:
     """Measures one file and prints its row."""
-    scene = read_scene(path, threads=processors())
+    scene = sparklod.read(path)
     splats, degree, form = len(scene.splats), scene.splats.sh_degree, scene.format
     decoded = sum(getattr(scene.splats, field.name).nbytes for field in dataclasses.fields(scene.splats))
     del scene
@@ -155,9 +150,9 @@ def row(path: Path, transform: SplatTransform, runs: int) -> None:
 def main() -> None:
     """Prints a Markdown table."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("scenes", nargs="+", type=Path, help="splat files; the last is also tiled, see --millions")
-    parser.add_argument("--millions", type=float, nargs="*", default=[], help="sizes to tile to, in every format")
-    parser.add_argument("--runs", type=int, default=5, help="runs of each, in turns; medians are printed")
+    parser.add_argument("scenes", nargs="+", type=Path, help="splat files; --millions tiles the last")
+    parser.add_argument("--millions", type=float, nargs="*", default=[], help="splats to tile to, in all formats")
+    parser.add_argument("--runs", type=int, default=5, help="number of runs, in turns; medians are printed")
     arguments = parser.parse_args()
     print(f"Machine: {machine()}. Medians of {arguments.runs} runs.\n")
     print("| " + " | ".join(HEADINGS) + " |")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import io
 import json
 import math
 import os
@@ -20,32 +19,7 @@ import numpy as np
 from bench_build import machine
 from numpy.typing import NDArray
 
-from sparklod_cli.cameras.camera import Camera
-from sparklod_cli.cameras.formats.source import Parsed
-from sparklod_cli.cameras.frame import DEFAULT_UP, Settings
-from sparklod_cli.cameras.framing import framing
-from sparklod_cli.cameras.generators import orbit
-from sparklod_cli.cameras.path import GENERATED, cameras_of
-from sparklod_cli.codecs import spz
-from sparklod_cli.codecs.gpu import ext_splats, lod_tree
-from sparklod_cli.codecs.gpu.lod_tree import Nodes
-from sparklod_cli.compare import on_background
-from sparklod_cli.images.metrics import psnr
-from sparklod_cli.io import read_scene
-from sparklod_cli.lod import quality, quick
-from sparklod_cli.lod.budget import Budget, parse_budgets
-from sparklod_cli.lod.traversal import Forest, Instance, Traversal
-from sparklod_cli.model.lod_tree import LodTree
-from sparklod_cli.model.scene import Scene
-from sparklod_cli.model.selection import Selection
-from sparklod_cli.model.splats import Splats
-from sparklod_cli.render.rasterizer import Image, draw
-from sparklod_cli.render.settings import RasterSettings
-from sparklod_cli.render.shading import show
-from sparklod_cli.simulation.frames import view_of
-from sparklod_cli.support import jit
-from sparklod_cli.support.defaults import DEFAULT_GROWTH
-from sparklod_cli.support.parallel import processors
+import sparklod_cli as sparklod
 
 #: What a folder stands for.
 REAL_SCENES = ("biker.ply", "playbot.sog", "playbot-125k.ply", "meadow.sog")
@@ -67,8 +41,14 @@ BUDGETS = "2%,5%,10%,25%,50%"
 #: middle, and how many radii away from it.
 SIZE, FOV_Y, AROUND, ELEVATION, DISTANCES = (960, 540), 60.0, 6, 15.0, (1.6, 3.5)
 
+#: The ball that cameras go around holds this share of the splats; so many splats are looked at to find it.
+SHARE, SAMPLE = 0.9, 1 << 18
+
 #: Grays that pictures are compared on.
 BACKGROUNDS = (0.0, 1.0)
+
+#: A picture, (height, width, 4).
+Image = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -76,13 +56,11 @@ class Built:
     """A tree as a viewer holds it, and how long building it took.
 
     Attributes:
-        splats: of all nodes, without spherical harmonics.
-        nodes: the same as the traversal reads them.
+        tree: without spherical harmonics.
         seconds: of each run.
     """
 
-    splats: Splats
-    nodes: Nodes
+    tree: sparklod.Tree
     seconds: list[float]
 
 
@@ -132,52 +110,54 @@ class FullDetail:
     """A scene as it was read, drawn from every camera.
 
     Args:
-        splats: of the scene; their spherical harmonics are left out.
+        scene: without spherical harmonics.
 
     Attributes:
         leaves: how many splats there are.
     """
 
-    def __init__(self, splats: Splats) -> None:
-        self.leaves = len(splats)
-        self._cameras = cameras_around(splats.center)
-        self._pictures = [picture(splats.with_max_sh(0), camera) for camera in self._cameras]
+    def __init__(self, scene: sparklod.Scene) -> None:
+        self.leaves = len(scene)
+        self._cameras = cameras_around(scene)
+        self._pictures = [sparklod.render(scene, camera) for camera in self._cameras]
 
-    def psnr(self, built: Built, budgets: Sequence[Budget]) -> NDArray[np.float64]:
-        """(cameras, budgets) dB: how far cuts of a tree are from it."""
-        forest = Forest([built.nodes])
-        # One for each budget: a traversal begins where its last cut ended.
-        traversals = [(Traversal(forest, [Instance()]), budget.of(self.leaves)) for budget in budgets]
+    def psnr(self, tree: sparklod.Tree, budgets: Sequence[str]) -> NDArray[np.float64]:
+        """(cameras, budgets) dB: how far cuts of a tree are from it; nodes have the precision that Spark holds."""
+        settings = sparklod.LodSettings(1, sparklod.Cones(), pixel_scale_limit=0.0)
         found = np.empty((len(self._cameras), len(budgets)))
         for row, camera, full in zip(found, self._cameras, self._pictures, strict=True):
-            for at, (traversal, budget) in enumerate(traversals):
-                cut = traversal.cut(view_of(camera), budget=budget).indices()[0]
-                row[at] = difference(picture(built.splats.take(cut), camera), full)
+            for at, budget in enumerate(budgets):
+                count = count_of(budget, self.leaves)
+                cut = sparklod.cut(tree, camera, budget=count, settings=settings, precision="float16")
+                row[at] = difference(sparklod.render(cut, camera), full)
         return found
 
 
-def cameras_around(center: NDArray[np.floating]) -> tuple[Camera, ...]:
+def count_of(budget: str, leaves: int) -> int:
+    """Splats of a budget such as "5%" or "5000"."""
+    return max(1, int(float(budget[:-1]) * leaves / 100)) if budget.endswith("%") else int(budget)
+
+
+def cameras_around(scene: sparklod.Scene) -> list[sparklod.Camera]:
     """Cameras around the middle of a scene whose up is -y, near ones and far ones."""
-    middle, radius = framing(center)
-    frames = []
-    for away in DISTANCES:
-        frames += orbit(AROUND, middle, away * radius, math.radians(ELEVATION), DEFAULT_UP)
-    settings = Settings(size=SIZE, fov_y=math.radians(FOV_Y))
-    return cameras_of(Parsed(frames), GENERATED["orbit"], settings).cameras
-
-
-def picture(splats: Splats, camera: Camera) -> Image:
-    """What a camera sees."""
-    return draw(show([(splats, np.eye(4))], camera), camera, RasterSettings())
+    center = scene.splats.center[:: max(len(scene) // SAMPLE, 1)].astype(np.float64)
+    middle = np.median(center, axis=0)
+    radius = float(np.quantile(np.linalg.norm(center - middle, axis=1), SHARE))
+    how = {"count": AROUND, "center": tuple(middle), "elevation": ELEVATION, "fov_y": FOV_Y, "size": SIZE}
+    return [
+        camera
+        for away in DISTANCES
+        for camera in sparklod.orbit(scene, distance=away * radius, **how)  # type: ignore
+    ]
 
 
 def difference(image: Image, full: Image) -> float:
     """PSNR in dB, mean of the backgrounds."""
-    return statistics.mean(psnr(on_background(image, gray), on_background(full, gray)) for gray in BACKGROUNDS)
+    return statistics.mean(sparklod.psnr(image, full, background=gray) for gray in BACKGROUNDS)
 
 
 def spark(path: Path, builder: str, runs: int) -> Built:
-    """A tree of one of Spark's builders, with the sizes of nodes that Spark gave it."""
+    """A tree of one of Spark's builders, as its memory holds it."""
     with tempfile.TemporaryDirectory() as folder:
         program = Path(__file__).with_name("spark_build.mjs")
         command = ["node", str(program), str(path), str(runs), builder, folder]
@@ -186,43 +166,39 @@ def spark(path: Path, builder: str, runs: int) -> Built:
             raise SystemExit(f"Spark failed on {path}: {result.stderr.strip()}")
         names = ("ext0", "ext1", "lod_tree")
         words = {name: np.fromfile(Path(folder, f"{name}.u32"), np.uint32).reshape(-1, 4) for name in names}
-    seconds = [json.loads(line)["build"] for line in result.stdout.splitlines()]
-    return Built(ext_splats.unpack(words, threads=processors()), lod_tree.unpack(words), seconds)
+    tree = sparklod.unpack(words)
+    assert isinstance(tree, sparklod.Tree)
+    return Built(tree, [json.loads(line)["build"] for line in result.stdout.splitlines()])
 
 
-def ours(splats: Splats, method: str, arguments: argparse.Namespace) -> Built:
+def ours(scene: sparklod.Scene, method: str, arguments: argparse.Namespace) -> Built:
     """A tree of one of our builders, as its file holds it."""
     seconds = []
     for run in range(arguments.runs + 1):
         start = time.perf_counter()
-        nodes, tree = quick.build(splats) if method == "quick" else quality.build(splats, arguments.growth)
+        tree = sparklod.build_lod(scene, method=method, growth=arguments.growth)
         if run:  # the first may have to compile
             seconds.append(time.perf_counter() - start)
-    held, links = as_written(Scene(nodes.with_max_sh(0), tree))
-    packed = lod_tree.pack(held, links, threads=processors())
-    return Built(held, lod_tree.unpack(packed), seconds)
-
-
-def as_written(scene: Scene) -> tuple[Splats, LodTree]:
-    """A tree after its coding as SPZ, with the options of `build-lod`."""
-    data = b"".join(spz.encode(scene, threads=processors()))
-    held = spz.decode(io.BytesIO(data), threads=processors())
-    assert held.tree is not None
-    return held.splats, held.tree
+    with tempfile.TemporaryDirectory() as folder:
+        written = sparklod.read(sparklod.write(Path(folder, "tree.spz"), tree).path)
+    assert isinstance(written, sparklod.Tree)
+    return Built(written, seconds)
 
 
 def measure(path: Path, arguments: argparse.Namespace) -> Found:
     """Measures one scene with every method, and prints a row for each."""
-    splats, _ = Selection().apply(read_scene(path, threads=processors()).splats)
-    full = FullDetail(splats)
+    read = sparklod.read(path)
+    kept, _ = sparklod.Selection().apply(read.splats.with_max_sh(0))
+    scene = sparklod.Scene(kept, antialiased=read.antialiased)
+    full = FullDetail(scene)
     found = {}
     for method in arguments.methods:
         if method.startswith("spark-"):
             built = spark(path, method.removeprefix("spark-"), arguments.runs)
         else:
-            built = ours(splats, method, arguments)
-        leaves = int(np.count_nonzero(built.nodes.tree.is_leaf))
-        one = Measured(len(built.splats), leaves, built.seconds, full.psnr(built, arguments.budgets))
+            built = ours(scene, method, arguments)
+        leaves = int(np.count_nonzero(built.tree.tree.is_leaf))
+        one = Measured(len(built.tree), leaves, built.seconds, full.psnr(built.tree, arguments.budgets))
         decibels = [f"{mean:.2f}" for mean in one.mean]
         line([path.name, METHODS[method], f"{one.nodes / one.leaves:.2f}", *decibels, f"{one.build:.3f}"])
         found[method] = one
@@ -268,13 +244,13 @@ def write_json(file: Path, found: dict[str, Found], arguments: argparse.Namespac
         "runs": arguments.runs,
         "growth": arguments.growth,
         "cameras": cameras,
-        "budgets": [budget.text for budget in arguments.budgets],
+        "budgets": arguments.budgets,
         "scenes": scenes,
     }
     file.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
 
 
-def plot(file: Path, found: dict[str, Found], budgets: Sequence[Budget]) -> None:
+def plot(file: Path, found: dict[str, Found], budgets: Sequence[str]) -> None:
     """Draws PSNR over the share of the leaves, a panel for each scene and a line for each builder."""
     from matplotlib.figure import Figure
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
@@ -286,7 +262,7 @@ def plot(file: Path, found: dict[str, Found], budgets: Sequence[Budget]) -> None
     for number, (scene, of_scene) in enumerate(found.items(), 1):
         axes = figure.add_subplot(down, across, number, title=scene, xlabel="share of the leaves", ylabel="PSNR, dB")
         for method, measured in of_scene.items():
-            shares = [100 * budget.of(measured.leaves) / measured.leaves for budget in budgets]
+            shares = [100 * count_of(budget, measured.leaves) / measured.leaves for budget in budgets]
             axes.plot(shares, measured.mean, styles[method], markersize=4, label=METHODS[method])
         axes.set_xscale("log")
         axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
@@ -310,12 +286,13 @@ def parsed() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("scenes", nargs="+", type=Path, help=f"splat files, or a folder with {', '.join(REAL_SCENES)}")
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS), help="what builds trees")
-    parser.add_argument("--budgets", type=parse_budgets, default=BUDGETS, help="shares of the leaves, or counts")
-    parser.add_argument("--growth", type=float, default=DEFAULT_GROWTH, help="of our quality builder")
+    parser.add_argument("--budgets", default=BUDGETS, help="shares of the leaves, or counts, between commas")
+    parser.add_argument("--growth", type=float, default=1.4, help="of our quality builder")
     parser.add_argument("--runs", type=int, default=3, help="runs of each builder; medians are printed")
     parser.add_argument("--json", type=Path, help="file for all numbers, with those of each camera")
     parser.add_argument("--plot", type=Path, help="file for the curves, such as fidelity.png; needs matplotlib")
     arguments = parser.parse_args()
+    arguments.budgets = arguments.budgets.split(",")
     if "SPARK_DIR" not in os.environ and any(method.startswith("spark-") for method in arguments.methods):
         parser.error("Spark's builders need SPARK_DIR: a folder with Spark in its node_modules")
     return arguments
@@ -324,8 +301,7 @@ def parsed() -> argparse.Namespace:
 def main() -> None:
     """Prints Markdown tables."""
     arguments = parsed()
-    jit.use_threads(processors())
-    budgets = [budget.text.replace("%", " %") for budget in arguments.budgets]
+    budgets = [budget.replace("%", " %") for budget in arguments.budgets]
     print(f"Machine: {machine()}. PSNR in dB; medians of {arguments.runs} builds.\n")
     head(["scene", "builder", "nodes / leaves", *budgets, "build s"])
     found = {path.name: measure(path, arguments) for path in scenes_of(arguments.scenes)}

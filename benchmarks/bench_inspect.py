@@ -1,4 +1,4 @@
-"""Looking at LoD files, beside inflating them alone in one run: `python benchmarks/bench_inspect.py --help`."""
+"""Measures `inspect` against mere decompression in one run: `python benchmarks/bench_inspect.py --help`."""
 
 from __future__ import annotations
 
@@ -14,15 +14,10 @@ from typing import NamedTuple
 from bench_build import MEASURED, machine
 from scenes import load, tiled
 
-from sparklod_cli.codecs import spz
-from sparklod_cli.io import write_whole
-from sparklod_cli.lod import quick
-from sparklod_cli.model.scene import Scene
-from sparklod_cli.model.splats import Splats
-from sparklod_cli.support import jit
-from sparklod_cli.support.parallel import processors
+import sparklod_cli as sparklod
+from sparklod_cli import Scene, Splats
 
-#: What no way to look at a file can do without: inflating all of it, as the codec does, and keeping nothing.
+#: Decompresses a file as the codec does and keeps nothing, which every way to inspect it has to do at least.
 INFLATE = """
 import re, sys
 from pathlib import Path
@@ -34,7 +29,7 @@ with open(sys.argv[1], "rb") as file:
 print(re.search(r"VmHWM:\\s+(\\d+)", Path("/proc/self/status").read_text())[1])
 """
 
-#: Programs and arguments, to which the file is added.
+#: Ways to inspect a file: a program and its arguments, to which the file is added.
 WAYS = {
     "inflate": (INFLATE,),
     "--json": (MEASURED, "inspect", "--json"),
@@ -57,14 +52,14 @@ HEADINGS = (
 
 
 class Run(NamedTuple):
-    """One process: its wall time, and its peak memory as the kernel saw it."""
+    """Wall time of a process in s, and its peak resident memory in bytes."""
 
     seconds: float
     bytes: int
 
 
 def run_of(way: str, path: Path) -> Run:
-    """Runs a way to look at a file; whether something is found does not matter."""
+    """Runs one of `WAYS` on a file, whether or not `inspect` has findings."""
     start = time.perf_counter()
     done = subprocess.run([sys.executable, "-c", *WAYS[way], str(path)], capture_output=True, text=True, check=False)
     seconds = time.perf_counter() - start
@@ -74,21 +69,21 @@ def run_of(way: str, path: Path) -> Run:
 
 
 def bake(source: Splats, nodes: int, path: Path) -> tuple[int, int]:
-    """Writes the tree of a scene that is tiled to about so many nodes; its leaves and its nodes."""
-    sample = nodes // 4  # how much a tree grows over its leaves hardly depends on their number
-    growth = len(quick.build(tiled(source.with_max_sh(0), sample))[1]) / sample
+    """Tiles a scene and writes its tree of about `nodes` nodes; returns the numbers of leaves and of nodes."""
+    sample = nodes // 4  # the ratio of nodes to leaves hardly depends on the number of leaves
+    growth = len(sparklod.build_lod(Scene(tiled(source.with_max_sh(0), sample)))) / sample
     leaves = round(nodes / growth)
-    splats, tree = quick.build(tiled(source, leaves))
-    write_whole(path, spz.encode(Scene(splats, tree), threads=processors()), overwrite=True)
+    tree = sparklod.build_lod(Scene(tiled(source, leaves)))
+    sparklod.write(path, tree, overwrite=True)
     return leaves, len(tree)
 
 
 def rows(source: Splats, nodes: int, folder: Path, runs: int) -> None:
-    """Measures one size of file in every way, in turns, and prints a row for each."""
+    """Measures all ways on one size of file, in turns, and prints a row for each."""
     path = folder / "tree.spz"
     leaves, nodes = bake(source, nodes, path)
     for way in WAYS:
-        run_of(way, path)  # fills caches, the operating system's and numba's
+        run_of(way, path)  # fills the caches of the operating system and of numba
     turns = [{way: run_of(way, path) for way in WAYS} for _ in range(runs)]
     medians = {way: statistics.median(turn[way].seconds for turn in turns) for way in WAYS}
     for way in WAYS:
@@ -113,12 +108,11 @@ def rows(source: Splats, nodes: int, folder: Path, runs: int) -> None:
 def main() -> None:
     """Prints a Markdown table."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("scene", type=Path, help="splat file that is tiled and baked")
+    parser.add_argument("scene", type=Path, help="splat file to tile and bake")
     parser.add_argument("--millions", type=float, nargs="*", default=[1, 5, 10], help="nodes of the files")
     parser.add_argument("--sh", type=int, nargs="*", default=[0, 2], help="SH degrees, none above the scene's")
-    parser.add_argument("--runs", type=int, default=5, help="runs of each, in turns; medians are printed")
+    parser.add_argument("--runs", type=int, default=5, help="number of runs, in turns; medians are printed")
     arguments = parser.parse_args()
-    jit.use_threads(processors())
     print(f"Machine: {machine()}. Medians of {arguments.runs} runs.\n")
     print("| " + " | ".join(HEADINGS) + " |")
     print("|---" * len(HEADINGS) + "|")

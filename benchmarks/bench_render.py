@@ -1,4 +1,4 @@
-"""Drawing splats, on the backend numba: `python benchmarks/bench_render.py --help`."""
+"""Measures drawing with the numba backend: `python benchmarks/bench_render.py --help`."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from sparklod_cli.support.parallel import processors
 
 
 def scattered(count: int, camera: Camera) -> ShadedSplats:
-    """Round splats of 1.5 to 2.5 pixels of standard deviation all over a picture, opaque by a tenth to wholly."""
+    """Scatters round splats over a picture, of 1.5 to 2.5 pixels of standard deviation and opacities of 0.1 to 1."""
     rng = np.random.default_rng(0)
     depth = rng.uniform(2, 10, count)
     focal = camera.focal[0]
@@ -38,9 +38,11 @@ def scattered(count: int, camera: Camera) -> ShadedSplats:
 def main() -> None:
     """Prints a Markdown table."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--splats", type=int, nargs="*", default=[100_000, 500_000, 1_500_000])
-    parser.add_argument("--size", type=int, nargs=2, default=[1280, 720], help="width and height")
-    parser.add_argument("--runs", type=int, default=15, help="after one that is not counted; medians are printed")
+    parser.add_argument(
+        "--splats", type=int, nargs="*", default=[100_000, 500_000, 1_500_000], help="numbers of splats"
+    )
+    parser.add_argument("--size", type=int, nargs=2, default=[1280, 720], help="width and height in pixels")
+    parser.add_argument("--runs", type=int, default=15, help="number of runs after the first; medians are printed")
     arguments = parser.parse_args()
     jit.use_threads(processors())
     width, height = arguments.size
@@ -49,11 +51,11 @@ def main() -> None:
     print(f"Machine: {machine()}. {width} x {height} pixels, medians of {arguments.runs} runs.\n")
     print("| splats | ms (min to max) | million splats/s |\n|---|---|---|")
     for count in arguments.splats:
-        shown = scattered(count, camera)
+        splats = scattered(count, camera)
         seconds = []
         for _ in range(arguments.runs + 1):
             start = time.perf_counter()
-            draw(shown, camera, RasterSettings())
+            draw(splats, camera, RasterSettings())
             seconds.append(time.perf_counter() - start)
         median = statistics.median(seconds[1:])
         spread = f"{1e3 * min(seconds[1:]):.0f} to {1e3 * max(seconds[1:]):.0f}"

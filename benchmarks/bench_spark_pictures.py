@@ -1,6 +1,6 @@
-"""Our pictures beside Spark's own, in headless Chromium: `python -m benchmarks.bench_spark_pictures --help`.
+"""Compares pictures with Spark's own in headless Chromium: `python -m benchmarks.bench_spark_pictures --help`.
 
-Run it from the repository's root; it uses the program that the tests drive the browser with.
+Run it from the repository's root: it imports the tests' program that drives the browser.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ HEADINGS = (
 
 
 def row(scene: str, view: int, found: Difference) -> str:
-    """One view, in Markdown."""
+    """Returns the Markdown row of one view."""
     around, up, away = AROUND[view]
     cells = [
         scene,
@@ -55,16 +55,16 @@ def row(scene: str, view: int, found: Difference) -> str:
 def main() -> None:
     """Prints a Markdown table."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("scenes", type=Path, nargs="+", help="files of splats, and of trees")
-    parser.add_argument("--budgets", type=int, nargs="*", default=[50_000], help="how much of a tree is drawn")
-    parser.add_argument("--size", default="960x540")
-    parser.add_argument("--views", type=int, default=len(AROUND), help="how many of them")
-    parser.add_argument("--sort", choices=SORTS, default=SORTS[0])
+    parser.add_argument("scenes", type=Path, nargs="+", help="splat files and LoD files")
+    parser.add_argument("--budgets", type=int, nargs="*", default=[50_000], help="numbers of nodes to draw of a tree")
+    parser.add_argument("--size", default="960x540", help="width and height in pixels")
+    parser.add_argument("--views", type=int, default=len(AROUND), help="number of views")
+    parser.add_argument("--sort", choices=SORTS, default=SORTS[0], help="order in which splats are blended")
     arguments = parser.parse_args()
     chromium = shutil.which("chromium")
     if chromium is None or "SPARK_DIR" not in os.environ:
         raise SystemExit(
-            "needs Chromium, and SPARK_DIR: a folder with Spark, three and playwright-core in its node_modules"
+            "needs Chromium, and SPARK_DIR: a folder whose node_modules has Spark, three and playwright-core"
         )
     jit.use_threads(processors())
     width, height = map(int, arguments.size.split("x"))

@@ -1,4 +1,4 @@
-"""Finding cuts, beside Spark's own traversal in one run: `python benchmarks/bench_traverse.py --help`."""
+"""Measures traversals against Spark's own in one run: `python benchmarks/bench_traverse.py --help`."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ import numpy as np
 from bench_build import machine
 from scenes import load, tiled
 
+import sparklod_cli as sparklod
 from sparklod_cli.cameras.framing import framing
 from sparklod_cli.cameras.pose import look_at
 from sparklod_cli.codecs.gpu import lod_tree
-from sparklod_cli.codecs.gpu.lod_tree import Nodes
-from sparklod_cli.lod import quick
-from sparklod_cli.lod.traversal import Forest, Instance, Traversal, View
+from sparklod_cli.lod.traversal import Forest, Traversal, TreeInstance, View
+from sparklod_cli.model.nodes import Nodes
+from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
-from sparklod_cli.support import jit
 from sparklod_cli.support.parallel import ordered_map, processors
 
 HEADINGS = (
@@ -47,7 +47,7 @@ class Spark:
         self._node = subprocess.Popen(["node", str(program)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
     def ask(self, **request: Any) -> list[float]:
-        """Milliseconds of each view of a request."""
+        """Sends a request; returns the milliseconds of each of its views."""
         assert self._node.stdin and self._node.stdout
         self._node.stdin.write(json.dumps(request) + "\n")
         self._node.stdin.flush()
@@ -62,7 +62,7 @@ class Spark:
 
 
 def flight(center: np.ndarray, radius: float, frames: int) -> list[View]:
-    """Half a circle around the middle of a scene, at 1.5 times the radius of one tile, looking at it."""
+    """Returns views on half a circle around a scene, at 1.5 times the radius of one tile, looking at its centre."""
     views = []
     for angle in np.linspace(0, np.pi, frames):
         eye = center + 1.5 * radius * np.array([np.sin(angle), -0.4, np.cos(angle)])
@@ -71,15 +71,15 @@ def flight(center: np.ndarray, radius: float, frames: int) -> list[View]:
 
 
 def tree_of(source: Splats, nodes: int) -> Nodes:
-    """The nodes of a scene that is tiled to about so many, as Spark holds them."""
-    sample = min(nodes // 4, 500_000)  # how much a tree grows over its leaves hardly depends on their number
-    growth = len(quick.build(tiled(source, sample))[1]) / sample
-    splats, tree = quick.build(tiled(source, round(nodes / growth)))
-    return lod_tree.unpack(lod_tree.pack(splats, tree, threads=processors()))
+    """Tiles and bakes a scene to a tree of about `nodes` nodes; returns them as Spark stores them."""
+    sample = min(nodes // 4, 500_000)  # the ratio of nodes to leaves hardly depends on the number
+    growth = len(sparklod.build_lod(Scene(tiled(source, sample)))) / sample
+    tree = sparklod.build_lod(Scene(tiled(source, round(nodes / growth))))
+    return lod_tree.unpack(sparklod.pack(tree, "lodtree"))
 
 
 def seconds_of(traversal: Traversal, views: list[View], budget: int, threads: int) -> float:
-    """Seconds a frame of a whole path."""
+    """Seconds per frame of a whole path."""
     start = time.perf_counter()
     for _ in ordered_map(lambda view: len(traversal.cut(view, budget=budget)), views, threads):
         pass
@@ -87,8 +87,8 @@ def seconds_of(traversal: Traversal, views: list[View], budget: int, threads: in
 
 
 def first(forest: Forest, view: View, budget: int) -> float:
-    """Seconds of a cut for which there is none before it to go by; its buffers are there."""
-    traversal = Traversal(forest, [Instance()])
+    """Seconds of a cut that cannot start from the one before it; its buffers are allocated already."""
+    traversal = Traversal(forest, [TreeInstance()])
     traversal.cut(view, budget=budget)
     traversal.forget()
     start = time.perf_counter()
@@ -97,7 +97,7 @@ def first(forest: Forest, view: View, budget: int) -> float:
 
 
 def rows(nodes: Nodes, spark: Spark, budgets: list[int], frames: int, runs: int, radius: float, folder: Path) -> None:
-    """Measures one tree with every budget, in turns with Spark, and prints a row for each."""
+    """Measures one tree with every budget, in turns with Spark, and prints a row for each budget."""
     forest = Forest([nodes])
     center, _ = framing(nodes.center)
     views = flight(center, radius, frames)
@@ -105,7 +105,7 @@ def rows(nodes: Nodes, spark: Spark, budgets: list[int], frames: int, runs: int,
     words_of(nodes).tofile(words)
     spark.ask(tree=str(words))
     words.unlink()
-    traversal = Traversal(forest, [Instance()])
+    traversal = Traversal(forest, [TreeInstance()])
     for budget in budgets:
         asked = [
             {"viewToObjectCols": view.camera_to_world.T.ravel().tolist(), "maxSplats": budget, "pixelScaleLimit": 0}
@@ -139,7 +139,7 @@ def rows(nodes: Nodes, spark: Spark, budgets: list[int], frames: int, runs: int,
 
 
 def words_of(nodes: Nodes) -> np.ndarray:
-    """The words of nodes that came from words."""
+    """Returns the words of nodes that were unpacked from words."""
     rows = np.empty(len(nodes.size), lod_tree.NODE)
     rows["center"], rows["size"] = nodes.center, nodes.size
     rows["child_count"], rows["child_start"] = nodes.tree.child_count, nodes.tree.child_start
@@ -149,13 +149,20 @@ def words_of(nodes: Nodes) -> np.ndarray:
 def main() -> None:
     """Prints a Markdown table."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("scene", type=Path, help="splat file that is tiled and baked")
-    parser.add_argument("--millions", type=float, nargs="*", default=[0.5, 1, 2, 5, 10, 20], help="nodes of the trees")
-    parser.add_argument("--budgets", type=int, nargs="*", default=[50_000, 200_000, 500_000, 1_500_000])
-    parser.add_argument("--frames", type=int, default=24, help="of the path")
-    parser.add_argument("--runs", type=int, default=5, help="runs of each, in turns; medians are printed")
+    parser.add_argument("scene", type=Path, help="splat file to tile and bake")
+    parser.add_argument(
+        "--millions",
+        type=float,
+        nargs="*",
+        default=[0.5, 1, 2, 5, 10, 20],
+        help="nodes of the trees",
+    )
+    parser.add_argument(
+        "--budgets", type=int, nargs="*", default=[50_000, 200_000, 500_000, 1_500_000], help="in nodes"
+    )
+    parser.add_argument("--frames", type=int, default=24, help="frames of the path")
+    parser.add_argument("--runs", type=int, default=5, help="number of runs, in turns; medians are printed")
     arguments = parser.parse_args()
-    jit.use_threads(processors())
     print(f"Machine: {machine()}. Medians of {arguments.runs} runs of {arguments.frames} frames.\n")
     print("| " + " | ".join(HEADINGS) + " |")
     print("|---" * len(HEADINGS) + "|")
@@ -165,7 +172,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         for millions in arguments.millions:
             nodes = tree_of(scene, round(millions * 1e6))
-            # A budget of more than the tree has is no budget.
+            # Skip budgets near or above the number of leaves: they limit nothing.
             budgets = [budget for budget in arguments.budgets if budget < len(nodes.size) / 2]
             rows(nodes, spark, budgets, arguments.frames, arguments.runs, radius, Path(folder))
     spark.close()

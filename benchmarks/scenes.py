@@ -1,4 +1,4 @@
-"""Scenes to measure with: real ones, and larger ones tiled from them."""
+"""Scenes for the benchmarks: real ones, and larger ones tiled from them."""
 
 from __future__ import annotations
 
@@ -8,16 +8,18 @@ from pathlib import Path
 
 import numpy as np
 
-from sparklod_cli.io import read_scene
-from sparklod_cli.model.sh import SH_C0
-from sparklod_cli.model.splats import Splats
+import sparklod_cli as sparklod
+from sparklod_cli import Splats
+
+#: The first spherical harmonic, 1 / (2 * sqrt(pi)).
+SH_C0 = 0.28209479177387814
 
 
 def tiled(splats: Splats, count: int, seed: int = 0) -> Splats:
-    """`count` splats: copies of a scene side by side on the ground, each centre jittered, in random order.
+    """Tiles a scene: `count` splats of copies side by side on the ground, with jittered centres, in random order.
 
-    The jitter, half the largest scale of each splat, keeps copies from sharing the cells of the first; the order is as
-    random as training leaves it, which is harder on memory than a sorted scene.
+    The jitter, half the largest scale of each splat, keeps copies from falling into the same cells of the grid. The
+    order is as random as in a trained scene, which is harder on memory than a sorted one.
     """
     rng = np.random.default_rng(seed)
     copies = math.ceil(count / len(splats))
@@ -32,7 +34,7 @@ def tiled(splats: Splats, count: int, seed: int = 0) -> Splats:
 
 
 def write_ply(path: Path, splats: Splats) -> None:
-    """An Inria-style binary PLY, without normals."""
+    """Writes a binary PLY as Inria's trainer does, but without normals."""
     rest = splats.sh.transpose(0, 2, 1).reshape(len(splats), -1)
     names = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", *(f"f_rest_{i}" for i in range(rest.shape[1]))]
     names += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
@@ -55,6 +57,6 @@ def write_ply(path: Path, splats: Splats) -> None:
 
 
 def load(path: Path) -> Splats:
-    """The splats of a file that can be drawn."""
-    splats = read_scene(path, threads=2).splats
+    """Reads the splats of a file that can be drawn: opacity and scale above 0."""
+    splats = sparklod.read(path).splats
     return splats.take((splats.opacity > 0) & (splats.scale.max(axis=1) > 0))

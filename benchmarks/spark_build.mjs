@@ -1,8 +1,9 @@
-// node spark_build.mjs FILE [RUNS [BUILDER [FOLDER]]]: seconds that one of Spark's own builders (its wasm, in Node) takes
-// for a splat file. SPARK_DIR names a folder whose node_modules holds @sparkjsdev/spark. Prints one JSON object a run.
+// node spark_build.mjs FILE [RUNS [BUILDER [FOLDER]]]: measures the seconds that one of Spark's own builders (its wasm, in
+// Node) takes for a splat file. SPARK_DIR names a folder whose node_modules has @sparkjsdev/spark. Prints a JSON object for
+// each run.
 //
-// BUILDER is "tiny" (base 1.5), which is what there is if none is named, or "quality" (the Bhattacharyya builder, base 1.75).
-// In FOLDER it leaves the tree as raw files of uint32, four a node: ext0.u32 and ext1.u32, its ExtSplats, and lod_tree.u32.
+// BUILDER is "tiny" (base 1.5; the default) or "quality" (the Bhattacharyya builder, base 1.75). FOLDER receives the tree as
+// raw files of uint32, four a node: ext0.u32 and ext1.u32, its ExtSplats, and lod_tree.u32.
 import fs from 'node:fs';
 import path from 'node:path';
 import vm from 'node:vm';
@@ -15,7 +16,7 @@ const source = fs.readFileSync(bundle, 'utf8');
 const wasm = Buffer.from(source.match(/const WASM = decode64\("([^"]+)"\)/)[1], 'base64');
 const worker = vm.runInThisContext(source.match(/^const jsContent = (.*?);?$/m)[1]);
 
-// The worker talks through self.postMessage and tells the build's time in a line of its log.
+// The worker answers through self.postMessage and logs the time of the build in a line of its own.
 const log = [];
 const handlers = [];
 const answers = new Map();
@@ -37,7 +38,7 @@ await new Promise((resolve) => setTimeout(resolve, 300));
 
 function keep({ numSplats, extArrays, extra }) {
   for (const [name, words] of Object.entries({ ext0: extArrays[0], ext1: extArrays[1], lod_tree: extra.lodTree }))
-    fs.writeFileSync(path.join(folder, `${name}.u32`), words.subarray(0, 4 * numSplats)); // more rows are allocated
+    fs.writeFileSync(path.join(folder, `${name}.u32`), words.subarray(0, 4 * numSplats)); // Spark allocates more rows than it uses
 }
 
 for (let run = 1; run <= Number(runs); run++) {

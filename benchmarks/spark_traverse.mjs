@@ -1,7 +1,9 @@
-// node spark_traverse.mjs: Spark's own traversal (its wasm, in Node), asked line by line on stdin.
-// SPARK_DIR names a folder whose node_modules holds @sparkjsdev/spark. {tree: FILE of uint32 x 4 a node} loads a tree in
-// place of the last; {views: [{viewToObjectCols, maxSplats, pixelScaleLimit}, ...], indices: FILE or null} traverses it.
-// An answer a line: {ms: [of each view]}; the nodes of the last view go to FILE.
+// node spark_traverse.mjs: runs Spark's own traversal (its wasm, in Node). SPARK_DIR names a folder whose node_modules has
+// @sparkjsdev/spark.
+//
+// Reads a request a line on stdin: {tree: FILE of four uint32 a node} loads a tree in place of the last one;
+// {views: [{viewToObjectCols, maxSplats, pixelScaleLimit}, ...], indices: FILE or null} traverses it. Writes an answer a line
+// on stdout: {ms: [milliseconds of each view]}; the nodes of the last view go to FILE.
 import fs from 'node:fs';
 import path from 'node:path';
 import readline from 'node:readline';

@@ -1,10 +1,10 @@
 // Reads and writes splat files with splat-transform's library: node --expose-gc transform_read.mjs.
-// FOREIGN_DIR names a folder whose node_modules holds @playcanvas/splat-transform and playcanvas.
+// FOREIGN_DIR names a folder whose node_modules has @playcanvas/splat-transform and playcanvas.
 //
-// A request a line on stdin, an answer a line on stdout:
-//   {read: path}                    {splats, seconds}: from the file to its table of float32 columns
-//   {write: path, source, options}  {}: in the format of its name
-// and {error} where it fails.
+// Reads a request a line on stdin and writes an answer a line on stdout:
+//   {read: path}                    {splats, seconds}: the time from the file to a table of float32 columns
+//   {write: path, source, options}  {}: writes the file in the format that its name says
+// The answer to a request that fails is {error}.
 import fs from 'node:fs';
 import path from 'node:path';
 import { createInterface } from 'node:readline';
@@ -48,7 +48,7 @@ async function answer({ read, write, source, options }) {
     await writeFile({ filename: write, outputFormat: getOutputFormat(write, wanted), dataTable, options: wanted }, disk);
     return {};
   }
-  globalThis.gc(); // what went before is not this run's to clear away
+  globalThis.gc(); // so that this run does not collect the garbage of earlier ones
   const start = performance.now();
   const { numRows } = await table(read);
   return { splats: numRows, seconds: (performance.now() - start) / 1000 };
@@ -58,4 +58,4 @@ for await (const line of createInterface({ input: process.stdin })) {
   const reply = await answer(JSON.parse(line)).catch((error) => ({ error: String(error?.message ?? error) }));
   process.stdout.write(JSON.stringify(reply) + '\n');
 }
-process.exit(0); // its worker threads would keep it alive
+process.exit(0); // the library's worker threads would keep the process alive

@@ -42,7 +42,7 @@ def check_scene(scene: Scene) -> None:
 
 def check_report(path: Path) -> None:
     """Checks that any file has a report, which is valid JSON and whose findings are printable lines."""
-    found, _ = report.inspect(path, report.Wanted(True, True, True), threads=2)
+    found, _ = report.inspect(path, report.ReportSettings(True, True, True), threads=2)
     try:
         json.dumps(found.as_dict(), allow_nan=False)
     except ValueError as error:

@@ -107,7 +107,6 @@ def bake(
     settings: BakeSettings,
     *,
     overwrite: bool = False,
-    make_parent: bool = False,
     threads: int = 1,
     progress: Progress = silent,
 ) -> Baked:
@@ -118,7 +117,6 @@ def bake(
         target: an SPZ file, or one of arrays, whatever its name; - is standard output.
         settings: how.
         overwrite: replace a file that exists.
-        make_parent: make the folder of the output if there is none.
         threads: to work on.
         progress: told of the stages.
 
@@ -127,7 +125,7 @@ def bake(
         OutOfMemoryError: it does not fit into memory.
     """
     with memory_told():
-        write = sink(target, overwrite=overwrite, make_parent=make_parent)
+        write = sink(target, overwrite=overwrite)
         start = time.perf_counter()
         scene = read_scene(source, threads=threads, progress=progress)
         if scene.tree is not None:

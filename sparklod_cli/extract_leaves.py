@@ -61,7 +61,6 @@ def extract_leaves(
     options: WriteOptions,
     *,
     overwrite: bool = False,
-    make_parent: bool = False,
     threads: int = 1,
     progress: Progress = silent,
 ) -> Extracted:
@@ -72,7 +71,6 @@ def extract_leaves(
         target: its suffix tells the format, which is SPZ where it has none; - is standard output.
         options: how to write; what is None is taken from the input, which keeps its values as they are.
         overwrite: replace a file that exists.
-        make_parent: make the folder of the output if there is none.
         threads: to work on.
         progress: told of the stages.
 
@@ -82,7 +80,7 @@ def extract_leaves(
         ValueError: no format of plain splats has that suffix.
     """
     with memory_told():
-        write = sink(target, overwrite=overwrite, make_parent=make_parent)
+        write = sink(target, overwrite=overwrite)
         suffix = target.suffix.lower() or SUFFIX
         if suffix not in WRITABLE:
             raise ValueError(f"{suffix} is not one of {', '.join(WRITABLE)}")

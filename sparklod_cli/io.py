@@ -251,32 +251,30 @@ def _raw_layout(size: int, count: int) -> npy.Layout:
     return npy.Layout((size // 4, 4), np.dtype(np.uint8))
 
 
-def check_writable(path: Path, *, overwrite: bool, make_parent: bool = False) -> None:
+def check_writable(path: Path, *, overwrite: bool) -> None:
     """Raises `OutputError` where an output cannot be written, before work goes into it.
+
+    Folders on the way to it that do not exist are no error: `write_whole` makes them.
 
     Args:
         path: of the output.
         overwrite: an existing file may be replaced.
-        make_parent: make its directory if there is none.
     """
-    if make_parent:
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise OutputError(f"cannot make {path.parent}: {_reason(error)}") from None
     try:
         if path.is_dir():
             raise OutputError(f"{path} is a directory")
         if path.is_file() and not overwrite:
             raise OutputError(f"{path} exists, add --overwrite to replace it")
-        if not path.parent.is_dir():
-            raise OutputError(f"the directory {path.parent} does not exist")
+        path.exists()  # raises where its name is too long
+        nearest = next(folder for folder in path.absolute().parents if folder.exists())
+        if not nearest.is_dir():
+            raise OutputError(f"cannot write {path}: {nearest} is a file, not a folder")
     except OSError as error:
         raise OutputError(f"cannot write {path}: {_reason(error)}") from None
 
 
 def write_whole(path: Path, pieces: Iterable[bytes], *, overwrite: bool) -> int:
-    """Writes a file so that it appears complete or not at all, and returns its size.
+    """Writes a file so that it appears complete or not at all, and returns its size; makes its folder if need be.
 
     It gets its name when it is filled and synced, see `whole`; an interruption leaves nothing behind.
 
@@ -288,14 +286,16 @@ def write_whole(path: Path, pieces: Iterable[bytes], *, overwrite: bool) -> int:
         if path.exists() and not path.is_file():  # a pipe or a device is written to, never replaced
             with path.open("wb") as file:
                 return sum(map(file.write, pieces))
-        return atomic.write(Path(os.path.realpath(path)), pieces, overwrite=overwrite)
+        target = Path(os.path.realpath(path))
+        target.parent.mkdir(parents=True, exist_ok=True)
+        return atomic.write(target, pieces, overwrite=overwrite)
     except FileExistsError:
         raise OutputError(f"{path} exists, add --overwrite to replace it") from None
     except OSError as error:
         raise OutputError(f"cannot write {path}: {_reason(error)}") from None
 
 
-def sink(path: Path, *, overwrite: bool, make_parent: bool = False) -> Sink:
+def sink(path: Path, *, overwrite: bool) -> Sink:
     """What writes an output, and is known to be able to as far as that can be told before; - is standard output.
 
     Raises:
@@ -303,7 +303,7 @@ def sink(path: Path, *, overwrite: bool, make_parent: bool = False) -> Sink:
     """
     if path == DASH:
         return write_stdout
-    check_writable(path, overwrite=overwrite, make_parent=make_parent)
+    check_writable(path, overwrite=overwrite)
     return functools.partial(write_whole, path, overwrite=overwrite)
 
 

@@ -70,7 +70,7 @@ def without_time(rows: Any) -> list[dict[str, Any]]:
 # The package
 
 
-def test_importing_it_loads_nothing_heavy() -> None:
+def test_importing_the_package_loads_nothing_heavy() -> None:
     code = "import sys, sparklod_cli; print(*(name for name in ('numpy', 'numba', 'click') if name in sys.modules))"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split() == []
 
@@ -81,7 +81,7 @@ def test_reading_loads_no_numba() -> None:
     assert said.split() == ["False"]
 
 
-def test_its_names_are_there_and_typed() -> None:
+def test_every_public_name_exists_and_is_typed() -> None:
     """What is imported at run time is what type checkers are told."""
     for name in sparklod.__all__:
         assert getattr(sparklod, name).__name__ == name
@@ -115,7 +115,7 @@ def test_every_public_function_and_class_says_what_it_is() -> None:
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".spz"])
-def test_what_is_written_is_read(scene: sparklod.Scene, tmp_path: Path, suffix: str) -> None:
+def test_a_written_scene_is_read_back(scene: sparklod.Scene, tmp_path: Path, suffix: str) -> None:
     written = sparklod.write(tmp_path / f"scene{suffix}", scene)
     again = sparklod.read(written.path)
     assert written.bytes == written.path.stat().st_size
@@ -140,7 +140,7 @@ def test_a_tree_is_read_as_a_tree(tree: sparklod.Tree, held: sparklod.Scene) -> 
     assert "nodes" in repr(held) and "leaves" in repr(held) and "levels" in repr(held)
 
 
-def test_its_leaves_are_the_scene(scene: sparklod.Scene, tree: sparklod.Tree) -> None:
+def test_leaves_of_a_tree_are_the_scene(scene: sparklod.Scene, tree: sparklod.Tree) -> None:
     leaves = sparklod.extract_leaves(tree)
     assert leaves.tree is None
     order, given = (np.lexsort(each.splats.center.T) for each in (leaves, scene))
@@ -212,7 +212,7 @@ def test_arrays_of_other_shapes_are_refused(wrong: dict[str, Any], message: str)
         sparklod.Scene.from_arrays(**{**columns, **wrong})
 
 
-def test_splats_that_are_none_are_refused() -> None:
+def test_invalid_splats_are_refused() -> None:
     splats = random_splats(50)
     columns = {each.name: getattr(splats, each.name) for each in dataclasses.fields(splats)}
     with pytest.raises(sparklod.InvalidSplatsError, match="not finite"):
@@ -262,7 +262,7 @@ def test_a_cut_is_within_its_budget(held: sparklod.Tree) -> None:
 
 
 @pytest.mark.parametrize("budget", [0, -3, 1.5, 0.0, "nothing"])
-def test_what_is_no_budget_is_refused(held: sparklod.Tree, budget: Any) -> None:
+def test_invalid_budgets_are_refused(held: sparklod.Tree, budget: Any) -> None:
     with pytest.raises(ValueError, match=r"budget|neither"):
         sparklod.cut(held, camera(), budget=budget)
 

@@ -23,7 +23,7 @@ from sparklod_cli.codecs.gpu.table import ENCODINGS
 from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.inspection import leaves, values
 from sparklod_cli.inspection.findings import ERROR, NOTE, Finding
-from sparklod_cli.inspection.report import Wanted, inspect
+from sparklod_cli.inspection.report import ReportSettings, inspect
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod.builders import METHODS
 from sparklod_cli.model.gaussian import normalized_quat
@@ -104,7 +104,7 @@ def write(path: Path, pieces: Iterable[bytes]) -> int:
 
 def reported(source: Path) -> None:
     """Makes everything that `inspect` can say of a file."""
-    report, scene = inspect(source, Wanted(values=True, all_quantities=True, check=True))
+    report, scene = inspect(source, ReportSettings(values=True, all_quantities=True, check=True))
     json.dumps(report.as_dict(), allow_nan=False)
     assert scene is not None
     for name in values.names_of(scene.splats):
@@ -113,7 +113,7 @@ def reported(source: Path) -> None:
 
 def checked(output: Path, source: Path) -> list[Finding]:
     """What `inspect --check --leaves-of` finds."""
-    report, scene = inspect(output, Wanted(check=True))
+    report, scene = inspect(output, ReportSettings(check=True))
     assert scene is not None
     return [*(report.findings or []), *leaves.check(scene, read_scene(source))]
 
@@ -139,7 +139,7 @@ def refused(error: SparklodError) -> bool:
 
 @given(scenes(), st.sampled_from(METHODS), st.sampled_from(SPZ_VERSIONS), BITS)
 @settings(max_examples=300, deadline=None)
-def test_what_is_written_passes_our_own_check(splats: Splats, method: str, version: int, bits: int | None) -> None:
+def test_baked_files_pass_inspect_check(splats: Splats, method: str, version: int, bits: int | None) -> None:
     with tempfile.TemporaryDirectory() as folder:
         how = BakeSettings(method=method, spz=WriteOptions(spz_version=version, fractional_bits=bits))
         try:
@@ -268,7 +268,7 @@ def test_bakes_of_random_scenes_pass_the_recipe_for_ci(count: int, seed: int, ex
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_a_line_without_width_is_not_what_a_node_stands_for(method: str, tmp_path: Path) -> None:
+def test_splats_without_width_pass_their_check(method: str, tmp_path: Path) -> None:
     """SPZ gives it a width, after the tree is built."""
     splats = random_splats(3)
     splats.scale[:] = [[8e-5, 1e-5, 1e-6], [3e-7, 7e-4, 1e-13], [1e-24, 1e-19, 11]]

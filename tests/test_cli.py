@@ -12,7 +12,7 @@ from tests.commands.build_lod.runs import sparklod
 from tests.conftest import ROOT
 
 
-def test_version_and_help_everywhere() -> None:
+def test_every_command_has_version_and_help() -> None:
     for arguments in (["--version"], ["build-lod", "--version"]):
         assert sparklod(*arguments).stdout.decode() == f"sparklod, version {__version__}\n"
     for arguments in (["--help"], *([command, "--help"] for command in COMMANDS)):

@@ -73,7 +73,7 @@ def column(table: list[Row], name: str) -> list[Any]:
     return [row[name] for row in table]
 
 
-def test_all_splats_are_full_detail(twice: Scenes) -> None:
+def test_a_budget_of_all_splats_is_full_detail(twice: Scenes) -> None:
     for row in rows(twice, "100%,150%,1M"):
         assert row["psnr_black"] == row["psnr_white"] == row["psnr"] == row["worst_tile_psnr"] == MOST_PSNR
         assert row["ssim_black"] == row["ssim_white"] == row["ssim"] == 1
@@ -81,7 +81,7 @@ def test_all_splats_are_full_detail(twice: Scenes) -> None:
         assert (row["psnr"], row["ssim"]) == (MOST_PSNR, 1)
 
 
-def test_more_splats_come_nearer_to_it(twice: Scenes) -> None:
+def test_larger_budgets_come_nearer_to_full_detail(twice: Scenes) -> None:
     table = rows(twice, "5%,15%,40%,80%")
     for name in ("psnr", "ssim"):
         means = [np.mean(column(group, name)) for group in rows_by_budget(table, 4)]
@@ -108,7 +108,7 @@ def test_rows_tell_what_was_drawn(twice: Scenes, width: float | None) -> None:
         assert row["worst_tile_x"] in (0, 64) and row["worst_tile_y"] in (0, 64)
 
 
-def test_the_same_for_any_number_of_threads(twice: Scenes) -> None:
+def test_threads_do_not_change_a_comparison(twice: Scenes) -> None:
     assert rows(twice, "10%,50%", threads=1) == rows(twice, "10%,50%", threads=3)
 
 
@@ -125,7 +125,7 @@ def test_a_pixel_limit_ends_cuts_early(twice: Scenes) -> None:
     assert row["psnr"] < 60  # type: ignore[operator]
 
 
-def test_a_budget_holds_the_roots(twice: Scenes) -> None:
+def test_a_budget_smaller_than_the_number_of_instances_is_refused(twice: Scenes) -> None:
     with pytest.raises(SparklodError, match="a budget of 1 is less than one splat for each of 2 instances"):
         Comparison(twice, LOD, parse_budgets("50%,1"), RENDER)
 
@@ -157,7 +157,7 @@ def run(capsys: pytest.CaptureFixture[str], *arguments: object, budgets: str = "
     return status, said.out, said.err
 
 
-def test_the_table_goes_to_standard_output(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_table_of_a_comparison_goes_to_standard_output(capsys: pytest.CaptureFixture[str]) -> None:
     status, out, err = run(capsys)
     lines = out.splitlines()
     assert status == 0
@@ -167,7 +167,7 @@ def test_the_table_goes_to_standard_output(capsys: pytest.CaptureFixture[str]) -
     assert max(map(len, err.splitlines())) <= 100
 
 
-def test_json_is_the_summary(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_json_is_the_summary_of_a_comparison(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     target = tmp_path / "table.json"
     asserts = ("--assert", "psnr_min>1", "--assert", "50%: ssim_min > 2")
     status, out, _ = run(capsys, "--json", "-o", target, *asserts)
@@ -197,7 +197,9 @@ def test_assertions_are_of_all_budgets_or_of_one(capsys: pytest.CaptureFixture[s
         ("churn<1", "no column 'churn'"),
     ],
 )
-def test_assertions_about_what_is_not_there(capsys: pytest.CaptureFixture[str], text: str, message: str) -> None:
+def test_assertions_about_missing_columns_or_budgets_are_refused(
+    capsys: pytest.CaptureFixture[str], text: str, message: str
+) -> None:
     status, out, err = run(capsys, "--assert", text)
     assert (status, out) == (2, "")
     assert message in err

@@ -36,7 +36,7 @@ def lack(monkeypatch: pytest.MonkeyPatch, *packages: str) -> None:
     monkeypatch.setattr(metadata, "version", version)
 
 
-def test_here_nothing_is_a_problem(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_this_installation_has_no_problem(monkeypatch: pytest.MonkeyPatch) -> None:
     lack(monkeypatch, "moderngl", "open3d")  # which take many seconds to try
     begun: list[str] = []
     checks = check_all(begun.append)
@@ -115,7 +115,7 @@ def test_a_sparklod_that_is_not_installed_is_a_note(monkeypatch: pytest.MonkeyPa
         ({"layer": "workqueue"}, "threads", "note", "run by workqueue", "libgomp1"),
     ],
 )
-def test_what_is_said_of_kernels(
+def test_the_check_of_the_cache_counts_kernels(
     about: dict[str, object], name: str, state: str, says: str, advice: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     answer(monkeypatch, out=f"a warning\n{json.dumps({**HEALTHY, **about})}\n")
@@ -175,7 +175,7 @@ def test_one_opengl_is_enough(broken: tuple[str, ...], monkeypatch: pytest.Monke
         (1, "", "a\nno device\n", "note", "it has crashed: no device"),
     ],
 )
-def test_what_open3d_answers(
+def test_answers_of_open3d_become_checks(
     code: int, out: str, err: str, state: str, value: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(doctor, "_is_installed", lambda package: True)
@@ -215,7 +215,7 @@ def test_a_program_that_never_answers_is_given_up(monkeypatch: pytest.MonkeyPatc
     assert (code, err) == (1, "no answer within 0.2 seconds")
 
 
-def test_what_nobody_foresaw_is_a_note_and_the_rest_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unexpected_error_in_a_check_is_a_note(monkeypatch: pytest.MonkeyPatch) -> None:
     answer(monkeypatch, out="no JSON")
     lack(monkeypatch, "moderngl", "open3d")
 

@@ -68,7 +68,7 @@ def test_splat_is_sorted_by_importance(tree_file: Path, tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_scene(tmp_path / "back.splat").splats.center, expected.center)
 
 
-def test_other_bits_and_versions_can_be_had(tree_file: Path, tmp_path: Path) -> None:
+def test_fractional_bits_and_version_can_be_chosen(tree_file: Path, tmp_path: Path) -> None:
     assert unlod(tree_file, "-o", tmp_path / "back.spz", "--spz-version", 3, "--fractional-bits", 8) == 0
     back = read_scene(tmp_path / "back.spz")
     assert (back.header["version"], back.header["fractional_bits"]) == (3, 8)
@@ -83,7 +83,7 @@ def test_leaves_that_cannot_be_drawn_are_written_too(tmp_path: Path) -> None:
     assert len(read_scene(tmp_path / "scene-unlod.spz").splats) == 50
 
 
-def test_what_is_no_tree_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_file_without_a_tree_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert unlod(FIXTURES / "one.ply", "--output-dir", tmp_path) == 1
     assert "it has no Level-of-Detail tree whose leaves could be written" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())

@@ -37,7 +37,7 @@ def planted_run(monkeypatch: pytest.MonkeyPatch, what: str, **how: object) -> tu
 
 
 @pytest.mark.parametrize("fault", planted.FAULTS, ids=lambda fault: fault.__name__)
-def test_what_is_planted_is_found(fault: object, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_planted_fault_is_found(fault: object, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     name, kind = fault.__name__, planted.FAULTS[fault]
     tally, said = planted_run(monkeypatch, name, keep=tmp_path)
     (found,) = tally.found
@@ -52,14 +52,12 @@ def test_what_is_planted_is_found(fault: object, monkeypatch: pytest.MonkeyPatch
 
 
 @pytest.mark.parametrize(("what", "refused"), [("works", 0), ("refuses", 1)])
-def test_a_result_and_an_error_of_ours_are_no_findings(
-    what: str, refused: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_results_and_sparklod_errors_are_no_findings(what: str, refused: int, monkeypatch: pytest.MonkeyPatch) -> None:
     tally, said = planted_run(monkeypatch, what)
     assert (tally.cases, tally.refused, tally.found, said) == (1, refused, [], [])
 
 
-def test_there_is_another_process_when_one_dies(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_process_that_dies_is_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
     request = {"target": PLANTED, "seed": 1, "case": 0}
     with Child(limit=LIMIT, patience=20.0) as child:
         monkeypatch.setenv("PLANTED", "crashes")
@@ -68,7 +66,7 @@ def test_there_is_another_process_when_one_dies(monkeypatch: pytest.MonkeyPatch)
         assert [child.run(request)["finding"] for _ in range(3)] == [None] * 3
 
 
-def test_faults_are_told_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_different_faults_have_different_signatures(monkeypatch: pytest.MonkeyPatch) -> None:
     signatures = set()
     for what in ("raises", "warns", "breaks_a_law"):
         tally, _ = planted_run(monkeypatch, what)
@@ -76,7 +74,7 @@ def test_faults_are_told_apart(monkeypatch: pytest.MonkeyPatch) -> None:
     assert len(signatures) == 3
 
 
-def test_the_exit_status_and_the_replay(
+def test_findings_set_the_exit_status_and_can_be_replayed(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("PLANTED", "raises")
@@ -94,7 +92,7 @@ def test_the_exit_status_and_the_replay(
 
 
 @pytest.mark.parametrize("target", TARGETS)
-def test_a_case_is_the_same_whenever_it_is_asked_for(target: str) -> None:
+def test_a_case_has_the_same_bytes_in_every_process(target: str) -> None:
     code = (
         "import hashlib, json, sys; from fuzz.case import case_of; case = case_of(sys.argv[1], 7, 3);"
         "text = json.dumps([case.what, sorted((n, d.hex()) for n, d in case.files.items()), dict(case.run)]);"
@@ -108,7 +106,7 @@ def test_a_case_is_the_same_whenever_it_is_asked_for(target: str) -> None:
 
 
 @pytest.mark.parametrize("target", TARGETS)
-def test_cases_do_not_depend_on_those_before(target: str) -> None:
+def test_cases_do_not_depend_on_earlier_ones(target: str) -> None:
     forwards = {number: digest(case_of(target, 1, number)) for number in range(150)}
     backwards = {number: digest(case_of(target, 1, number)) for number in reversed(range(150))}
     assert forwards == backwards
@@ -120,7 +118,7 @@ def digest(case: Case) -> str:
 
 
 @pytest.mark.parametrize("target", TARGETS)
-def test_every_target_makes_cases_that_go_far_enough(target: str) -> None:
+def test_no_target_has_only_refused_cases(target: str) -> None:
     """A target all of whose cases are refused tries nothing but the first check of a reader."""
     assert hasattr(target_of(target), "check")
     with Child() as child:

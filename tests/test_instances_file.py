@@ -28,14 +28,14 @@ def scene(tmp_path: Path) -> Path:
     return tmp_path / "scene.json"
 
 
-def test_an_instance_says_where_its_file_is_and_nothing_else(scene: Path) -> None:
+def test_an_instance_needs_only_its_file(scene: Path) -> None:
     (place,) = written(scene, {"file": "trees/door.spz"})
     assert place.file == scene.parent / "trees" / "door.spz"
     assert (place.name, place.lod_scale, place.foveation) == ("door", 1.0, None)
     assert np.array_equal(place.object_to_world, np.eye(4))
 
 
-def test_a_file_may_be_anywhere(scene: Path) -> None:
+def test_the_file_of_an_instance_may_be_anywhere(scene: Path) -> None:
     assert [place.file for place in written(scene, {"file": "/srv/a.spz"}, {"file": "../b.spz"})] == [
         Path("/srv/a.spz"),
         scene.parent / "../b.spz",
@@ -192,7 +192,7 @@ def test_a_mistake_is_told_in_a_line(wrong: object, said: str, scene: Path) -> N
         ('{"instances": [{"file": "a", "name": "b"}, {"file": "c", "name": "b"}]}', "two instances are called 'b'"),
     ],
 )
-def test_a_file_that_is_none(text: str, said: str, scene: Path) -> None:
+def test_files_that_are_not_instances_files_are_refused_in_one_line(text: str, said: str, scene: Path) -> None:
     scene.write_text(text)
     with pytest.raises(InstancesFileError) as caught:
         read_instances(scene)
@@ -202,13 +202,13 @@ def test_a_file_that_is_none(text: str, said: str, scene: Path) -> None:
 
 
 @pytest.mark.parametrize("depth", range(900, 1000, 7))
-def test_however_deep_it_is(depth: int, scene: Path) -> None:
+def test_deeply_nested_instances_files_are_refused(depth: int, scene: Path) -> None:
     scene.write_text('{"instances": [{"file": "a", "scale": ' + "[" * depth + "]" * depth + "}]}")
     with pytest.raises(InstancesFileError):
         read_instances(scene)
 
 
-def test_a_file_that_cannot_be_read(tmp_path: Path) -> None:
+def test_an_unreadable_instances_file_is_named(tmp_path: Path) -> None:
     (tmp_path / "bytes.json").write_bytes(b"\xff\xfe\x00")
     for path in (tmp_path / "missing.json", tmp_path, tmp_path / "bytes.json"):
         with pytest.raises(FormatError, match="cannot be read") as caught:
@@ -236,7 +236,7 @@ optional = dict.fromkeys(list(KEYS)[1:], anything | lists)
 plausible = st.fixed_dictionaries({"file": st.text(min_size=1)}, optional=optional)
 
 
-def test_what_never_ends_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_endless_or_huge_instances_files_are_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(SparklodError, match="it is a pipe or a device"):
         read_instances(Path("/dev/zero"))
     monkeypatch.setattr("sparklod_cli.io.MAX_TEXT", 100)
@@ -247,7 +247,7 @@ def test_what_never_ends_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=300)
 @given(anything | st.fixed_dictionaries({"instances": st.lists(some_instances | plausible | anything, max_size=3)}))
-def test_whatever_it_says_it_is_understood_or_refused_in_a_line(scene: Path, data: Any) -> None:
+def test_any_instances_file_is_read_or_refused_in_one_line(scene: Path, data: Any) -> None:
     scene.write_text(json.dumps(data))
     try:
         places = read_instances(scene)

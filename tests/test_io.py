@@ -20,7 +20,7 @@ SAMPLES = {"PLY": "sh1.ply", "PLY ascii": "sh1-ascii.ply", "SPZ": "golden/sh3-v3
 
 @pytest.mark.parametrize("suffix", [*(suffix for form in FORMATS for suffix in form.suffixes), ".PLY", ".dat", ""])
 @pytest.mark.parametrize("kind", SAMPLES)
-def test_the_suffix_says_nothing(kind: str, suffix: str, tmp_path: Path) -> None:
+def test_the_content_decides_the_format_whatever_the_suffix(kind: str, suffix: str, tmp_path: Path) -> None:
     path = tmp_path / f"scene{suffix}"
     path.write_bytes((FIXTURES / SAMPLES[kind]).read_bytes())
     assert read_scene(path).format.startswith(kind.split()[0])
@@ -41,14 +41,14 @@ def test_the_suffix_says_nothing(kind: str, suffix: str, tmp_path: Path) -> None
         (b"\x28\xb5\x2f\xfd" + bytes(100), "not a splat file"),  # bare zstd
     ],
 )
-def test_what_is_no_splat_file(content: bytes, reason: str, tmp_path: Path) -> None:
+def test_files_that_are_not_splat_files_are_refused_with_a_reason(content: bytes, reason: str, tmp_path: Path) -> None:
     path = tmp_path / "scene.ply"
     path.write_bytes(content)
     with pytest.raises(FormatError, match=reason):
         read_scene(path)
 
 
-def test_what_cannot_be_opened(tmp_path: Path) -> None:
+def test_missing_files_and_folders_are_refused(tmp_path: Path) -> None:
     with pytest.raises(FormatError, match="cannot be read: no such file"):
         read_scene(tmp_path / "missing.ply")
     with pytest.raises(FormatError, match="cannot be read"):
@@ -58,7 +58,7 @@ def test_what_cannot_be_opened(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(IS_ROOT, reason="root may read everything")
-def test_what_may_not_be_read(tmp_path: Path) -> None:
+def test_a_file_without_permission_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "scene.ply"
     path.write_bytes((FIXTURES / "one.ply").read_bytes())
     path.chmod(0)
@@ -76,7 +76,7 @@ def test_a_scene_outlives_its_file(tmp_path: Path) -> None:
     assert (splats.center == before).all()
 
 
-def test_small_texts_are_plain_files_of_some_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_texts_must_be_regular_files_below_a_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever is named, what is read is bounded, and nothing waits for what never comes."""
     text, pipe = tmp_path / "a.json", tmp_path / "pipe"
     text.write_bytes(b"\xef\xbb\xbf{}")

@@ -63,7 +63,9 @@ def test_an_interruption_leaves_nothing_and_spoils_nothing(
 
 
 @pytest.mark.parametrize("named", [False, True])
-def test_the_file_is_not_there_before_it_is_whole(named: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_file_has_the_final_name_before_it_is_whole(
+    named: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     if named:
         monkeypatch.setattr(atomic, "UNNAMED", None)
     elif not has_unnamed_files(tmp_path):
@@ -181,13 +183,13 @@ def test_a_file_that_may_not_grow_leaves_nothing(tmp_path: Path) -> None:
     assert names(tmp_path) == []
 
 
-def test_where_a_file_cannot_be(tmp_path: Path) -> None:
+def test_a_path_that_cannot_be_a_file_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_bytes(b"")
     (tmp_path / "directory").mkdir()
     refused = {
         "directory": "is a directory",
-        "missing/out.spz": "does not exist",
-        "file/out.spz": "does not exist",
+        "file/out.spz": "is a file, not a folder",
+        "file/missing/out.spz": "is a file, not a folder",
         "n" * 300: "file name too long",
     }
     for name, reason in refused.items():
@@ -220,12 +222,16 @@ def test_a_directory_that_may_not_be_written_to(tmp_path: Path) -> None:
     closed.chmod(0o700)
 
 
-def test_the_directory_is_made_when_asked_for(tmp_path: Path) -> None:
-    check_writable(tmp_path / "a" / "b" / "out.spz", overwrite=False, make_parent=True)
-    assert (tmp_path / "a" / "b").is_dir()
-    (tmp_path / "file").write_bytes(b"")
-    with pytest.raises(OutputError, match=r"cannot make .*file"):
-        check_writable(tmp_path / "file" / "out.spz", overwrite=False, make_parent=True)
+def test_folders_are_made_when_there_is_something_to_write(tmp_path: Path) -> None:
+    target = tmp_path / "a" / "b" / "out.spz"
+    check_writable(target, overwrite=False)
+    assert names(tmp_path) == []
+    write_whole(target, [b"x"], overwrite=False)
+    assert target.read_bytes() == b"x"
+    link = tmp_path / "link.spz"
+    link.symlink_to(tmp_path / "c" / "out.spz")
+    write_whole(link, [b"y"], overwrite=False)
+    assert (tmp_path / "c" / "out.spz").read_bytes() == b"y"
 
 
 def test_standard_output_gets_the_pieces(capfdbinary: pytest.CaptureFixture[bytes]) -> None:
@@ -260,7 +266,7 @@ def test_a_name_that_is_taken_meanwhile_is_not_replaced(tmp_path: Path) -> None:
     assert names(tmp_path) == ["out.spz"]
 
 
-def test_what_was_private_stays_private(tmp_path: Path) -> None:
+def test_a_replaced_file_keeps_its_permissions(tmp_path: Path) -> None:
     target = tmp_path / "out.spz"
     target.write_bytes(b"old")
     target.chmod(0o600)

@@ -73,7 +73,7 @@ def test_colours_of_whole_numbers_span_what_the_cuts_have(by: str, budget: int) 
     assert (texts[0], texts[-1]) == (f"{scale.low}", f"{scale.high}")
 
 
-def test_in_full_it_is_the_leaves() -> None:
+def test_full_detail_is_the_leaves() -> None:
     scenes = read_scenes(at(TOWN, PLAIN))
     town, plain = CutFinder(scenes, None).cut(seen(scenes)).parts
     loaded = scenes.loaded[0]
@@ -150,7 +150,7 @@ def test_through_an_encoding_splats_are_rounded_and_the_cut_stays() -> None:
     assert 30 < qualities["packed"] < qualities["ext"]
 
 
-def test_what_spz_cannot_hold_is_said(tmp_path: Path) -> None:
+def test_an_encoding_says_what_spz_cannot_hold(tmp_path: Path) -> None:
     splats = random_splats(30)
     splats.center[3] = 1e9
     (tmp_path / "far.ply").write_bytes(b"".join(ply.encode(Scene(splats))))
@@ -158,7 +158,7 @@ def test_what_spz_cannot_hold_is_said(tmp_path: Path) -> None:
         read_scenes(at(tmp_path / "far.ply"), through="spz")
 
 
-def test_what_cannot_be_drawn_is_left_out() -> None:
+def test_splats_that_cannot_be_drawn_are_left_out() -> None:
     file = FIXTURES / "faults" / "nan.ply"
     scenes = read_scenes(at(file))
     assert scenes.loaded[0].splats.is_valid().all()
@@ -169,7 +169,7 @@ def test_what_cannot_be_drawn_is_left_out() -> None:
 
 @pytest.mark.parametrize("size", [(160, 90), (90, 160)])
 @pytest.mark.parametrize("file", [TOWN, PLAIN, FIXTURES / "demo.ply"], ids=lambda path: path.name)
-def test_a_fitted_camera_has_the_scene_in_its_picture(file: Path, size: tuple[int, int]) -> None:
+def test_a_fitted_camera_sees_the_scene(file: Path, size: tuple[int, int]) -> None:
     scenes = read_scenes(at(file))
     view = fitted(camera(*size), covered(scenes.balls()))
     center = scenes.balls().center

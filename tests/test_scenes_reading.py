@@ -58,7 +58,7 @@ def test_placed_splats_have_the_covariance_of_the_matrix(matrix: np.ndarray) -> 
         assert getattr(there, column.name).dtype == getattr(splats, column.name).dtype
 
 
-def test_nothing_moves_where_it_stands() -> None:
+def test_the_identity_moves_no_splat() -> None:
     splats = random_splats(50)
     there = placed(splats, np.eye(4))
     assert np.array_equal(there.center, splats.center)
@@ -194,7 +194,7 @@ def test_foveation_is_that_of_all_or_its_own() -> None:
     ],
     ids=lambda value: getattr(value, "name", None),
 )
-def test_what_cannot_be_read_names_its_file(file: Path, kind: type[SparklodError], said: str) -> None:
+def test_an_unreadable_file_of_an_instance_is_named(file: Path, kind: type[SparklodError], said: str) -> None:
     with pytest.raises(kind) as caught:
         read_scenes([Instance(TREE, "good"), Instance(file, "bad")], columns=TRAVERSED, trees_only=True)
     assert str(caught.value).startswith(f"{file}: {said}") or said in str(caught.value)
@@ -223,7 +223,7 @@ stems = st.sampled_from(["a", "a 2", "a 2 2", "a 3", "total", "total.spz", "tota
 
 
 @given(st.lists(stems, max_size=12), st.lists(stems, max_size=4))
-def test_instances_get_names_that_nobody_has(names: list[str], taken: list[str]) -> None:
+def test_instances_get_unique_names(names: list[str], taken: list[str]) -> None:
     given_names = names_of([Path(f"{name}.spz") for name in names], taken)
     assert len(set(given_names)) == len(names)
     assert not {"total", *taken} & set(given_names)

@@ -44,14 +44,14 @@ def test_the_table_has_just_the_kernels_that_a_job_calls(job: str, tmp_path: Pat
     assert called == set(warmup.JOBS[job].kernels)
 
 
-def test_a_second_time_there_is_nothing_to_do(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_second_warmup_compiles_nothing(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["warmup", "--json"]) == 0
     captured = capsys.readouterr()
     assert json.loads(captured.out)["compiled"] == 0
     assert captured.err == f"all kernels are in {jit.CACHE_FOLDER}\n"
 
 
-def test_without_a_cache_it_fails(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_warmup_without_a_cache_fails(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(jit, "CACHE_FOLDER", None)
     assert run(["warmup"]) == 1
     assert "set NUMBA_CACHE_DIR" in capsys.readouterr().err

@@ -253,7 +253,7 @@ def inspect(
     """
     from ..inspection import report
 
-    wanted = report.Wanted(values=values or all_quantities, all_quantities=all_quantities, check=check)
+    wanted = report.ReportSettings(values=values or all_quantities, all_quantities=all_quantities, check=check)
     with telling(progress) as told, memory_told():
         found, _ = report.inspect(Path(path), wanted, threads=thread_count(threads), progress=told)
     return found

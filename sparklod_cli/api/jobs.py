@@ -33,7 +33,9 @@ if TYPE_CHECKING:
     from ..scenes.loaded import Scenes
     from ..simulation.outputs import FrameOutputs, WrittenFrames
     from ..simulation.streaming import StreamingSettings
-    from ..tables.columns import Row
+    from ..simulation.summary import Summary
+    from ..tables.assertions import Assertion, Outcome
+    from ..tables.comparison import BudgetSummary
     from ..tables.output import Filter, TableOutput
 
 
@@ -166,14 +168,35 @@ class Compared:
     """What a comparison found.
 
     Attributes:
-        rows: of `tables.comparison.COLUMNS`, for each camera one for each budget.
+        pictures: how many were compared.
         path: the cameras.
         leaves: splats of full detail, all instances together.
+        summary: what the pictures come to, for each budget.
+        outcomes: whether each assertion held.
     """
 
-    rows: list[Row]
+    pictures: int
     path: CameraPath
     leaves: int
+    summary: list[BudgetSummary]
+    outcomes: list[Outcome]
+
+
+@dataclass(frozen=True)
+class Traversed:
+    """What a traversal found.
+
+    Attributes:
+        frames: what was written of them.
+        path: the cameras.
+        summary: what the frames come to.
+        outcomes: whether each assertion held.
+    """
+
+    frames: WrittenFrames
+    path: CameraPath
+    summary: Summary
+    outcomes: list[Outcome]
 
 
 def compare_files(
@@ -184,6 +207,7 @@ def compare_files(
     table: TableOutput,
     *,
     fitted: bool,
+    asserts: Sequence[tuple[int | None, Assertion]] = (),
     plot: Path | None = None,
     overwrite: bool = False,
     ready: Callable[[CameraPath, Scenes], None] = lambda path, scenes: None,
@@ -198,6 +222,7 @@ def compare_files(
         render: how pictures are drawn.
         table: where the rows go, at once when all are known.
         fitted: move near and far apart where cameras are chosen for the scenes.
+        asserts: what must hold, each with the place of the budget that it is about; None for all of them.
         plot: file of the charts; None for none.
         overwrite: replace files that exist.
         ready: is told of cameras and scenes before the first picture is drawn.
@@ -207,6 +232,8 @@ def compare_files(
         SparklodError: a file cannot be read or written, is no tree, or a picture cannot be drawn.
     """
     from ..compare import Comparison, write_charts
+    from ..tables.assertions import check
+    from ..tables.comparison import rows_by_budget, summarize
 
     scenes = view.read(trees_only=True)
     path = view.path(lambda: scenes)
@@ -226,7 +253,10 @@ def compare_files(
     table.write(rows, passed=passed)
     if plot is not None:
         write_charts(plot, rows, budgets, scenes.title, overwrite=overwrite)
-    return Compared(rows, path, comparison.leaves)
+    groups = rows_by_budget(rows, len(budgets))
+    outcomes = [each for at, what in asserts for each in check([what], rows if at is None else groups[at])]
+    summary = summarize(rows, [budget.text for budget in budgets])
+    return Compared(len(rows), path, comparison.leaves, summary, outcomes)
 
 
 def traverse_files(
@@ -237,10 +267,11 @@ def traverse_files(
     outputs: FrameOutputs,
     *,
     by_instance: bool = False,
+    asserts: Sequence[Assertion] = (),
     ready: Callable[[CameraPath, Scenes], None] = lambda path, scenes: None,
     passed: Filter | None = None,
     bar: bool = True,
-) -> WrittenFrames:
+) -> Traversed:
     """Simulates what a viewer draws of files along a path, and writes what is made of the frames.
 
     Args:
@@ -250,6 +281,7 @@ def traverse_files(
         streaming: how chunks get to the viewer.
         outputs: where the frames go.
         by_instance: make rows of single instances, too.
+        asserts: what must hold.
         ready: is told of cameras and scenes before the first frame.
         passed: what the bytes of the table are passed through on their way to standard output.
         bar: tell how many frames are done.
@@ -258,8 +290,11 @@ def traverse_files(
         UnfitError: the budget, or the chunk cache, is too small for the roots.
         SparklodError: a file cannot be read or written, or is no tree.
     """
+    from ..simulation.columns import EMPTY
     from ..simulation.frames import Simulation
     from ..simulation.outputs import write_frames
+    from ..simulation.summary import summarize
+    from ..tables.assertions import check
 
     outputs.check()
     scenes = view.read(trees_only=True, plain=outputs.plot is not None)
@@ -271,4 +306,5 @@ def traverse_files(
         raise UnfitError(str(error)) from None
     ready(path, scenes)
     progress = view.progress if bar else silent
-    return write_frames(simulation, path, outputs, threads=view.threads, progress=progress, passed=passed)
+    frames = write_frames(simulation, path, outputs, threads=view.threads, progress=progress, passed=passed)
+    return Traversed(frames, path, summarize(frames.rows), check(asserts, frames.rows, empty=EMPTY))

@@ -208,7 +208,6 @@ def _baking(ctx: click.Context, outputs: Outputs, threads: int, console: Console
             target,
             settings,
             overwrite=outputs.overwrite,
-            make_parent=outputs.output_dir is not None,
             threads=threads,
             progress=console.progress,
         )
@@ -232,7 +231,6 @@ def _extracting(
             target,
             options,
             overwrite=outputs.overwrite,
-            make_parent=outputs.output_dir is not None,
             threads=threads,
             progress=console.progress,
         )

@@ -18,11 +18,12 @@ MOST_ROWS = 8
 MOST_LEVELS = 64
 
 
-def lines(report: dict[str, Any]) -> Iterator[str]:
-    """The lines of a report, given as its JSON."""
+def lines(name: str, report: dict[str, Any]) -> Iterator[str]:
+    """The lines of a report on a file, given as its JSON."""
     tree, values = report["tree"], report["values"]
     noun = "node" if tree else "splat"
-    yield f"{printable(report['file'])}  {report['format']}, {size_of(report['bytes'])}"
+    size = "" if report["bytes"] is None else f", {size_of(report['bytes'])}"
+    yield f"{printable(name)}  {report['format']}{size}"
     about = [count_of(report["splats"], noun), f"SH {report['sh_degree']}"]
     about += ["antialiased"] * bool(report["antialiased"])
     if "fractional_bits" in report["header"]:

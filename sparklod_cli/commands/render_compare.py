@@ -19,10 +19,8 @@ from .paths import keep_apart
 if TYPE_CHECKING:
     from ..api.jobs import Compared
     from ..cameras.path import CameraPath
-    from ..lod.budget import Budget
     from ..lod.settings import LodSettings
     from ..scenes.loaded import Scenes
-    from ..tables.assertions import Assertion
     from ..tables.comparison import BudgetSummary
     from ..tables.output import TableOutput
     from .render import Asked
@@ -58,14 +56,15 @@ def compare(ctx: click.Context, asked: Asked) -> int:
                 asked.appearance.settings(max_sh=asked.comparison.max_sh),
                 table,
                 fitted=fitted(ctx),
+                asserts=asserts,
                 plot=asked.comparison.plot,
                 overwrite=asked.pictures.overwrite,
                 ready=ready,
                 passed=passed,
             )
         console.clear()
-        console.detail(f"  {len(compared.rows):,} pictures, {time.perf_counter() - start:.2f} s")
-        return _report(console, asked, compared, budgets, asserts)
+        console.detail(f"  {compared.pictures:,} pictures, {time.perf_counter() - start:.2f} s")
+        return _report(console, asked, compared, [at for at, _ in asserts])
 
 
 def _table(asked: Asked) -> TableOutput:
@@ -96,34 +95,29 @@ def _limited(asked: Asked) -> LodSettings:
     return settings
 
 
-def _report(
-    console: Console,
-    asked: Asked,
-    compared: Compared,
-    budgets: Sequence[Budget],
-    asserts: Sequence[tuple[int | None, Assertion]],
-) -> int:
-    from ..tables.assertions import check
-    from ..tables.comparison import rows_by_budget, summarize
+def _report(console: Console, asked: Asked, compared: Compared, about: Sequence[int | None]) -> int:
+    """Says what the comparison comes to; the exit status.
 
-    rows, path = compared.rows, compared.path
-    groups = rows_by_budget(rows, len(budgets))
-    outcomes = [
-        outcome for at, assertion in asserts for outcome in check([assertion], rows if at is None else groups[at])
-    ]
-    summary = summarize(rows, [budget.text for budget in budgets])
+    Args:
+        console: says it.
+        asked: on the command line.
+        compared: what was found.
+        about: of each assertion, the place of the budget that it is about; None for all of them.
+    """
+    summary, outcomes = compared.summary, compared.outcomes
     if asked.general.as_json:
         held = [{"assert": each.assertion.text, "held": each.held, "value": each.value} for each in outcomes]
         figures = [each.as_dict() for each in summary]
-        whole = {"frames": len(path.cameras), "leaves": compared.leaves, "budgets": figures, "asserts": held}
+        frames = len(compared.path.cameras)
+        whole = {"frames": frames, "leaves": compared.leaves, "budgets": figures, "asserts": held}
         click.echo(json.dumps(whole, allow_nan=False))
-    told = lines(summary, path, compared.leaves)
+    told = lines(summary, compared.path, compared.leaves)
     if _on_screen(asked):
         click.echo("\n".join(told))
     else:
         for line in told:
             console.say(line)
-    for (at, _), outcome in zip(asserts, outcomes, strict=True):
+    for at, outcome in zip(about, outcomes, strict=True):
         of = f", at a budget of {outcome.worst['budget']:,}" if at is None and outcome.worst is not None else ""
         if outcome.held:
             console.detail(f"  holds: {outcome.message()}{of}")

@@ -19,10 +19,9 @@ from .paths import claim_stdout, keep_apart
 from .usage import options_of
 
 if TYPE_CHECKING:
+    from ..api.jobs import Traversed
     from ..cameras.path import CameraPath
     from ..scenes.loaded import Scenes
-    from ..simulation.outputs import WrittenFrames
-    from ..tables.assertions import Assertion
 
 #: Below this share of splats in front of the cameras, path and scene probably do not share their axes.
 LEAST_IN_FRONT = 0.05
@@ -90,21 +89,23 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
         view = View(instances, where.where(), where.settings(), lod.precision, general.threads, console.progress)
         try:
             with where.told():
-                written = traverse_files(
+                traversed = traverse_files(
                     view,
                     budget,
                     lod.settings(budget=1),
                     network.settings(),
                     outputs,
                     by_instance=place.per_instance,
+                    asserts=asserts,
                     ready=ready,
                     passed=for_screen if screen and outputs.table.form != "parquet" else None,
                     bar=not screen,  # a bar and a table do not go together on one screen
                 )
         except UnfitError as error:
             raise click.UsageError(str(error)) from None
+        written, cameras_read = traversed.frames, len(traversed.path.cameras)
         console.clear()
-        console.detail(f"  {len(written.rows):,} frames, {time.perf_counter() - start:.2f} s")
+        console.detail(f"  {cameras_read:,} frames of {traversed.path.format}, {time.perf_counter() - start:.2f} s")
         if written.note:
             console.say(f"{outputs.plot}: {written.note}")
         if written.in_front < LEAST_IN_FRONT:
@@ -113,35 +114,22 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
                 " not share their axes (--camera-axes, --world-transform, --up)"
             )
         on_stdout = place.summary_on_stdout(ctx, as_json=general.as_json)
-        ctx.exit(_report(console, written, asserts, place.summary, as_json=general.as_json, on_stdout=on_stdout))
+        ctx.exit(_report(console, traversed, place.summary, as_json=general.as_json, on_stdout=on_stdout))
 
 
-def _report(
-    console: Console,
-    written: WrittenFrames,
-    asserts: list[Assertion],
-    summary: bool | None,
-    *,
-    as_json: bool,
-    on_stdout: bool,
-) -> int:
+def _report(console: Console, traversed: Traversed, summary: bool | None, *, as_json: bool, on_stdout: bool) -> int:
     """Says what is asked for; the exit status.
 
     Args:
         console: says it.
-        written: the frames.
-        asserts: what must hold.
+        traversed: what was found.
         summary: whether to print it; None where a person reads standard error.
         as_json: print it as JSON on standard output.
         on_stdout: print it on standard output, in place of the table.
     """
-    from ..simulation.columns import EMPTY
-    from ..simulation.summary import summarize
-    from ..tables.assertions import check
     from .traverse_text import lines
 
-    outcomes = check(asserts, written.rows, empty=EMPTY)
-    whole = summarize(written.rows)
+    whole, outcomes = traversed.summary, traversed.outcomes
     if as_json:
         held = [{"assert": each.assertion.text, "held": each.held, "value": each.value} for each in outcomes]
         click.echo(json.dumps(whole.as_dict() | {"asserts": held}, allow_nan=False))

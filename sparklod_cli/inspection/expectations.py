@@ -1,10 +1,10 @@
-"""What a CI job expects of a file, and where a report falls short of it."""
+"""What a file should be, as options, assertions and files of expectations say it, and where a report falls short."""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -12,10 +12,40 @@ from typing import Any
 from ..io import read_text
 from ..support.errors import SparklodError
 from ..support.printable import printable
-from ..support.units import count_of
 from ..support.untrusted import QUOTED, parse_json, parse_toml, quoted, shown
+from ..tables.conditions import BadAssertionError, Condition, is_number, number_text, parse
+from ..tables.files import near
 from .findings import Finding
 from .report import Report
+
+#: Short names for what most assertions are about, beside the fields of the report, and how a report gives them.
+NAMES: dict[str, Callable[[dict[str, Any]], Any]] = {
+    "nodes": lambda report: report["splats"],
+    "leaves": lambda report: report["tree"]["leaves"] if report["tree"] else report["splats"],
+    "growth": lambda report: report["tree"]["growth"],
+    "depth": lambda report: report["tree"]["depth"],
+    "sh": lambda report: report["sh_degree"],
+    "lod": lambda report: report["tree"] is not None,
+}
+
+#: The codes of findings about some names; that of the others is expect.value.
+CODES = {
+    "bytes": "expect.bytes",
+    "leaves": "expect.splats",
+    "sh": "expect.sh",
+    "lod": "expect.lod",
+    "growth": "expect.growth",
+}
+
+#: What the keys of a file mean, and the options of their names: a name and a sign.
+KEYS = {
+    "max_bytes": ("bytes", "<="),
+    "min_splats": ("leaves", ">="),
+    "max_splats": ("leaves", "<="),
+    "sh": ("sh", "=="),
+    "lod": ("lod", "=="),
+    "max_growth": ("growth", "<="),
+}
 
 
 class ExpectationError(SparklodError):
@@ -24,7 +54,7 @@ class ExpectationError(SparklodError):
 
 @dataclass(frozen=True)
 class Expectations:
-    """What a file should be; None means anything.
+    """What a file should be; None means anything. Each is a condition, see `conditions`.
 
     Attributes:
         max_bytes: of the file.
@@ -32,8 +62,8 @@ class Expectations:
         sh: the SH degree.
         lod: whether it should be a tree.
         max_growth: nodes over leaves.
-        values: by the way to a value of the report ("tree.depth"), what it should be: a value, or a table of `min` and
-            `max`.
+        values: by the field of the report ("tree.depth"), what it should be: a value, or a table of `min` and `max`.
+        asserts: texts such as "nodes<=5M"; they are about `NAMES` and fields of the report.
     """
 
     max_bytes: int | None = None
@@ -43,10 +73,41 @@ class Expectations:
     lod: bool | None = None
     max_growth: float | None = None
     values: dict[str, Any] = field(default_factory=dict)
+    asserts: tuple[str, ...] = ()
+
+    def conditions(self) -> list[Condition]:
+        """All of them, in the order of the attributes."""
+        found = [
+            Condition.of(name, sign, getattr(self, key))
+            for key, (name, sign) in KEYS.items()
+            if getattr(self, key) is not None
+        ]
+        for name, wanted in self.values.items():
+            ends = [(sign, wanted[end]) for end, sign in (("min", ">="), ("max", "<=")) if _is_range(wanted, end)]
+            found += [Condition.of(name, sign, bound) for sign, bound in ends or [("==", wanted)]]
+        return found + [parse_assertion(text) for text in self.asserts]
+
+
+def parse_assertion(text: str) -> Condition:
+    """A condition on a report.
+
+    Raises:
+        BadAssertionError: it cannot be understood, or is about nothing that a report has.
+    """
+    condition = parse(text, example="nodes<=5M")
+    known = [*NAMES, *(each.name for each in fields(Report))]
+    if condition.name.partition(".")[0] not in known:
+        name = printable(condition.name, QUOTED)
+        raise BadAssertionError(f"{text!r}: there is no {name!r} in a report{near(condition.name, known)}")
+    return condition
+
+
+def _is_range(wanted: Any, end: str) -> bool:
+    return isinstance(wanted, dict) and end in wanted
 
 
 def read(path: Path) -> Expectations:
-    """The expectations in a .json or .toml file.
+    """The expectations in a .json or .toml file: keys that are attributes of `Expectations`, and `assert`.
 
     Raises:
         ExpectationError: it cannot be read, or says something that is not an expectation.
@@ -58,8 +119,8 @@ def read(path: Path) -> Expectations:
         raise ExpectationError(f"{path} is not what it is called: {quoted(error)}") from None
     if not isinstance(data, dict):
         raise ExpectationError(f"{path} is not a table of expectations")
-    types: dict[str, tuple[type, ...]] = {each.name: (int,) for each in fields(Expectations)}
-    types |= {"lod": (bool,), "max_growth": (int, float), "values": (dict,)}
+    types: dict[str, tuple[type, ...]] = dict.fromkeys(KEYS, (int,))
+    types |= {"lod": (bool,), "max_growth": (int, float), "values": (dict,), "assert": (list,)}
     for name, value in data.items():
         if name not in types:
             raise ExpectationError(f"{path}: {printable(name, QUOTED)} is not one of {', '.join(types)}")
@@ -67,98 +128,83 @@ def read(path: Path) -> Expectations:
             raise ExpectationError(f"{path}: {name} cannot be {shown(value)}")
         if isinstance(value, (int, float)) and not 0 <= value < math.inf:
             raise ExpectationError(f"{path}: {name} cannot be {shown(value)}")
-    values = dict(_flat(data.get("values", {}), str(path)))
-    return Expectations(**data | {"values": values})
+    values = dict(_flat(data.pop("values", {}), str(path)))
+    asserts = data.pop("assert", [])
+    for each in asserts:
+        if not isinstance(each, str):
+            raise ExpectationError(f"{path}: assert cannot hold {shown(each)}, only texts such as 'nodes<=5M'")
+        try:
+            parse_assertion(each)
+        except BadAssertionError as error:
+            raise ExpectationError(f"{path}: assert {quoted(error)}") from None
+    return Expectations(**data, values=values, asserts=tuple(asserts))
 
 
 def _flat(table: dict[str, Any], path: str, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Expectations by the whole ways to their values; in TOML `tree.depth = 2` is a table in a table."""
+    """Expectations by the full names of their fields; in TOML `tree.depth = 2` is a table in a table."""
     for key, wanted in table.items():
-        way = prefix + key
+        name = prefix + key
         if isinstance(wanted, dict) and wanted and not wanted.keys() & {"min", "max"}:
-            yield from _flat(wanted, path, f"{way}.")
+            yield from _flat(wanted, path, f"{name}.")
             continue
         if isinstance(wanted, dict) and not (wanted and wanted.keys() <= {"min", "max"}):
-            raise ExpectationError(f"{path}: {printable(way, QUOTED)} is to have min and max, not {shown(wanted)}")
-        if isinstance(wanted, dict) and not all(map(_is_number, wanted.values())):
+            raise ExpectationError(f"{path}: {printable(name, QUOTED)} takes min and max, not {shown(wanted)}")
+        if isinstance(wanted, dict) and not all(map(is_number, wanted.values())):
             raise ExpectationError(
-                f"{path}: min and max of {printable(way, QUOTED)} are to be numbers, not {shown(wanted)}"
+                f"{path}: min and max of {printable(name, QUOTED)} must be numbers, not {shown(wanted)}"
             )
         try:
             json.dumps(wanted)
         except TypeError:
             raise ExpectationError(
-                f"{path}: {printable(way, QUOTED)} cannot be {shown(wanted)}, no report has such a value"
+                f"{path}: {printable(name, QUOTED)} cannot be {shown(wanted)}, no report has such a value"
             ) from None
-        yield way, wanted
+        yield name, wanted
 
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and not math.isnan(value)
-
-
-def value_at(report: dict[str, Any], way: str) -> Any:
-    """The value at a way of keys and indices with dots between ("tree.levels.0.nodes").
+def value_at(report: dict[str, Any], name: str) -> Any:
+    """The value of a field: keys and indices with dots between ("tree.levels.0.nodes").
 
     Raises:
         ExpectationError: there is none.
     """
     value: Any = report
     try:
-        for key in way.split("."):
+        for key in name.split("."):
             value = value[int(key)] if isinstance(value, list) else value[key]
     except (KeyError, IndexError, TypeError, ValueError):
-        raise ExpectationError(f"the report has no {printable(way, QUOTED)}") from None
+        raise ExpectationError(f"the report has no {printable(name, QUOTED)}") from None
     return value
+
+
+def _value(report: dict[str, Any], name: str) -> Any:
+    if name not in NAMES:
+        return value_at(report, name)
+    try:
+        return NAMES[name](report)
+    except TypeError:
+        raise ExpectationError("the file has no tree") from None
 
 
 def check(report: Report, expected: Expectations) -> list[Finding]:
     """Where a report falls short of expectations; of a file that could not be read nothing is expected."""
     if report.format is None:
         return []
+    plain = report.as_dict()
     found = []
-    is_tree = report.tree is not None
-    splats = report.tree.leaves if report.tree is not None else report.splats or 0
-    found_splats = count_of(splats, "leaf", "leaves") if is_tree else count_of(splats, "splat")
-    if expected.max_bytes is not None and (report.bytes or 0) > expected.max_bytes:
-        found.append(Finding("expect.bytes", f"{report.bytes:,} bytes, expected at most {expected.max_bytes:,}"))
-    if expected.min_splats is not None and splats < expected.min_splats:
-        found.append(Finding("expect.splats", f"{found_splats}, expected at least {expected.min_splats:,}"))
-    if expected.max_splats is not None and splats > expected.max_splats:
-        found.append(Finding("expect.splats", f"{found_splats}, expected at most {expected.max_splats:,}"))
-    if expected.sh is not None and report.sh_degree != expected.sh:
-        found.append(Finding("expect.sh", f"SH degree {report.sh_degree}, expected {expected.sh}"))
-    if expected.lod is not None and is_tree != expected.lod:
-        found.append(Finding("expect.lod", "no tree, expected one" if expected.lod else "a tree, expected none"))
-    if expected.max_growth is not None:
-        growth = report.tree.growth if report.tree is not None else None
-        if growth is None or growth > expected.max_growth:
-            what = "no tree" if growth is None else f"growth {growth}"
-            found.append(Finding("expect.growth", f"{what}, expected a growth of at most {expected.max_growth:g}"))
-    return found + _values(report.as_dict(), expected.values)
-
-
-def _values(report: dict[str, Any], expected: dict[str, Any]) -> list[Finding]:
-    found = []
-    for way, wanted in expected.items():
+    for condition in expected.conditions():
+        code = CODES.get(condition.name, "expect.value")
+        text = printable(condition.text, QUOTED)
         try:
-            value = value_at(report, way)
+            value = _value(plain, condition.name)
         except ExpectationError as error:
-            found.append(Finding("expect.value", f"{error}, expected {_as_json(wanted)}"))
+            found.append(Finding(code, f"{text}: {error}"))
             continue
-        if not _fits(value, wanted):
-            found.append(
-                Finding("expect.value", f"{printable(way, QUOTED)} is {_as_json(value)}, expected {_as_json(wanted)}")
-            )
+        if not condition.holds(value):
+            found.append(Finding(code, f"{text}: {printable(condition.name, QUOTED)} is {_text(value)}"))
     return found
 
 
-def _as_json(value: Any) -> str:
-    """As the report and its expectations are written, and no longer than a line of a log."""
-    return printable(json.dumps(value), QUOTED)
-
-
-def _fits(value: Any, wanted: Any) -> bool:
-    if isinstance(wanted, dict):
-        return _is_number(value) and bool(wanted.get("min", value) <= value <= wanted.get("max", value))
-    return bool(value == wanted) and isinstance(value, bool) == isinstance(wanted, bool)
+def _text(value: Any) -> str:
+    """As a report writes it, no longer than a line of a log."""
+    return number_text(value) if is_number(value) else printable(json.dumps(value), QUOTED)

@@ -12,8 +12,11 @@ from typing import Any
 from .. import __version__
 from ..figures.svg import bar, children_groups, histogram_chart, text_of
 from ..figures.tree_plot import Picture
+from ..model.scene import Scene
 from ..tables.histograms import Histogram
+from . import values
 from .findings import CODES, ERROR, NOTE, WARNING
+from .report import Report
 
 #: Content security policy: only the style and the pictures inside the page, whatever the name of a file contains.
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
@@ -62,6 +65,14 @@ class Section:
     report: Mapping[str, Any]
     picture: Picture | None = None
     histograms: Mapping[str, Histogram] = field(default_factory=dict)
+
+
+def section_of(report: Report, scene: Scene | None, picture: Picture | None) -> Section:
+    """The section about a file: its report, its picture, and histograms of what was read of it."""
+    drawn = {}
+    if scene is not None and len(scene.splats):
+        drawn = {name: values.histogram_of(scene.splats, name) for name in values.names_of(scene.splats)}
+    return Section(report.as_dict(), picture, drawn)
 
 
 def page(sections: Sequence[Section]) -> str:

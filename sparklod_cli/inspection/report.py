@@ -25,7 +25,7 @@ TREE_COLUMNS = ("scale", "opacity")
 
 
 @dataclass(frozen=True)
-class Wanted:
+class ReportSettings:
     """What to report beside the header and the tree.
 
     Attributes:
@@ -81,7 +81,7 @@ class Report:
 
 
 def inspect(
-    path: Path, wanted: Wanted, *, threads: int = 1, progress: Progress = silent
+    path: Path, settings: ReportSettings, *, threads: int = 1, progress: Progress = silent
 ) -> tuple[Report, Scene | None]:
     """The report on a file, and its scene as far as it was read.
 
@@ -89,11 +89,11 @@ def inspect(
 
     Args:
         path: of the file, or of the folder of an unpacked SOG.
-        wanted: what to report.
+        settings: what to report.
         threads: to read with.
         progress: called while the file is read.
     """
-    columns = COLUMNS if wanted.values or wanted.check else TREE_COLUMNS
+    columns = COLUMNS if settings.values or settings.check else TREE_COLUMNS
     size = size_of_input(path)
     try:
         scene = examine_scene(path, columns=columns, threads=threads, progress=progress)
@@ -104,9 +104,9 @@ def inspect(
     findings = _container_findings(scene)
     facts = None
     if scene.tree is not None and count:
-        facts, found = tree.examine(splats, scene.tree, check=wanted.check, scale_ends=values.scale_ends(scene))
+        facts, found = tree.examine(splats, scene.tree, check=settings.check, scale_ends=values.scale_ends(scene))
         findings += found
-    if wanted.check:
+    if settings.check:
         findings += values.check(scene)
     report = Report(
         file=str(path),
@@ -120,8 +120,8 @@ def inspect(
         compression_ratio=round(4 * count * (14 + 3 * COEFFICIENTS[splats.sh_degree]) / size, 3) if size else None,
         notes=list(scene.notes),
         tree=facts,
-        values=values.examine(splats, all_quantities=wanted.all_quantities) if wanted.values else None,
-        findings=findings if wanted.check else None,
+        values=values.examine(splats, all_quantities=settings.all_quantities) if settings.values else None,
+        findings=findings if settings.check else None,
     )
     return report, scene
 

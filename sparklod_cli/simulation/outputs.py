@@ -50,7 +50,7 @@ class FrameOutputs:
             from ..figures.charts import load_matplotlib
 
             load_matplotlib()
-        if self.indices is not None and self.indices.exists():  # it is made when all else is known to be right
+        if self.indices is not None:
             check_writable(self.indices / "0.npy", overwrite=True)
 
     def index_files(self, numbers: Sequence[int], instances: int) -> Iterator[Path]:
@@ -119,8 +119,6 @@ def write_frames(
         OutputError: a file cannot be written.
     """
     kept = _Kept()
-    if outputs.indices is not None:
-        check_writable(outputs.indices / "0.npy", overwrite=True, make_parent=True)
 
     def rows() -> Iterator[Row]:
         for frame in simulation.run(path, threads=threads, progress=progress):

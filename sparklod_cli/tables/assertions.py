@@ -2,35 +2,15 @@
 
 from __future__ import annotations
 
-import math
-import operator
-import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from decimal import Decimal
 from types import MappingProxyType
 
-from ..support.errors import SparklodError
+from . import conditions
 from .columns import Column, Row
+from .conditions import SIGNS, BadAssertionError, is_number, number_text
 from .files import near
 from .statistics import STATISTICS, Number, is_statistic, numbers, statistic, totals
-
-COMPARISONS: dict[str, Callable[[Number, Number], bool]] = {
-    "<=": operator.le,
-    ">=": operator.ge,
-    "==": operator.eq,
-    "!=": operator.ne,
-    "<": operator.lt,
-    ">": operator.gt,
-}
-
-TEXT = re.compile(r"\s*(?P<left>[^<>=!]*?)\s*(?P<sign>[<>=!]+)\s*(?P<right>[^<>=!]*?)\s*")
-NUMBER = re.compile(r"(?P<number>[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]{1,3})?)\s*(?P<unit>[kKMG%]?)")
-UNITS: dict[str, int | Decimal] = {"": 1, "k": 10**3, "K": 10**3, "M": 10**6, "G": 10**9, "%": Decimal("0.01")}
-
-
-class BadAssertionError(SparklodError):
-    """An assertion is not well formed, or its column is empty."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +21,7 @@ class Assertion:
         text: as it was given, without spaces at its ends.
         column: a numeric column.
         statistic: of its cells, see `statistics`; empty if every frame must hold by itself.
-        sign: one of `COMPARISONS`.
+        sign: one of `conditions.SIGNS`.
         bound: right side of the comparison.
     """
 
@@ -53,7 +33,7 @@ class Assertion:
 
     def holds(self, value: Number) -> bool:
         """Whether a value compares with the bound as it must."""
-        return COMPARISONS[self.sign](value, self.bound)
+        return SIGNS[self.sign](value, self.bound)
 
 
 @dataclass(frozen=True)
@@ -104,13 +84,11 @@ def parse(text: str, columns: Sequence[Column]) -> Assertion:
     Raises:
         BadAssertionError: it is not well formed; suggests similar names.
     """
-    found = TEXT.fullmatch(text)
-    if not found or not found["left"] or not found["right"]:
-        raise BadAssertionError(f"{text!r} is not an assertion like 'churn_p95<0.2'")
-    if found["sign"] not in COMPARISONS:
-        raise BadAssertionError(f"{text!r}: {found['sign']} is not one of {' '.join(COMPARISONS)}")
-    column, name = _column(text, found["left"], columns)
-    return Assertion(text.strip(), column, name, found["sign"], _bound(text, found["right"]))
+    condition = conditions.parse(text, example="churn_p95<0.2")
+    column, name = _column(text, condition.name, columns)
+    if not is_number(condition.bound):
+        raise BadAssertionError(f"{text!r}: {condition.bound!r} is not a number such as 0.2, 500k, 2M or 20%")
+    return Assertion(condition.text, column, name, condition.sign, condition.bound)
 
 
 def _column(text: str, left: str, columns: Sequence[Column]) -> tuple[Column, str]:
@@ -138,16 +116,6 @@ def _unknown(left: str, columns: Sequence[Column]) -> str:
         statistics = f"{', '.join(STATISTICS)} or a percentile such as p95"
         return f"{left[len(of) + 1 :]!r} is not a statistic of {of}: {statistics}"
     return f"there is no column {name!r}{meant or near(name, numeric)}"
-
-
-def _bound(text: str, right: str) -> Number:
-    found = NUMBER.fullmatch(right)
-    if not found:
-        raise BadAssertionError(f"{text!r}: {right!r} is not a number such as 0.2, 500k, 2M or 20%")
-    number = float(Decimal(found["number"]) * UNITS[found["unit"]])  # decimal arithmetic, so that 1.1k is exactly 1100
-    if not math.isfinite(number):
-        raise BadAssertionError(f"{text!r}: {right} is too large")
-    return int(number) if number.is_integer() else number
 
 
 def check(
@@ -196,11 +164,6 @@ def _badness(assertion: Assertion, value: Number) -> Number:
         return -value
     away = abs(value - assertion.bound)
     return away if assertion.sign == "==" else -away
-
-
-def number_text(value: Number) -> str:
-    """A number as exact as a comparison needs it: "1,234,567", "0.2", "0.123457"."""
-    return f"{int(value):,}" if float(value).is_integer() and abs(value) < 1e15 else f"{value:.9g}"
 
 
 def place_text(row: Row) -> str:

@@ -57,7 +57,7 @@ def places(camera: Camera, scene: Balls) -> np.ndarray:
 
 
 @given(scene=scenes(), size=SIZES, azimuth=st.floats(0, 360), tilt=st.floats(-80, 80), fov=st.floats(20, 100))
-def test_a_fitted_camera_has_all_in_its_picture_and_fills_it(
+def test_a_fitted_camera_sees_the_whole_scene_and_fills_its_picture(
     scene: Balls, size: tuple[int, int], azimuth: float, tilt: float, fov: float
 ) -> None:
     scene = covered(scene)
@@ -72,7 +72,7 @@ def test_a_fitted_camera_has_all_in_its_picture_and_fills_it(
 
 
 @given(scene=scenes(), size=SIZES, count=st.integers(1, 24), tilt=st.floats(-80, 80))
-def test_every_camera_of_an_orbit_has_all_in_its_picture(
+def test_every_camera_of_an_orbit_sees_the_whole_scene(
     scene: Balls, size: tuple[int, int], count: int, tilt: float
 ) -> None:
     scene = covered(scene)
@@ -88,7 +88,7 @@ def test_every_camera_of_an_orbit_has_all_in_its_picture(
     assert max(reach) == pytest.approx(FILLED, rel=1e-4), "and one of them as large as it can be"
 
 
-def test_all_but_one_in_a_thousand_are_covered_with_all_that_they_cover() -> None:
+def test_the_largest_thousandth_of_the_balls_is_left_out() -> None:
     random = np.random.default_rng(0)
     scene = Balls(random.uniform(-1, 1, (20_000, 3)), np.full(20_000, 0.1))
     scene.radius[:10] = 2.2  # few, and large
@@ -112,7 +112,7 @@ def test_a_backdrop_is_not_framed() -> None:
     assert len(kept.center) == pytest.approx(19_000, rel=0.01)
 
 
-def test_framing_is_not_impressed_by_what_is_far_away() -> None:
+def test_framing_ignores_splats_far_away() -> None:
     random = np.random.default_rng(0)
     center = random.normal(size=(20_000, 3)).astype(np.float32) + np.array([5, 6, 7])
     center[:500] = 1e6
@@ -127,7 +127,7 @@ def test_framing_is_not_impressed_by_what_is_far_away() -> None:
 
 
 @pytest.mark.filterwarnings("error")
-def test_balls_stand_where_splats_do_and_leave_out_what_is_no_number() -> None:
+def test_balls_have_the_places_of_finite_splats() -> None:
     splats = Splats.zeros(5, 0)
     splats.scale[:] = (0.1, 0.5, 0.2)
     splats.center[:, 0] = (1, 2, np.nan, 3e38, 4)
@@ -141,7 +141,7 @@ def test_balls_stand_where_splats_do_and_leave_out_what_is_no_number() -> None:
 
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("size", [1e-6, 1e-4, 1.0, 1e5, 1e30])
-def test_a_scene_of_any_size_is_in_reach(size: float) -> None:
+def test_the_clip_planes_reach_around_a_scene_of_any_size(size: float) -> None:
     scene = covered(Balls(np.random.default_rng(0).normal(size=(500, 3)) * size, np.zeros(500)))
     frames = orbit(5, (0, 0, 0), 1, 0, DEFAULT_UP)
     cameras = [fitted(camera_of(frame.matrix, frame.lens, 0, "", Settings()), scene) for frame in frames]

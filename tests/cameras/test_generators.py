@@ -48,7 +48,7 @@ def test_a_scene_is_first_seen_from_its_front(up: tuple[float, ...], front: tupl
     assert np.allclose(positions(dolly(4, (0, 0, 0), 2, 1, 0, up))[0], 2 * np.array(front))
 
 
-def test_a_dolly_grows_evenly() -> None:
+def test_distances_of_a_dolly_have_one_ratio() -> None:
     frames = dolly(9, (1, 1, 1), 16.0, 1.0, math.radians(20), DOWN_Y)
     distances = np.linalg.norm(positions(frames) - 1, axis=1)
     assert distances[[0, -1]] == pytest.approx([16, 1])
@@ -71,7 +71,7 @@ KEYS = [
 ]
 
 
-def test_keyframes_are_passed_and_nothing_jumps() -> None:
+def test_a_path_passes_its_keyframes_without_jumps() -> None:
     frames = between(KEYS, 200, DOWN_Y)
     seen = positions(frames)
     assert len(frames) == 1 + 200 * 6
@@ -106,7 +106,7 @@ def test_keyframes_in_one_place_turn_the_camera() -> None:
     assert np.allclose(aheads(same), (0, 0, 1))
 
 
-def test_a_lens_without_keys_of_it_stays() -> None:
+def test_keyframes_without_a_lens_keep_the_given_one() -> None:
     lens = Lens((640, 480), (600, 610), (300, 200))
     keys = [Key(key.eye, key.target) for key in KEYS]
     assert all(frame.lens == lens for frame in between(keys, 5, DOWN_Y, lens))
@@ -118,7 +118,7 @@ def test_a_lens_without_keys_of_it_stays() -> None:
     ("times", "said"),
     [((0.0, None), "some have none"), ((1.0, 1.0), "do not increase"), ((0.0, 1e300), "are more than")],
 )
-def test_times_that_make_no_sense(times: tuple[float | None, ...], said: str) -> None:
+def test_keyframe_times_that_do_not_rise_are_refused(times: tuple[float | None, ...], said: str) -> None:
     keys = [Key(key.eye, key.target, time=time) for key, time in zip(KEYS, times, strict=False)]
     with pytest.raises(CameraPathError, match=said):
         between(keys, 30, DOWN_Y)
@@ -145,7 +145,7 @@ def test_both_tangents_reproduce_straight_lines_and_catmull_rom_parabolas() -> N
     assert np.allclose(hermite(knots, parabola, catmull_rom_tangents(knots, parabola), at)[:, 0], at**2)
 
 
-def test_generated_cameras_have_times() -> None:
+def test_generated_cameras_have_times_by_the_frame_rate() -> None:
     path = cameras_of(Parsed(orbit(4, (0, 0, 0), 1, 0, DOWN_Y)), GENERATED["orbit"], Settings(fps=2))
     assert [camera.time for camera in path.cameras] == [0, 0.5, 1, 1.5]
     assert path.format == "an orbit"

@@ -60,7 +60,7 @@ def test_axes_of_a_file_can_be_overridden() -> None:
     assert np.allclose(turned.position, KNOWN[1].position)
 
 
-def test_where_eyes_look_needs_no_axes() -> None:
+def test_cameras_with_a_target_take_no_axes() -> None:
     with pytest.raises(CameraPathError, match="--camera-axes cannot be used with it"):
         read_fixture("supersplat-v2.json", Settings(axes=Axes.OPENCV_C2W))
     frames = [{"eye": [0, 0, -5], "target": [0, 0, 0]}]
@@ -77,7 +77,7 @@ def test_a_world_is_turned_scaled_and_moved() -> None:
     assert np.allclose(pixel(after, moved), pixel(before, LANDMARK))
 
 
-def test_scale_goes_and_small_errors_are_evened_out() -> None:
+def test_scale_is_removed_from_a_pose_and_rounding_is_corrected() -> None:
     pose = np.eye(4)
     pose[:3, :3] = 3 * np.array([[0.8, 0, 0.6], [0, 1, 0], [-0.6, 0, 0.8]])
     pose[:3, 3] = 1, 2, 3
@@ -92,7 +92,7 @@ def test_scale_goes_and_small_errors_are_evened_out() -> None:
     assert np.allclose(rotation, rough, atol=0.01)
 
 
-def test_a_scaled_matrix_of_the_world_to_the_camera_has_its_camera_where_it_is() -> None:
+def test_a_scaled_world_to_camera_matrix_keeps_the_position() -> None:
     matrix = np.diag([2.0, 2.0, 2.0, 1.0])
     matrix[:3, 3] = -2, -4, -6
     assert with_matrix(matrix, axes="opengl-w2c").position.tolist() == [1, 2, 3]
@@ -110,19 +110,19 @@ def test_a_scaled_matrix_of_the_world_to_the_camera_has_its_camera_where_it_is()
         (np.eye(4) + np.eye(4, k=3) * 1e300, "not finite, or too large"),
     ],
 )
-def test_what_is_no_pose_is_an_error_that_names_the_frame(matrix: NDArray[np.float64], said: str) -> None:
+def test_a_matrix_that_is_not_a_pose_is_an_error_that_names_the_frame(matrix: NDArray[np.float64], said: str) -> None:
     good = {"matrix": np.eye(4).tolist()}
     with pytest.raises(CameraPathError, match=f"the camera of frame 1 \\(second\\) .*{said}"):
         own(frames=[good, {"matrix": matrix.tolist(), "name": "second"}])
 
 
-def test_what_cannot_be_inverted_is_an_error() -> None:
+def test_a_matrix_that_cannot_be_inverted_is_an_error() -> None:
     flat = np.diag([1.0, 1.0, 0.0, 1.0]).tolist()
     with pytest.raises(CameraPathError, match="frame 0 has a matrix that cannot be inverted"):
         own(frames=[{"matrix": flat}], axes="opencv-w2c")
 
 
-def test_a_file_that_says_nothing_gets_the_defaults() -> None:
+def test_a_file_without_settings_gets_the_defaults() -> None:
     camera = with_matrix(np.eye(4))
     assert (camera.width, camera.height, camera.principal) == (1280, 720, (640, 360))
     assert math.degrees(camera.fov_y) == pytest.approx(60)
@@ -198,7 +198,7 @@ def test_a_path_of_millions_is_an_error() -> None:
 
 
 @pytest.mark.parametrize("step", [False, True])
-def test_supersplat_between_its_keys(step: bool) -> None:
+def test_supersplat_interpolates_between_its_keys(step: bool) -> None:
     """Keys at frames 0 and 10 of a straight line; a step holds the first until the second."""
     values = {"position": [0, 0, 0, 10, 0, 0], "target": [0, 0, 9, 10, 0, 9], "fov": [50, 60]}
     track = {
@@ -241,7 +241,7 @@ def test_views_of_supersplat_where_there_is_no_animation() -> None:
     assert one.cameras[0].camera_to_world[1, 1] > 0, "y is up in SuperSplat"
 
 
-def test_known_poses_of_own_frames_in_other_words() -> None:
+def test_eye_and_target_quaternion_and_flat_matrix_give_the_same_pose() -> None:
     """Eye, target and up; position and quaternion; a flat matrix."""
     known = KNOWN[3]
     target = np.array(known.position) + 3 * np.array(known.ahead)

@@ -192,12 +192,12 @@ def all_bombs(tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 
 @pytest.mark.parametrize("name", BOMBS)
-def test_each_is_refused_for_what_is_wrong_with_it(name: str, all_bombs: Run) -> None:
+def test_each_bomb_is_refused_for_its_own_reason(name: str, all_bombs: Run) -> None:
     (reason,) = all_bombs.lines_about(name)
     assert "memory" not in reason  # "does not fit into memory" would send people shopping
 
 
-def test_all_are_refused_in_little_memory_and_time(all_bombs: Run) -> None:
+def test_all_bombs_are_refused_in_little_memory_and_time(all_bombs: Run) -> None:
     assert all_bombs.code == 1
     assert len(all_bombs.lines) == len(BOMBS), all_bombs.lines
     assert 0 < all_bombs.kilobytes < 600_000  # numba takes most of it

@@ -45,7 +45,7 @@ POSITION, SCALE = [-1.0, 0.0, 2.0, 3.0, 1023.0, 2.0], [-2.0, 0.0, 1.0, 0.0, 1.0,
 HALF = 0.5**0.5
 
 
-def test_every_word_by_hand() -> None:
+def test_every_word_is_decoded_as_worked_out_by_hand() -> None:
     none, all_ones = 0, 2**32 - 1
     mixed = 1 << 21 | 7 << 11 | 2047
     splats = decode(
@@ -78,7 +78,7 @@ def test_sh_bytes_are_the_middles_of_their_256th_parts_but_for_the_ends() -> Non
     np.testing.assert_array_equal(sh, np.reshape(values, (1, 3, 3)).transpose(0, 2, 1))  # red's come first
 
 
-def test_degree_4_is_cut() -> None:
+def test_sh_of_degree_4_are_cut_to_degree_3() -> None:
     scene = decode(by_words([*POSITION, *SCALE], (0, 0, 0, 0), sh=bytes(range(72))))
     assert scene.splats.sh_degree == 3
     assert scene.notes == ("SH degree 4 is cut to 3",)

@@ -38,7 +38,7 @@ def packed(data: np.ndarray, *, level: int = 5, threads: int = 1) -> bytes:
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_it_is_one_member_without_a_time_that_python_reads(size: int) -> None:
+def test_gzip_is_one_member_without_a_time_that_python_reads(size: int) -> None:
     data = sample(size)
     made = packed(data)
     assert made[:10] == bytes([0x1F, 0x8B, 8, 0, 0, 0, 0, 0, 0, 0xFF])  # deflate, no flags, no time, unknown system
@@ -100,7 +100,7 @@ def test_inflating_beyond_the_end_gives_less() -> None:
 
 
 @pytest.mark.parametrize("cut", range(1, 9))
-def test_a_checksum_that_is_cut_is_missed(cut: int) -> None:
+def test_a_truncated_checksum_is_refused(cut: int) -> None:
     inflate = compression.Inflate(io.BytesIO(gzip.compress(b"some")[:-cut]))
     inflate.read(4)
     with pytest.raises(FormatError, match="checksum is missing"):
@@ -132,7 +132,7 @@ PROMISED = 10 * compression.MAX_RATIO * compression.TRUSTED_SIZE
         (PROMISED, PROMISED // compression.MAX_RATIO - 1, False),
     ],
 )
-def test_promises_are_measured_by_the_file(total: int, file_size: int, allowed: bool) -> None:
+def test_a_promised_size_is_bounded_by_the_size_of_the_file(total: int, file_size: int, allowed: bool) -> None:
     if allowed:
         compression.check_promise(total, file_size)
     else:

@@ -97,7 +97,7 @@ def header(name: str, data: bytes) -> list[int]:
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_a_file_that_is_cut_is_refused_wherever_it_is_cut(name: str) -> None:
+def test_a_file_truncated_anywhere_is_refused(name: str) -> None:
     data = content(name)
     places = {
         *header(name, data),
@@ -158,7 +158,7 @@ def members(name: str) -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize("name", [*GZIPPED, *ZIPPED])
-def test_bits_under_a_right_checksum(name: str) -> None:
+def test_flipped_bits_under_a_valid_checksum_give_a_scene_or_a_format_error(name: str) -> None:
     """What a faulty writer could make: gzip or zip find nothing wrong with it."""
     rng = np.random.default_rng(15)
     for data, packed in insides(name):
@@ -179,7 +179,7 @@ WORDS = (
 
 @pytest.mark.parametrize("name", FILES)
 @pytest.mark.parametrize("seed", range(2))
-def test_bytes_put_in_cut_out_or_changed_give_a_scene_or_a_format_error(name: str, seed: int) -> None:
+def test_inserted_deleted_or_changed_bytes_give_a_scene_or_a_format_error(name: str, seed: int) -> None:
     rng = np.random.default_rng([11, seed, len(name)])
     raw, packed = insides(name)[0]  # of SOG, meta.json
     reach = [len(header(name, raw)), len(raw)]
@@ -206,7 +206,7 @@ NUMBERS = (np.nan, np.inf, -np.inf, 3e38, -3e38, 1e-45, 0.0, -1.0)
 
 @pytest.mark.parametrize("threads", [1, 2])
 @pytest.mark.parametrize("name", [name for name in FILES if name.endswith(("splat", "compressed.ply", "old.ply"))])
-def test_numbers_that_no_scene_has_are_passed_on_quietly(name: str, threads: int) -> None:
+def test_invalid_numbers_are_passed_on_without_a_warning(name: str, threads: int) -> None:
     """Whether they are an error is for `selection` to say; numpy must not warn of them, on any thread."""
     raw = content(name)
     begin = len(header(name, raw)) if name.endswith(".ply") else 6144 if name.endswith(".ksplat") else 0
@@ -230,12 +230,12 @@ MAGICS = (
 )
 
 
-def test_the_magics_are_of_all_formats_that_have_one() -> None:
+def test_every_format_with_a_magic_is_tried() -> None:
     assert {sniff(magic, "") for magic in MAGICS} == {form for form in FORMATS if form.beginning}
 
 
 @pytest.mark.parametrize("magic", MAGICS)
-def test_random_bytes_with_a_magic(magic: bytes) -> None:
+def test_random_bytes_after_a_magic_give_a_scene_or_a_format_error(magic: bytes) -> None:
     rng = np.random.default_rng(12)
     for size in (0, 1, 12, 40, 1000, 100_000):
         for _ in range(10):
@@ -246,14 +246,14 @@ def test_random_bytes_with_a_magic(magic: bytes) -> None:
 
 
 @pytest.mark.parametrize("suffix", sorted({suffix for form in FORMATS for suffix in form.suffixes}))
-def test_random_bytes_with_a_suffix(suffix: str) -> None:
+def test_random_bytes_with_a_suffix_give_a_scene_or_a_format_error(suffix: str) -> None:
     rng = np.random.default_rng(14)
     for size in (0, 1, 12, 31, 33, 1000, 4097, 100_001):
         for _ in range(10):
             assert attempt(f"scene{suffix}", rng.bytes(size)) != "scene" or (size == 0 and suffix == ".splat")
 
 
-def test_a_header_without_its_splats_is_no_scene() -> None:
+def test_a_header_without_its_splats_is_refused() -> None:
     for version in (1, 2, 3):
         for count in (0, 1, 1_000_000, 4_294_967_295):
             result = attempt("", by_hand.spz_gzip(version, count, 3, 12, 0, []))

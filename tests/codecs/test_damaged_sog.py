@@ -62,7 +62,7 @@ def replaced(document: Any, path: tuple[Any, ...], value: Any) -> Any:
 
 
 @pytest.mark.parametrize("name", [f"{FOLDER}/meta.json", *ZIPPED])
-def test_meta_that_says_anything_else(name: str) -> None:
+def test_a_changed_meta_json_gives_a_scene_or_a_format_error(name: str) -> None:
     unpacked = name.startswith(FOLDER)
     files = FILES if unpacked else members(name)
     meta = json.loads(files["meta.json"])
@@ -77,7 +77,7 @@ def test_meta_that_says_anything_else(name: str) -> None:
 
 
 @pytest.mark.parametrize("part", ["means_l.webp", "means_u.webp", "quats.webp", "scales.webp", "sh0.webp"])
-def test_images_that_are_cut_swapped_missing_or_something_else(part: str) -> None:
+def test_changed_swapped_or_missing_images_give_a_scene_or_a_format_error(part: str) -> None:
     assert attempt("meta.json", META, files=FILES) == "scene"
     others = {name: data for name, data in FILES.items() if name != part}
     assert attempt("meta.json", META, files=others) != "scene"

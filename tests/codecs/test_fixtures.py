@@ -10,12 +10,12 @@ from tests.conftest import FIXTURES
 SCRIPT = FIXTURES / "make_fixtures.py"
 
 
-def test_they_are_what_the_script_makes() -> None:
+def test_fixtures_are_what_the_script_makes() -> None:
     done = subprocess.run([sys.executable, SCRIPT, "--check"], capture_output=True, text=True, timeout=120)
     assert (done.returncode, done.stdout, done.stderr) == (0, "all as they should be\n", "")
 
 
-def test_they_are_small_and_in_the_table() -> None:
+def test_fixtures_are_small_and_listed_in_the_table() -> None:
     files = [path for path in FIXTURES.rglob("*") if path.is_file() and path.suffix not in (".py", ".pyc", ".md")]
     assert len(files) > 20
     assert sum(path.stat().st_size for path in files) < 3e6

@@ -45,7 +45,7 @@ def small_row(place: tuple[int, int, int], sh: bytes = b"") -> bytes:
     return struct.pack("<3H", *place) + rest + sh
 
 
-def test_a_row_of_floats_by_hand() -> None:
+def test_a_row_of_floats_is_decoded_as_worked_out_by_hand() -> None:
     numbers = (1.5, -2.25, 1e6, 2, 1, 0.5, 0, 0, -3, 4)  # w x y z, of any length
     sh = np.arange(24) / 16
     row = struct.pack("<10f4B24f", *numbers, 0, 51, 255, 102, *sh)
@@ -65,7 +65,7 @@ BUCKETS = {"bucket_splats": 2, "buckets": 3, "width": 4.0, "bucket_bytes": 12, "
 CENTERS = struct.pack("<9f", 0, 0, 0, 10, 20, 30, -5, -5, -5)
 
 
-def test_places_in_buckets_by_hand() -> None:
+def test_positions_in_buckets_are_decoded_as_worked_out_by_hand() -> None:
     """One full bucket of two, then one that has one, and one that has two though it could have been full."""
     places = [(32767, 0, 65534), (32768, 32767, 65535), (32767, 32767, 32767), (0, 0, 0), (65534, 65534, 65534)]
     section = BUCKETS | {"splats": 5, "room": 5}
@@ -104,7 +104,7 @@ def test_a_section_may_have_room_for_more_than_it_has() -> None:
 
 
 @pytest.mark.parametrize("level", [1, 2])
-def test_no_steps_means_32767(level: int) -> None:
+def test_a_range_of_0_steps_means_32767(level: int) -> None:
     section = BUCKETS | {"splats": 1, "room": 1, "full": 0, "partial": 1, "buckets": 1}
     rest = struct.pack("<I", 1) + CENTERS[:12] + small_row((65534, 32767, 0))
     one, other = (decode(headers(level, 1, section | {"steps": steps}) + rest).splats for steps in (0, 32767))

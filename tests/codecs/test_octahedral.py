@@ -80,7 +80,7 @@ def test_angles_are_off_by_half_a_step(steps: Steps) -> None:
 
 
 @BOTH
-def test_rotations_take_their_own_codes_back(steps: Steps) -> None:
+def test_decoded_rotations_have_their_own_codes(steps: Steps) -> None:
     rng = np.random.default_rng(6)
     # On the rim of the square two codes mean the same axis, and a turn by 0 has none.
     u, v = rng.integers(1, steps[0], (2, 200_000))
@@ -91,7 +91,7 @@ def test_rotations_take_their_own_codes_back(steps: Steps) -> None:
 
 
 @BOTH
-def test_rim_means_the_same_rotation_twice(steps: Steps) -> None:
+def test_two_codes_on_the_rim_mean_one_rotation(steps: Steps) -> None:
     most = steps[0]
     v = np.arange(most + 1)
     rim = octahedral.decode_axis_angle(np.full(v.size, most), v, np.full(v.size, steps[1]), steps)

@@ -39,7 +39,7 @@ def assert_same(one: Scene, other: Scene) -> None:
         np.testing.assert_array_equal(getattr(one.splats, column), getattr(other.splats, column), column)
 
 
-def test_every_column_by_hand() -> None:
+def test_every_column_is_decoded_as_worked_out_by_hand() -> None:
     center = [[1.5, -2.25, 1e6], [0, 0, 0]]
     rest = np.arange(2 * 9).reshape(2, 9) / 16
     data = by_hand.ply(
@@ -139,14 +139,14 @@ def test_doubles_are_rounded_to_float32(text: bool) -> None:
     assert_same(scene, decode(by_hand.ply(given, text=text, types="f4")))
 
 
-def test_crlf_throughout_an_ascii_file() -> None:
+def test_an_ascii_file_with_crlf_lines_is_read() -> None:
     data = by_hand.ply(columns(), text=True)
     assert_same(decode(data.replace(b"\n", b"\r\n")), decode(data))
 
 
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("text", [False, True], ids=["binary", "ascii"])
-def test_infinite_logits_and_logarithms_are_what_they_mean(text: bool) -> None:
+def test_infinite_logits_and_log_scales_become_their_limits(text: bool) -> None:
     given = columns()
     given["opacity"][:] = [np.inf, -np.inf, 1000, -1000, 0]
     given["scale_1"][:] = [-np.inf, -1000, 0, 0, 0]
@@ -156,7 +156,7 @@ def test_infinite_logits_and_logarithms_are_what_they_mean(text: bool) -> None:
 
 
 @pytest.mark.filterwarnings("error")
-def test_what_is_not_finite_is_passed_on_quietly() -> None:
+def test_values_that_are_not_finite_are_passed_on_without_a_warning() -> None:
     """Whether it is an error is for `selection` to say; a reader that warned would print on standard error."""
     given = columns()
     rows = bytearray(by_hand.ply(given))
@@ -243,13 +243,13 @@ def test_comments_may_be_in_any_encoding() -> None:
 
 
 @pytest.mark.parametrize("count", ["5_0", "+5", "-5", "0x5", "5.0", "five", "", "5 5"])
-def test_a_count_is_digits(count: str) -> None:
+def test_a_count_must_be_digits(count: str) -> None:
     with pytest.raises(FormatError, match="a name and a count"):
         decode(by_hand.ply(columns()).replace(b"element vertex 5", f"element vertex {count}".encode(), 1))
 
 
 @pytest.mark.parametrize("digits", [101, 5_000, 900_000])
-def test_a_count_of_more_digits_than_any_file_has_bytes(digits: int) -> None:
+def test_a_count_of_too_many_digits_is_refused(digits: int) -> None:
     head = b"ply\nformat binary_little_endian 1.0\nelement vertex " + b"9" * digits + b"\nend_header\n"
     with pytest.raises(FormatError, match=f"promises a count of {digits:,} digits"):
         ply.decode(io.BytesIO(head))
@@ -264,7 +264,7 @@ def test_space_around_the_words_of_a_header_does_not_matter() -> None:
 @pytest.mark.parametrize("count", ["4000000000", "18446744073709551615", "1" + "0" * 30])
 @pytest.mark.parametrize("element", ["vertex", "camera", "face"])
 @pytest.mark.parametrize("text", [False, True], ids=["binary", "ascii"])
-def test_a_count_that_cannot_be_is_refused_before_memory_is_asked_for(text: bool, element: str, count: str) -> None:
+def test_an_impossible_count_is_refused_before_memory_is_allocated(text: bool, element: str, count: str) -> None:
     data = by_hand.ply(columns(), text=text, before=[some_cameras(), some_faces()])
     data = re.sub(rf"element {element} \d+".encode(), f"element {element} {count}".encode(), data)
     tracemalloc.start()

@@ -28,7 +28,7 @@ def vertices(data: bytes) -> np.ndarray:
 
 
 @pytest.mark.parametrize("sh_degree", [0, 1, 2, 3])
-def test_the_properties_are_inria_s_in_inria_s_order(sh_degree: int) -> None:
+def test_the_properties_are_in_the_order_of_inrias_trainer(sh_degree: int) -> None:
     splats = random_splats(7, sh_degree=sh_degree)
     data = encode(splats)
     rows = vertices(data)
@@ -60,7 +60,7 @@ def test_every_value_is_where_inria_writes_it() -> None:
 
 
 @pytest.mark.filterwarnings("error")
-def test_logarithms_of_nothing_are_finite_and_come_back() -> None:
+def test_scales_and_opacities_of_0_are_written_finite_and_come_back() -> None:
     splats = random_splats(4)
     splats.opacity[:] = [0, 1, 1e-45, np.nextafter(np.float32(1), np.float32(0))]
     splats.scale[:, 1] = [0, 1e-45, 1e38, 1]
@@ -73,7 +73,7 @@ def test_logarithms_of_nothing_are_finite_and_come_back() -> None:
     assert back.scale[0, 1] == 0
 
 
-def test_what_was_read_is_written_as_it_was() -> None:
+def test_a_file_that_was_read_is_written_the_same() -> None:
     """All that the file has but normals and the lengths of rotations, to float32's precision."""
     given = splat_columns(50, sh_degree=3)
     rows = vertices(encode(ply.decode(io.BytesIO(by_hand.ply(given))).splats))

@@ -35,7 +35,7 @@ def test_fixed24_is_off_by_half_a_step(values: np.ndarray, bits: int) -> None:
 
 
 @given(codes=arrays(np.uint8, (20, 3)), bits=st.integers(0, 24))
-def test_fixed24_takes_every_code_back(codes: np.ndarray, bits: int) -> None:
+def test_every_code_of_fixed24_comes_back(codes: np.ndarray, bits: int) -> None:
     back = quantize.encode_fixed24(quantize.decode_fixed24(codes, bits), bits)
     np.testing.assert_array_equal(back, codes)
 
@@ -62,7 +62,7 @@ BYTE_CODINGS = {
 
 
 @pytest.mark.parametrize("name", BYTE_CODINGS)
-def test_every_byte_comes_back(name: str) -> None:
+def test_every_decoded_byte_is_encoded_the_same(name: str) -> None:
     encode, decode = BYTE_CODINGS[name]
     np.testing.assert_array_equal(encode(decode(CODES)), CODES)
 
@@ -235,14 +235,14 @@ def test_rotations_come_back_as_unit_and_as_either_sign(name: str) -> None:
 
 
 @given(codes=arrays(np.uint8, (50, 3)))
-def test_first_three_takes_its_codes_back(codes: np.ndarray) -> None:
+def test_codes_of_first_three_come_back(codes: np.ndarray) -> None:
     xyz = codes / 127.5 - 1
     possible = codes[(xyz**2).sum(axis=1) < 1]  # longer ones are made unit, so they move
     back = quantize.encode_quat_first_three(quantize.decode_quat_first_three(possible))
     np.testing.assert_array_equal(back, possible)
 
 
-def test_smallest_three_takes_its_codes_back() -> None:
+def test_codes_of_smallest_three_come_back() -> None:
     rng = np.random.default_rng(6)
     parts, largest = rng.integers(-511, 512, (20_000, 3)), rng.integers(0, 4, 20_000)
     others = parts / 511 * 0.5**0.5
@@ -256,7 +256,7 @@ def test_smallest_three_takes_its_codes_back() -> None:
     np.testing.assert_array_equal(back, codes)
 
 
-def test_smallest_three_by_hand() -> None:
+def test_smallest_three_is_as_worked_out_by_hand() -> None:
     half = 0.5**0.5
     quats = np.array([[0, 0, 0, 1], [0, half, 0, -half], [-0.3, 0.9, 0.1, 0.3]], np.float32)
     codes = quantize.encode_quat_smallest_three(normalized_quat(quats)).view("<u4")[:, 0]

@@ -52,7 +52,7 @@ def test_every_format_has_a_writer() -> None:
 
 @pytest.mark.parametrize("name", SCENES)
 @pytest.mark.parametrize(("form", "way"), CASES)
-def test_what_is_written_comes_back(form: str, way: str, name: str, tmp_path: Path) -> None:
+def test_a_scene_comes_back_within_the_precision_of_its_format(form: str, way: str, name: str, tmp_path: Path) -> None:
     case = WRITERS[form][way]
     source = scene(name, lod=case.lod)
     back = read_scene(put(case.write(source), tmp_path, form))
@@ -83,7 +83,7 @@ def assert_close(back: Splats, source: Splats, allowed: Precision) -> None:
 @pytest.mark.parametrize("name", SCENES)
 @pytest.mark.parametrize("version", [2, 3])
 @pytest.mark.parametrize("lod", [False, True])
-def test_writing_again_changes_nothing(name: str, version: int, lod: bool) -> None:
+def test_writing_a_decoded_scene_again_changes_nothing(name: str, version: int, lod: bool) -> None:
     """SPZ of SPZ: whatever was rounded once stays where it is (rotations beyond half a turn excepted)."""
     options = spz.settled(scene(name), WriteOptions(spz_version=version))
     once = spz.decode(io.BytesIO(b"".join(spz.encode(scene(name, lod=lod), options))))
@@ -100,7 +100,7 @@ def test_spz_keeps_whether_a_scene_is_antialiased(antialiased: bool) -> None:
 
 
 @pytest.mark.parametrize(("form", "way"), CASES)
-def test_it_is_read_the_same_on_any_number_of_threads(form: str, way: str, tmp_path: Path) -> None:
+def test_threads_do_not_change_what_is_read(form: str, way: str, tmp_path: Path) -> None:
     case = WRITERS[form][way]
     splats = random_splats(17_000, sh_degree=1)  # more than one chunk of rows
     source = Scene(splats, star(len(splats)) if case.lod else None)

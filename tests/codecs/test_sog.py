@@ -79,7 +79,7 @@ def version_2() -> Files:
     return with_meta(meta, POSITIONS | {"a.webp": image(*codes), "b.webp": image(*codes), "q.webp": QUATS})
 
 
-def test_every_pixel_of_version_2_by_hand() -> None:
+def test_pixels_of_version_2_are_decoded_as_worked_out_by_hand() -> None:
     scene = decode(version_2())
     splats = scene.splats
     assert (scene.format, scene.antialiased, scene.notes, splats.sh_degree) == ("SOG 2", False, (), 0)
@@ -91,7 +91,7 @@ def test_every_pixel_of_version_2_by_hand() -> None:
     np.testing.assert_allclose(splats.opacity, [0, 1, 0.2, 1 / 255], atol=1e-7)
 
 
-def test_every_pixel_of_version_1_by_hand() -> None:
+def test_pixels_of_version_1_are_decoded_as_worked_out_by_hand() -> None:
     meta = {"means": LOGS | {"shape": [4, 3], "files": ["means_l.webp", "means_u.webp"]}}
     meta |= {"quats": {"shape": [4, 4], "encoding": "quaternion_packed", "files": ["q.webp"]}}
     meta |= {"scales": {"mins": [-1, 0, 1], "maxs": [0, 0, 3], "files": ["a.webp"]}}
@@ -141,7 +141,7 @@ def test_an_image_without_alpha_is_opaque() -> None:
     assert (splats.opacity == 1).all()
 
 
-def test_a_rotation_that_says_of_none_that_it_is_the_largest_is_not_a_number() -> None:
+def test_a_rotation_without_a_valid_tag_is_nan() -> None:
     quats = decode(version_2() | {"q.webp": image((128, 128, 128, 251), (128, 128, 128, 252))}).splats.quat_xyzw
     assert np.isnan(quats).any(axis=1).tolist() == [True, False, False, False]
 
@@ -161,7 +161,7 @@ def test_a_codebook_may_begin_with_null() -> None:
 
 @pytest.mark.parametrize("folder", ["", "scene/", "a/b/"])
 @pytest.mark.parametrize("method", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
-def test_how_it_is_zipped_makes_no_difference(folder: str, method: int) -> None:
+def test_folders_and_compression_of_the_zip_make_no_difference(folder: str, method: int) -> None:
     assert_same(decode(FILES, folder=folder, method=method), read_scene(FOLDER))
 
 
@@ -241,7 +241,7 @@ def test_a_link_is_followed(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no pipes here")
-def test_a_pipe_beside_it_is_not_waited_for(tmp_path: Path) -> None:
+def test_a_pipe_in_the_folder_is_not_waited_for(tmp_path: Path) -> None:
     folder = unpacked(tmp_path, FILES)
     (folder / "means_l.webp").unlink()
     os.mkfifo(folder / "means_l.webp")
@@ -339,7 +339,7 @@ def test_a_folder_without_its_files_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "name", ["\ud800.webp", "\udcff.webp", "\0.webp", "\x1b[2J\n.webp", "x" * 3000, "../a.webp", "", "."]
 )
-def test_names_that_no_file_beside_it_has_are_told_in_a_line(name: str, tmp_path: Path) -> None:
+def test_a_missing_image_is_named_in_one_line(name: str, tmp_path: Path) -> None:
     meta = json.loads(FILES["meta.json"])
     meta["quats"]["files"] = [name]
     for file, data in (FILES | {"meta.json": json.dumps(meta).encode()}).items():

@@ -40,7 +40,7 @@ def encode(splats: Splats, **more: object) -> bytes:
     return b"".join(splat.encode(Scene(splats, **more)))  # type: ignore[arg-type]
 
 
-def test_every_byte_by_hand() -> None:
+def test_every_byte_is_decoded_as_worked_out_by_hand() -> None:
     splats = decode(b"".join(ROWS))
     np.testing.assert_array_equal(splats.center, [[1.5, -2.25, 1e6], [0, 0, 0], [-1, 2, 3]])
     np.testing.assert_array_equal(splats.scale, np.float32([[2, 1, 0.5], [0.5, 0.25, 3], [0, 1e-30, 1e30]]))
@@ -50,12 +50,12 @@ def test_every_byte_by_hand() -> None:
     assert splats.sh_degree == 0
 
 
-def test_these_bytes_are_written_again() -> None:
+def test_a_decoded_file_is_encoded_to_the_same_bytes() -> None:
     """They are in order of importance."""
     assert encode(decode(b"".join(ROWS))) == b"".join(ROWS)
 
 
-def test_what_a_byte_cannot_hold_is_clamped() -> None:
+def test_values_beyond_a_byte_are_clamped() -> None:
     splats = random_splats(3, sh_degree=2)
     splats.rgb[:] = [[-0.5, 1.5, 0.5]] * 3
     splats.quat_xyzw[:] = [[0, 0, 0, 1], [0, 0, 0, -1], [0, 1, 0, 0]]
@@ -103,7 +103,7 @@ def test_a_quaternion_of_zeros_in_splat_is_not_a_number() -> None:
 
 
 @pytest.mark.parametrize("suffix", [".splat", ".SPLAT"])
-def test_only_the_suffix_tells_it(suffix: str, tmp_path: Path) -> None:
+def test_only_the_suffix_makes_a_file_splat(suffix: str, tmp_path: Path) -> None:
     path = tmp_path / f"scene{suffix}"
     path.write_bytes(GOLDEN.read_bytes())
     assert read_scene(path).format == "SPLAT"
@@ -119,6 +119,6 @@ def test_a_suffix_does_not_make_another_format_of_a_file(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("size", [1, 31, 33, 32 * 60 - 1])
-def test_a_size_that_is_no_multiple_of_32_is_refused(size: int) -> None:
+def test_a_size_that_is_not_a_multiple_of_32_is_refused(size: int) -> None:
     with pytest.raises(FormatError, match=f"its {size:,} bytes are not a multiple of 32"):
         decode(GOLDEN.read_bytes()[:size])

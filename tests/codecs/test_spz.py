@@ -57,7 +57,7 @@ def golden(name: str) -> Scene:
         ("hand-v4-sh4", "SPZ 4", 3, False, SMALLEST_THREE),  # its table of streams comes after 16 other bytes
     ],
 )
-def test_every_field_of_a_file_made_by_hand(
+def test_every_field_of_a_file_made_by_hand_is_decoded(
     name: str, format_name: str, sh_degree: int, antialiased: bool, quats: list[list[float]]
 ) -> None:
     scene = golden(name)
@@ -78,7 +78,7 @@ def test_every_field_of_a_file_made_by_hand(
 
 
 @pytest.mark.parametrize("version", [2, 3])
-def test_every_stream_of_a_tree(version: int) -> None:
+def test_every_stream_of_a_tree_has_its_bytes(version: int) -> None:
     data = gzip.decompress((GOLDEN / f"tree-v{version}.spz").read_bytes())
     bits, count = 8, 8  # the smallest scale is e ** -1.5 (its largest axis: e ** -2.5), 16 steps of 1 / 256 and more
     assert struct.unpack("<IIIBBBB", data[:16]) == (0x5053474E, version, count, 1, bits, 0x80, 0)
@@ -107,7 +107,7 @@ def test_every_stream_of_a_tree(version: int) -> None:
         assert [code >> 30 for code in codes] == [0 if abs(a) > abs(b) else 3 for a, b in zip(x, w, strict=True)]
 
 
-def test_a_tree_is_read() -> None:
+def test_a_tree_comes_back() -> None:
     scene = golden("tree-v3")
     assert scene.format == "SPZ 3 LoD"
     assert scene.tree is not None
@@ -186,7 +186,7 @@ def test_extent_limits_auto_and_refuses_more_by_name(reach: float, most: int) ->
             bits_of(splats, most + 1)
 
 
-def test_what_no_bits_hold_is_refused() -> None:
+def test_coordinates_that_no_fractional_bits_hold_are_refused() -> None:
     for bits in (None, 0):
         with pytest.raises(FormatError, match=r"coordinates reach 1e\+07, SPZ holds at most 8388606"):
             bits_of(splats_with(reach=1e7), bits)
@@ -198,7 +198,7 @@ def test_only_versions_2_and_3_are_written() -> None:
             spz.settled(Scene(random_splats(1)), WriteOptions(spz_version=version))
 
 
-def test_merged_splats_have_no_say_in_the_bits() -> None:
+def test_fractional_bits_are_chosen_by_the_leaves_alone() -> None:
     """A tree gets those of its leaves: its inner nodes are larger, and may lie farther out only by the extent."""
     leaves = splats_with(scale=0.01, count=20)
     root = leaves.take(np.zeros(400, np.int64))
@@ -222,7 +222,7 @@ def test_settled_options_are_settled_and_write_the_same_bytes() -> None:
     assert b"".join(spz.encode(scene, once)) == b"".join(spz.encode(scene))
 
 
-def test_options_like_those_of_a_file_are_its_own_where_nobody_chose() -> None:
+def test_options_default_to_those_of_the_file() -> None:
     scene = spz.decode(io.BytesIO(b"".join(spz.encode(Scene(random_splats(9)), WriteOptions(2, 9)))))
     assert spz_options.like(scene, WriteOptions()) == WriteOptions(2, 9)
     assert spz_options.like(scene, WriteOptions(3, 0, 7)) == WriteOptions(3, 0, 7)
@@ -231,7 +231,7 @@ def test_options_like_those_of_a_file_are_its_own_where_nobody_chose() -> None:
     assert spz_options.like(Scene(scene.splats), WriteOptions()) == WriteOptions()
 
 
-def test_what_is_clamped_is_counted_by_splat() -> None:
+def test_clamped_values_are_counted_by_splat() -> None:
     splats = random_splats(8, sh_degree=1)
     splats.scale[:] = 1
     low, high = math.exp(-10 - 1 / 32), math.exp(255.5 / 16 - 10)
@@ -316,7 +316,7 @@ def test_broken_spz_is_refused_with_a_reason(what: str) -> None:
         spz.decode(io.BytesIO(make()))
 
 
-def test_what_follows_is_allowed_where_extensions_are_announced() -> None:
+def test_bytes_after_the_streams_are_allowed_with_extensions() -> None:
     assert len(spz.decode(io.BytesIO(gzipped(flags=0x02, more=b"an extension"))).splats) == 3
 
 

@@ -73,7 +73,7 @@ def no_scene() -> Balls:
     raise AssertionError("nobody needs to know the scene")
 
 
-def test_without_any_it_is_an_orbit_that_sees_the_scene() -> None:
+def test_the_default_path_is_an_orbit_that_sees_the_scene() -> None:
     path = cameras()
     assert len(path.cameras) == 60
     camera = path.cameras[0]
@@ -86,7 +86,7 @@ def test_without_any_it_is_an_orbit_that_sees_the_scene() -> None:
         assert np.array_equal(one.camera_to_world, other.camera_to_world)
 
 
-def test_an_orbit_as_it_is_wanted() -> None:
+def test_an_orbit_follows_its_options() -> None:
     options = ("--orbit", 4, "--center", "0,0,0", "--distance", 10, "--elevation", 0, "--up", "0,0,1")
     path = cameras(*map(str, options), scene=no_scene)
     assert np.allclose([camera.position for camera in path.cameras], [[0, -10, 0], [10, 0, 0], [0, 10, 0], [-10, 0, 0]])
@@ -129,7 +129,7 @@ def test_a_camera_path_has_the_cameras_of_its_file(name: str) -> None:
         check_pose(camera, known)
 
 
-def test_what_is_said_about_a_file() -> None:
+def test_options_override_what_a_camera_file_says() -> None:
     options = ("--size", "640x480", "--fov", "90", "--every", "3", "--fps", "10", "--camera-format", "tum")
     path = cameras("--camera-path", FOLDER / "tum.txt", *options)
     assert path.numbers == (0, 3)
@@ -180,7 +180,7 @@ def test_wrong_camera_options_are_errors_that_name_them() -> None:
         assert f"--world-transform {said}" in " ".join(output.split())
 
 
-def test_files_that_are_not_what_they_should_be(tmp_path: Path) -> None:
+def test_wrong_camera_files_are_errors_that_name_them(tmp_path: Path) -> None:
     missing = tmp_path / "missing.json"
     assert file_error("--camera-path", missing) == f"{missing} cannot be read: no such file or directory"
     assert "is a directory, without images.bin and cameras.bin, or images.txt" in file_error("--camera-path", tmp_path)
@@ -209,7 +209,7 @@ def test_a_file_of_gigabytes_is_not_read(monkeypatch: pytest.MonkeyPatch) -> Non
         ("--keyframes", "0,0,9:0,0,0 9,0,0:0,0,0", "--seconds", "1e6", "--fps", "1e6"),
     ],
 )
-def test_no_more_cameras_are_made_than_are_taken(options: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_many_generated_cameras_are_refused(options: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:
     made = []
     whole = generators.frame_looking
 
@@ -228,7 +228,7 @@ def test_no_more_cameras_are_made_than_are_taken(options: tuple[str, ...], monke
     assert path.numbers[:4] == tuple(range(0, count, count // 4))
 
 
-def test_the_help_names_what_there_is() -> None:
+def test_the_help_lists_formats_and_axes() -> None:
     text = " ".join(run("--help")[0].output.split())
     for said in ("EYE:TARGET", "'EYE:TARGET ...'", "WxH", "auto|sparklod|csv|nerfstudio", "opengl-c2w|opencv-c2w"):
         assert said in text

@@ -93,7 +93,7 @@ def with_values(count: int = 20, **values: Any) -> bytes:
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("name", PROPERTIES)
-def test_a_number_that_is_not_finite(name: str, value: float, bake: Bake) -> None:
+def test_a_value_that_is_not_finite_is_refused_dropped_or_its_limit(name: str, value: float, bake: Bake) -> None:
     (result,) = bake(data := with_values(**{name: value}))
     (dropped,) = bake(data, options=["--on-invalid", "drop"])
     if (name == "opacity" or name.startswith("scale")) and value == -np.inf:
@@ -167,7 +167,7 @@ def test_hard_numbers_give_a_valid_tree_or_one_error(what: str, method: str, bak
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_a_hundred_thousand_at_one_place(method: str, bake: Bake) -> None:
+def test_a_hundred_thousand_splats_at_one_place_are_baked(method: str, bake: Bake) -> None:
     columns = splat_columns(100_000)
     for name in "xyz":
         columns[name][:] = 0.25
@@ -183,7 +183,7 @@ WHOLE = ("one.ply", "sh1.ply", "sh1-ascii.ply", *(f"golden/hand-{name}.spz" for 
 
 
 @pytest.mark.parametrize("name", WHOLE)
-def test_a_file_that_is_cut(name: str, bake: Bake) -> None:
+def test_a_truncated_file_is_one_error(name: str, bake: Bake) -> None:
     data = (FIXTURES / name).read_bytes()
     header = data.index(b"end_header") if name.endswith("ply") else len(data)
     end = len(data) - 24 if "ascii" in name else len(data)  # a number that lost its last digits is still one
@@ -242,7 +242,7 @@ def test_files_that_are_no_scene_are_refused_with_a_reason(what: str, bake: Bake
     assert reason in result
 
 
-def test_what_is_no_file(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_paths_that_are_not_files_are_one_error(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "directory").mkdir()
     for name in ("directory", "missing.ply", "n" * 250 + ".ply", "n" * 300):
         source = tmp_path / name

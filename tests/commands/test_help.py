@@ -42,7 +42,7 @@ def test_each_option_stands_under_one_heading(name: str, capsys: pytest.CaptureF
     assert next(iter(reversed(headings))) == GENERAL
 
 
-@pytest.mark.parametrize("name", ["build-lod"])
+@pytest.mark.parametrize("name", ["build-lod", "inspect"])
 def test_the_first_heading_has_the_few_options_that_most_people_need(name: str) -> None:
     command = command_of(name)
     first, params = next(iter(command.by_heading(click.Context(command)).items()))

@@ -165,7 +165,7 @@ def test_a_folder_is_not_filled_with_inputs_replaced(tmp_path: Path, capsys: pyt
     assert other.read_bytes() == PLAIN.read_bytes()
 
 
-def test_names_in_other_letters_where_those_are_the_same(
+def test_names_that_differ_in_case_are_one_file_where_case_is_ignored(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     large, small = (str(tmp_path / name) for name in ("Out", "out"))
@@ -176,7 +176,7 @@ def test_names_in_other_letters_where_those_are_the_same(
     assert "two outputs would be written to" in capsys.readouterr().err
 
 
-def test_what_a_folder_tells_of_letters(tmp_path: Path) -> None:
+def test_whether_a_folder_ignores_case_is_found_out(tmp_path: Path) -> None:
     folder = tmp_path / "Web"
     folder.mkdir()
     same = folder.with_name("wEB").exists()
@@ -194,7 +194,7 @@ def test_devices_are_not_replaced() -> None:
 
 @pytest.mark.parametrize("name", ["", "s3://bucket/x.spz", "https://example.org/x.spz"])
 @pytest.mark.parametrize(("command", "given", "written"), ROWS)
-def test_what_is_no_path_is_said(
+def test_names_that_cannot_be_paths_are_refused(
     command: str, given: str, written: str, name: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     said = "is an address on a network, not a path" if name else "the name is empty"

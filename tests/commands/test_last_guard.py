@@ -60,7 +60,7 @@ def test_verbose_shows_the_traceback_before_the_error(broken: Break, capsys: Sai
     assert "Traceback" not in capsys.readouterr().err
 
 
-def test_what_it_says_is_short_and_without_control_characters(broken: Break, capsys: Said) -> None:
+def test_the_line_of_a_bug_is_short_and_printable(broken: Break, capsys: Said) -> None:
     broken(RuntimeError("\x1b[31m" + "x" * 100_000))
     assert run(["inspect", str(SCENE)]) == 1
     (line,) = capsys.readouterr().err.splitlines()
@@ -68,7 +68,7 @@ def test_what_it_says_is_short_and_without_control_characters(broken: Break, cap
     assert len(line) < 400
 
 
-def test_an_interruption_is_none_of_it(broken: Break, capsys: Said) -> None:
+def test_an_interruption_is_not_reported_as_a_bug(broken: Break, capsys: Said) -> None:
     broken(KeyboardInterrupt())
     assert run(["inspect", str(SCENE)]) == 130
     assert capsys.readouterr().err.strip() == "interrupted"

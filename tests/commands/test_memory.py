@@ -90,7 +90,9 @@ def limited(folder: Path, room: int, small: object, large: object, command: str)
 
 @pytest.mark.skipif(sys.platform != "linux", reason="memory is limited and counted as Linux does")
 @pytest.mark.parametrize("name", COMMANDS)
-def test_a_file_that_is_too_large(name: str, large: tuple[Path, Path], tmp_path: Path) -> None:
+def test_a_file_too_large_for_memory_is_one_error_that_names_it(
+    name: str, large: tuple[Path, Path], tmp_path: Path
+) -> None:
     room, command = COMMANDS[name]
     plain = command.startswith("build-lod HERE")
     small, file = (PLAIN, large[0]) if plain else (TREE, large[1])
@@ -130,7 +132,7 @@ def test_one_file_that_is_too_large_does_not_stop_the_others(
 
 
 @pytest.mark.parametrize("threads", [1, 3])
-def test_memory_that_runs_out_in_a_thread(threads: int) -> None:
+def test_memory_that_runs_out_in_a_thread_is_an_out_of_memory_error(threads: int) -> None:
     def work(size: int) -> int:
         return len(np.empty(size, np.uint8))
 

@@ -35,7 +35,7 @@ ONES = re.compile(r"(?<![\d.,])1 (?:\w+ )?(splats|nodes|levels|leaves|frames|cam
         ("8x²", "is not a width and a height"),
     ],
 )
-def test_a_wrong_size_is_said_with_its_value(size: str, said: str, capsys: Said) -> None:
+def test_a_wrong_picture_size_is_quoted(size: str, said: str, capsys: Said) -> None:
     assert run(["render", str(TREE), "--size", size]) == 2
     err = capsys.readouterr().err
     assert said in err
@@ -43,12 +43,12 @@ def test_a_wrong_size_is_said_with_its_value(size: str, said: str, capsys: Said)
 
 
 @pytest.mark.parametrize(("size", "status"), [("3MB", 0), ("3MiB", 0), ("10", 3), ("0.01kB", 3), ("1GiB", 0)])
-def test_files_are_held_to_a_size_with_a_unit(size: str, status: int) -> None:
+def test_max_bytes_takes_units(size: str, status: int) -> None:
     assert run(["inspect", str(TREE), "--max-bytes", size]) == status
 
 
 @pytest.mark.parametrize("size", ["-1", "3Mbit", "3 apples", "1.5", "3iB"])
-def test_what_is_no_size(size: str, capsys: Said) -> None:
+def test_a_text_that_is_not_a_size_is_wrong_usage(size: str, capsys: Said) -> None:
     assert run(["inspect", str(TREE), f"--max-bytes={size}"]) == 2
     assert f"{size!r} is not a size: whole bytes, such as 3000000, 3MB or 3MiB" in capsys.readouterr().err
 
@@ -105,7 +105,7 @@ def test_what_is_clamped_is_said_with_its_end_and_what_to_do(
     assert err.count("clamped to") == 1
 
 
-def test_one_is_not_many(tmp_path: Path, capsys: Said) -> None:
+def test_counts_of_one_have_a_singular_noun(tmp_path: Path, capsys: Said) -> None:
     look = ("--look-at", "0,-1,4:0,0,0", "--size", "8x8")
     lod = tmp_path / "one-lod.spz"
     for arguments in (

@@ -36,7 +36,7 @@ def save(path: Path, values: np.ndarray) -> Path:
 
 @pytest.mark.parametrize("suffix", [".npy", ".rgba"])
 @pytest.mark.parametrize("kind", [np.uint8, np.float32])
-def test_npy_and_raw_of_bytes_and_floats(suffix: str, kind: type, tmp_path: Path) -> None:
+def test_colours_are_read_from_npy_and_raw_of_bytes_and_floats(suffix: str, kind: type, tmp_path: Path) -> None:
     codes = bytes_of()
     values = codes if kind is np.uint8 else (codes / 255).astype(kind)
     got = read_rgba(save(tmp_path / f"colors{suffix}", values), COUNT)
@@ -44,7 +44,7 @@ def test_npy_and_raw_of_bytes_and_floats(suffix: str, kind: type, tmp_path: Path
     np.testing.assert_allclose(got, codes / 255, atol=1e-7)
 
 
-def test_they_take_the_place_of_the_splats_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_colours_replace_those_of_the_splats(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """What is drawn of a leaf is its new colour; SH stay, and alpha 0 removes."""
     codes = bytes_of()
     codes[:7, 3] = 0
@@ -76,7 +76,9 @@ def test_they_take_the_place_of_the_splats_own(tmp_path: Path, capsys: pytest.Ca
         ("a.npy", np.array([{}] * COUNT), "is not a .npy file"),
     ],
 )
-def test_what_does_not_fit_is_refused(name: str, values: np.ndarray, message: str, tmp_path: Path) -> None:
+def test_colours_of_a_wrong_shape_or_type_are_refused(
+    name: str, values: np.ndarray, message: str, tmp_path: Path
+) -> None:
     with pytest.raises(FormatError, match=message):
         read_rgba(save(tmp_path / name, values), COUNT)
 
@@ -138,7 +140,7 @@ HEADERS = {
 
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("header", HEADERS.values(), ids=HEADERS)
-def test_a_header_that_says_anything_is_refused_in_a_line(header: str, tmp_path: Path) -> None:
+def test_a_malformed_npy_header_is_refused_in_one_line(header: str, tmp_path: Path) -> None:
     for version in (1, 2, 3):
         path = tmp_path / f"{version}.npy"
         path.write_bytes(npy(header, bytes(16 * COUNT), version))
@@ -150,7 +152,7 @@ def test_a_header_that_says_anything_is_refused_in_a_line(header: str, tmp_path:
 
 
 @pytest.mark.parametrize("version", [1, 2, 3])
-def test_headers_as_others_write_them(version: int, tmp_path: Path) -> None:
+def test_npy_headers_of_other_writers_are_read(version: int, tmp_path: Path) -> None:
     values = (bytes_of() / 255).astype("<f4")
     rows, columns = values.tobytes(), values.tobytes(order="F")
     for header, data in {
@@ -165,14 +167,14 @@ def test_headers_as_others_write_them(version: int, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["<f2", "<f8", ">f4", ">f8"])
-def test_floats_of_every_size(kind: str, tmp_path: Path) -> None:
+def test_colours_are_read_from_floats_of_every_width(kind: str, tmp_path: Path) -> None:
     values = np.asfortranarray(bytes_of() / 255).astype(kind)
     np.testing.assert_allclose(read_rgba(save(tmp_path / "a.npy", values), COUNT), values, atol=1e-7)
 
 
 @given(st.data())
 @settings(max_examples=300)
-def test_bytes_that_are_changed(data: st.DataObject) -> None:
+def test_changed_bytes_give_colours_or_a_format_error(data: st.DataObject) -> None:
     """Colours or a `FormatError`, whatever is done to a file."""
     with tempfile.TemporaryDirectory() as folder:
         path = save(Path(folder) / "a.npy", bytes_of())
@@ -186,14 +188,14 @@ def test_bytes_that_are_changed(data: st.DataObject) -> None:
 
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("value", [1e300, -1e300, np.inf, -np.inf, np.nan, -1e-30])
-def test_floats_that_are_no_colours(value: float, tmp_path: Path) -> None:
+def test_floats_outside_of_0_to_1_are_refused(value: float, tmp_path: Path) -> None:
     values = np.full((COUNT, 4), 0.5)
     values[3, 2] = value
     with pytest.raises(FormatError, match=r"values that are not 0\.\.1"):
         read_rgba(save(tmp_path / "a.npy", values), COUNT)
 
 
-def test_what_is_no_file_is_not_read() -> None:
+def test_devices_and_folders_are_not_read_as_colours() -> None:
     for path in (Path("/dev/zero"), Path("/dev/null"), FIXTURES):
         with pytest.raises(
             FormatError, match=re.escape(f"{path} cannot be read: it is a directory, a pipe or a device")

@@ -40,6 +40,6 @@ def test_the_table_has_all_formats_and_their_axes() -> None:
         assert said.startswith(f"`{form.axes.value}`" if form.axes else "eye and target"), form.name
 
 
-def test_it_says_what_the_program_says() -> None:
+def test_the_page_agrees_with_the_program() -> None:
     assert re.search(r"--world-transform [-01,]+", PLAYCANVAS).group() in PAGE  # type: ignore[union-attr]
     assert f"all {sum(model.focals > 0 for model in MODELS)} camera models" in PAGE

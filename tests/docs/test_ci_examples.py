@@ -130,7 +130,7 @@ def test_the_workflow_stops_beyond_the_budget(web: Path, shell: Shell) -> None:
     assert re.fullmatch(r"::error file=web/demo-lod\.spz,title=expect\.bytes::.+\n", done.stdout)
 
 
-def test_the_workflow_stops_at_another_original(project: Path, web: Path, shell: Shell) -> None:
+def test_the_workflow_stops_at_leaves_of_another_original(project: Path, web: Path, shell: Shell) -> None:
     shutil.copy(FIXTURES / "needle.ply", project / "scenes" / "sh0.ply")
     done = shell(STEPS["Compare with the originals"])
     assert done.returncode == 3
@@ -229,7 +229,7 @@ def test_the_script_stops_at_a_broken_tree(web: Path, shell: Shell) -> None:
 
 
 @pytest.mark.parametrize("language", ["toml", "json"])
-def test_expectations_of_the_page(web: Path, capsys: pytest.CaptureFixture[str], language: str) -> None:
+def test_expectations_on_the_page_can_be_read(web: Path, capsys: pytest.CaptureFixture[str], language: str) -> None:
     path = web / f"expect.{language}"
     (text,) = blocks(PAGE, language)
     path.write_text(text)
@@ -239,7 +239,7 @@ def test_expectations_of_the_page(web: Path, capsys: pytest.CaptureFixture[str],
 
 
 @pytest.mark.parametrize("page", ["ci.md", "inspect.md"])
-def test_links_of_the_pages(page: str) -> None:
+def test_links_of_the_pages_lead_to_files(page: str) -> None:
     text = (ROOT / "docs" / page).read_text(encoding="utf-8")
     links = re.findall(r"\]\(([^)#]*)(?:#([^)]+))?\)", text)
     assert links

@@ -36,7 +36,7 @@ def test_a_full_disk_is_one_error_and_leaves_no_file(name: str, tmp_path: Path) 
         assert list(disk.iterdir()) == []
 
 
-def test_a_disk_that_fills_up_keeps_what_was_there(tmp_path: Path) -> None:
+def test_a_disk_that_fills_up_keeps_the_file_to_be_replaced(tmp_path: Path) -> None:
     with mounted(tmp_path / "disk", "size=16k") as disk:
         target = disk / "demo.spz"
         shutil.copy(TREE, target)
@@ -81,7 +81,7 @@ PRINTERS = {
 
 @needs_full
 @pytest.mark.parametrize("name", PRINTERS)
-def test_standard_output_on_a_full_device(name: str) -> None:
+def test_a_full_standard_output_is_one_error(name: str) -> None:
     done = shell('"$@" > /dev/full', *PRINTERS[name])
     assert done.returncode == 1
     errors = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
@@ -93,7 +93,7 @@ def test_standard_output_on_a_full_device(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["build-lod", "traverse"])
-def test_a_folder_that_cannot_be_written(name: str, tmp_path: Path) -> None:
+def test_a_read_only_folder_is_one_error(name: str, tmp_path: Path) -> None:
     arguments, output = WRITERS[name]
     with mounted(tmp_path / "disk", "size=64k,ro") as disk:
         done = sparklod(*arguments, disk / output)
@@ -104,7 +104,7 @@ def test_a_folder_that_cannot_be_written(name: str, tmp_path: Path) -> None:
         assert list(disk.iterdir()) == []
 
 
-def test_folders_of_outputs_that_cannot_be_made(tmp_path: Path) -> None:
+def test_output_folders_that_cannot_be_made_are_one_error(tmp_path: Path) -> None:
     with mounted(tmp_path / "disk", "size=64k,ro") as disk:
         for arguments in (
             ["build-lod", SMALL, "--output-dir", disk / "new"],

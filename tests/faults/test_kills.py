@@ -70,7 +70,7 @@ def is_writing(process: int, folder: Path) -> bool:
 
 @pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="this system does not tell which files are open")
 @pytest.mark.parametrize("name", ["build-lod", "many cuts"])
-def test_killed_while_it_writes(name: str, tmp_path: Path) -> None:
+def test_a_run_killed_while_it_writes_leaves_only_whole_files(name: str, tmp_path: Path) -> None:
     caught = 0
     for _ in range(4):
         process = subprocess.Popen(

@@ -16,7 +16,7 @@ pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no 
 
 
 @pytest.mark.parametrize("name", WRITERS)
-def test_the_size_of_files(name: str, tmp_path: Path) -> None:
+def test_a_limit_of_file_size_is_one_error_or_a_small_file(name: str, tmp_path: Path) -> None:
     arguments, output = WRITERS[name]
     done = shell('ulimit -f 1; "$@"', *arguments, tmp_path / output)
     if done.returncode == 0:  # it is small

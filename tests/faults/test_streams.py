@@ -22,7 +22,7 @@ def nobody_reads() -> int:
 
 
 @pytest.mark.parametrize("name", PRINTERS)
-def test_nobody_reads_standard_output(name: str) -> None:
+def test_a_pipe_without_a_reader_is_exit_code_1(name: str) -> None:
     pipe = nobody_reads()
     try:
         done = sparklod(*PRINTERS[name], stdout=pipe, stderr=-1, capture_output=False)
@@ -42,7 +42,7 @@ def test_nobody_reads_standard_output(name: str) -> None:
     ],
     ids=lambda arguments: arguments[0],
 )
-def test_a_reader_that_has_seen_enough(arguments: list[object]) -> None:
+def test_a_reader_that_stops_early_causes_no_traceback(arguments: list[object]) -> None:
     done = shell('set -o pipefail; "$@" | head -c 10 | wc -c', *arguments)
     assert done.stdout.strip() == "10"
     assert done.returncode in (0, 1)  # what is short is in the pipe before its reader goes
@@ -51,7 +51,7 @@ def test_a_reader_that_has_seen_enough(arguments: list[object]) -> None:
 
 
 @pytest.mark.parametrize("name", PRINTERS)
-def test_standard_output_is_closed(name: str) -> None:
+def test_a_closed_standard_output_is_one_error(name: str) -> None:
     done = shell('"$@" >&-', *PRINTERS[name])
     assert done.returncode == 1
     errors = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
@@ -83,7 +83,7 @@ def test_errors_without_a_stream_to_say_them_are_exit_codes(tmp_path: Path) -> N
         assert (done.returncode, done.stdout) == (code, ""), arguments
 
 
-def test_standard_error_that_nobody_reads(tmp_path: Path) -> None:
+def test_a_standard_error_without_a_reader_spoils_no_output(tmp_path: Path) -> None:
     pipe = nobody_reads()
     try:
         target = tmp_path / "demo.spz"

@@ -15,7 +15,7 @@ from tests.tables.rows import flight
 
 @pytest.mark.usefixtures("drawing")
 class TestPictureOfPath:
-    def test_it_shows_the_scene_and_the_path(self) -> None:
+    def test_the_figure_shows_the_scene_and_the_path(self) -> None:
         of = scenery()
         with_frame = pixels(picture_of_path(of.cameras, of.splats, of.depth, frame=3, size=SIZE))
         without = pixels(picture_of_path(of.cameras, of.splats, of.depth, size=SIZE))
@@ -25,11 +25,11 @@ class TestPictureOfPath:
         assert count_of(with_frame[body], "#ff5c8a", 40) > 10
         assert count_of(without[body], "#ff5c8a", 40) == 0
 
-    def test_it_is_the_same_again(self) -> None:
+    def test_two_figures_have_the_same_bytes(self) -> None:
         of = scenery()
         assert len({picture_of_path(of.cameras, of.splats, of.depth, size=SIZE) for _ in range(2)}) == 1
 
-    def test_one_camera_and_one_splat(self) -> None:
+    def test_one_camera_and_one_splat_are_drawn(self) -> None:
         splats = random_splats(1)
         assert picture_of_path(circle(1), splats, np.array([4]), frame=0, size=SIZE)
 
@@ -52,7 +52,7 @@ class TestPictureOfPath:
             picture_of_path(of.cameras, of.splats, of.depth, size=SIZE)
 
     @pytest.mark.usefixtures("charting")
-    def test_it_stands_below_the_charts(self) -> None:
+    def test_the_figure_is_below_the_charts(self) -> None:
         whole = plotted(flight(5), scenery=scenery())
         alone = pixels(plotted(flight(5)).png)
         both = pixels(whole.png)
@@ -74,7 +74,7 @@ def test_frusta_are_what_the_camera_sees() -> None:
 
 
 @pytest.mark.parametrize("up", [(0, -1, 0), (0, 1, 0), (0, 0, 1)])
-def test_above_is_what_it_is_for_the_cameras(up: tuple[float, float, float]) -> None:
+def test_the_viewpoint_has_the_up_of_the_cameras(up: tuple[float, float, float]) -> None:
     positions = [(4, 0.5, 0.7), (0.3, 4, 3), (2, 0.4, 4)]
     low, high = np.array([-3.0, -2, -1]), np.array([3.0, 2, 1])
     eye = _above([looking(position, up) for position in positions], low, high, (1600, 1000))

@@ -15,7 +15,7 @@ from tests.tables.rows import flight, row
 
 
 @pytest.mark.parametrize("most", [0, 1, 2, 3, 7, 999, 12_345, 2_500_000])
-def test_axes_count_in_whole_numbers(most: int, charting: None) -> None:
+def test_ticks_of_counts_are_integers(most: int, charting: None) -> None:
     matplotlib = charts.load_matplotlib()
     figure = matplotlib.figure.Figure()
     matplotlib.backends.backend_agg.FigureCanvasAgg(figure)
@@ -33,7 +33,7 @@ class TestCharts:
     def test_the_same_rows_give_the_same_picture(self) -> None:
         assert plotted(flight(60)) == plotted(flight(60))
 
-    def test_it_is_as_wide_as_it_should_be(self) -> None:
+    def test_a_chart_has_its_width(self) -> None:
         image = pixels(plotted(flight(60)).png)
         assert image.shape[1] == charts.WIDTH
         assert image.shape[0] > charts.ROW * len(charts.PANELS) / 2
@@ -77,12 +77,12 @@ class TestCharts:
         ],
     )
     @pytest.mark.filterwarnings("error")
-    def test_rows_with_nothing_in_them(self, cells: dict[str, int | float]) -> None:
+    def test_rows_of_any_cells_are_drawn(self, cells: dict[str, int | float]) -> None:
         rows: list[Row] = [row(frame, **cells) for frame in range(4)]
         assert plotted(rows).note is None
 
     @pytest.mark.parametrize("title", ["$x", "a\nb", "", "城.spz", "w" * 1000])
-    def test_any_name_is_a_title(self, title: str) -> None:
+    def test_any_name_can_be_a_title(self, title: str) -> None:
         assert plotted(flight(3), title).png
 
     def test_a_chart_leaves_single_instances_out(self) -> None:

@@ -46,7 +46,7 @@ def test_ellipsoids_are_not_thinner_than_a_pixel() -> None:
 
 
 @given(st.integers(0, 10**9), st.integers(1, 1000))
-def test_no_more_than_the_most_are_chosen_evenly(count: int, most: int) -> None:
+def test_a_sample_is_even_and_has_the_size_asked_for(count: int, most: int) -> None:
     if count > most:
         index = ellipsoids.evenly(count, most)
         assert len(index) == most
@@ -55,7 +55,7 @@ def test_no_more_than_the_most_are_chosen_evenly(count: int, most: int) -> None:
         assert index[-1] < count
 
 
-def test_evenly_takes_all_of_few() -> None:
+def test_an_even_sample_of_few_has_all() -> None:
     assert ellipsoids.evenly(5, 5).tolist() == [0, 1, 2, 3, 4]
 
 
@@ -90,7 +90,7 @@ def test_wall_lines_are_at_multiples_of_the_step() -> None:
 
 @pytest.mark.parametrize("aspect", [0.5, 1.6, 3])
 @pytest.mark.parametrize("extent", [(1.0, 1, 1), (100, 1, 1), (1, 50, 0.1), (1e-6, 1e-6, 1e-6)])
-def test_a_viewpoint_has_all_in_its_frame(aspect: float, extent: tuple[float, float, float]) -> None:
+def test_a_viewpoint_sees_all_within_its_frame(aspect: float, extent: tuple[float, float, float]) -> None:
     corners = ellipsoids.CORNERS * extent + 7
     frame = (0.1, 0.2, 0.8, 0.9)
     eye = viewpoint(corners, np.array([-0.6, 0.5, -1]), np.array([0, -1.0, 0]), aspect=aspect, frame=frame)

@@ -35,7 +35,7 @@ def test_colors_tell_sizes_apart() -> None:
     assert 0 <= min(places) <= max(places) <= 1
 
 
-def test_colors_of_splats_that_are_all_the_same() -> None:
+def test_equal_splats_have_one_color() -> None:
     splats = random_splats(5).take(np.zeros(5, np.int64))
     for by in ("size", "opacity", "chunk"):
         coloring = color_by(by, splats, np.arange(5), None)
@@ -61,7 +61,7 @@ def test_few_levels_at_the_ends_do_not_take_colors_from_the_others() -> None:
     assert [text for _, text in coloring.marks] == ["5 or less", "6", "7 or more"]
 
 
-def test_opacity_beyond_one_is_said_as_d() -> None:
+def test_opacities_above_one_are_labelled_as_lod_opacity() -> None:
     splats = random_splats(1000)
     assert color_by("opacity", splats, np.arange(1000), None).title == "opacity"
     splats.opacity[0] = 50

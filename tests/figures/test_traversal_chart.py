@@ -16,7 +16,7 @@ def test_a_chart_of_no_frames_is_an_error() -> None:
         plotted([])
 
 
-def test_matplotlib_is_not_installed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_matplotlib_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(SparklodError, match=r"pip install 'sparklod\[render\]'") as caught:
         plotted(flight(3))

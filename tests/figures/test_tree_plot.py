@@ -56,7 +56,7 @@ def drawn(picture: Picture) -> np.ndarray:
 
 @pytest.mark.usefixtures("drawing")
 class TestPictures:
-    def test_it_shows_the_scene(self, scene: Scene) -> None:
+    def test_the_figure_shows_the_scene(self, scene: Scene) -> None:
         picture = plot(scene, size=SIZE)
         assert pixels(picture).shape == (200, 320, 3)
         assert 0.02 < drawn(picture).mean() < 0.98
@@ -67,7 +67,7 @@ class TestPictures:
         assert plot(scene, depth=3, size=SIZE) == plot(scene, depth=3, size=SIZE)
 
     @pytest.mark.parametrize("size", [(161, 97), (400, 400), (200, 500)])
-    def test_it_is_as_large_as_wanted(self, scene: Scene, size: tuple[int, int]) -> None:
+    def test_the_figure_has_the_size_asked_for(self, scene: Scene, size: tuple[int, int]) -> None:
         assert pixels(plot(scene, depth=2, size=size)).shape == (size[1], size[0], 3)
 
     def test_colors_and_depths_make_other_pictures(self, scene: Scene) -> None:
@@ -76,12 +76,12 @@ class TestPictures:
         assert len({picture.png for picture in pictures}) == len(pictures)
         assert len({picture.description for picture in pictures}) == len(pictures)
 
-    def test_all_depths_are_seen_from_the_same_place(self, scene: Scene) -> None:
+    def test_all_depths_have_one_viewpoint(self, scene: Scene) -> None:
         corner = (slice(-60, None), slice(0, 60))
         axes = [pixels(plot(scene, depth=level, size=SIZE))[corner] for level in (4, 5)]
         assert (axes[0] == axes[1]).mean() > 0.97
 
-    def test_what_is_said_is_what_is_drawn(self, scene: Scene) -> None:
+    def test_the_description_counts_what_is_drawn(self, scene: Scene) -> None:
         assert scene.tree is not None
         depth = scene.tree.depths()
         picture = plot(scene, depth=3, size=SIZE)
@@ -98,7 +98,7 @@ class TestPictures:
         assert drawn(picture).any()
         assert "boxes" in plot(Scene(random_splats(50)), by="chunk", size=SIZE).description
 
-    def test_many_are_points_and_more_are_a_sample(self, scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_many_splats_are_points_and_more_are_a_sample(self, scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(pyvista_scene, "MOST_ELLIPSOIDS", 100)
         picture = plot(scene, size=SIZE)
         assert "points" in picture.description
@@ -108,7 +108,7 @@ class TestPictures:
         assert "an even sample of 1,000" in sample.description
         assert sample.png == plot(scene, size=SIZE).png != picture.png
 
-    def test_huge_ones_are_points_too(self) -> None:
+    def test_huge_splats_are_drawn_as_points(self) -> None:
         splats = random_splats(3000)
         picture = plot(Scene(dataclasses.replace(splats, scale=np.full_like(splats.scale, 1e5))), size=SIZE)
         assert "points" in picture.description
@@ -122,7 +122,7 @@ class TestPictures:
         assert picture.description.startswith("1 splat;")
         assert drawn(picture).any()
 
-    def test_numbers_out_of_range_do_not_spoil_it(self) -> None:
+    def test_values_out_of_range_do_not_spoil_the_figure(self) -> None:
         good = random_splats(2000)
         alone = drawn(plot(Scene(good), size=SIZE))
         center, scale, quat, opacity = (np.array(c) for c in (good.center, good.scale, good.quat_xyzw, good.opacity))
@@ -134,7 +134,7 @@ class TestPictures:
         assert picture.description.startswith("1,995 splats")
         assert abs(drawn(picture).mean() - alone.mean()) < 0.5 * alone.mean()
 
-    def test_a_speck_far_out(self) -> None:
+    def test_a_small_scene_far_from_the_origin_is_drawn(self) -> None:
         splats = random_splats(20)
         far = dataclasses.replace(
             splats, center=np.full_like(splats.center, 1e7), scale=splats.scale * np.float32(1e-9)
@@ -171,13 +171,13 @@ def fresh() -> Iterator[None]:
 
 @pytest.mark.usefixtures("fresh")
 class TestWhereNoneCanBeDrawn:
-    def test_pyvista_is_not_installed(self, scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_a_missing_pyvista_is_named(self, scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setitem(sys.modules, "pyvista", None)
         with pytest.raises(SparklodError, match=r"pip install 'sparklod\[render\]'") as caught:
             plot(scene)
         assert "\n" not in str(caught.value)
 
-    def test_there_is_no_opengl(self, scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_a_missing_opengl_is_an_error(self, scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setitem(sys.modules, "pyvista", subprocess)  # any module: it is not asked for anything
         monkeypatch.setattr(pyvista_scene, "PROBE", "import os; os.abort()")
         with pytest.raises(SparklodError, match="apt install libegl1 libgl1-mesa-dri"):

@@ -94,7 +94,7 @@ def test_a_video_has_the_frames(size: tuple[int, int], form: str) -> None:
 
 
 @pytest.mark.parametrize("form", ["mp4", "webm"])
-def test_without_imageio_it_is_said(form: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_imageio_is_named(form: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "imageio", None)
     with pytest.raises(SparklodError, match=rf"^\.{form} is written by imageio: pip install 'sparklod\[video\]'"):
         animation.check(form, 30)

@@ -30,14 +30,14 @@ def test_cells_are_the_pictures(count: int, size: tuple[int, int]) -> None:
     assert (columns - 1) * rows < count <= columns * rows or columns * (rows - 1) < count <= columns * rows
 
 
-def test_pictures_of_a_screen_stand_as_on_one() -> None:
+def test_pictures_are_laid_out_for_a_screen() -> None:
     assert grid(4, (1280, 720)) == (2, 2)
     assert grid(9, (1280, 720)) == (3, 3)
     assert grid(2, (720, 1280)) == (2, 1)
     assert grid(1, (5, 5)) == (1, 1)
 
 
-def test_one_with_alpha_makes_the_sheet_have_it() -> None:
+def test_one_picture_with_alpha_gives_the_sheet_alpha() -> None:
     plain, clear = pictures(1, 20, 20)[0], pictures(1, 20, 20, channels=4)[0]
     whole = sheet([plain, clear], ["one", "two\n\0"])
     (ax, ay), (bx, by) = cells(2, (20, 20))

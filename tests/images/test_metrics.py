@@ -41,7 +41,7 @@ def ssim_as_written(a: np.ndarray, b: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("noise", [0.01, 0.1, 0.5])
-def test_ssim_is_that_of_the_paper(noise: float) -> None:
+def test_ssim_is_the_formula_of_the_paper(noise: float) -> None:
     a, b = pictures(noise=noise)
     assert ssim(a, b) == pytest.approx(ssim_as_written(a, b), abs=1e-12)
 
@@ -69,13 +69,13 @@ def test_ssim_of_flat_images_compares_their_means_alone() -> None:
     assert ssim(a, b) == pytest.approx((2 * 0.25 * 0.75 + C1) / (0.25**2 + 0.75**2 + C1), abs=1e-12)
 
 
-def test_ssim_of_what_is_smaller_than_its_window() -> None:
+def test_ssim_of_an_image_smaller_than_its_window_is_defined() -> None:
     a, b = pictures(7, 4)
     assert ssim(a, a) == pytest.approx(1, abs=1e-12)
     assert -1 < ssim(a, b) < 1
 
 
-def test_ssim_takes_float32_as_it_comes() -> None:
+def test_ssim_of_float32_is_that_of_float64() -> None:
     a, b = (image.astype(np.float32) for image in pictures())
     assert ssim(a, b) == pytest.approx(ssim_as_written(a.astype(np.float64), b.astype(np.float64)), abs=1e-12)
 
@@ -89,7 +89,7 @@ def test_psnr_of_a_known_difference() -> None:
     assert psnr(a, b) == pytest.approx(-10 * math.log10(0.25 / 192))
 
 
-def test_psnr_has_a_most() -> None:
+def test_psnr_of_equal_images_is_the_largest() -> None:
     a = np.full((8, 8, 3), 0.5)
     assert psnr(a, a) == MOST_PSNR
     assert psnr(a, a + 1e-9) == MOST_PSNR

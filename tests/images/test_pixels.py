@@ -29,7 +29,7 @@ def images(draw: st.DrawFn) -> np.ndarray:
 
 
 @given(images(), COLORS)
-def test_a_background_is_what_is_let_through(image: np.ndarray, color: tuple[float, float, float]) -> None:
+def test_a_background_shows_through_transparency(image: np.ndarray, color: tuple[float, float, float]) -> None:
     result = pixels.over(image, color)
     alpha = image[..., 3:].astype(np.float64)
     assert np.allclose(result[..., :3], image[..., :3] + (1 - alpha) * color, atol=1e-6)
@@ -110,7 +110,7 @@ def test_a_picture_of_floats_is_kept_to_the_bit() -> None:
 
 
 @pytest.mark.parametrize("channels", [3, 4])
-def test_a_scale_stands_at_the_right(channels: int) -> None:
+def test_a_color_scale_is_added_at_the_right(channels: int) -> None:
     bar = smooth("numbers", np.empty(0), VIRIDIS, [(0.0, "0"), (1.0, "12 or more")])
     codes = np.full((360, 640, channels), 255, np.uint8)
     result = pixels.with_scale(codes, bar)
@@ -140,7 +140,7 @@ def test_a_gain_shows_differences_and_cuts_few(size: float) -> None:
     assert not shown[:20].any()
 
 
-def test_what_is_the_same_needs_no_gain() -> None:
+def test_equal_images_need_no_gain() -> None:
     same = np.ones((8, 8, 4), np.float32)
     assert pixels.gain_for([pixels.apart(same, same)]) == 1
 

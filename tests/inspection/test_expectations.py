@@ -10,7 +10,7 @@ import pytest
 
 from sparklod_cli.cli import run
 from sparklod_cli.inspection.expectations import ExpectationError, Expectations, check, value_at
-from sparklod_cli.inspection.report import Report, Wanted, inspect
+from sparklod_cli.inspection.report import Report, ReportSettings, inspect
 from tests.conftest import FIXTURES
 from tests.inspection.expected import DEPTH, LEAVES, NODES, PLAIN, TREE, written
 
@@ -19,7 +19,7 @@ def codes(report: Report, **expected: Any) -> list[str]:
     return [found.code for found in check(report, Expectations(**expected))]
 
 
-def test_each_expectation_of_a_tree(tree: Report) -> None:
+def test_each_expectation_of_a_tree_holds_or_gives_its_code(tree: Report) -> None:
     size = TREE.stat().st_size
     assert codes(tree) == []
     for name, holds, fails, code in [
@@ -34,7 +34,7 @@ def test_each_expectation_of_a_tree(tree: Report) -> None:
         assert codes(tree, **{name: fails}) == [code]
 
 
-def test_each_expectation_of_plain_splats(plain: Report) -> None:
+def test_each_expectation_of_plain_splats_holds_or_gives_its_code(plain: Report) -> None:
     for name, holds, fails, code in [
         ("min_splats", 60, 61, "expect.splats"),
         ("max_splats", 60, 59, "expect.splats"),
@@ -46,17 +46,17 @@ def test_each_expectation_of_plain_splats(plain: Report) -> None:
     assert codes(plain, max_growth=9.0) == ["expect.growth"]  # there is none without a tree
 
 
-def test_all_that_falls_short_is_said(tree: Report) -> None:
+def test_every_expectation_that_fails_is_reported(tree: Report) -> None:
     expected = {"max_bytes": 1, "max_splats": 1, "sh": 3, "lod": False, "max_growth": 1, "values": {"splats": 1}}
     found = check(tree, Expectations(**expected))
     assert [each.code.removeprefix("expect.") for each in found] == ["bytes", "splats", "sh", "lod", "growth", "value"]
-    assert found[1].message == "6 leaves, expected at most 1"
-    assert "growth 1.5, expected" in found[4].message
-    assert found[5].message == "splats is 9, expected 1"
+    assert found[1].message == "leaves<=1: leaves is 6"
+    assert found[4].message == "growth<=1: growth is 1.5"
+    assert found[5].message == "splats==1: splats is 9"
 
 
-def test_of_what_cannot_be_read_nothing_is_expected() -> None:
-    report, scene = inspect(FIXTURES / "points.ply", Wanted())
+def test_an_unreadable_file_is_not_checked_further() -> None:
+    report, scene = inspect(FIXTURES / "points.ply", ReportSettings())
     assert scene is None
     assert codes(report, min_splats=1, lod=True, values={"splats": 3}) == []
 
@@ -81,29 +81,30 @@ def test_of_what_cannot_be_read_nothing_is_expected() -> None:
         ("notes", [], ["SH degree 4 is cut to 3"]),
     ],
 )
-def test_values_of_the_report(tree: Report, way: str, holds: Any, fails: Any) -> None:
+def test_values_of_the_report_are_met_or_give_a_finding(tree: Report, way: str, holds: Any, fails: Any) -> None:
     if way == "tree.children":  # a table has no least and no most
         assert codes(tree, values={way: holds}) == ["expect.value"]
         return
     assert codes(tree, values={way: holds}) == []
     (found,) = check(tree, Expectations(values={way: fails}))
     assert found.code == "expect.value"
-    assert found.message.startswith(f"{way} is ")
-    assert found.message.endswith(json.dumps(fails))
+    ends = {"min": ">=", "max": "<="}
+    asked = [f"{ends[end]}{most}" for end, most in fails.items()] if isinstance(fails, dict) else []
+    assert found.message.startswith(tuple(f"{way}{each}: {way} is " for each in asked or [f"=={json.dumps(fails)}"]))
 
 
-def test_a_minimum_of_what_is_no_number_is_not_met(tree: Report) -> None:
+def test_a_minimum_of_a_value_that_is_not_a_number_fails(tree: Report) -> None:
     for way in ("format", "antialiased", "values.box"):
         assert codes(tree, values={way: {"min": 0}}) == ["expect.value"]
 
 
 @pytest.mark.parametrize("way", ["", "nothing", "tree.", "tree.levels.99", "tree.levels.x", "splats.0", "format.0"])
-def test_a_way_that_leads_nowhere_is_an_error(tree: Report, way: str) -> None:
+def test_a_path_that_the_report_has_not_is_an_error(tree: Report, way: str) -> None:
     with pytest.raises(ExpectationError, match=f"the report has no {way}"):
         value_at(tree.as_dict(), way)
 
 
-def test_a_way_leads_to_a_value_of_the_report(tree: Report) -> None:
+def test_a_path_leads_to_a_value_of_the_report(tree: Report) -> None:
     plain = tree.as_dict()
     assert value_at(plain, "tree.levels.0") == plain["tree"]["levels"][0]
     assert value_at(plain, "tree.levels.2.leaves") == 5
@@ -122,7 +123,7 @@ OPTIONS = [
 
 
 @pytest.mark.parametrize(("holds", "fails", "code"), OPTIONS, ids=[option[0][0] for option in OPTIONS])
-def test_every_option_holds_a_file_to_something(
+def test_every_option_passes_and_fails_with_its_code(
     holds: list[Any], fails: list[Any], code: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(["inspect", str(TREE), *map(str, holds)]) == 0
@@ -157,7 +158,7 @@ def test_an_original_that_cannot_be_read_is_named(original: object, capsys: pyte
 def test_a_tree_can_be_required(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["inspect", str(TREE), "--require-lod"]) == 0
     assert run(["inspect", str(TREE), str(PLAIN), "--require-lod"]) == 3
-    assert capsys.readouterr().out == f"{PLAIN}: error: expect.lod: no tree, expected one\n"
+    assert capsys.readouterr().out == f"{PLAIN}: error: expect.lod: lod==true: lod is false\n"
 
 
 def test_options_win_over_the_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -178,13 +179,14 @@ def test_an_expectation_is_that_there_are_no_errors_either(capsys: pytest.Captur
     assert "tree.single-child" in capsys.readouterr().out
 
 
-def test_values_are_there_for_who_expects_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_expected_values_are_computed_without_stats(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = written(tmp_path, '{"values": {"values.quantities.sh1.max": {"max": 9}, "values.box.min.0": {"min": 99}}}')
     assert run(["inspect", str(PLAIN), "--expect", str(path)]) == 3
-    assert capsys.readouterr().out.startswith(f"{PLAIN}: error: expect.value: values.box.min.0 is -")
+    said = "values.box.min.0>=99: values.box.min.0 is -"
+    assert capsys.readouterr().out.startswith(f"{PLAIN}: error: expect.value: {said}")
 
 
-def test_a_way_that_one_file_has_not_does_not_stop_the_others(
+def test_a_path_missing_in_one_file_does_not_stop_the_others(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = written(tmp_path, '{"values": {"tree.depth": 2}}')

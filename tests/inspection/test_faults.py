@@ -15,7 +15,7 @@ from sparklod_cli.cli import run
 from sparklod_cli.codecs.compression import PIECE
 from sparklod_cli.commands.inspect_text import lines
 from sparklod_cli.inspection.findings import CODES, ERROR
-from sparklod_cli.inspection.report import Report, Wanted, inspect
+from sparklod_cli.inspection.report import Report, ReportSettings, inspect
 from tests.conftest import FIXTURES, real_scene
 
 FOLDER = FIXTURES / "faults"
@@ -161,7 +161,7 @@ UNPLANTED = {"values.opacity", "values.rotation"}
 
 
 @pytest.mark.parametrize("name", FAULTS)
-def test_a_fault_is_found_by_its_code_and_nothing_else_is_cried(
+def test_each_fault_is_found_by_its_code_and_no_other(
     name: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(FOLDER)
@@ -176,7 +176,7 @@ def test_a_fault_is_found_by_its_code_and_nothing_else_is_cried(
 
 
 @pytest.mark.parametrize("name", PLACES)
-def test_it_is_said_where_the_fault_is(name: str) -> None:
+def test_a_finding_says_where_the_fault_is(name: str) -> None:
     found = checked(FOLDER / name).findings or []
     place = PLACES[name]
     if isinstance(place, int):
@@ -194,7 +194,7 @@ def test_every_file_is_in_the_table_and_every_code_has_a_file() -> None:
 
 
 def checked(path: Path) -> Report:
-    return inspect(path, Wanted(check=True))[0]
+    return inspect(path, ReportSettings(check=True))[0]
 
 
 #: Fixtures that are odd on purpose, and what is said of them.
@@ -314,7 +314,7 @@ def test_whatever_the_bytes_are_there_is_a_report(path: Path, tmp_path: Path) ->
         broken.write_bytes(by_hand.gzip_stored(changed(inside or b"", rng)) if deep else changed(data, rng))
         if attempt == 0:
             broken.write_bytes(data)
-        for wanted in (Wanted(check=True), Wanted(values=True, all_quantities=True)):
+        for wanted in (ReportSettings(check=True), ReportSettings(values=True, all_quantities=True)):
             report, scene = inspect(broken, wanted)
             plain = json.loads(json.dumps(report.as_dict(), allow_nan=False))
             if scene is not None:

@@ -14,7 +14,7 @@ import pytest
 from sparklod_cli.figures.svg import children_groups
 from sparklod_cli.figures.tree_plot import Picture
 from sparklod_cli.inspection.html import Section, page
-from sparklod_cli.inspection.report import Wanted, inspect
+from sparklod_cli.inspection.report import ReportSettings, inspect
 from sparklod_cli.inspection.values import histogram_of, names_of
 from sparklod_cli.tables.histograms import histogram
 from tests.conftest import FIXTURES
@@ -152,7 +152,7 @@ def test_a_page_suits_light_and_dark_and_loads_nothing() -> None:
 
 
 @pytest.mark.parametrize("name", ["<script>alert(1)</script>.spz", "a\"b'c&d.spz", "\udcff\x00\n.spz", "\u202egnp.spz"])
-def test_names_are_only_text(name: str) -> None:
+def test_names_on_the_page_are_escaped(name: str) -> None:
     finding = {"severity": "error", "code": name, "message": name, "index": None, "count": None}
     report = REPORT | {"file": name, "format": name, "notes": [name], "findings": [finding]}
     picture = Picture(b"png", f"{name}; {name}")
@@ -175,7 +175,7 @@ def test_names_are_only_text(name: str) -> None:
         {"file": "x.ply", "values": {"box": None, "box_98": None, "non_finite": 3, "quantities": {"x": {"p1": None}}}},
     ],
 )
-def test_what_is_missing_is_left_out(report: dict[str, Any]) -> None:
+def test_missing_figures_are_left_out(report: dict[str, Any]) -> None:
     said(Section(report))
 
 
@@ -237,7 +237,7 @@ def test_many_files_are_listed() -> None:
 
 @pytest.mark.parametrize("name", ["golden/tree-v3.spz", "golden/sh3-v2.sog", "sh1.ply", "points.ply"])
 def test_a_page_of_a_real_file_says_what_its_report_says(name: str) -> None:
-    report, scene = inspect(FIXTURES / name, Wanted(values=True, all_quantities=True, check=True))
+    report, scene = inspect(FIXTURES / name, ReportSettings(values=True, all_quantities=True, check=True))
     counted = {} if scene is None else {name: histogram_of(scene.splats, name) for name in names_of(scene.splats)}
     text = said(Section(report.as_dict(), histograms=counted))
     assert name in text

@@ -56,12 +56,12 @@ def test_the_leaves_of_real_trees_are_the_splats(source: str, tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("bits", [0, 4, 9])
-def test_coarse_positions_make_splats_fall_together(bits: int, tmp_path: Path) -> None:
+def test_splats_that_coarse_positions_merge_are_no_finding(bits: int, tmp_path: Path) -> None:
     path = real_scene("biker.ply")
     assert check(baked(path, tmp_path, "--fractional-bits", bits), read_scene(path)) == []
 
 
-def test_what_cannot_be_drawn_is_not_expected() -> None:
+def test_splats_that_cannot_be_drawn_are_not_expected() -> None:
     splats = random_splats(50, sh_degree=1)
     splats.opacity[3] = 0
     splats.scale[8] = 0
@@ -70,7 +70,7 @@ def test_what_cannot_be_drawn_is_not_expected() -> None:
     assert check(tree_of(splats.take(good)), Scene(splats)) == []
 
 
-def test_less_sh_may_have_been_asked_for(tmp_path: Path) -> None:
+def test_a_lower_sh_degree_is_no_finding(tmp_path: Path) -> None:
     original = read_scene(FIXTURES / "sh3.ply")
     for degree in (0, 1, 2):
         assert check(baked(FIXTURES / "sh3.ply", tmp_path, "--max-sh", degree), original) == []
@@ -150,12 +150,12 @@ def test_a_leaf_that_is_changed_is_found(name: str) -> None:
     assert f"{node:,}" in findings[0].message
 
 
-def test_a_step_is_no_change() -> None:
+def test_a_difference_of_one_step_is_no_finding() -> None:
     assert changed_leaf(moved(1))[1] == []
     assert changed_leaf(set_to("rgb", lambda rgb: rgb + np.float32(0.007)))[1] == []
 
 
-def test_a_step_is_no_change_however_many_leaves_make_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_difference_of_one_step_in_many_leaves_is_no_finding(monkeypatch: pytest.MonkeyPatch) -> None:
     """Another writer may round all colours down."""
     monkeypatch.setattr(leaves, "MAX_SEARCHED", 50, raising=False)
     splats = random_splats(300, sh_degree=1)

@@ -22,7 +22,7 @@ from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.inspection import values
 from sparklod_cli.inspection.expectations import value_at
 from sparklod_cli.inspection.findings import CODES
-from sparklod_cli.inspection.report import SCHEMA_VERSION, Wanted, inspect
+from sparklod_cli.inspection.report import SCHEMA_VERSION, ReportSettings, inspect
 from sparklod_cli.lod import quick
 from sparklod_cli.model.lod_tree import MAX_CHILDREN, LodTree
 from sparklod_cli.model.scene import Scene
@@ -36,11 +36,11 @@ SUFFIXES = {suffix for form in FORMATS for suffix in form.suffixes}
 FILES = sorted(path for path in FIXTURES.rglob("*") if path.suffix in SUFFIXES)
 SMALL = [path for path in FILES if path.stat().st_size < 100_000 and "faults" not in path.parts]
 WAYS = {
-    "plain": Wanted(),
-    "values": Wanted(values=True),
-    "stats": Wanted(values=True, all_quantities=True),
-    "check": Wanted(check=True),
-    "all": Wanted(values=True, all_quantities=True, check=True),
+    "plain": ReportSettings(),
+    "values": ReportSettings(values=True),
+    "stats": ReportSettings(values=True, all_quantities=True),
+    "check": ReportSettings(check=True),
+    "all": ReportSettings(values=True, all_quantities=True, check=True),
 }
 
 Report = dict[str, Any]
@@ -51,7 +51,7 @@ def name_of(value: Any) -> str | None:
     return value.relative_to(FIXTURES).as_posix() if isinstance(value, Path) else None
 
 
-def report_of(path: Path, wanted: Wanted) -> Report:
+def report_of(path: Path, wanted: ReportSettings) -> Report:
     """A report after its way through JSON, which would not take a NaN."""
     report: Report = json.loads(json.dumps(inspect(path, wanted)[0].as_dict(), allow_nan=False))
     return report
@@ -91,13 +91,13 @@ def broken(path: Path) -> Iterator[tuple[str, bytes]]:
 
 @pytest.mark.parametrize("wanted", WAYS.values(), ids=WAYS.keys())
 @pytest.mark.parametrize("path", FILES, ids=name_of)
-def test_reports_of_the_fixtures(path: Path, wanted: Wanted) -> None:
+def test_reports_of_the_fixtures_follow_the_schema(path: Path, wanted: ReportSettings) -> None:
     assert faults(report_of(path, wanted)) == []
 
 
 @pytest.mark.parametrize("wanted", WAYS.values(), ids=WAYS.keys())
 @pytest.mark.parametrize("sh_degree", range(4))
-def test_reports_of_trees_follow_the_schema(tmp_path: Path, sh_degree: int, wanted: Wanted) -> None:
+def test_reports_of_trees_follow_the_schema(tmp_path: Path, sh_degree: int, wanted: ReportSettings) -> None:
     path = tmp_path / "tree.spz"
     path.write_bytes(tree_bytes(sh_degree))
     report = report_of(path, wanted)
@@ -107,7 +107,7 @@ def test_reports_of_trees_follow_the_schema(tmp_path: Path, sh_degree: int, want
 
 @pytest.mark.parametrize("wanted", WAYS.values(), ids=WAYS.keys())
 @pytest.mark.parametrize("path", SMALL, ids=name_of)
-def test_reports_of_broken_files(tmp_path: Path, path: Path, wanted: Wanted) -> None:
+def test_reports_of_broken_files_follow_the_schema(tmp_path: Path, path: Path, wanted: ReportSettings) -> None:
     for name, data in broken(path):
         file = tmp_path / f"broken{path.suffix}"
         file.write_bytes(data)
@@ -116,7 +116,7 @@ def test_reports_of_broken_files(tmp_path: Path, path: Path, wanted: Wanted) -> 
 
 @pytest.mark.parametrize("most", [1, 3, MAX_CHILDREN])
 @pytest.mark.parametrize("count", [1, 2, 5, 300])
-def test_reports_of_broken_trees(tmp_path: Path, count: int, most: int) -> None:
+def test_reports_of_broken_trees_follow_the_schema(tmp_path: Path, count: int, most: int) -> None:
     """Links that lead anywhere, and splats that are nowhere to be seen."""
     for seed in range(20):
         rng = np.random.default_rng(seed)
@@ -134,13 +134,13 @@ def test_reports_of_broken_trees(tmp_path: Path, count: int, most: int) -> None:
 
 @pytest.mark.parametrize("wanted", WAYS.values(), ids=WAYS.keys())
 @pytest.mark.parametrize("path", ["missing.spz", "."])
-def test_reports_of_unreadable_files_follow_the_schema(tmp_path: Path, path: str, wanted: Wanted) -> None:
+def test_reports_of_unreadable_files_follow_the_schema(tmp_path: Path, path: str, wanted: ReportSettings) -> None:
     report = report_of(tmp_path / path, wanted)
     assert faults(report) == []
     assert report["findings"][0]["code"] == "file.unreadable"
 
 
-def test_the_command_prints_it(lod: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_reports_that_the_command_prints_follow_the_schema(lod: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """With findings of expectations, too; many files give JSON lines."""
     options = ["--json", "--stats", "--check", "--sh", "0", "--max-bytes", "1", "--max-growth", "1"]
     assert run(["inspect", str(lod), "missing.spz", str(FIXTURES / "sh2.ply"), *options]) == 3
@@ -170,7 +170,7 @@ def holder(report: Any, way: tuple[Any, ...]) -> Any:
 @pytest.fixture
 def full(lod: Path) -> Report:
     """A report in which nothing is null that need not be."""
-    report = report_of(lod, Wanted(values=True, all_quantities=True, check=True))
+    report = report_of(lod, ReportSettings(values=True, all_quantities=True, check=True))
     finding = {"severity": "error", "code": "tree.size", "message": "node 3", "index": 3, "count": 1}
     report = report | {"findings": [finding], "notes": ["a note"]}
     assert faults(report) == []
@@ -223,14 +223,14 @@ def test_an_unknown_field_is_noticed(full: Report) -> None:
 @pytest.mark.parametrize(
     "field, value", [("code", "tree.ghost"), ("severity", "fatal"), ("index", -1), ("count", 0), ("message", None)]
 )
-def test_a_finding_that_there_cannot_be_is_noticed(full: Report, field: str, value: object) -> None:
+def test_an_unknown_code_of_a_finding_is_noticed(full: Report, field: str, value: object) -> None:
     full["findings"][0][field] = value
     assert faults(full)
 
 
-def test_what_was_not_read_has_no_numbers(full: Report) -> None:
+def test_reports_of_unread_files_have_no_figures(full: Report) -> None:
     assert faults(full | {"format": None})
-    report = report_of(Path("missing.spz"), Wanted())
+    report = report_of(Path("missing.spz"), ReportSettings())
     assert faults(report | {"findings": []})
     assert faults(report | {"splats": 3})
     assert faults(report | {"format": "PLY"})
@@ -253,7 +253,7 @@ def schemas(schema: Any) -> Iterator[tuple[str, Any]]:
             yield from schemas(value)
 
 
-def test_the_schema_is_one_and_tells_of_everything() -> None:
+def test_the_schema_is_valid_and_describes_every_field() -> None:
     Draft202012Validator.check_schema(SCHEMA)
     found = list(schemas(SCHEMA))
     assert len(found) > 60
@@ -263,7 +263,7 @@ def test_the_schema_is_one_and_tells_of_everything() -> None:
     assert all(schema["description"] for schema in SCHEMA["$defs"].values())
 
 
-def test_the_schema_has_what_the_code_has() -> None:
+def test_the_schema_has_the_fields_of_the_code() -> None:
     assert SCHEMA["properties"]["schema_version"]["const"] == SCHEMA_VERSION
     finding = SCHEMA["$defs"]["finding"]["properties"]
     assert finding["code"]["enum"] == list(CODES)
@@ -274,10 +274,10 @@ def test_the_schema_has_what_the_code_has() -> None:
     assert list(SCHEMA["$defs"]["summary"]["properties"]) == ["min", *values.PERCENTILES, "max", "mean"]
 
 
-def test_header_fields_are_of_files_that_there_are() -> None:
+def test_every_header_field_occurs_in_a_fixture() -> None:
     seen: set[str] = set()
     for path in FILES:
-        seen |= report_of(path, Wanted())["header"].keys()
+        seen |= report_of(path, ReportSettings())["header"].keys()
     assert seen == SCHEMA["properties"]["header"]["properties"].keys()
 
 

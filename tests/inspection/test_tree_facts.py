@@ -138,7 +138,7 @@ def test_the_coarse_cut_is_a_cut_whatever_the_sizes(most: int, seed: int, fallin
         assert cut == expected
 
 
-def test_a_tree_by_hand() -> None:
+def test_facts_of_a_small_tree_are_those_worked_out_by_hand() -> None:
     """The root has two children, the first of which has three."""
     splats = sized([8.0, 4.0, 1.0, 1.0, 2.0, 4.0])
     splats.opacity[:2] = [3.0, 1.0]
@@ -153,18 +153,18 @@ def test_a_tree_by_hand() -> None:
     assert (facts.chunks, facts.chunks_of_coarse_cut) == (1, 1)
 
 
-def test_a_tree_of_one_node() -> None:
+def test_a_tree_of_one_node_has_facts() -> None:
     facts, findings = examine(sized([1.0]), tree_of([(0, 0)]))
     assert findings == []
     assert (facts.leaves, facts.inner, facts.growth, facts.depth, facts.children) == (1, 0, 1.0, 0, {})
 
 
-def test_a_level_of_no_size_has_none() -> None:
+def test_a_level_of_nodes_without_size_has_no_mean_size() -> None:
     facts, _ = examine(sized([1.0, 0.0, 1.0]), tree_of([(2, 1), (0, 0), (0, 0)]))
     assert [level.size for level in facts.levels] == [1.0, None]
 
 
-def test_no_leaves_are_no_division_by_zero() -> None:
+def test_a_tree_without_leaves_has_no_growth() -> None:
     facts, findings = examine(sized([1.0, 1.0]), tree_of([(1, 1), (1, 0)]))
     assert (facts.leaves, facts.growth) == (0, 2.0)
     assert codes(findings) == {"tree.root", "tree.order", "tree.single-child"}
@@ -184,7 +184,7 @@ def test_without_a_check_nothing_is_looked_for() -> None:
 
 
 @pytest.mark.parametrize(("size", "found"), [(0.99, True), (1.01, False), (3.0, False), (0.0, True)])
-def test_how_much_smaller_than_its_children_a_node_may_be(size: float, found: bool) -> None:
+def test_a_node_smaller_than_a_share_of_its_children_is_a_finding(size: float, found: bool) -> None:
     child = 1 / facts_of.MIN_SIZE_RATIO
     splats = sized([100.0, size, child, child, 1000.0])
     splats.opacity[4] = 1e-10  # a large one that covers nearly nothing
@@ -194,7 +194,7 @@ def test_how_much_smaller_than_its_children_a_node_may_be(size: float, found: bo
 
 @pytest.mark.parametrize("rise", [0.9, 1.1])
 @pytest.mark.parametrize("nodes", [facts_of.MIN_NODES, facts_of.MIN_NODES + 3, 3000])
-def test_what_counts_as_coarse_before_fine(nodes: int, rise: float) -> None:
+def test_a_rise_of_size_in_a_large_tree_is_a_finding(nodes: int, rise: float) -> None:
     """Half of the leaves below a small node, and half below one that is larger by a factor, which comes behind them."""
     half = (nodes - 3) // 2
     sizes = np.ones(nodes)

@@ -13,7 +13,7 @@ import pytest
 from sparklod_cli.cli import run
 from sparklod_cli.codecs import ply, splat, spz
 from sparklod_cli.inspection import values
-from sparklod_cli.inspection.report import Wanted, inspect
+from sparklod_cli.inspection.report import ReportSettings, inspect
 from sparklod_cli.inspection.values import (
     MAIN,
     PERCENTILES,
@@ -70,7 +70,7 @@ BY_HAND = {
 
 
 @pytest.mark.parametrize("name", BY_HAND)
-def test_each_quantity_of_three_splats(name: str) -> None:
+def test_each_quantity_of_three_splats_is_as_worked_out_by_hand(name: str) -> None:
     assert quantity(three(), name).tolist() == pytest.approx(BY_HAND[name])
     summary = examine(three(), all_quantities=True).quantities[name]
     assert summary["min"] == pytest.approx(min(BY_HAND[name]), rel=EXACT)
@@ -79,7 +79,7 @@ def test_each_quantity_of_three_splats(name: str) -> None:
     assert summary["mean"] == pytest.approx(sum(BY_HAND[name]) / 3, rel=EXACT)
 
 
-def test_the_other_facts_of_three_splats() -> None:
+def test_the_other_facts_of_three_splats_are_as_worked_out_by_hand() -> None:
     facts = examine(three())
     assert facts.box is not None
     assert facts.box_98 is not None
@@ -90,7 +90,7 @@ def test_the_other_facts_of_three_splats() -> None:
 
 
 @pytest.mark.parametrize("degree", range(4))
-def test_what_there_is_depends_on_the_degree(degree: int) -> None:
+def test_quantities_depend_on_the_sh_degree(degree: int) -> None:
     splats = random_splats(5, sh_degree=degree)
     names = [*QUANTITIES, *["sh1", "sh2", "sh3"][:degree]]
     assert names_of(splats) == names
@@ -199,7 +199,7 @@ def test_an_opacity_out_of_range_is_an_error_where_there_is_no_tree() -> None:
 
 
 @pytest.mark.parametrize("name", ["opacity", "scale"])
-def test_many_splats_that_cannot_be_drawn_are_said(name: str) -> None:
+def test_many_splats_that_cannot_be_drawn_are_a_finding(name: str) -> None:
     splats = random_splats(20)
     column = getattr(splats, name)
     column[:2] = 0
@@ -218,7 +218,7 @@ def test_a_scale_of_0_along_one_axis_can_be_drawn() -> None:
 
 @pytest.mark.parametrize("version", [1, 2, 3, 4])
 @pytest.mark.parametrize("sign", [1, -1])
-def test_centers_at_the_end_of_the_fixed_point(version: int, sign: int) -> None:
+def test_centres_at_the_end_of_the_fixed_point_are_a_finding(version: int, sign: int) -> None:
     """Version 1 has floats; and without a header nothing is known of codes."""
     end = (2**23 - 1) / 2**12
     at_end, inside = with_first("center", sign * end), with_first("center", sign * (end - 2**-12))
@@ -228,7 +228,7 @@ def test_centers_at_the_end_of_the_fixed_point(version: int, sign: int) -> None:
     assert codes(at_end, version=version) == codes(at_end) == []
 
 
-def test_many_scales_at_the_ends_of_their_code_are_said() -> None:
+def test_many_scales_at_the_ends_of_their_code_are_a_finding() -> None:
     header = {"version": 3, "fractional_bits": 12}
     for end in np.exp(np.float32([-10, 255 / 16 - 10])):
         splats = random_splats(200)
@@ -239,7 +239,7 @@ def test_many_scales_at_the_ends_of_their_code_are_said() -> None:
         assert codes(splats) == []
 
 
-def test_thin_splats_are_as_thin_as_their_code_goes_and_nobody_minds() -> None:
+def test_thin_splats_at_the_end_of_their_code_are_no_finding() -> None:
     splats = random_splats(200)
     splats.scale[:, 2] = np.exp(np.float32(-10))
     assert codes(splats, version=3, fractional_bits=12) == []
@@ -248,7 +248,7 @@ def test_thin_splats_are_as_thin_as_their_code_goes_and_nobody_minds() -> None:
 
 
 @pytest.mark.parametrize(("far", "found"), [(65_519.9, False), (65_520.0, True), (-1e7, True)])
-def test_centers_that_float16_cannot_hold(far: float, found: bool) -> None:
+def test_centres_beyond_float16_are_a_finding(far: float, found: bool) -> None:
     assert codes(with_first("center", far)) == ["values.center-far"] * found
     with np.errstate(over="ignore"):
         assert bool(np.isinf(np.float32(far).astype(np.float16))) == found
@@ -260,10 +260,10 @@ def test_the_bounds_are_said_of_scenes_as_they_are_written(tmp_path: Path) -> No
     splats.scale[:10] = 1e-6
     path = tmp_path / "scene.spz"
     path.write_bytes(b"".join(spz.encode(Scene(splats))))
-    report, _ = inspect(path, Wanted(check=True))
+    report, _ = inspect(path, ReportSettings(check=True))
     assert [(found.code, found.count) for found in report.findings or []] == [("values.scale-clamped", 10)]
     path.write_bytes(b"".join(ply.encode(Scene(splats))))
-    assert inspect(path, Wanted(check=True))[0].findings == []
+    assert inspect(path, ReportSettings(check=True))[0].findings == []
 
 
 @pytest.mark.parametrize("count", [1, 2, 1000])
@@ -271,7 +271,7 @@ def test_values_of_files_are_those_of_what_was_written(count: int, tmp_path: Pat
     splats = random_splats(count, seed=count)
     path = tmp_path / "scene.splat"
     path.write_bytes(b"".join(splat.encode(Scene(splats))))
-    report, scene = inspect(path, Wanted(values=True, all_quantities=True))
+    report, scene = inspect(path, ReportSettings(values=True, all_quantities=True))
     assert report.values is not None
     assert scene is not None
     assert report.values == examine(scene.splats, all_quantities=True)
@@ -281,7 +281,7 @@ def test_values_of_files_are_those_of_what_was_written(count: int, tmp_path: Pat
     assert (report.bytes_per_splat, report.compression_ratio) == (32.0, 1.75)
 
 
-def test_names_are_what_the_command_line_takes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_quantity_is_a_field_of_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "scene.ply"
     path.write_bytes(b"".join(ply.encode(Scene(random_splats(10, sh_degree=2)))))
     for name in values.names_of(random_splats(1, sh_degree=2)):

@@ -159,12 +159,12 @@ def test_words_of_a_real_scene_are_those_of_spark(spark: Spark, name: str) -> No
     check_file(spark, real_scene(name), share=2e-3)
 
 
-def test_tree_of_a_real_scene(spark: Spark, tmp_path: Path) -> None:
+def test_words_of_a_baked_real_scene_are_those_of_spark(spark: Spark, tmp_path: Path) -> None:
     check_file(spark, baked(tmp_path / "tree.spz", read_scene(real_scene("biker.ply")).splats, 3), share=2e-3)
 
 
 @pytest.mark.parametrize("layout", ["Packed", "Ext"])
-def test_tree_of_sparks_own_builder(spark: Spark, tmp_path: Path, layout: str) -> None:
+def test_the_tree_of_sparks_own_builder_comes_back(spark: Spark, tmp_path: Path, layout: str) -> None:
     """What it keeps of each merged splat, read and measured by us, gives its nodes back."""
     path = ply(tmp_path / "random.ply", random_splats(20_000))
     words = spark.load_words(layout, path, lod=True)
@@ -176,7 +176,7 @@ def test_tree_of_sparks_own_builder(spark: Spark, tmp_path: Path, layout: str) -
     assert differs[:, 1].mean() > 0.9
 
 
-def test_worker_has_no_true_zero_but_zero(spark: Spark, tmp_path: Path) -> None:
+def test_sparks_worker_codes_only_a_scale_of_0_as_zero(spark: Spark, tmp_path: Path) -> None:
     """Its pages and its JavaScript say that scales below e ** -30 are 0, and so do we."""
     splats = random_splats(1)
     splats.scale[:] = [0, np.exp(-31), np.exp(-29)]

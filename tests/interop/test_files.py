@@ -48,7 +48,7 @@ def test_spark_reads_any_number_of_fractional_bits(spark: Spark, extent: float, 
     laws.check(spark, scene, WriteOptions(fractional_bits=bits))
 
 
-def test_coordinates_at_the_limit(spark: Spark) -> None:
+def test_spark_reads_coordinates_at_the_limit(spark: Spark) -> None:
     splats = random_splats(2)
     limit = spz_options.LAST_CODE
     splats.center[:] = [[limit, -limit, 0.4], [-limit, limit, -0.6]]
@@ -60,7 +60,7 @@ def test_spark_reads_a_tree_of_one_node(spark: Spark) -> None:
     assert len(got.center) == 1
 
 
-def test_more_children_in_one_place_than_a_node_may_have(spark: Spark) -> None:
+def test_spark_reads_more_coincident_splats_than_a_node_has_children(spark: Spark) -> None:
     count = MAX_CHILDREN + 5000
     scene = baked(random_splats(1).take(np.zeros(count, np.intp)))
     got = laws.check(spark, scene)
@@ -87,7 +87,7 @@ def test_a_page_that_asks_for_lod_gets_our_tree(spark: Spark) -> None:
     laws.check_tree(got, scene.tree)
 
 
-def test_a_truncated_file_is_an_error(spark: Spark) -> None:
+def test_spark_refuses_a_truncated_file(spark: Spark) -> None:
     """So that the tests above would notice if Spark could not read a file."""
     data = encoded(baked(random_splats(500)))
     with pytest.raises(AssertionError, match="failed: "):

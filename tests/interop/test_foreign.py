@@ -133,12 +133,12 @@ def check_with_splat_transform(foreign: Foreign, file: File) -> None:
 
 
 @pytest.mark.parametrize("file", [*FILES, *HARD], indirect=True)
-def test_splat_transform_reads_the_same(foreign: Foreign, file: File) -> None:
+def test_splat_transform_reads_the_same_splats(foreign: Foreign, file: File) -> None:
     check_with_splat_transform(foreign, file)
 
 
 @pytest.mark.parametrize("writer, scene", REAL)
-def test_splat_transform_reads_the_same_of_real_scenes(
+def test_splat_transform_reads_the_same_splats_of_real_scenes(
     foreign: Foreign, make: Callable[..., File], writer: str | None, scene: str
 ) -> None:
     check_with_splat_transform(foreign, make(writer, real_scene(scene)))
@@ -155,7 +155,7 @@ HEADERS = {
 
 @pytest.mark.parametrize("changes", HEADERS.values(), ids=HEADERS.keys())
 @pytest.mark.parametrize("level", range(3))
-def test_headers_that_mkkelloggs_viewer_takes(
+def test_unusual_ksplat_headers_are_read_as_by_others(
     foreign: Foreign, make: Callable[..., File], tmp_path: Path, level: int, changes: list[tuple[int, str, int]]
 ) -> None:
     data = bytearray(make(f"KSPLAT {level} in sections", FIXTURES / "sh2.ply").path.read_bytes())
@@ -189,7 +189,7 @@ def spark_can_read(writer: str | None, source: str) -> bool:
 
 
 @pytest.mark.parametrize("file", [row for row in FILES if spark_can_read(*row.values[0])], indirect=True)
-def test_spark_reads_the_same(spark: Spark, file: File) -> None:
+def test_spark_reads_the_same_splats(spark: Spark, file: File) -> None:
     got, splats = spark.load(file.path), read_scene(file.path).splats
     within(got.center, splats.center, 2.0**-21 * np.abs(splats.center).max())
     within(got.rgb, splats.rgb, HALF * np.abs(splats.rgb) + TINY)

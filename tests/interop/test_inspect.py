@@ -177,7 +177,7 @@ def source(request: pytest.FixtureRequest) -> Path:
 
 
 @pytest.mark.parametrize("builder", BUILDERS)
-def test_judged_as_what_it_is(
+def test_facts_and_findings_of_sparks_trees_are_right(
     spark: Spark, tmp_path: Path, capsys: pytest.CaptureFixture[str], source: Path, builder: str
 ) -> None:
     path = tmp_path / "tree.spz"
@@ -199,7 +199,9 @@ def test_judged_as_what_it_is(
 
 
 @pytest.mark.parametrize("builder", BUILDERS)
-def test_leaves_are_the_splats(spark: Spark, tmp_path: Path, capsys: pytest.CaptureFixture[str], builder: str) -> None:
+def test_leaves_of_sparks_trees_are_the_splats_but_for_small_rotations(
+    spark: Spark, tmp_path: Path, capsys: pytest.CaptureFixture[str], builder: str
+) -> None:
     """But for turns below 2.5 degrees: Spark's builders hold the w of a rotation as a float16, which makes 1 of it."""
     source, path = FIXTURES / "demo.ply", tmp_path / "tree.spz"
     scene = spark_tree(spark, source, builder)

@@ -66,7 +66,7 @@ def test_spark_draws_spherical_harmonics_as_we_do(page: Page, tmp_path: Path, sh
 
 
 @pytest.mark.parametrize("sort", SORTS)
-def test_splats_in_one_place(page: Page, tmp_path: Path, sort: str) -> None:
+def test_spark_draws_coincident_splats_in_our_order(page: Page, tmp_path: Path, sort: str) -> None:
     """Which of them is in front."""
     splats = random_splats(300).take(np.repeat(np.arange(300), 3))
     splats.rgb[:] = np.random.default_rng(1).uniform(0, 1, splats.rgb.shape)

@@ -167,7 +167,7 @@ def test_the_cut_of_one_tree_is_that_of_spark(spark: Spark, name: str, method: s
     assert reasons >= {"budget", "pixel"}
 
 
-def test_every_cone_at_a_budget_that_is_used_up(spark: Spark) -> None:
+def test_the_cut_of_every_cone_is_that_of_spark(spark: Spark) -> None:
     tree = baked(scene("demo.ply"))
     both = Both(spark, [tree])
     for camera in cameras(tree.nodes, 12, seed=3):
@@ -188,7 +188,7 @@ def test_the_cut_of_every_budget_is_that_of_spark(spark: Spark) -> None:
 
 
 @pytest.mark.parametrize("names, views", [(["demo.ply"], 40), (["demo.ply", "biker.spz", "playbot.sog"], 20)])
-def test_instances_compete_for_one_budget(spark: Spark, names: list[str], views: int) -> None:
+def test_the_cut_of_several_instances_is_that_of_spark(spark: Spark, names: list[str], views: int) -> None:
     """Several of one tree, and of several: turned, scaled, moved, and some of them exactly where others are."""
     trees = [baked(scene(name)) for name in names]
     both = Both(spark, trees)

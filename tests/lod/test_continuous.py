@@ -81,7 +81,7 @@ def test_weights_sum_to_the_budget_where_that_is_what_ends_the_cut(width: float,
 
 
 @given(cases(), st.sampled_from(WIDTHS))
-def test_all_leaves_where_the_budget_does_not_matter(case: Case, width: float) -> None:
+def test_with_a_large_budget_all_leaves_have_weight_one(case: Case, width: float) -> None:
     case = Case(case.trees, case.instances, case.view, case.most, 0.0)
     cut = ContinuousCuts(case.traversal()).cut(case.view, budget=case.budget, width=width)
     ordinary = case.find()
@@ -92,7 +92,7 @@ def test_all_leaves_where_the_budget_does_not_matter(case: Case, width: float) -
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_the_ordinary_cut_where_nothing_has_time_to_fade(seed: int) -> None:
+def test_without_a_range_to_fade_in_it_is_the_ordinary_cut(seed: int) -> None:
     case = some_case(seed)
     ordinary = case.find()
     cut = ContinuousCuts(case.traversal()).cut(case.view, budget=case.budget, width=1 + 1e-9)
@@ -158,7 +158,7 @@ def log_scales(case: Case, view: View) -> np.ndarray:
     return np.log(np.concatenate(scales).astype(np.float64))
 
 
-def test_a_tiny_step_across_the_place_where_a_node_is_divided_changes_next_to_nothing() -> None:
+def test_a_tiny_step_across_a_threshold_changes_next_to_nothing() -> None:
     case = some_case(3, foveation=Cones())
     cuts = ContinuousCuts(case.traversal())
     far, near = 6.0, 3.0
@@ -207,7 +207,7 @@ def test_shares_rise_from_nothing_at_the_threshold_to_all_at_its_multiple() -> N
     st.integers(0, 60),
     st.sampled_from(WIDTHS),
 )
-def test_the_threshold_uses_the_room_and_no_more(nodes: list[tuple[float, int]], room: int, width: float) -> None:
+def test_the_threshold_uses_the_budget_and_no_more(nodes: list[tuple[float, int]], room: int, width: float) -> None:
     limit = np.array([node[0] for node in nodes])
     more = np.array([node[1] for node in nodes], np.int64)
     threshold = find_threshold(limit, more, room, width)

@@ -100,7 +100,7 @@ def test_the_order_of_the_nodes_does_not_matter(case: Case, random: object) -> N
 
 
 @given(cases(), st.data())
-def test_changes_are_those_of_sets(case: Case, data: st.DataObject) -> None:
+def test_added_and_removed_nodes_are_those_of_sets(case: Case, data: st.DataObject) -> None:
     found = case.traversal()
     changes = Changes(found.forest, case.instances)
     before: list[set[int]] | None = None
@@ -141,11 +141,11 @@ def test_one_splat_in_a_cut_has_the_size_and_overdraw_of_its_place() -> None:
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
-def test_a_size_that_is_none_fills_the_picture(bad: float) -> None:
+def test_a_size_that_is_not_finite_fills_the_picture(bad: float) -> None:
     assert at_distance([0, 0, -1], bad).overdraw == pytest.approx(1)
 
 
-def test_a_cut_of_nothing_has_no_figures() -> None:
+def test_an_empty_cut_has_no_figures() -> None:
     tree = Nodes(np.zeros((1, 3), np.float32), np.ones(1, np.float32), links([]))
     case = Case([tree], [TreeInstance()], View(np.eye(4), 1.0, 1.0), 1, 0.0)
     cut = case.find(resident=np.zeros(1, np.bool_))

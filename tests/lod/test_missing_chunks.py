@@ -62,7 +62,7 @@ class TestSmallChunks:
             assert there[chunks].all()  # what is drawn is there
 
     @given(cases(60), st.data())
-    def test_what_is_wanted_in_turn_comes_to_the_whole_cut(self, case: Case, data: st.DataObject) -> None:
+    def test_loading_the_wanted_chunks_in_turn_gives_the_whole_cut(self, case: Case, data: st.DataObject) -> None:
         """As a viewer fetches it: the roots, then always the most wanted chunk that is missing."""
         found = case.traversal()
         whole = case.find(found)

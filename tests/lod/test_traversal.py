@@ -30,7 +30,7 @@ def test_the_cut_is_that_of_one_queue(case: Case) -> None:
 
 
 @given(cases(), st.data())
-def test_what_is_no_larger_than_the_limit_is_not_divided(case: Case, data: st.DataObject) -> None:
+def test_nodes_no_larger_than_the_limit_are_not_refined(case: Case, data: st.DataObject) -> None:
     """The limit is exactly a node's pixel scale."""
     found = case.traversal()
     sight = views_of(found.forest, case.instances, case.view)
@@ -42,7 +42,7 @@ def test_what_is_no_larger_than_the_limit_is_not_divided(case: Case, data: st.Da
 
 
 @given(cases(), st.data())
-def test_cuts_before_do_not_matter(case: Case, data: st.DataObject) -> None:
+def test_earlier_cuts_do_not_change_a_cut(case: Case, data: st.DataObject) -> None:
     found = case.traversal()
     for _ in range(data.draw(st.integers(2, 5))):
         budget = data.draw(st.integers(len(case.instances), case.most + 3))
@@ -52,7 +52,7 @@ def test_cuts_before_do_not_matter(case: Case, data: st.DataObject) -> None:
 
 
 @given(cases(), st.data())
-def test_numbers_that_are_none(case: Case, data: st.DataObject) -> None:
+def test_nan_and_infinity_give_a_cut(case: Case, data: st.DataObject) -> None:
     """NaN counts as more than infinity, as in Spark; what comes of it is a cut."""
     bad = st.sampled_from([math.nan, math.inf, -math.inf, 65504.0, 3e38, 1e-45])
     for tree in case.trees:
@@ -122,7 +122,7 @@ def test_the_cut_of_large_trees_is_that_of_one_queue(seed: int) -> None:
         check(case, case.find(found))
 
 
-def test_threads_share_a_traversal() -> None:
+def test_threads_can_share_a_traversal() -> None:
     case, rng = large_case(9), np.random.default_rng(9)
     found = case.traversal()
     asked = [
@@ -138,7 +138,7 @@ def test_threads_share_a_traversal() -> None:
 
 
 @pytest.mark.parametrize("ends", [1, 2, 3])
-def test_chains_that_are_longer_than_the_buffers(ends: int) -> None:
+def test_chains_longer_than_the_buffers_are_traversed(ends: int) -> None:
     """A node of one child adds nothing, so no budget bounds how many are looked at."""
     length = 4 * CHUNK_NODES
     assert length > VISITS * ends + CHUNK_NODES
@@ -161,7 +161,7 @@ def seen_from(distance: float) -> View:
     return View(camera, 1.4, 1.0)
 
 
-def test_a_node_is_looked_at_twice() -> None:
+def test_a_tree_as_long_as_the_buffers_is_cut_as_by_one_queue() -> None:
     """Where the buffers are as long as the tree: by the threshold, then by the queue."""
     tree = links([2, 2, 2])
     size = np.array([1, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5], np.float32)
@@ -171,7 +171,7 @@ def test_a_node_is_looked_at_twice() -> None:
     assert sorted(cut.node.tolist()) == [1, 5, 6]
 
 
-def test_many_children_and_many_instances() -> None:
+def test_many_children_and_many_instances_are_traversed() -> None:
     tree = links([65535])
     rng = np.random.default_rng(0)
     center = rng.normal(size=(65536, 3)).astype(np.float32)

@@ -70,6 +70,6 @@ def test_each_fault_is_named(counts: list[int], starts: list[int], message: str)
         tree_of(counts, starts).validate()
 
 
-def test_columns_of_different_lengths_are_no_tree() -> None:
+def test_columns_of_different_lengths_are_refused() -> None:
     with pytest.raises(TreeError, match="2 child counts but 1"):
         LodTree(np.zeros(2, np.uint16), np.zeros(1, np.uint32)).validate()

@@ -21,7 +21,7 @@ def with_value(splats: Splats, name: str, row: int, value: float) -> Splats:
 
 @pytest.mark.parametrize("name", COLUMNS)
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_what_is_not_finite_is_an_error_or_dropped(name: str, value: float) -> None:
+def test_values_that_are_not_finite_are_an_error_or_dropped(name: str, value: float) -> None:
     splats = with_value(random_splats(9, sh_degree=1), name, 4, value)
     with pytest.raises(InvalidSplatsError, match=r"1 of 9 splats are not finite .* splat 4\), add --on-invalid drop"):
         Selection().apply(splats)
@@ -76,6 +76,6 @@ def test_nothing_left_is_an_error_that_says_why() -> None:
         Selection().apply(random_splats(0))
 
 
-def test_what_is_kept_is_not_copied() -> None:
+def test_a_selection_of_all_copies_nothing() -> None:
     splats = random_splats(5)
     assert Selection().apply(splats)[0] is splats

@@ -63,13 +63,13 @@ def test_sh_above_a_degree_is_left_out() -> None:
     assert random_splats(5, sh_degree=1).with_max_sh(3).sh_degree == 1
 
 
-def test_a_count_of_coefficients_that_no_degree_has_is_an_error() -> None:
+def test_a_wrong_number_of_coefficients_is_an_error() -> None:
     with pytest.raises(FormatError, match="4 SH coefficients"):
         degree_of(4)
 
 
 @given(arrays(np.float32, st.tuples(st.integers(1, 20)), elements=st.floats(np.float32(1e-6), 1000, width=32)))
-def test_lod_opacity_and_back(opacity: np.ndarray) -> None:
+def test_lod_opacity_can_be_inverted(opacity: np.ndarray) -> None:
     coded = lod_opacity(opacity)
     assert coded.dtype == np.float32
     assert np.array_equal(coded[opacity <= 1], opacity[opacity <= 1])

@@ -281,7 +281,7 @@ def test_parts_come_one_after_another() -> None:
         (lambda: Transform(np.eye(4)), r"shape \(4, 4\)"),
     ],
 )
-def test_what_is_no_transform_is_refused(make: object, says: str) -> None:
+def test_wrong_transforms_are_refused(make: object, says: str) -> None:
     with pytest.raises(ValueError, match=says):
         make()  # type: ignore[operator]
 
@@ -332,7 +332,7 @@ def test_a_camera_that_moves_along_sees_the_same_picture(transform: Transform) -
 
 
 @pytest.mark.parametrize("transform", MOVES)
-def test_it_would_not_if_spherical_harmonics_were_left_as_they_are(transform: Transform) -> None:
+def test_unrotated_spherical_harmonics_would_change_the_picture(transform: Transform) -> None:
     splats = scene()
     moved = dataclasses.replace(transform.apply(splats), sh=splats.sh)
     assert psnr(picture(splats, Transform()), picture(moved, transform)) < OTHER

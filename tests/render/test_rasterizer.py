@@ -102,7 +102,7 @@ def threads(count: int) -> Iterator[None]:
 @pytest.mark.parametrize("sort", SORTS)
 @pytest.mark.parametrize("profile", PROFILES)
 @pytest.mark.parametrize("most", [1.0, 5.0])
-def test_it_draws_what_the_twin_draws(most: float, profile: str, sort: str) -> None:
+def test_pictures_are_those_of_the_twin(most: float, profile: str, sort: str) -> None:
     for seed in range(3):
         image = check(shown(150, seed=seed, most=most), camera_at(), RasterSettings(profile=profile, sort=sort))
         assert image[..., 3].mean() > 0.1
@@ -115,7 +115,7 @@ def test_pictures_of_any_size_are_those_of_the_twin(size: tuple[int, int]) -> No
 
 
 @pytest.mark.parametrize("principal", [(0.0, 0.0), (57.0, 10.0), (-20.0, 20.0), (28.0, 70.0)])
-def test_a_principal_point_that_is_not_in_the_middle(principal: tuple[float, float]) -> None:
+def test_an_off_centre_principal_point_shifts_the_picture(principal: tuple[float, float]) -> None:
     """What is dropped is told by where it is on the picture, not by its angle to the optical axis."""
     image = check(shown(400, spread=1.5), camera_at(principal=principal))
     assert image[..., 3].mean() > 0.02
@@ -173,7 +173,7 @@ def test_a_splat_is_dropped_when_its_center_is_beyond_the_clip() -> None:
         assert image.any() == drawn
 
 
-def test_more_than_opaque_is_never_more_than_five() -> None:
+def test_an_lod_opacity_above_five_is_five() -> None:
     camera = camera_at()
     five, more = (draw(one((0, 0, 0), 0.3, d, (1, 0.5, 0)), camera, RasterSettings()) for d in (5.0, 7.5))
     np.testing.assert_array_equal(five, more)
@@ -189,7 +189,7 @@ def test_colours_follow_the_direction_by_spherical_harmonics(sh_degree: int) -> 
 
 
 @pytest.mark.parametrize("size", [1.0, 1.7])
-def test_placing_splats_is_moving_the_camera(size: float) -> None:
+def test_moving_splats_is_moving_the_camera_the_other_way(size: float) -> None:
     splats, camera = random_splats(300, sh_degree=3), camera_at()
     matrix = np.linalg.inv(look_at((0.4, 0.9, -0.3), (1.0, 0.2, 0.5), (0.1, -1.0, 0.3)))
     matrix[:3, :3] *= size
@@ -238,7 +238,7 @@ def test_of_splats_in_one_place_the_last_is_in_front() -> None:
 
 
 @pytest.mark.parametrize("profile", PROFILES)
-def test_what_is_opaque_and_near_hides_all(profile: str) -> None:
+def test_an_opaque_near_splat_hides_all_behind_it(profile: str) -> None:
     camera = camera_at((0, 0, 4))
     wall = one((0, 0, 2.5), 2.0, 5.0, (0.2, 0.4, 0.6))
     image = draw(joined(shown(200, spread=0.4), wall), camera, RasterSettings(profile=profile))

@@ -87,7 +87,7 @@ def test_a_billboard_is_as_wide_as_its_splat() -> None:
 
 
 @pytest.mark.parametrize("style", STYLES)
-def test_what_is_too_near_or_too_far_is_not_drawn(style: str) -> None:
+def test_splats_outside_near_and_far_are_not_drawn(style: str) -> None:
     source = plain(balls((0, 0, 0)))
     for raster in (RasterSettings(near=5.1), RasterSettings(far=4.9)):
         assert not drawn(source, style=style, raster=raster).image.any()
@@ -112,14 +112,14 @@ def test_colours_are_those_of_the_scale(by: str) -> None:
         assert np.allclose(pixel[:3] / pixel[3], renderer.scale.rgb(np.array(value)), atol=0.01)
 
 
-def test_a_colour_that_means_something_is_not_lit() -> None:
+def test_color_by_ignores_spherical_harmonics() -> None:
     splats = random_splats(200, sh_degree=3)
     dark = dataclasses.replace(splats, rgb=np.zeros_like(splats.rgb), sh=np.zeros_like(splats.sh))
     images = [drawn(plain(each), color_by="size").image for each in (splats, dark)]
     assert np.array_equal(*images)
 
 
-def test_levels_want_a_tree() -> None:
+def test_color_by_level_needs_a_tree() -> None:
     with pytest.raises(SparklodError, match="no file is a Level-of-Detail tree"):
         drawn(plain(balls((0, 0, 0))), color_by="level")
 
@@ -134,7 +134,7 @@ def test_depth_is_how_far_along_the_axis(style: str) -> None:
     assert not result.image[0, 0].any()
 
 
-def test_a_scale_is_of_all_cameras() -> None:
+def test_a_color_scale_spans_all_cameras() -> None:
     near, far = camera(z=3.0), camera(z=30.0)
     scale = Renderer(plain(balls((0, 0, 0), (0.1, 0, 0))), RenderSettings(color_by="depth"), [near, far]).scale
     assert scale is not None

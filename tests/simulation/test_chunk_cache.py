@@ -22,7 +22,7 @@ def here(cache: ChunkCache) -> set[int]:
 
 @settings(max_examples=400)  # what goes wrong here takes several steps that suit each other
 @given(st.data())
-def test_what_was_least_recently_used_is_given_up(data: st.DataObject) -> None:
+def test_the_least_recently_used_chunk_is_evicted(data: st.DataObject) -> None:
     trees = data.draw(st.lists(st.integers(1, 5), min_size=1, max_size=3))
     chunks = Chunks([np.ones(count, np.int64) for count in trees])
     capacity = data.draw(st.none() | st.integers(len(trees), len(chunks) + 1))
@@ -54,7 +54,7 @@ def test_what_was_least_recently_used_is_given_up(data: st.DataObject) -> None:
         assert not rooted or set(chunks.roots) <= set(cache.admitted)
 
 
-def test_what_came_late_goes_before_what_is_wanted() -> None:
+def test_unwanted_late_arrivals_are_evicted_first() -> None:
     cache = ChunkCache(Chunks([[1, 1, 1], [1]]), 3)
     cache.want([])
     for chunk in (0, 3, 1):  # the last is not wanted, and there is room
@@ -66,7 +66,7 @@ def test_what_came_late_goes_before_what_is_wanted() -> None:
     assert [cache.arrive(chunk) for chunk in (0, 3, 1, 2)] == [None, None, None, 1]
 
 
-def test_a_copy_goes_its_own_way() -> None:
+def test_a_copy_of_a_cache_is_independent() -> None:
     cache = ChunkCache(Chunks([[1, 1, 1]]), 2)
     cache.want([1])
     cache.arrive(0)
@@ -91,14 +91,14 @@ def test_a_chunk_that_no_tree_has_cannot_be_wanted(wanted: list[int]) -> None:
         ChunkCache(Chunks([[1, 1], [1]])).want(wanted)
 
 
-def test_the_roots_have_to_fit() -> None:
+def test_a_cache_smaller_than_the_roots_is_refused() -> None:
     chunks = Chunks([[1], [1, 1]])
     with pytest.raises(ValueError, match="the roots of 2 trees"):
         ChunkCache(chunks, 1)
     ChunkCache(chunks, 2)
 
 
-def test_chunks_are_numbered_through() -> None:
+def test_chunks_are_numbered_across_trees() -> None:
     chunks = Chunks([[5, 6], np.array([7], np.uint32), [8, 9]])
     assert chunks.sizes == [5, 6, 7, 8, 9]
     assert chunks.roots == [0, 2, 3]
@@ -108,7 +108,7 @@ def test_chunks_are_numbered_through() -> None:
 
 
 @pytest.mark.parametrize("sizes", [[[1], []], [[1], [2, -1]], [[1], [[2]]]])
-def test_sizes_that_cannot_be(sizes: list[list[int]]) -> None:
+def test_impossible_chunk_sizes_are_refused(sizes: list[list[int]]) -> None:
     with pytest.raises(ValueError, match="chunks of tree 1"):
         Chunks(sizes)
 

@@ -27,7 +27,7 @@ OF_ALL = {
 
 
 @pytest.mark.parametrize("viewer", viewers(), ids=str)
-def test_laws_of_all_rows(three: Scenes, viewer: tuple[LodSettings, StreamingSettings]) -> None:
+def test_columns_of_a_row_agree_with_each_other(three: Scenes, viewer: tuple[LodSettings, StreamingSettings]) -> None:
     path, (settings, streaming) = around(12), viewer
     rows = rows_of(three, settings, path, streaming, by_instance=True)
     assert len(rows) == 12 * 4
@@ -98,7 +98,7 @@ def test_a_cut_stops_for_the_reason_it_says(three: Scenes, viewer: tuple[LodSett
             assert cell["selected"] + 160 > settings.budget or settings.budget < 160
 
 
-def test_every_reason_comes_up(three: Scenes) -> None:
+def test_every_stop_reason_occurs(three: Scenes) -> None:
     assert {
         row["stop_reason"]
         for settings, streaming in viewers()
@@ -133,7 +133,7 @@ def test_a_frame_does_not_depend_on_those_before(three: Scenes) -> None:
     assert all(without(row, OF_THE_PAST) == by_place[row["frame"], row["instance"]] for row in backwards)
 
 
-def test_numbers_and_names_are_those_of_the_path(town: Scenes) -> None:
+def test_frame_numbers_and_names_are_those_of_the_path(town: Scenes) -> None:
     first, second = (
         camera((0, -1, -3), time=0.5),
         dataclasses.replace(camera((1, -2, -4), (0, 0, 1), time=2), name="door"),
@@ -164,7 +164,7 @@ def test_the_limit_follows_each_camera(town: Scenes) -> None:
     assert len({row["selected"] for row in fixed}) == 1  # without foveation it is all that counts
 
 
-def test_churn_of_one_who_rests_and_of_one_who_jumps(town: Scenes) -> None:
+def test_churn_is_0_at_rest_and_1_for_a_jump(town: Scenes) -> None:
     rows: list[Any] = rows_of(town, LodSettings(4_000, SPARK), resting(4))
     assert [(row["added"], row["removed"], row["churn"]) for row in rows[1:]] == [(0, 0, 0.0)] * 3
     assert (rows[0]["added"], rows[0]["removed"], rows[0]["churn"]) == (rows[0]["selected"], 0, None)
@@ -175,7 +175,7 @@ def test_churn_of_one_who_rests_and_of_one_who_jumps(town: Scenes) -> None:
     assert (again["added"], again["removed"], again["churn"]) == (1, cut["selected"], 1.0)
 
 
-def test_budgets_and_caches_that_are_too_small(three: Scenes) -> None:
+def test_budgets_and_caches_that_are_too_small_are_refused(three: Scenes) -> None:
     with pytest.raises(ValueError, match="a budget of 2 splats is less than one for each of 3 instances"):
         Simulation(three, LodSettings(2))
     with pytest.raises(ValueError, match="cannot hold the roots of 2 trees"):
@@ -185,7 +185,7 @@ def test_budgets_and_caches_that_are_too_small(three: Scenes) -> None:
         Simulation(many, LodSettings(10**6))
 
 
-def test_frames_tell_how_much_is_in_front(town: Scenes) -> None:
+def test_frames_have_the_share_of_splats_in_front(town: Scenes) -> None:
     at, away = camera((0, -1, -6)), camera((0, -1, -6), (0, -1, -20))
     first, second = Simulation(town, LodSettings(5_000)).run(path_of([at, away]))
     assert (first.in_front, second.in_front) == (1.0, 0.0)

@@ -31,14 +31,14 @@ def test_a_cache_never_holds_more_than_fits(three: Scenes, capacity: int) -> Non
             assert any(row["missing"] for row in rows)
 
 
-def test_what_fits_is_never_missing(three: Scenes) -> None:
+def test_chunks_that_fit_the_cache_are_never_missing(three: Scenes) -> None:
     for cache in (None, 4):
         rows = rows_of(three, LodSettings(20_000, SPARK), around(20), StreamingSettings(chunk_cache=cache))
         assert all(row["missing"] == 0 for row in rows)
         assert all(row["complete_in_s"] is None for row in rows)
 
 
-def test_without_bandwidth_or_latency_all_comes_at_once(three: Scenes) -> None:
+def test_without_bandwidth_or_latency_chunks_arrive_at_once(three: Scenes) -> None:
     timing = {"traverse_ms"}
     for cache in (None, 2):
         default, infinite = (
@@ -80,7 +80,7 @@ def test_a_resting_camera_gets_the_whole_cut(town: Scenes, network: Network, bud
     assert all(row["churn"] == 0 for row in rows[complete + 1 :])
 
 
-def test_a_tree_of_one_chunk_is_there_when_it_was_promised() -> None:
+def test_a_tree_of_one_chunk_arrives_when_predicted() -> None:
     hand = read_scenes([Instance(HAND, "hand")])
     size, latency, speed = HAND.stat().st_size, 0.1, 500.0
     rows: list[Any] = rows_of(hand, LodSettings(100, SPARK), resting(60), StreamingSettings(Network(speed, latency)))

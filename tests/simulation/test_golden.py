@@ -32,7 +32,7 @@ def rows() -> list[Row]:
         return list(csv.DictReader(file))
 
 
-def test_the_documented_command_writes_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_documented_command_writes_the_golden_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     found = re.search(r"^sparklod traverse town\.spz (?:.*\\\n)*.*$", README, re.MULTILINE)
     assert found is not None
     command = shlex.split(found[0].replace("\\\n", " "))
@@ -95,7 +95,7 @@ def test_cameras_are_where_trigonometry_puts_them(rows: list[Row]) -> None:
         assert row["pixel_scale_limit"] == f"{2 * math.tan(math.radians(30)) / 360:.6g}"
 
 
-def test_cuts_are_those_of_a_queue(rows: list[Row]) -> None:
+def test_cuts_of_the_golden_table_are_those_of_a_queue(rows: list[Row]) -> None:
     """Whichever chunks there are, as many as the table says, one set of them explains all cells of a row."""
     nodes = town()
     weight = twin.cones(90, 120, 0.4, 0.2)
@@ -121,7 +121,7 @@ def test_cuts_are_those_of_a_queue(rows: list[Row]) -> None:
         assert row["churn"] == f"{len(cut ^ before) / both if both else 0:.4f}"
 
 
-def test_what_is_fetched_is_what_there_is(rows: list[Row]) -> None:
+def test_fetched_bytes_are_those_of_the_file(rows: list[Row]) -> None:
     """A chunk has its share of the file, and comes no sooner than the network brings it."""
     size, count = TOWN.stat().st_size, len(town().size)
     ends = [min(count, 65_536 * chunk) * size // count for chunk in range(4)]

@@ -42,7 +42,7 @@ def rest(stream: Stream, wanted: list[int]) -> list[tuple[float, int]]:
 
 @settings(max_examples=400)  # what goes wrong here takes several steps that suit each other
 @given(st.data(), tree_sizes, networks)
-def test_the_same_as_the_twin(data: st.DataObject, sizes: list[list[int]], network: Network) -> None:
+def test_a_stream_does_what_its_twin_does(data: st.DataObject, sizes: list[list[int]], network: Network) -> None:
     chunks = Chunks(sizes)
     capacity = data.draw(st.none() | st.integers(len(sizes), len(chunks)))
     stream, twin = Stream(chunks, network, capacity=capacity), Twin(chunks, network, NaiveCache(capacity))
@@ -96,7 +96,7 @@ def test_every_byte_comes_once_and_never_faster_than_the_link(
 
 
 @given(st.data(), tree_sizes, networks)
-def test_it_does_not_matter_in_how_many_steps_time_advances(
+def test_the_number_of_time_steps_does_not_matter(
     data: st.DataObject, sizes: list[list[int]], network: Network
 ) -> None:
     chunks = Chunks(sizes)
@@ -117,7 +117,7 @@ def test_it_does_not_matter_in_how_many_steps_time_advances(
 
 
 @given(tree_sizes, networks)
-def test_complete_is_when_it_says(sizes: list[list[int]], network: Network) -> None:
+def test_the_predicted_completion_is_when_all_is_there(sizes: list[list[int]], network: Network) -> None:
     chunks = Chunks(sizes)
     stream = Stream(chunks, network, start=5.0)
     wanted = list(range(len(chunks)))
@@ -204,7 +204,7 @@ def test_transfers_share_the_link() -> None:
     assert [(pytest.approx(3.0), 0), (pytest.approx(5.0), 1)] == rest(stream, [])
 
 
-def test_what_is_under_way_is_not_cancelled_when_the_camera_turns() -> None:
+def test_fetches_are_not_cancelled_when_the_camera_turns() -> None:
     stream = Stream(Chunks([[MB] * 5]), Network(MB, 0.5, 1))
     stream.want([])
     stream.advance(1.5)
@@ -216,7 +216,7 @@ def test_what_is_under_way_is_not_cancelled_when_the_camera_turns() -> None:
     assert here(stream) == {0, 1, 3, 4}
 
 
-def test_what_comes_too_late_takes_no_place_of_what_is_wanted() -> None:
+def test_a_late_chunk_evicts_no_wanted_one() -> None:
     stream = Stream(Chunks([[MB] * 4]), Network(MB, 0.25, 1), capacity=2)
     stream.want([1])
     stream.advance(3.0)
@@ -269,6 +269,6 @@ def test_a_stream_refuses_to_go_back_in_time() -> None:
         (1.0, 0.0, 0, "0 fetchers"),
     ],
 )
-def test_networks_that_cannot_be(bandwidth: float, latency: float, fetchers: int, message: str) -> None:
+def test_impossible_networks_are_refused(bandwidth: float, latency: float, fetchers: int, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         Network(bandwidth, latency, fetchers)

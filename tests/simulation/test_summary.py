@@ -14,7 +14,7 @@ from sparklod_cli.tables.assertions import check, parse
 from tests.tables.rows import flight, row
 
 
-def test_its_statistics_are_what_assertions_compare() -> None:
+def test_statistics_of_a_summary_are_those_of_assertions() -> None:
     rows = flight()
     for quantity in summarize(rows).quantities:
         if quantity.name == IN_FRUSTUM:
@@ -24,7 +24,7 @@ def test_its_statistics_are_what_assertions_compare() -> None:
             assert getattr(quantity, name) == pytest.approx(outcome.value, rel=1e-8)
 
 
-def test_the_share_in_the_picture() -> None:
+def test_the_share_in_the_frustum_is_that_of_numpy() -> None:
     rows = flight()
     shares = [row["in_frustum"] / row["selected"] for row in rows]  # type: ignore[operator]
     (quantity,) = [each for each in summarize(rows).quantities if each.name == IN_FRUSTUM]
@@ -42,7 +42,7 @@ def test_totals_are_sums_over_all_frames() -> None:
     assert list(summary.stop_reasons.values()) == sorted(summary.stop_reasons.values(), reverse=True)
 
 
-def test_frames_to_look_at() -> None:
+def test_the_worst_frames_are_named() -> None:
     rows = flight()
     moments = {moment.what: moment for moment in summarize(rows).moments}
     assert set(moments) == set(MOMENTS)
@@ -55,12 +55,12 @@ def test_frames_to_look_at() -> None:
     assert moments["coarsest"].value > 1
 
 
-def test_the_first_of_equal_frames_is_looked_at() -> None:
+def test_the_first_of_equally_bad_frames_is_named() -> None:
     rows = [row(frame, churn=0.5 if frame in (2, 4) else 0.1) for frame in range(6)]
     assert [moment.frame for moment in summarize(rows).moments] == [2]
 
 
-def test_what_is_empty_or_nothing_is_left_out() -> None:
+def test_columns_without_values_are_left_out() -> None:
     rows = [row(frame, selected=5, missing=0, pixel_scale_min=1.0, pixel_scale_limit=1.0) for frame in range(3)]
     summary = summarize(rows)
     assert [quantity.name for quantity in summary.quantities] == ["selected", "pixel_scale_min", "missing"]
@@ -106,14 +106,14 @@ class TestText:
         assert max(map(len, text)) <= WIDTH
         assert not any("\n" in line for line in text)
 
-    def test_it_says_it_for_people(self) -> None:
+    def test_the_lines_of_a_summary_have_its_figures(self) -> None:
         text = "\n".join(lines(summarize(flight())))
         assert "300 frames, 9.967 s" in text
         assert "67.3 % at the pixel limit, 32.7 % at the budget" in text
         assert "45.5 MB in 56 chunks, 11.4 MB of it in 14 chunks for the first frame" in text
         assert "219     7.300 s  39.9 % of the splats pop" in text
 
-    def test_empty_columns_have_no_line(self) -> None:
+    def test_columns_without_values_have_no_line(self) -> None:
         text = "\n".join(lines(summarize(flight(bandwidth=False, timing=False))))
         assert "complete" not in text
         assert "traversal" not in text

@@ -87,7 +87,7 @@ def test_a_writer_that_is_killed_leaves_whole_files_only(overwrite: bool, unname
     assert seen  # not all were killed before they had written anything
 
 
-def test_what_the_living_write_is_left_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_files_of_running_processes_are_left_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(atomic, "UNNAMED", None)
     target = tmp_path / "out"
 
@@ -104,7 +104,7 @@ def test_what_the_living_write_is_left_alone(tmp_path: Path, monkeypatch: pytest
     assert target.read_bytes() == b"outer"
 
 
-def test_what_the_dead_have_left_is_removed_and_nothing_else(tmp_path: Path, unnamed: bool) -> None:
+def test_only_files_of_dead_processes_are_removed(tmp_path: Path, unnamed: bool) -> None:
     left = tmp_path / atomic.PARTS.format("0123456789abcdef")
     left.write_bytes(b"half a")
     kept = [tmp_path / name for name in (".sparklod-notes.txt", "a.part", ".sparklod-link.part", ".sparklod-dir.part")]
@@ -156,7 +156,7 @@ def test_no_part_has_more_permissions_than_the_file(
 
 
 @pytest.mark.parametrize("overwrite", [False, True])
-def test_a_file_system_without_links(
+def test_files_are_written_without_hard_links(
     overwrite: bool, unnamed: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refused(*args: object, **kwargs: object) -> None:
@@ -179,7 +179,7 @@ def swept(folder: Path) -> None:
         path.unlink()
 
 
-def test_a_part_that_is_swept_before_it_is_locked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_part_swept_before_it_is_locked_is_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(atomic, "UNNAMED", None)
     lock: Callable[[int], None] = atomic._lock
     rounds = []
@@ -197,7 +197,7 @@ def test_a_part_that_is_swept_before_it_is_locked(tmp_path: Path, monkeypatch: p
 
 
 #: Modules that write files, and what: outputs (whole or to a device), the cache of kernels, what Open3D's process says.
-WRITERS = {"io.py", "whole.py", "render/open3d_process.py"}
+WRITERS = {"io.py", "support/atomic.py", "render/open3d/process.py"}
 
 
 def writes(call: ast.Call) -> bool:
@@ -212,7 +212,7 @@ def writes(call: ast.Call) -> bool:
     )
 
 
-def test_files_are_written_in_one_way() -> None:
+def test_only_these_modules_write_files() -> None:
     found = set()
     for path in (ROOT / "sparklod_cli").rglob("*.py"):
         calls = (node for node in ast.walk(ast.parse(path.read_text("utf-8"))) if isinstance(node, ast.Call))

@@ -27,7 +27,7 @@ def test_a_kernel_works_where_no_cache_can_be_written(monkeypatch: pytest.Monkey
     assert jit.kernel()(add)(1.0, 2.0) == 3
 
 
-def test_where_compiled_code_is_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_the_cache_is_where_the_environment_says(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "given"))
     given = jit._cache_folder()
     assert given is not None
@@ -47,7 +47,7 @@ def imported(path: Path) -> set[Path]:
     return {path for path in found if path.is_file()}
 
 
-def test_the_cache_is_named_by_all_that_kernels_are_made_of() -> None:
+def test_the_name_of_the_cache_depends_on_every_source_of_kernels() -> None:
     made_of, new = set(), {*PACKAGE.glob("*/kernels/*.py"), PACKAGE / "support/jit.py"}
     while new:
         made_of |= new
@@ -56,7 +56,7 @@ def test_the_cache_is_named_by_all_that_kernels_are_made_of() -> None:
     assert made_of == {path for pattern in jit.SOURCES for path in PACKAGE.glob(pattern)}
 
 
-def test_a_change_of_any_kernel_or_constant_is_a_new_cache(tmp_path: Path) -> None:
+def test_a_change_of_a_kernel_or_constant_makes_a_new_cache(tmp_path: Path) -> None:
     copy = tmp_path / "sparklod_cli"
     shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
     code = "from sparklod_cli.support import jit; print(jit.CACHE_FOLDER)"
@@ -68,7 +68,7 @@ def test_a_change_of_any_kernel_or_constant_is_a_new_cache(tmp_path: Path) -> No
     assert len(set(folders)) == 3
 
 
-def test_kernels_can_be_debugged() -> None:
+def test_kernels_run_without_compilation() -> None:
     code = "from sparklod_cli.lod.kernels.geometry import ellipsoid_area; print(ellipsoid_area(1.0, 1.0, 1.0))"
     environment = {**os.environ, "NUMBA_DISABLE_JIT": "1"}
     command = [sys.executable, "-c", code]
@@ -76,7 +76,7 @@ def test_kernels_can_be_debugged() -> None:
     assert float(done.stdout) == pytest.approx(12.566, abs=1e-3)
 
 
-def test_kernels_that_are_compiled_are_told_and_not_those_inside_them() -> None:
+def test_compilations_are_reported_but_not_nested_ones() -> None:
     inner = numba.njit(lambda x: x + 1)
 
     def outer(x: int) -> int:
@@ -98,7 +98,7 @@ def test_kernels_that_are_compiled_are_told_and_not_those_inside_them() -> None:
 
 
 @pytest.mark.parametrize("given", [{}, {"OMP_WAIT_POLICY": "ACTIVE"}, {"GOMP_SPINCOUNT": "7"}])
-def test_threads_do_not_spin_unless_somebody_says_so(given: dict[str, str]) -> None:
+def test_threads_do_not_spin_unless_the_environment_says_so(given: dict[str, str]) -> None:
     code = "import os; from sparklod_cli.support import jit; print(os.environ.get('GOMP_SPINCOUNT'))"
     clean = {name: value for name, value in os.environ.items() if name not in (*jit.WAITING, "OMP_WAIT_POLICY")}
     command = [sys.executable, "-c", code]

@@ -41,7 +41,7 @@ def was_cached(kernel: Any) -> bool:
     return bool(kernel.stats.cache_hits) and not kernel.stats.cache_misses
 
 
-def test_what_was_compiled_for_another_processor_is_not_there(tmp_path: Path) -> None:
+def test_code_compiled_for_another_processor_is_not_used(tmp_path: Path) -> None:
     compiled(tmp_path, [])(2.0)
     assert list(tmp_path.glob(pattern_of("test_jit_cache.twice")))
     code = "from sparklod_cli.support.jit_cache import pattern_of; print(pattern_of('test_jit_cache.twice'))"

@@ -19,14 +19,14 @@ def pretend(monkeypatch: pytest.MonkeyPatch, files: dict[str, str]) -> None:
     monkeypatch.setattr(machine, "_text", known.get)
 
 
-def test_here_it_is_told_without_an_error() -> None:
+def test_memory_and_quota_of_this_machine_are_plausible() -> None:
     total, available, quota = machine.total_memory(), machine.available_memory(), machine.processor_quota()
     assert total is None or total > 0
     assert available is None or total is None or 0 <= available <= total
     assert quota is None or quota > 0
 
 
-def test_without_limits_it_is_the_machines(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_limits_memory_is_that_of_the_machine(monkeypatch: pytest.MonkeyPatch) -> None:
     pretend(monkeypatch, {"/proc/meminfo": MEMINFO, "/sys/fs/cgroup/memory.max": "max"})
     assert machine.total_memory() == pytest.approx(16 * GB, rel=1e-6)
     assert machine.available_memory() == pytest.approx(8 * GB, rel=1e-6)
@@ -46,7 +46,7 @@ def test_the_least_limit_of_any_group_above_counts(folder: str, monkeypatch: pyt
     assert (machine.total_memory(), machine.available_memory(), machine.processor_quota()) == (4 * GB, 3 * GB, 1.5)
 
 
-def test_limits_of_version_1(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_limits_of_cgroup_version_1_are_read(monkeypatch: pytest.MonkeyPatch) -> None:
     memory, cpu = "/sys/fs/cgroup/memory", "/sys/fs/cgroup/cpu/job"
     files = {"/proc/meminfo": MEMINFO, "/proc/self/cgroup": V1, f"{memory}/memory.limit_in_bytes": str(2**63 - 4096)}
     files |= {f"{memory}/job/memory.limit_in_bytes": str(2 * GB), f"{memory}/job/memory.usage_in_bytes": str(3 * GB)}

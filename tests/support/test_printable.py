@@ -36,7 +36,7 @@ EVIL = {
 
 
 @given(TEXTS.map("".join), st.none() | st.integers(40, 200))
-def test_it_stands_on_one_line_and_does_nothing(text: str, most: int | None) -> None:
+def test_printable_text_is_one_line_without_commands(text: str, most: int | None) -> None:
     shown = printable(text, most)
     assert shown.isprintable()
     shown.encode()
@@ -51,7 +51,7 @@ def test_plain_text_stays_as_it_is(text: str) -> None:
     assert printable(text) == text
 
 
-def test_it_is_spelt_as_in_strings() -> None:
+def test_control_characters_are_spelt_as_in_python() -> None:
     assert printable("a\n\x1b\x9b\u202e\U000e0001\udce9é 漢") == r"a\n\x1b\x9b\u202e\U000e0001\xe9é 漢"
 
 
@@ -70,7 +70,7 @@ def is_harmless(text: str) -> bool:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="names of any bytes are of Linux")
 @pytest.mark.parametrize("name", EVIL)
-def test_names_of_files_do_nothing_in_any_command(
+def test_no_command_prints_a_file_name_raw(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Said
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -109,7 +109,9 @@ def test_names_of_files_do_nothing_in_any_command(
         assert all(len(line) <= MOST + 20 for line in err.split("\n")), arguments
 
 
-def test_annotations_hold_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Said) -> None:
+def test_a_file_name_cannot_start_another_annotation(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Said
+) -> None:
     monkeypatch.chdir(tmp_path)
     for evil in EVIL.values():
         assert run(["inspect", f"{evil}.no", "--check", "--format", "github"]) == 3
@@ -119,6 +121,6 @@ def test_annotations_hold_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         assert out[:-1].isprintable()
 
 
-def test_a_table_on_a_screen() -> None:
+def test_tables_for_a_screen_have_no_control_characters() -> None:
     pieces = [b"frame,name\n", "0,\x1b[2Ja\rb\n1,\u202e\n".encode()]
     assert b"".join(for_screen(pieces)) == b"frame,name\n0,\\x1b[2Ja\\rb\n1,\\u202e\n"

@@ -59,25 +59,25 @@ def test_full_standard_output_is_a_failure(arguments: tuple[object, ...]) -> Non
     assert "Exception" not in done.stderr
 
 
-def test_who_prints_nothing_needs_no_standard_output(tmp_path: Path) -> None:
+def test_a_run_that_prints_nothing_needs_no_standard_output(tmp_path: Path) -> None:
     assert sparklod(("build-lod", PLAIN, "-o", tmp_path / "out.spz"), ">&-").returncode == 0
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full here")
-def test_work_goes_on_where_nobody_hears_of_it(tmp_path: Path) -> None:
+def test_work_goes_on_without_a_standard_error(tmp_path: Path) -> None:
     assert sparklod(("build-lod", PLAIN, "-o", tmp_path / "out.spz"), "2> /dev/full").returncode == 0
     assert (tmp_path / "out.spz").exists()
     assert sparklod(("build-lod", tmp_path / "missing.ply"), "2> /dev/full").returncode == 1
     assert sparklod(("build-lod", PLAIN, "--best"), "2> /dev/full").returncode == 2
 
 
-def test_a_reader_that_goes_away_hears_nothing_more() -> None:
+def test_a_reader_that_stops_early_causes_no_message() -> None:
     done = sparklod(("inspect", *[TREE] * 50), "| head -n 1")
     assert done.stdout.count("\n") == 1
     assert done.stderr == ""
 
 
-def test_what_an_encoding_has_not_is_spelt(tmp_path: Path) -> None:
+def test_characters_outside_the_encoding_are_escaped(tmp_path: Path) -> None:
     tree = tmp_path / "café 漢.spz"
     tree.write_bytes(TREE.read_bytes())
     done = sparklod(("inspect", tree), "").stdout
@@ -90,7 +90,7 @@ def test_what_an_encoding_has_not_is_spelt(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("filename", ["/cache/kernel.nbi", None])
-def test_other_errors_of_the_system_are_not_blamed_on_it(
+def test_other_system_errors_are_not_blamed_on_standard_output(
     filename: str | None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def fails(*args: object, **kwargs: object) -> None:
@@ -102,7 +102,7 @@ def test_other_errors_of_the_system_are_not_blamed_on_it(
     assert capsys.readouterr().err == f"error: cannot go on: {where}no space left on device\n"
 
 
-def test_an_error_of_what_is_written_is_not_its_own() -> None:
+def test_an_error_while_making_the_output_is_not_one_of_standard_output() -> None:
     def pieces() -> list[bytes]:
         raise OSError(5, "Input/output error")
 

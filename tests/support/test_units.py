@@ -69,21 +69,21 @@ BAD = ["", "k", "Mbit", "-1", "-5ms", "-20Mbit", "nan", "inf", "1e999", "1,000",
 
 
 @pytest.mark.parametrize("text", [*BAD, "20", "20M", "0Mbit", "0.0B/s", "20Mibit", "20MiB/s", "20Mbit/h", "20Tbit"])
-def test_bandwidths_that_are_none(text: str) -> None:
+def test_texts_that_are_not_bandwidths_are_refused(text: str) -> None:
     with pytest.raises(ValueError, match="bandwidth") as caught:
         parse_bandwidth(text)
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("text", [*BAD, "60", "0", "60us", "60 m", "infs", "60m s"])
-def test_latencies_that_are_none(text: str) -> None:
+def test_texts_that_are_not_latencies_are_refused(text: str) -> None:
     with pytest.raises(ValueError, match="is not a latency") as caught:
         parse_latency(text)
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("text", [*BAD, "1.5", "1.2345k", "500kk", "500ki", "9" * 40, "1e-1"])
-def test_counts_that_are_none(text: str) -> None:
+def test_texts_that_are_not_counts_are_refused(text: str) -> None:
     with pytest.raises(ValueError, match="is not a count") as caught:
         parse_count(text)
     assert "\n" not in str(caught.value)

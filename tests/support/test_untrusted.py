@@ -21,7 +21,7 @@ ANY_TEXT = st.text(st.characters(min_codepoint=0xD000, max_codepoint=0xE0FF, exc
 
 
 @given(VALUES)
-def test_what_json_can_say_is_read_as_it_is(value: Any) -> None:
+def test_valid_json_is_read_as_by_python(value: Any) -> None:
     assert parse_json(json.dumps(value)) == value
     assert parse_json(json.dumps(value, ensure_ascii=False).encode()) == value
 
@@ -39,7 +39,7 @@ def test_json_nested_more_than_64_deep_is_refused(opening: str, closing: str) ->
             parse_json(nested(depth, opening, closing))
 
 
-def test_depth_of_toml_is_bounded() -> None:
+def test_toml_nested_too_deep_is_refused() -> None:
     assert parse_toml(".".join("a" * (MAX_DEPTH - 1)) + " = 1")
     for text in (".".join("a" * 3000) + " = 1", f"[{'.'.join('a' * 3000)}]", f"a = {nested(3000, '[', ']')}"):
         with pytest.raises(ValueError, match="it is nested more than 64 deep"):
@@ -47,7 +47,7 @@ def test_depth_of_toml_is_bounded() -> None:
 
 
 @pytest.mark.parametrize("digits", ["9" * 20, "9" * 5000, "-" + "9" * 5000, "1" + "0" * 4000])
-def test_no_number_is_too_long(digits: str) -> None:
+def test_numbers_of_too_many_digits_are_floats_or_refused(digits: str) -> None:
     """Of a whole number beyond 64 bits there is a float, with which nothing can go on for long, or that fails."""
     for value in parse_json(f'[{digits}, {{"a": {digits}}}]'):
         assert isinstance(value["a"] if isinstance(value, dict) else value, float)
@@ -69,7 +69,7 @@ def test_surrogates_can_be_kept() -> None:
 
 
 @pytest.mark.parametrize("data", [b"\xff\xfe{\x00}\x00", b'"\xed\xa0\x80"', b"", b"{", b"[1,]", "\ufeff", "\0"])
-def test_what_is_not_json_is_a_value_error_of_one_line(data: str | bytes) -> None:
+def test_invalid_json_is_a_value_error_of_one_line(data: str | bytes) -> None:
     with pytest.raises(ValueError) as caught:
         parse_json(data)
     assert "\n" not in str(caught.value)
@@ -79,7 +79,7 @@ def test_a_byte_order_mark_is_no_harm() -> None:
     assert parse_json(b'\xef\xbb\xbf{"a": 1}') == {"a": 1}
 
 
-def test_what_is_shown_is_short() -> None:
+def test_quoted_values_are_short() -> None:
     deep: list[Any] = []
     for _ in range(100_000):
         deep = [deep]

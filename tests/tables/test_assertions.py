@@ -10,8 +10,9 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from sparklod_cli.simulation.columns import COLUMNS, EMPTY
-from sparklod_cli.tables.assertions import COMPARISONS, BadAssertionError, Outcome, check, parse
+from sparklod_cli.tables.assertions import Outcome, check, parse
 from sparklod_cli.tables.columns import Row
+from sparklod_cli.tables.conditions import SIGNS, BadAssertionError
 from sparklod_cli.tables.statistics import STATISTICS
 from tests.tables.rows import flight, row
 
@@ -28,7 +29,7 @@ def churns(*values: float | None) -> list[Row]:
     return [row(frame, churn=value) for frame, value in enumerate(values)]
 
 
-@given(st.sampled_from(NUMERIC), st.none() | NAMED, st.sampled_from(sorted(COMPARISONS)), st.floats(-1e12, 1e12))
+@given(st.sampled_from(NUMERIC), st.none() | NAMED, st.sampled_from(sorted(SIGNS)), st.floats(-1e12, 1e12))
 def test_every_assertion_is_understood(name: str, statistic: str | None, sign: str, bound: float) -> None:
     left = name if statistic is None else f"{name}_{statistic}"
     for text in (f"{left}{sign}{bound!r}", f" {left} {sign}  {bound!r} "):
@@ -47,10 +48,10 @@ def test_any_other_text_is_refused_in_a_line(text: str) -> None:
     except BadAssertionError as error:
         assert "\n" not in str(error)
     else:
-        assert any(sign in text for sign in COMPARISONS)
+        assert any(sign in text for sign in SIGNS)
 
 
-@given(st.lists(st.floats(0, 1), min_size=1, max_size=30), NAMED, st.sampled_from(sorted(COMPARISONS)))
+@given(st.lists(st.floats(0, 1), min_size=1, max_size=30), NAMED, st.sampled_from(sorted(SIGNS)))
 def test_statistics_are_those_of_numpy(values: list[float], statistic: str, sign: str) -> None:
     rows = churns(*values)
     cells = [each["churn"] for each in rows]
@@ -64,16 +65,16 @@ def test_statistics_are_those_of_numpy(values: list[float], statistic: str, sign
         expected = np.percentile(column, int(statistic[1:]))
     outcome = asked(f"churn_{statistic}{sign}0.5", rows)
     assert math.isclose(outcome.value, float(expected), rel_tol=1e-12, abs_tol=1e-15)
-    assert outcome.held == COMPARISONS[sign](outcome.value, 0.5)
+    assert outcome.held == SIGNS[sign](outcome.value, 0.5)
 
 
-@given(st.lists(st.none() | st.floats(0, 1), min_size=1, max_size=30), st.sampled_from(sorted(COMPARISONS)))
+@given(st.lists(st.none() | st.floats(0, 1), min_size=1, max_size=30), st.sampled_from(sorted(SIGNS)))
 def test_without_a_statistic_every_frame_must_hold(values: list[float | None], sign: str) -> None:
     rows = churns(*values)
     cells = [each["churn"] for each in rows if each["churn"] is not None]
     assume(cells)
     outcome = asked(f"churn{sign}0.5", rows)
-    failed = [cell for cell in cells if not COMPARISONS[sign](cell, 0.5)]
+    failed = [cell for cell in cells if not SIGNS[sign](cell, 0.5)]
     assert (outcome.held, outcome.failed, outcome.frames) == (not failed, len(failed), len(cells))
     assert outcome.worst is not None
     assert outcome.worst["churn"] == outcome.value
@@ -107,7 +108,7 @@ def test_bounds_may_have_units_and_shares(text: str, bound: float) -> None:
         ("budget_used_max<40", "budget_used", "max"),
     ],
 )
-def test_the_longest_name_wins(text: str, column: str, statistic: str) -> None:
+def test_the_longest_column_name_is_taken(text: str, column: str, statistic: str) -> None:
     assertion = parse(text, COLUMNS)
     assert (assertion.column.name, assertion.statistic) == (column, statistic)
 
@@ -137,7 +138,7 @@ def test_the_longest_name_wins(text: str, column: str, statistic: str) -> None:
         ("name_max==1", "name is a text"),
     ],
 )
-def test_what_is_not_understood(text: str, message: str) -> None:
+def test_wrong_assertions_are_refused_with_the_reason(text: str, message: str) -> None:
     with pytest.raises(BadAssertionError, match=message) as caught:
         parse(text, COLUMNS)
     assert "\n" not in str(caught.value)
@@ -184,7 +185,7 @@ def test_a_column_without_values_cannot_be_asserted(text: str, why: str) -> None
         asked(text, flight(5, bandwidth=False, timing=False))
 
 
-def test_the_churn_of_one_frame() -> None:
+def test_churn_cannot_be_asserted_of_one_frame() -> None:
     with pytest.raises(BadAssertionError, match="there is only one frame"):
         asked("churn<1", flight(1))
     assert asked("churn_count==0", flight(1)).held

@@ -79,7 +79,7 @@ def test_parquet_gives_the_rows_back() -> None:
 
 
 @given(random_rows())
-def test_all_formats_tell_the_same(rows: list[Row]) -> None:
+def test_csv_and_json_have_the_same_rows(rows: list[Row]) -> None:
     expected = [{n: clean(c) if isinstance(c, str) else c for n, c in each.items()} for each in rows]
     # NUL ends a line for the module csv of Python 3.10.
     if not any("\0" in cell for each in rows for cell in each.values() if isinstance(cell, str)):
@@ -88,7 +88,7 @@ def test_all_formats_tell_the_same(rows: list[Row]) -> None:
 
 
 @given(random_rows())
-def test_parquet_tells_the_same(rows: list[Row]) -> None:
+def test_parquet_has_the_rows_of_the_other_formats(rows: list[Row]) -> None:
     assert from_parquet(encoded(rows, "parquet")) == json.loads(encoded(rows, "json"))["data"]
 
 
@@ -105,7 +105,7 @@ def test_a_table_of_no_rows_is_read_as_none(form: str) -> None:
 
 
 @pytest.mark.parametrize("start", ["=", "+", "-", "@", "\t", "\r", "\n"])
-def test_no_name_is_a_formula_and_every_number_stays_one(start: str) -> None:
+def test_csv_names_are_no_formulas_and_numbers_stay_numbers(start: str) -> None:
     name = f"{start}cmd|' /C calc'!A0"
     rows = [row(0, name=name, churn=-0.25)]
     columns = select(["name", "churn"])
@@ -128,7 +128,7 @@ def test_csv_quotes_names_and_leaves_empty_cells() -> None:
 
 
 @pytest.mark.parametrize("form", ["csv", "json"])
-def test_rows_are_written_as_they_come(form: str) -> None:
+def test_rows_are_written_before_all_are_known(form: str) -> None:
     """Also when they never end."""
     taken = 0
 

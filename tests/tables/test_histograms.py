@@ -27,7 +27,7 @@ def check(counted: Histogram, values: np.ndarray) -> None:
 
 
 @given(FLOATS, st.integers(1, 60))
-def test_everything_is_counted_once(values: np.ndarray, bins: int) -> None:
+def test_every_number_is_counted_once(values: np.ndarray, bins: int) -> None:
     counted = histogram(values, bins=bins)
     check(counted, values)
     assert len(counted.counts) in (0, 1, bins)

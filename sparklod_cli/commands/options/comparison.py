@@ -90,6 +90,7 @@ class Comparison:
         """
         from ...tables import assertions
         from ...tables.comparison import COLUMNS
+        from ...tables.conditions import BadAssertionError
 
         found = []
         for text in self.asserts:
@@ -103,7 +104,7 @@ class Comparison:
                 at = texts.index(name.strip())
             try:
                 found.append((at, dataclasses.replace(assertions.parse(rest, COLUMNS), text=text.strip())))
-            except assertions.BadAssertionError as error:
+            except BadAssertionError as error:
                 raise click.UsageError(f"--assert {error}") from None
         return found
 

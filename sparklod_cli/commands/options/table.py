@@ -95,10 +95,11 @@ class Table:
         """
         from ...simulation.columns import COLUMNS
         from ...tables import assertions
+        from ...tables.conditions import BadAssertionError
 
         try:
             return [assertions.parse(text, COLUMNS) for text in self.asserts]
-        except assertions.BadAssertionError as error:
+        except BadAssertionError as error:
             raise click.UsageError(f"--assert {error}") from None
 
 

@@ -161,7 +161,7 @@ def test_a_planted_fault_is_told_in_one_line(fault: str) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 @given(data=st.data())
-def test_what_is_cut_or_changed_gives_cameras_or_an_error(name: str, data: st.DataObject) -> None:
+def test_truncated_or_changed_files_give_cameras_or_an_error(name: str, data: st.DataObject) -> None:
     whole = files_at(FOLDER / name)
     contents = dict(whole.contents)
     file = data.draw(st.sampled_from(sorted(contents)))
@@ -214,7 +214,7 @@ def test_a_number_of_any_size_gives_cameras_or_an_error(name: str) -> None:
 @pytest.mark.parametrize(
     "model", [struct.pack("<d", 0.0), struct.pack("<d", 5e-324), struct.pack("<d", -1.0), struct.pack("<d", 1e308)]
 )
-def test_colmap_with_a_focal_length_that_is_none(model: bytes) -> None:
+def test_a_colmap_focal_length_that_is_not_positive_and_finite_is_refused(model: bytes) -> None:
     whole = files_at(FOLDER / "colmap-binary")
     cameras = bytearray(whole.contents["cameras.bin"])
     cameras[8 + 24 : 8 + 24 + 8] = model
@@ -248,14 +248,14 @@ def mutilated(value: Any, data: st.DataObject) -> Any:
 
 @pytest.mark.parametrize("name", [name for name in NAMES if name.endswith(".json")])
 @given(data=st.data())
-def test_anything_in_the_place_of_a_value_gives_cameras_or_an_error(name: str, data: st.DataObject) -> None:
+def test_any_value_replaced_by_another_gives_cameras_or_an_error(name: str, data: st.DataObject) -> None:
     root = mutilated(json.loads((FOLDER / name).read_text(encoding="utf-8")), data)
     for form in (None, CASES[name][0]):
         check_any(text_file(json.dumps(root)), form)
 
 
 @pytest.mark.parametrize("form", [form.name for form in FORMATS if form.name != "open3d"])
-def test_any_parser_refuses_what_is_another_format(form: str) -> None:
+def test_every_parser_refuses_files_of_other_formats(form: str) -> None:
     for name, (other, *_) in CASES.items():
         if other != form:
             with pytest.raises(CameraPathError):
@@ -264,7 +264,7 @@ def test_any_parser_refuses_what_is_another_format(form: str) -> None:
 
 @pytest.mark.parametrize("form", [None, *(form.name for form in FORMATS if form.name != "open3d")])
 @pytest.mark.parametrize("content", ["", "\n", "#", "\ufeff"])
-def test_any_parser_refuses_a_file_that_says_nothing(form: str | None, content: str) -> None:
+def test_every_parser_refuses_an_empty_file(form: str | None, content: str) -> None:
     for name in ("path.json", "path.csv", "images.txt"):
         with pytest.raises(CameraPathError):
             read(text_file(content, name), format=form)
@@ -274,7 +274,7 @@ def colmap(images: bytes = b"", cameras: bytes = b"") -> Files:
     return Files(Path("sparse"), {"images.bin": images, "cameras.bin": cameras})
 
 
-def test_colmap_that_promises_billions() -> None:
+def test_a_colmap_file_that_promises_billions_is_refused() -> None:
     whole = files_at(FOLDER / "colmap-binary").contents
     many = struct.pack("<Q", 10**12)
     with pytest.raises(CameraPathError, match=r"images.bin promises 1,000,000,000,000, more than it can hold"):
@@ -288,7 +288,7 @@ def test_colmap_that_promises_billions() -> None:
         read(colmap(points, whole["cameras.bin"]), format="colmap")
 
 
-def test_colmap_whose_cameras_are_not_there() -> None:
+def test_a_colmap_image_of_a_missing_camera_is_refused() -> None:
     images = b"1 1 0 0 0 0 0 5 9 a.jpg\n\n"
     for cameras, said in {
         b"8 PINHOLE 640 480 600 600 320 240\n": "image 1 has camera 9, which there is not",
@@ -317,13 +317,13 @@ TRAJECTORY = '{"class_name": "PinholeCameraTrajectory", "parameters": [%s]}'
         ("x.trajectory", TRAJECTORY % "", "rename it to .json or .log"),
     ],
 )
-def test_open3d_is_not_asked_about_broken_files(name: str, content: str, said: str) -> None:
+def test_broken_files_do_not_reach_open3d(name: str, content: str, said: str) -> None:
     """It would take them for whole ones."""
     with pytest.raises(CameraPathError, match=said):
         read(text_file(content, name), format="open3d")
 
 
-def test_what_is_missing_for_open3d_is_said(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_missing_open3d_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setitem(sys.modules, "open3d", None)
     with pytest.raises(CameraPathError, match=r"the package open3d, which is not installed; pip install 'sparklod\["):
         read(files_at(FOLDER / "open3d.json"))

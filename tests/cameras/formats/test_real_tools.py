@@ -128,7 +128,7 @@ def test_colmap_projects_a_point_to_the_same_pixel(kind: str, model: str, tmp_pa
 
 
 @pytest.mark.parametrize("suffix", [".json", ".log"])
-def test_open3d_wrote_what_we_read(suffix: str, tmp_path: Path) -> None:
+def test_a_trajectory_that_open3d_wrote_is_read(suffix: str, tmp_path: Path) -> None:
     open3d = pytest.importorskip("open3d", reason="open3d is not installed")
     poses = random_poses(4)
     trajectory = open3d.camera.PinholeCameraTrajectory()

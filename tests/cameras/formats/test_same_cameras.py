@@ -58,7 +58,7 @@ def case(name: str) -> Any:
 
 @pytest.mark.parametrize("named", [False, True], ids=["by-content", "by-name"])
 @pytest.mark.parametrize("name", [case(name) for name in CASES])
-def test_the_cameras_are_where_they_should_be(name: str, named: bool) -> None:
+def test_every_format_gives_the_known_cameras(name: str, named: bool) -> None:
     form, count, settings, second = CASES[name]
     path = read_fixture(name, settings, format=form if named else None)
     assert path.format == next(row.title for row in FORMATS if row.name == form)
@@ -74,17 +74,17 @@ def test_the_cameras_are_where_they_should_be(name: str, named: bool) -> None:
     assert path.cameras[1].time == pytest.approx(second, abs=1e-6)
 
 
-def test_every_format_is_tried() -> None:
+def test_every_format_has_a_fixture() -> None:
     assert {form for form, *_ in CASES.values()} == {form.name for form in FORMATS}
 
 
-def test_each_knows_its_own_files_only() -> None:
+def test_each_format_recognises_its_own_files_only() -> None:
     for name, (form, *_) in CASES.items():
         files = files_at(FOLDER / name)
         assert [row.name for row in FORMATS if row.parser().recognises(files)] == [form]
 
 
-def test_a_world_that_may_be_another_is_said() -> None:
+def test_a_format_that_may_have_another_world_says_so() -> None:
     for name in ("supersplat-v1.json", "splat-transform.json", "nerfstudio.json"):
         assert "--world-transform" in read_fixture(name).notes[-1]
         assert read_fixture(name, Settings(world=np.eye(4))).notes == ()
@@ -104,7 +104,7 @@ def test_colmap_without_its_cameras_keeps_its_poses() -> None:
 
 
 @pytest.mark.parametrize("file", ["images.bin", "cameras.bin"])
-def test_either_file_of_colmap_will_do(file: str) -> None:
+def test_a_colmap_model_is_found_by_either_of_its_files(file: str) -> None:
     check_pose(read_fixture(f"colmap-binary/{file}").cameras[2], KNOWN[2])
 
 
@@ -124,7 +124,7 @@ CAMERA_LINES = {
 
 
 @pytest.mark.parametrize("line", CAMERA_LINES)
-def test_lenses_of_colmap_lose_their_distortion_and_it_is_said(line: str) -> None:
+def test_colmap_distortion_is_dropped_with_a_note(line: str) -> None:
     fx, fy, said = CAMERA_LINES[line]
     images = b"1 1 0 0 0 0 0 5 9 a b.jpg\n\n2 1 0 0 0 0 0 5 9 c.jpg\n"
     path = read(Files(Path("x"), {"images.txt": images, "cameras.txt": f"9 {line}\n".encode()}), format="colmap")

@@ -77,7 +77,7 @@ def word(r: int, g: int, b: int, signs: int, exponent: int) -> int:
         ([0.12499999, 0, 0], word(255, 0, 0, 0, -3)),  # its logarithm is -3 in float32
     ],
 )
-def test_sh_word_by_hand(rgb: list[float], expected: int) -> None:
+def test_a_word_of_sh_is_that_worked_out_by_hand(rgb: list[float], expected: int) -> None:
     assert ext_splats.encode_sh(np.array([[rgb]], np.float32)).tolist() == [[expected]]
 
 

@@ -50,7 +50,7 @@ def test_a_node_is_four_words_of_these_bytes() -> None:
     assert packed["lod_tree"][0].tolist() == [x | y << 16, z | size << 16, 65535, 2**32 - 1]
 
 
-def test_both_sizes_by_hand() -> None:
+def test_both_node_sizes_are_those_worked_out_by_hand() -> None:
     splats = splats_with(3, scale=[0.25, 0.5, 0.75], opacity=[0.3, 1, linear_opacity(np.float32(3))])
     np.testing.assert_allclose(gaussian.spark_size(splats), [1, 1, 2.4], rtol=1e-6)
     np.testing.assert_allclose(gaussian.design_size(splats), [1.5, 1.5, 4.5], rtol=1e-6)
@@ -74,7 +74,7 @@ def test_centres_keep_their_error(center: np.ndarray) -> None:
 
 
 @pytest.mark.filterwarnings("error")
-def test_what_does_not_fit_is_infinite_quietly() -> None:
+def test_sizes_and_centres_beyond_float16_are_infinite_without_a_warning() -> None:
     splats = splats_with(1, center=[3e38, -3e38, 65519], scale=3e38, opacity=1000)
     got = lod_tree.unpack(lod_tree.pack(splats, links([0], [0])))
     assert got.center.tolist() == [[np.inf, -np.inf, 65504]]
@@ -112,7 +112,7 @@ def test_a_tree_of_no_nodes_is_an_empty_array() -> None:
         ({"lod_tree": np.uint32([[0, 0, 1, 1], [0, 0, 65536, 2]])}, "node 1 has 65,536 children, at most 65,535"),
     ],
 )
-def test_arrays_that_are_no_tree_are_refused(change: dict[str, np.ndarray], text: str) -> None:
+def test_arrays_that_are_not_a_tree_are_refused(change: dict[str, np.ndarray], text: str) -> None:
     with pytest.raises(FormatError, match=text):
         lod_tree.unpack(change)
 

@@ -68,7 +68,7 @@ def test_a_splat_is_four_words_of_these_bytes() -> None:
     assert packed[0, 0] == 153 << 24 | 51 << 16 | 255 << 8
 
 
-def test_sh_layout_by_hand() -> None:
+def test_words_of_sh_are_those_worked_out_by_hand() -> None:
     splats = random_splats(1, sh_degree=3)
     numbers = np.arange(45) - 22
     splats.sh[0] = (numbers / np.repeat([63, 127, 31], [9, 15, 21])).reshape(15, 3)
@@ -80,7 +80,7 @@ def test_sh_layout_by_hand() -> None:
 
 
 @pytest.mark.parametrize("sh_degree", range(4))
-def test_arrays_follow_the_degree(sh_degree: int) -> None:
+def test_there_is_an_array_for_each_sh_degree(sh_degree: int) -> None:
     splats = random_splats(7, sh_degree=sh_degree)
     packed = packed_splats.pack(splats)
     assert list(packed) == ["packed", "sh1", "sh2", "sh3"][: sh_degree + 1]
@@ -113,7 +113,7 @@ def test_lod_opacities_are_within_the_stated_bound(low: float, high: float, boun
     assert 0.99 * bound <= error <= ROUNDING * bound
 
 
-def test_center_on_a_grid() -> None:
+def test_centres_on_a_grid_keep_and_reach_the_error_of_float16() -> None:
     center = np.exp(ramp(-20, np.log(65504), 3))
     center[::2] *= -1
     error = np.abs(round_trip(splats_with(20_000, center=center)).center.astype(np.float64) - center)
@@ -160,7 +160,7 @@ def test_sh_are_within_half_a_step_of_the_range_of_their_degree(encoding: Encodi
 
 
 @given(data=st.data(), encoding=st.sampled_from([packed_splats.DEFAULT, WIDE, LOD]))
-def test_all_columns_of_any_splats(data: st.DataObject, encoding: Encoding) -> None:
+def test_all_columns_of_any_splats_are_within_their_bounds(data: st.DataObject, encoding: Encoding) -> None:
     def numbers(low: float, high: float, *shape: int) -> np.ndarray:
         return data.draw(arrays(np.float32, shape, elements=st.floats(np.float32(low), np.float32(high), width=32)))
 
@@ -205,7 +205,7 @@ def test_scales_are_coded_from_1_to_255_and_zero_as_0(scale: float, expected: in
 
 
 @pytest.mark.filterwarnings("error")
-def test_what_does_not_fit_is_clamped_quietly() -> None:
+def test_values_out_of_range_are_clamped_without_a_warning() -> None:
     assert code("rgb", rgb=[-0.1, 1.1, 3e38]) == [0, 255, 255]
     assert code("rgb", WIDE, rgb=[-3e38, -0.5, 2]) == [0, 0, 255]
     assert code("alpha", opacity=1000) == 255
@@ -233,7 +233,7 @@ def test_opacities_are_coded_by_whether_they_are_of_a_tree(opacity: float, plain
     assert code("alpha", LOD, opacity=opacity) == lod
 
 
-def test_all_codes_come_back() -> None:
+def test_unpacked_words_are_packed_to_the_same_words() -> None:
     rng = np.random.default_rng(3)
     packed = rng.integers(0, 2**32, (1000, 4), np.uint32)
     rows = packed.view(packed_splats.SPLAT)[:, 0]
@@ -247,7 +247,9 @@ def test_all_codes_come_back() -> None:
 
 @pytest.mark.filterwarnings("error")
 @given(packed=arrays(np.uint32, (9, 4)), sh1=arrays(np.uint32, (9, 2)), sh=arrays(np.uint32, (2, 9, 4)))
-def test_any_words_of_packed_splats_are_read_quietly(packed: np.ndarray, sh1: np.ndarray, sh: np.ndarray) -> None:
+def test_any_words_of_packed_splats_are_read_without_a_warning(
+    packed: np.ndarray, sh1: np.ndarray, sh: np.ndarray
+) -> None:
     splats = packed_splats.unpack({"packed": packed, "sh1": sh1, "sh2": sh[0], "sh3": sh[1]}, LOD)
     for column in ("scale", "quat_xyzw", "opacity", "rgb", "sh"):
         assert np.isfinite(getattr(splats, column)).all()
@@ -296,6 +298,6 @@ def test_sh_of_a_degree_that_is_missing_are_refused() -> None:
 
 
 @pytest.mark.parametrize("options", [{"rgb_min": 1}, {"ln_scale_max": -12}, {"sh2_max": 0}, {"rgb_max": float("nan")}])
-def test_an_encoding_must_span_something(options: dict[str, float]) -> None:
+def test_an_encoding_with_an_empty_range_is_refused(options: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=r"Encoding\("):
         Encoding(**options)

@@ -69,7 +69,7 @@ def test_json_is_an_object_a_file(scene: Path, tmp_path: Path, capsys: pytest.Ca
     assert bad == {"input": str(tmp_path / "missing.ply"), "error": "cannot be read: no such file or directory"}
 
 
-def test_merged_splats_outside_of_the_box_of_the_leaves(
+def test_merged_splats_beyond_the_leaves_lower_the_fractional_bits(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The quality builder may put them there: they get fewer bits where they would not fit."""
@@ -89,7 +89,7 @@ def test_merged_splats_outside_of_the_box_of_the_leaves(
     assert json.loads(capsys.readouterr().out)["fractional_bits"] < most
 
 
-def test_what_is_dropped_is_said(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_dropped_splats_are_counted_by_reason(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
     splats = read_scene(scene).splats
     x = float(sorted(splats.center[:, 0])[len(splats) // 2])
     assert build(scene, "--max-box", f"{x},1e9,1e9", "--json") == 0
@@ -108,7 +108,9 @@ def test_quiet_says_nothing_and_verbose_more(scene: Path, capsys: pytest.Capture
     assert "fractional bits; read" in capsys.readouterr().err
 
 
-def test_what_belongs_to_the_file_is_kept_or_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_properties_of_the_file_are_kept_or_their_loss_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     golden = FIXTURES / "golden"
     assert build(golden / "hand-v4.spz", golden / "hand-v4-sh4.spz", "--output-dir", tmp_path) == 0
     assert "SH degree 4 is cut to 3" in capsys.readouterr().err
@@ -124,7 +126,7 @@ def test_a_tree_is_not_baked_again(scene: Path, capsys: pytest.CaptureFixture[st
     assert "it is a Level-of-Detail file already" in capsys.readouterr().err
 
 
-def test_what_does_not_fit_into_memory_does_not_stop_the_others(
+def test_a_file_too_large_for_memory_does_not_stop_the_others(
     scene: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def full(*args: object, **kwargs: object) -> None:
@@ -137,7 +139,7 @@ def test_what_does_not_fit_into_memory_does_not_stop_the_others(
 
 
 @pytest.mark.parametrize("options", [[], ["--encoding", "ext"], ["--unlod"]])
-def test_a_name_without_a_suffix_promises_nothing(options: list[str], scene: Path, tmp_path: Path) -> None:
+def test_an_output_without_a_suffix_is_written(options: list[str], scene: Path, tmp_path: Path) -> None:
     source = FIXTURES / "golden" / "tree-v3.spz" if options == ["--unlod"] else scene
     assert build(source, "-o", tmp_path / "out", *options) == 0
     assert (tmp_path / "out").stat().st_size

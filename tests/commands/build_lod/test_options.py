@@ -14,7 +14,7 @@ from tests.commands.build_lod.runs import build
 from tests.conftest import FIXTURES
 
 
-def test_options_reach_the_file(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_options_of_spz_reach_the_file(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert build(scene, "-o", tmp_path / "a.spz", "--json", "--spz-version", 2, "--fractional-bits", 9) == 0
     record = json.loads(capsys.readouterr().out)
     assert (record["version"], record["fractional_bits"]) == (2, 9)
@@ -44,7 +44,7 @@ def test_quality_builds_a_tree_of_all_splats(scene: Path, tmp_path: Path, capsys
     assert sizes[1.05] < sizes[1.2] < sizes[2.0]
 
 
-def test_a_method_is_quick_if_nothing_is_said(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_default_method_is_quick(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for name, arguments in {"a": [], "b": ["--method", "quick"], "c": ["--method", "quality"]}.items():
         assert build(scene, "-o", tmp_path / f"{name}.spz", "--json", *arguments) == 0
     records = map(json.loads, capsys.readouterr().out.splitlines())
@@ -84,7 +84,7 @@ def test_options_reach_the_tree(scene: Path, tmp_path: Path, capsys: pytest.Capt
     assert sizes[1] < sizes[0]
 
 
-def test_more_processors_than_threads_that_are_taken(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_more_processors_than_the_most_threads_are_no_error(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sparklod_cli.support.parallel.processors", lambda: 5000)
     assert build(scene) == 0
 

@@ -65,7 +65,7 @@ def test_the_leaves_of_a_piped_tree_can_be_written(tmp_path: Path, monkeypatch: 
         (b'{"version": 2, "means": {"files": ["means_l.webp", "means_u.webp"]}}', "error: standard input: "),
     ],
 )
-def test_what_is_wrong_with_it_is_said_of_standard_input(
+def test_errors_name_standard_input(
     data: bytes, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pipe(monkeypatch, data)
@@ -74,13 +74,13 @@ def test_what_is_wrong_with_it_is_said_of_standard_input(
     assert not list(tmp_path.iterdir())
 
 
-def test_without_a_name_for_the_output_it_is_wrong_usage(capsys: pytest.CaptureFixture[str]) -> None:
+def test_standard_input_without_an_output_is_wrong_usage(capsys: pytest.CaptureFixture[str]) -> None:
     for arguments in (["-"], ["-", "--output-dir", "web"], ["-", SMALL]):
         assert build(*arguments) == 2
         assert "standard input has no name to derive one from; give --output" in capsys.readouterr().err
 
 
-def test_a_terminal_is_not_waited_for(
+def test_a_terminal_as_standard_input_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pipe(monkeypatch, b"")
@@ -92,7 +92,7 @@ def test_a_terminal_is_not_waited_for(
     assert "standard input is closed" in capsys.readouterr().err
 
 
-def test_it_can_be_read_twice_and_each_stream_is_read_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_standard_input_can_be_read_twice(monkeypatch: pytest.MonkeyPatch) -> None:
     for data in (b"first", b"second"):
         pipe(monkeypatch, data)
         files: list[Any] = [spooled().read() for _ in range(2)]

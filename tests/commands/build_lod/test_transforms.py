@@ -75,7 +75,7 @@ def test_a_camera_that_moves_along_sees_the_same_picture(case: str, tmp_path: Pa
 
 
 @pytest.mark.parametrize("name", COLUMNS)
-def test_nothing_changes_where_nothing_is_asked_for(name: str, tmp_path: Path) -> None:
+def test_without_transform_options_the_file_is_the_same(name: str, tmp_path: Path) -> None:
     assert build(SCENE, "-o", tmp_path / "a.spz") == 0
     assert build(SCENE, "-o", tmp_path / "b.spz", "--up", "y", "--rotate", "0,0,0", "--scale", 1) == 0
     one, other = (getattr(read_scene(tmp_path / f"{each}.spz").splats, name) for each in "ab")
@@ -102,7 +102,7 @@ def test_selection_goes_by_the_coordinates_of_the_input(tmp_path: Path) -> None:
         (["--translate", "1e9,0,0"], 1, "scale the scene"),
     ],
 )
-def test_what_cannot_be_done_is_said(
+def test_transforms_that_cannot_be_done_are_refused(
     arguments: list[str], status: int, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert build(SCENE, "-o", tmp_path / "out.spz", *arguments) == status

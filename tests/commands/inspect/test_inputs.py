@@ -39,13 +39,13 @@ def test_an_unpacked_sog_counts_as_one_file(tmp_path: Path, capsys: Said) -> Non
     ]
 
 
-def test_devices_are_not_read(capsys: Said) -> None:
+def test_inspect_does_not_read_devices(capsys: Said) -> None:
     assert inspect("/dev/null", "--check") == 3
     assert capsys.readouterr().out.count(": error: file.unreadable: ") == 1
 
 
 @pytest.mark.parametrize("name", ["no-splats.ply", "no-splats.spz"])
-def test_files_of_no_splats(name: str, capsys: Said) -> None:
+def test_files_without_splats_have_a_report(name: str, capsys: Said) -> None:
     assert inspect(FAULTS / name) == 0
     assert "0 splats, SH 0" in capsys.readouterr().out
     assert inspect(FAULTS / name, "--json", "--stats") == 0
@@ -55,7 +55,7 @@ def test_files_of_no_splats(name: str, capsys: Said) -> None:
     assert capsys.readouterr().out == f"{FAULTS / name}: error: values.empty: there are no splats\n"
 
 
-def test_scenes_are_let_go_of_before_the_next_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_scene_is_freed_before_the_next_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
     read = reports.inspect
     seen: list[weakref.ref[object]] = []
 
@@ -81,7 +81,7 @@ def chain(nodes: int) -> bytes:
 
 
 @pytest.mark.parametrize("nodes", [999, 1000, 1001, 50_000])
-def test_a_chain_is_told_of_in_bounds(nodes: int, tmp_path: Path, capsys: Said) -> None:
+def test_the_report_of_a_deep_chain_is_bounded(nodes: int, tmp_path: Path, capsys: Said) -> None:
     """Reports do not grow with the levels of a tree, and say how many they leave out."""
     path, page = tmp_path / "chain.spz", tmp_path / "page.html"
     path.write_bytes(chain(nodes))

@@ -32,7 +32,7 @@ def test_a_person_gets_a_report_on_standard_output(capsys: Said) -> None:
     assert "levels" not in plain
 
 
-def test_more_quantities_are_asked_for(capsys: Said) -> None:
+def test_stats_adds_quantities(capsys: Said) -> None:
     assert inspect(PLAIN, "--stats") == 0
     out = capsys.readouterr().out
     rows = [line.split()[0] for line in out.splitlines()]
@@ -41,7 +41,7 @@ def test_more_quantities_are_asked_for(capsys: Said) -> None:
     assert "sh1" not in capsys.readouterr().out
 
 
-def test_histograms_are_asked_for_by_name(capsys: Said) -> None:
+def test_histograms_are_printed_by_name(capsys: Said) -> None:
     assert inspect(PLAIN, "--histogram", "sh1", "--histogram", "opacity") == 0
     lines = [line.strip() for line in capsys.readouterr().out.splitlines()]
     assert 0 < lines.index("sh1") < lines.index("opacity") < len(lines) - 1
@@ -70,18 +70,18 @@ def test_the_exit_code_says_whether_a_file_was_read_and_checked(
     ("arguments", "message"),
     [
         ([], "Missing argument"),
-        ([TREE, "--json", "--field", "splats"], "--field and --json exclude each other"),
+        ([TREE, "--json", "--field", "splats"], "--field cannot be used with --json"),
         ([TREE, PLAIN, "--plot", "out.png"], "--plot takes one file, not 2"),
         ([TREE, "--check", "--fail-on", "note"], "--fail-on"),
         ([TREE, "--check", "--format", "gitlab"], "--format"),
         ([TREE, "--fail-on", "warning"], "--fail-on needs --check or an expectation"),
         ([TREE, "--format", "github"], "--format needs --check or an expectation"),
-        ([TREE, "--json", "--histogram", "scale"], "--histogram is for a person"),
-        ([TREE, "--field", "splats", "--histogram", "scale"], "--histogram is for a person"),
-        ([TREE, "--check", "--stats"], "--check prints findings; with --stats that is possible only as --json"),
-        ([TREE, "--sh", "0", "--stats"], "expectations print findings; with --stats that is possible only as --json"),
-        ([TREE, "--check", "--json", "--format", "github"], "--format is of findings in lines"),
-        ([TREE, "--check", "--field", "splats", "--format", "text"], "--format is of findings in lines"),
+        ([TREE, "--json", "--histogram", "scale"], "--histogram cannot be used with --"),
+        ([TREE, "--field", "splats", "--histogram", "scale"], "--histogram cannot be used with --"),
+        ([TREE, "--check", "--stats"], "--stats cannot be used with --check unless --json is given"),
+        ([TREE, "--sh", "0", "--stats"], "--stats cannot be used with expectations unless --json is given"),
+        ([TREE, "--check", "--json", "--format", "github"], "--format cannot be used with --"),
+        ([TREE, "--check", "--field", "splats", "--format", "text"], "--format cannot be used with --"),
         ([TREE, "--plot-level", "3"], "--plot-level needs --plot or --html"),
         ([TREE, "--plot-by", "size"], "--plot-by needs --plot or --html"),
         ([TREE, "--plot-by", "taste"], "--plot-by"),
@@ -93,7 +93,7 @@ def test_the_exit_code_says_whether_a_file_was_read_and_checked(
         ([TREE, "--max-growth", "0.9"], "--max-growth"),
         ([TREE, "--max-growth", "nan"], "--max-growth"),
         ([TREE, "--threads", "0"], "--threads"),
-        ([TREE, "--histogram", "beauty"], "--histogram knows"),
+        ([TREE, "--histogram", "beauty"], "--histogram: there is no quantity"),
     ],
 )
 def test_wrong_usage_of_inspect_is_exit_code_2(arguments: list[object], message: str, capsys: Said) -> None:
@@ -101,7 +101,7 @@ def test_wrong_usage_of_inspect_is_exit_code_2(arguments: list[object], message:
     assert message in capsys.readouterr().err
 
 
-def test_what_cannot_be_read_does_not_stop_the_others(capsys: Said) -> None:
+def test_an_unreadable_file_does_not_stop_the_others(capsys: Said) -> None:
     assert inspect(MISSING, TREE, CORRUPT, PLAIN) == 1
     out, err = capsys.readouterr()
     assert [line for line in out.splitlines() if not line.startswith(" ")] == [
@@ -114,7 +114,7 @@ def test_what_cannot_be_read_does_not_stop_the_others(capsys: Said) -> None:
     )
 
 
-def test_findings_are_data_and_what_is_good_is_talk(capsys: Said) -> None:
+def test_findings_go_to_stdout_and_good_news_to_stderr(capsys: Said) -> None:
     assert inspect("--check", MISSING, TREE, BROKEN, WARNED) == 3
     out, err = capsys.readouterr()
     assert out.splitlines() == [
@@ -125,7 +125,7 @@ def test_findings_are_data_and_what_is_good_is_talk(capsys: Said) -> None:
     assert err == f"{TREE}: nothing is wrong with its 9 nodes\n"
 
 
-def test_quiet_prints_what_is_asked_for_by_name_only(capsys: Said) -> None:
+def test_quiet_prints_only_what_options_name(capsys: Said) -> None:
     assert inspect("--check", "-q", TREE, BROKEN) == 3
     out, err = capsys.readouterr()
     assert (out.count("\n"), err) == (1, "")
@@ -166,7 +166,9 @@ def test_a_process_prints_findings_and_exits_3() -> None:
     assert (done.returncode, done.stdout, done.stderr) == (0, "6\n", "")
 
 
-def test_a_page_and_a_picture_are_said(tmp_path: Path, capsys: Said, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_paths_of_page_and_picture_are_printed(
+    tmp_path: Path, capsys: Said, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def drawn(*args: object, **kwargs: object) -> tree_plot.Picture:
         return tree_plot.Picture(b"\x89PNG" * 100, "all leaves: 6 nodes; coloured by level")
 
@@ -183,7 +185,7 @@ def test_a_page_and_a_picture_are_said(tmp_path: Path, capsys: Said, monkeypatch
 
 
 @pytest.mark.parametrize(("option", "name"), [("--html", "page.spz"), ("--plot", "picture.html")])
-def test_an_output_is_what_its_name_says(
+def test_wrong_suffixes_of_page_and_picture_are_refused(
     option: str, name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(["inspect", str(FIXTURES / "one.ply"), option, str(tmp_path / name)]) == 2

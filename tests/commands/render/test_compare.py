@@ -34,7 +34,7 @@ def table(capsys: Said) -> list[dict[str, str]]:
     return list(csv.DictReader(io.StringIO(capsys.readouterr().out)))
 
 
-def test_more_splats_are_nearer_to_all(capsys: Said) -> None:
+def test_larger_budgets_come_nearer_to_full_detail(capsys: Said) -> None:
     assert render(TOWN, *VIEW, "--compare", "--budget", "0.5%,5%,100%") == 0
     rows = table(capsys)
     assert len(rows) == 3
@@ -44,7 +44,7 @@ def test_more_splats_are_nearer_to_all(capsys: Said) -> None:
     assert [float(row["ssim"]) for row in rows][-1] == 1
 
 
-def test_what_does_not_hold_is_status_3(capsys: Said, tmp_path: Path) -> None:
+def test_an_assertion_of_a_comparison_that_fails_is_exit_code_3(capsys: Said, tmp_path: Path) -> None:
     how = (TOWN, *VIEW, "--compare", "--budget", "1%,100%", "--overwrite", "-o", tmp_path / "rows.csv")
     assert render(*how, "--assert", "100%:psnr>99", "-q") == 0
     capsys.readouterr()
@@ -77,7 +77,7 @@ def test_a_scene_of_any_size_is_compared_as_it_is_drawn(source: tuple[str, ...],
 
 
 @pytest.mark.parametrize("look", [("--look-at", "0,-3,9:0,-3,18"), ("--look-at", "0,-3,9:0,0,0", "--far", "0.02")])
-def test_a_comparison_with_nothing_is_none(look: tuple[str, ...], tmp_path: Path, capsys: Said) -> None:
+def test_a_comparison_without_a_covered_pixel_is_refused(look: tuple[str, ...], tmp_path: Path, capsys: Said) -> None:
     for how in (("--compare", "-o", tmp_path / "out.csv"), ("--diff", TOWN, "-o", tmp_path / "out.png")):
         assert render(TOWN, "--size", "64x48", *look, *how) == 1
         out, err = capsys.readouterr()
@@ -86,7 +86,7 @@ def test_a_comparison_with_nothing_is_none(look: tuple[str, ...], tmp_path: Path
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_summary_for_programs(capsys: Said) -> None:
+def test_json_of_a_comparison_is_its_summary(capsys: Said) -> None:
     assert render(TOWN, *VIEW, "--compare", "--budget", "1k,5%", "--json", "-q") == 0
     summary = json.loads(capsys.readouterr().out)
     assert summary["frames"] == 1
@@ -109,7 +109,9 @@ def test_a_summary_for_programs(capsys: Said) -> None:
         ("--sort-throttle", "0.01"),
     ],
 )
-def test_options_that_make_no_sense(arguments: tuple[str, ...], tmp_path: Path, capsys: Said) -> None:
+def test_options_that_cannot_be_used_with_compare_are_refused(
+    arguments: tuple[str, ...], tmp_path: Path, capsys: Said
+) -> None:
     name = "x.csv" if "--compare" in arguments else "x.png"
     assert render(TOWN, *VIEW, *arguments, "-o", tmp_path / name) == 2
     assert not list(tmp_path.iterdir())
@@ -117,7 +119,7 @@ def test_options_that_make_no_sense(arguments: tuple[str, ...], tmp_path: Path, 
 
 
 @pytest.mark.parametrize("name", ["table.png", "table.xlsx", "table.txt"])
-def test_a_table_is_what_its_name_says(name: str, tmp_path: Path, capsys: Said) -> None:
+def test_the_suffix_decides_the_format_of_a_comparison_table(name: str, tmp_path: Path, capsys: Said) -> None:
     assert render(TOWN, *VIEW, "--compare", "-o", tmp_path / name) == 2
     assert f"{name}: tables are written as .csv, .json, .parquet" in capsys.readouterr().err
     assert render(TOWN, *VIEW, "--compare", "--plot", tmp_path / "charts.svg") == 2

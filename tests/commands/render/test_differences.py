@@ -13,7 +13,7 @@ from sparklod_cli.images.metrics import psnr
 from tests.commands.render.runs import AT, DEMO, PLAIN, SIZE, Said, floats, pixels, render
 
 
-def test_a_difference_and_its_psnr(built: Path, tmp_path: Path, capsys: Said) -> None:
+def test_a_difference_is_drawn_and_its_psnr_said(built: Path, tmp_path: Path, capsys: Said) -> None:
     how = (*SIZE, *AT)
     assert render(DEMO, *how, "--diff", DEMO, "-o", tmp_path / "same.png", "--json", "-q") == 0
     assert json.loads(capsys.readouterr().out)["frames"][0]["psnr_db"] == 100

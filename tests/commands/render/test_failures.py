@@ -92,7 +92,7 @@ def test_wrong_usage_of_render_is_exit_code_2(
         ([PLAIN, "--color-by", "level"], "level", "no file is a Level-of-Detail tree"),
         ([TREE, "--camera-path", FAULTS / "no.json"], FAULTS / "no.json", "no such file"),
         (["--scene", FAULTS / "no.json"], FAULTS / "no.json", "no such file"),
-        ([TREE, "-o", "no/such/folder/out.png"], "no/such/folder", "does not exist"),
+        ([TREE, "-o", TREE / "out.png"], TREE, "is a file, not a folder"),
     ],
     ids=str,
 )
@@ -161,13 +161,13 @@ def test_an_interrupted_render_leaves_no_half_picture(
     assert "interrupted" in capsys.readouterr().err
 
 
-def test_cameras_that_see_nothing_are_wondered_at(tmp_path: Path, capsys: Said) -> None:
+def test_cameras_that_see_nothing_give_a_warning(tmp_path: Path, capsys: Said) -> None:
     assert render(PLAIN, *SIZE, "--look-at", "0,0,50:0,0,99", "-o", tmp_path / "x.png") == 0
     assert capsys.readouterr().err.startswith("warning: nothing is in view")
     assert render(PLAIN, *SIZE, "--look-at", "0,0,50:0,0,99", "-o", tmp_path / "x.png", "--overwrite", "-q") == 0
     assert capsys.readouterr().err == ""
 
 
-def test_a_budget_for_files_without_a_tree_is_wondered_at(tmp_path: Path, capsys: Said) -> None:
+def test_a_budget_for_files_without_a_tree_gives_a_warning(tmp_path: Path, capsys: Said) -> None:
     assert render(PLAIN, *SIZE, "--budget", 50, "-o", tmp_path / "x.png") == 0
     assert "no file is a Level-of-Detail tree, so all splats are drawn" in capsys.readouterr().err

@@ -16,7 +16,7 @@ from tests.commands.render.runs import AT, DEMO, PLAIN, SIZE, TOWN, TREE, Said, 
 from tests.conftest import FIXTURES
 
 
-def test_a_picture_of_a_tree(built: Path, tmp_path: Path, capsys: Said) -> None:
+def test_a_tree_is_drawn_to_a_png(built: Path, tmp_path: Path, capsys: Said) -> None:
     output = tmp_path / "preview.png"
     assert render(built, "--budget", "5k", "--size", "320x180", "-o", output) == 0
     out, err = capsys.readouterr()
@@ -29,7 +29,7 @@ def test_a_picture_of_a_tree(built: Path, tmp_path: Path, capsys: Said) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["preview.png"]
 
 
-def test_the_name_is_made_of_the_scenes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_default_output_is_named_after_the_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     assert render(PLAIN, *SIZE, "-q") == 0
     assert render(TOWN, *SIZE, "-q", "--orbit", 2, "--budget", "1k") == 0
@@ -104,7 +104,7 @@ def test_two_renders_give_the_same_bytes(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("by", defaults.COLOR_BY)
-def test_colours_that_mean_something(by: str, tmp_path: Path) -> None:
+def test_color_by_draws_a_color_scale(by: str, tmp_path: Path) -> None:
     how = (TOWN, "--budget", "4k", "--size", "480x270", "-q", "--color-by", by)
     assert render(*how, "-o", tmp_path / "bar.png") == 0
     assert render(*how, "--no-bar", "-o", tmp_path / "no.png") == 0

@@ -115,7 +115,7 @@ def test_traverse_never_writes_over_its_inputs(tmp_path: Path, capsys: Said) -> 
         ([TREE, "--camera-path", TREE], TREE, "no format that is known"),
         (["--scene", FAULTS / "no.json"], FAULTS / "no.json", "no such file"),
         (["--scene", CAMERAS / "inria.json"], CAMERAS / "inria.json", "has no list of instances"),
-        ([TREE, "-o", "no/such/folder/out.csv"], "no/such/folder", "does not exist"),
+        ([TREE, "-o", TREE / "out.csv"], TREE, "is a file, not a folder"),
         ([TREE, "-o", FIXTURES], FIXTURES, "is a directory"),
     ],
     ids=str,
@@ -153,7 +153,7 @@ def test_an_interrupted_traversal_leaves_no_half_table(
     assert "interrupted" in capsys.readouterr().err
 
 
-def test_a_polite_kill_leaves_nothing_behind(tmp_path: Path) -> None:
+def test_sigterm_leaves_nothing_behind(tmp_path: Path) -> None:
     """As Ctrl-C, which whoever runs tests in the background may have turned off."""
     settings = ("--orbit", "30000", "--budget", "50k", "--threads", "2", "-q", "-o", str(tmp_path / "out.csv"))
     command = [sys.executable, "-m", "sparklod_cli", "traverse", str(TOWN), *settings]

@@ -15,7 +15,7 @@ def cut_of(path: Path) -> np.ndarray:
     return nodes
 
 
-def test_indices_of_every_cut(tmp_path: Path, capsys: Said) -> None:
+def test_indices_out_writes_the_nodes_of_every_cut(tmp_path: Path, capsys: Said) -> None:
     folder = tmp_path / "new" / "cuts"
     assert traverse(TOWN, *ORBIT, "--budget", "20k", "--indices-out", folder) == 0
     rows = table(capsys.readouterr().out)
@@ -38,7 +38,7 @@ def test_indices_of_every_cut(tmp_path: Path, capsys: Said) -> None:
     assert len(cut_of(folder / "000000.npy")) <= 100
 
 
-def test_indices_of_instances_and_of_every_second_frame(tmp_path: Path, capsys: Said) -> None:
+def test_indices_out_names_instances_and_frames(tmp_path: Path, capsys: Said) -> None:
     cuts = tmp_path / "cuts"
     assert traverse(TREE, OTHER, *ORBIT, "--every", 2, "--indices-out", cuts, "--per-instance") == 0
     rows = table(capsys.readouterr().out)
@@ -52,7 +52,7 @@ def test_indices_of_instances_and_of_every_second_frame(tmp_path: Path, capsys: 
             assert len(cut_of(cuts / f"00000{row['frame']}.{at}.npy")) == int(row["selected"])
 
 
-def test_indices_do_not_go_where_a_file_is(tmp_path: Path, capsys: Said) -> None:
+def test_indices_out_refuses_a_path_that_is_a_file(tmp_path: Path, capsys: Said) -> None:
     (tmp_path / "cuts").touch()
     assert traverse(TREE, *ORBIT, "--indices-out", tmp_path / "cuts") == 2
     assert "cuts" in capsys.readouterr().err

@@ -72,7 +72,7 @@ def test_parquet_has_the_same_cells(tmp_path: Path, capsys: Said) -> None:
     assert parquet.read_table(tmp_path / "frames.parquet").to_pylist() == data
 
 
-def test_a_name_decides_the_format_unless_it_is_said(tmp_path: Path) -> None:
+def test_the_suffix_decides_the_format_unless_an_option_does(tmp_path: Path) -> None:
     for name, form in (("a.csv", None), ("a.JSON", None), ("a.txt", "csv"), ("a", "json"), ("b", None)):
         said = () if form is None else ("--format", form)
         assert traverse(TREE, *ORBIT, "-o", tmp_path / name, *said) == 0

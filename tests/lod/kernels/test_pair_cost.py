@@ -45,7 +45,7 @@ def test_the_cheapest_of_all_pairs_is_mutual() -> None:
     assert partner[partner[first]] == first
 
 
-def test_of_equals_half_find_each_other() -> None:
+def test_among_equal_rows_half_find_each_other() -> None:
     for count in (2, 3, 100, pair_cost.BLOCK + 1, 3 * pair_cost.BLOCK + 7):
         rows = np.repeat(twin.random_rows(1, seed=3), count, axis=0)
         nodes = np.arange(count, dtype=np.uint32)

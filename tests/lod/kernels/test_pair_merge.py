@@ -46,7 +46,7 @@ def test_products_on_planes_are_integrals(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_the_shared_share_is_that_of_integrals(seed: int) -> None:
+def test_the_overlap_is_that_of_integrals(seed: int) -> None:
     a, b = twin.random_rows(2, seed + 10, spread=0.7)
     shared = alone = 0.0
     for axes in PLANES:
@@ -86,7 +86,7 @@ def united(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return merged
 
 
-def test_a_quarter_of_what_two_equals_cover_both_do() -> None:
+def test_two_equal_splats_overlap_by_a_quarter() -> None:
     """A Gaussian's square sums to half of it, so two opaque equals cover 3/2 of one, with (2 - 1/4) / (3/2) of V."""
     a = twin.random_rows(1, seed=6)[0]
     a[COVERED] /= a[DENSITY]
@@ -99,7 +99,7 @@ def test_a_quarter_of_what_two_equals_cover_both_do() -> None:
     np.testing.assert_allclose(twin.matrix(merged), expected, atol=1e-5 * np.trace(expected))
 
 
-def test_two_that_share_nothing_are_merged_by_their_moments() -> None:
+def test_splats_that_do_not_overlap_are_merged_by_their_moments() -> None:
     a, b = twin.random_rows(2, seed=7)
     b[CENTER : CENTER + 3] += np.float32([60, -50, 40])
     merged = united(a, b)
@@ -112,7 +112,7 @@ def test_two_that_share_nothing_are_merged_by_their_moments() -> None:
 
 
 @pytest.mark.parametrize("spread", [0.0, 0.5, 3.0])
-def test_a_union_is_of_two_whichever_is_first(spread: float) -> None:
+def test_a_union_does_not_depend_on_the_order(spread: float) -> None:
     for seed in range(20):
         a, b = twin.random_rows(2, seed, spread)
         one, other = united(a, b), united(b, a)

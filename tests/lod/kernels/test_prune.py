@@ -98,7 +98,7 @@ def test_no_more_are_kept_than_asked_for_and_their_parents_are_nearest_of_them(b
     assert np.array_equal(binary.saved[inner] + 1, children[inner])
 
 
-def test_what_saves_most_for_its_error_is_kept() -> None:
+def test_the_most_useful_nodes_are_kept() -> None:
     """Of two inner nodes under a root, equal but for their errors, the one with less of it."""
     children = np.array([[0, 0]] * 4 + [[0, 1], [2, 3], [4, 5]], np.uint32)
     for worse in (4, 5):
@@ -128,7 +128,7 @@ def test_levels_rise_along_every_path(binary: Binary, share: float) -> None:
 
 
 @given(BINARIES, st.floats(0, 1))
-def test_placing_makes_a_tree_of_what_is_kept(binary: Binary, share: float) -> None:
+def test_kept_nodes_become_a_valid_tree(binary: Binary, share: float) -> None:
     kept = binary.drop(max(1, int(share * (binary.leaves - 1))))
     order, tree, inner, places = binary.place()
     tree.validate()
@@ -154,7 +154,7 @@ def test_with_nothing_dropped_the_tree_is_the_binary_one(binary: Binary) -> None
 
 
 @given(st.lists(st.floats(width=32, allow_nan=False), min_size=2, max_size=30))
-def test_keys_are_in_the_order_of_what_they_are_of(values: list[float]) -> None:
+def test_sort_keys_have_the_order_of_their_values(values: list[float]) -> None:
     keys = [prune.usefulness_key(value) for value in sorted(values)]
     assert keys == sorted(keys)
     assert min(keys) >= 0 and max(keys) < 1 << prune.KEY_BITS

@@ -98,7 +98,7 @@ def test_parents_are_those_that_have_a_node_as_a_child(links: Links) -> None:
 
 
 @given(st.lists(st.tuples(st.integers(-1, 29), st.sampled_from([-1, -1, -1, 0, 2])), min_size=1, max_size=30))
-def test_cycles_are_what_one_never_leaves_upwards(nodes: Links) -> None:
+def test_cycles_are_found_by_following_parents(nodes: Links) -> None:
     parent = [above if above < len(nodes) else -1 for above, _ in nodes]
     depth = [edges for _, edges in nodes]
     found = find_cycles(np.array(parent, np.int32), np.array(depth, np.int32))
@@ -140,7 +140,7 @@ def test_sums_over_levels_count_every_node_once(links: Links) -> None:
 
 
 @pytest.mark.parametrize("start", [0, 1, 100_000])
-def test_links_to_nearly_everything_take_no_longer(start: int) -> None:
+def test_overlapping_children_take_no_longer(start: int) -> None:
     """Followed one by one these were 2 * 10 ** 11."""
     nodes = 3_000_000
     count, begin = np.full(nodes, 65535, np.uint16), np.full(nodes, start, np.uint32)
@@ -152,7 +152,7 @@ def test_links_to_nearly_everything_take_no_longer(start: int) -> None:
     assert references.max() == nodes
 
 
-def test_a_tree_as_deep_as_it_has_nodes() -> None:
+def test_a_tree_that_is_a_chain_is_followed_to_its_end() -> None:
     nodes = 200_000
     count = np.ones(nodes, np.uint16)
     count[-1] = 0
@@ -164,12 +164,12 @@ def test_a_tree_as_deep_as_it_has_nodes() -> None:
     assert (nodes_of == 1).all()
 
 
-def test_it_runs_as_python() -> None:
+def test_the_kernels_give_the_same_without_compilation() -> None:
     """A kernel that is debugged wraps no integers that the compiled one does not."""
     twins = (
         test_every_node_is_visited_once_by_the_shortest_way,
         test_parents_are_those_that_have_a_node_as_a_child,
-        test_cycles_are_what_one_never_leaves_upwards,
+        test_cycles_are_found_by_following_parents,
         test_sums_over_levels_count_every_node_once,
     )
     tests = [f"{__file__}::{test.__name__}" for test in twins]

@@ -48,7 +48,7 @@ except SparklodError as error:
 
 
 @pytest.mark.parametrize("kind", context.PACKAGES)
-def test_either_library_will_do(kind: str) -> None:
+def test_either_opengl_library_is_enough(kind: str) -> None:
     if reason := context.probe(kind):
         pytest.skip(f"no OpenGL by {kind} (on Debian and Ubuntu: apt install {context.PACKAGES[kind]}): {reason}")
     only = f"from sparklod_cli.render.gl import context\ncontext.PACKAGES = {{{kind!r}: ''}}\n"
@@ -82,7 +82,7 @@ def test_a_driver_that_crashes_is_no_crash_here(monkeypatch: pytest.MonkeyPatch,
     assert context.probe.__wrapped__("osmesa") == "the driver ended the process that tried it, by signal 11"
 
 
-def test_not_in_a_process_that_was_forked_off(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_forked_process_gets_no_opengl(monkeypatch: pytest.MonkeyPatch) -> None:
     osmesa.on_gl_thread(lambda: None)
     monkeypatch.setattr("os.getpid", lambda: -1)
     with pytest.raises(BackendError, match="spawn"):
@@ -90,7 +90,7 @@ def test_not_in_a_process_that_was_forked_off(monkeypatch: pytest.MonkeyPatch) -
 
 
 @needs_opengl
-def test_leaves_others_their_opengl() -> None:
+def test_other_opengl_contexts_are_left_alone() -> None:
     """VTK takes it for granted that nobody else makes a context current on its thread."""
     pytest.importorskip("pyvista")
     try:

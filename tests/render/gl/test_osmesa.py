@@ -97,7 +97,7 @@ def psnr(image: Image, reference: Image) -> float:
 @pytest.mark.parametrize("profile", PROFILES)
 @pytest.mark.parametrize("eye", CAMERAS)
 @pytest.mark.parametrize("name", SPLATS)
-def test_draws_what_the_reference_draws(name: str, eye: str, profile: str) -> None:
+def test_osmesa_draws_what_the_reference_draws(name: str, eye: str, profile: str) -> None:
     look = RasterSettings(profile=profile)
     reference = rasterizer.draw(SPLATS[name], CAMERAS[eye], look)
     assert reference.any()
@@ -123,7 +123,7 @@ def test_the_demo_is_drawn_as_the_reference_draws_it(eye: tuple[float, ...], sor
 
 
 @needs_opengl
-def test_near_and_far_and_what_is_beside_the_picture() -> None:
+def test_clipping_is_that_of_the_reference() -> None:
     for look in (RasterSettings(near=3.5), RasterSettings(far=4.0), RasterSettings(near=3.9, far=4.1)):
         reference = rasterizer.draw(SPLATS["large"], CAMERAS["front"], look)
         assert psnr(osmesa.draw(SPLATS["large"], CAMERAS["front"], look), reference) >= FLOAT
@@ -215,7 +215,7 @@ def test_the_order_of_the_input_does_not_matter(precision: str) -> None:
 
 
 @needs_opengl
-def test_of_equally_far_ones_the_last_is_in_front() -> None:
+def test_of_equally_distant_splats_the_last_is_in_front() -> None:
     both = ShadedSplats(
         *(
             np.concatenate(pair)
@@ -232,7 +232,7 @@ def _columns(shown: ShadedSplats) -> list[FloatArray]:
 
 
 @needs_opengl
-def test_frames_share_what_they_can() -> None:
+def test_frames_of_the_same_splats_share_an_upload() -> None:
     shown, other = SPLATS["plausible"], SPLATS["merged"]
     renderer = osmesa.Renderer()
     first = renderer.draw(shown, CAMERAS["front"], RasterSettings())
@@ -318,7 +318,7 @@ def test_sorting_by_16_bits_hardly_changes_a_picture() -> None:
         assert psnr(*images) >= 60
 
 
-def test_halves_are_the_texture_of_the_viewer() -> None:
+def test_half_precision_has_the_texture_of_the_viewer() -> None:
     splats = random_splats(1500)
     shown = shade([(splats, np.eye(4))], CAMERAS["front"])
     words = texture.data_texture_of("half")
@@ -332,7 +332,7 @@ def test_halves_are_the_texture_of_the_viewer() -> None:
 
 
 @needs_opengl
-def test_more_than_opengl_takes() -> None:
+def test_sizes_beyond_opengls_limits_are_refused() -> None:
     wide = dataclasses.replace(CAMERAS["front"], width=1 << 20)
     with pytest.raises(BackendError, match="1048576 x 151 pixels are more than this OpenGL takes"):
         osmesa.draw(SPLATS["plausible"], wide, RasterSettings())

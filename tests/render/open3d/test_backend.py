@@ -133,7 +133,7 @@ def open3d() -> Iterator[None]:
 
 @pytest.mark.usefixtures("open3d")
 @pytest.mark.parametrize("at", [(0, 0, 0), (3e4, -2e4, 1e4)])
-def test_landmarks_are_where_they_belong(at: tuple[float, float, float]) -> None:
+def test_open3d_draws_landmarks_where_the_camera_sees_them(at: tuple[float, float, float]) -> None:
     seen = camera(600, 300, at=at)
     right, down, away = np.array([-0.9, 0.7, 0.1]), np.array([-0.3, -0.25, 0.4]), np.array([2.0, 1.5, 2.5])
     colors = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
@@ -181,7 +181,7 @@ def test_a_splat_larger_than_the_picture_is_drawn() -> None:
 
 @pytest.mark.usefixtures("open3d")
 @pytest.mark.parametrize(("count", "most_opacity", "least"), [(20_000, 1.0, 45), (3000, 4.0, 22)])
-def test_it_agrees_with_the_reference(count: int, most_opacity: float, least: float) -> None:
+def test_open3d_agrees_with_the_reference(count: int, most_opacity: float, least: float) -> None:
     """Measured: 56 dB, and 25 dB with merged splats, which it has no way to draw as they are."""
     seen = camera(500, 280)
     splats = crowd(seen, count, most_opacity)
@@ -191,7 +191,7 @@ def test_it_agrees_with_the_reference(count: int, most_opacity: float, least: fl
 
 
 @pytest.mark.usefixtures("open3d")
-def test_nothing_is_an_empty_picture() -> None:
+def test_a_picture_without_splats_is_empty() -> None:
     seen = straight(33, 17)
     image = backend.draw(shown(in_front(seen, 0, 0, -1)), seen, RasterSettings())
     assert image.shape == (17, 33, 4) and image.dtype == np.float32 and not image.any()
