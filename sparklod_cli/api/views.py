@@ -33,7 +33,7 @@ from .results import ComparisonTable, Frames
 if TYPE_CHECKING:
     from ..simulation.streaming import StreamingSettings
 
-#: What is looked at: a scene or a tree, or several and where they stand.
+#: A scene or a tree, or several of them, each with where it stands.
 Viewed = Scene | Instance | Iterable["Scene | Instance"]
 
 #: A count of splats, a share of full detail (a float, 0 to 1), or either as text: "500k", "5%".
@@ -129,7 +129,7 @@ def traverse(
         by_instance: rows of single instances, too.
         precision: see `cut`.
         threads: to find cuts on; None for all processors. Only `traverse_ms` depends on it.
-        progress: is told how much is done.
+        progress: called with how much is done.
 
     Raises:
         FormatError: a scene has no tree.
@@ -168,7 +168,7 @@ def compare(
         render: how pictures are drawn; as Spark 2 does unless given.
         precision: see `cut`.
         threads: to work on; None for all processors. The table does not depend on it.
-        progress: is told how much is done.
+        progress: called with how much is done.
 
     Raises:
         FormatError: what is cut has no tree.
@@ -216,7 +216,7 @@ def _opaque(a: Image, b: Image, background: float) -> list[Image]:
 
 
 def scenes_of(viewed: Viewed, threads: int | None, precision: str = PRECISIONS[0]) -> Scenes:
-    """What is looked at, prepared; a single scene keeps that for the next time."""
+    """The scenes, prepared for views; a single scene keeps them for the next call."""
     if precision not in PRECISIONS:
         raise ValueError(f"there is no precision {precision!r}; give one of {', '.join(PRECISIONS)}")
     count = thread_count(threads)

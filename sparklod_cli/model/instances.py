@@ -25,7 +25,7 @@ class Instance:
 
     Attributes:
         source: a splat file, or a scene in memory.
-        name: for people and tables; unique among the instances of a run.
+        name: its name in messages and tables; unique among the instances of a run.
         object_to_world: (4, 4) rotation, uniform scale and translation.
         lod_scale: multiplies the pixel scales of its nodes; above 1 it gets more of the budget than others.
         foveation: its own; None for that of the viewer.
