@@ -23,7 +23,7 @@ from ..render.settings import RenderSettings
 from ..scenes.finder import CutFinder, FixedCut
 from ..scenes.loaded import UNNAMED, Cut, Scenes
 from ..scenes.reading import read_scenes
-from ..support.defaults import BLEND, PRECISIONS, PRESETS
+from ..support.defaults import BLEND, PRECISIONS
 from ..support.errors import FormatError, memory_told
 from ..support.threads import on_threads, thread_count
 from ..tables.comparison import COLUMNS as OF_COMPARISON
@@ -180,7 +180,7 @@ def compare(
         scenes = _trees(viewed, count, precision)
         full = None if scene is None else scenes_of(scene, count)
         given = [_budget(budget) for budget in budgets]
-        lod = settings or LodSettings(1, pixel_scale_limit=0.0)
+        lod = settings or LodSettings(pixel_scale_limit=0.0)
         comparison = Comparison(scenes, lod, given, render or RenderSettings(), full=full)
         rows = list(comparison.run(_path(cameras), threads=count, progress=told))
     return ComparisonTable(rows, OF_COMPARISON, [budget.text for budget in given])
@@ -252,7 +252,7 @@ def _trees(viewed: Viewed, threads: int, precision: str) -> Scenes:
 def _lod(
     scenes: Scenes, budget: BudgetLike | None, settings: LodSettings | None, continuous: bool | float
 ) -> LodSettings:
-    settings = settings or LodSettings(next(iter(PRESETS.values())))
+    settings = settings or LodSettings()
     if budget is not None:
         settings = replace(settings, budget=_budget(budget).of(scenes.leaves))
     if continuous:
