@@ -139,7 +139,7 @@ REFUSED: dict[str, tuple[Callable[[], bytes], str]] = {
     "fewer buckets than are full": (lambda: edited(SECTION + 32, "I", 99), "buckets of a section do not follow KSPLAT"),
     "buckets that hold too little": (
         lambda: edited(SECTION + 8, "I", 1),
-        "too small for its 36 splats",
+        "buckets of a section are too small for its 36 splats",
     ),
     "more sections than bytes": (lambda: edited(4, "I", 10), "10 sections"),
     "no header": (lambda: GOLDEN[0].read_bytes()[:4095], "cut short inside the header"),

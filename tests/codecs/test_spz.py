@@ -308,7 +308,7 @@ REFUSED: dict[str, tuple[Callable[[], bytes], str]] = {
         lambda: gzipped(flags=0x80, more=struct.pack("<3H3I", *[0] * 6)),
         "Level-of-Detail tree is broken",
     ),
-    "an LoD file without splats": (lambda: by_hand.spz_gzip(2, 0, 0, 12, 0x80, []), "tree is broken"),
+    "an LoD file without splats": (lambda: by_hand.spz_gzip(2, 0, 0, 12, 0x80, []), "Level-of-Detail tree is broken"),
 }
 
 

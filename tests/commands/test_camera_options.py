@@ -45,8 +45,8 @@ def run(*arguments: str | Path, scene: Any = scene_of_shells) -> tuple[Result, l
     def command(ctx: click.Context, **_: Any) -> None:
         asked = options_of(ctx, Cameras)
         asked.check(ctx)
-        with asked.told():
-            found.append(asked.where().cameras(asked.settings(), scene))
+        with asked.usage_errors():
+            found.append(asked.camera_source().cameras(asked.settings(), scene))
 
     return CliRunner().invoke(command, [str(argument) for argument in arguments]), found
 
