@@ -123,7 +123,7 @@ class FullDetail:
 
     def psnr(self, tree: sparklod.Tree, budgets: Sequence[str]) -> NDArray[np.float64]:
         """(cameras, budgets) dB: how far cuts of a tree are from it; nodes have the precision that Spark holds."""
-        settings = sparklod.LodSettings(1, sparklod.Cones(), pixel_scale_limit=0.0)
+        settings = sparklod.LodSettings(foveation=sparklod.Cones(), pixel_scale_limit=0.0)
         found = np.empty((len(self._cameras), len(budgets)))
         for row, camera, full in zip(found, self._cameras, self._pictures, strict=True):
             for at, budget in enumerate(budgets):

@@ -15,6 +15,8 @@ import numpy as np
 
 from .codecs import npy
 from .codecs.formats import FORMATS, HEAD, Format, sniff
+from .codecs.gpu import dump
+from .codecs.gpu.table import NPZ, RAW_SUFFIXES
 from .codecs.sog_files import MAX_META, META, names_beside
 from .model.scene import Scene
 from .model.splats import COLUMNS, FloatArray
@@ -25,6 +27,9 @@ from .support.stdin import DASH, spooled
 from .support.stdout import ReaderGoneError, told
 from .support.units import count_of
 from .support.untrusted import shown
+
+#: How a .npz begins, which is a zip.
+ZIP = b"PK\x03\x04"
 
 #: Bytes of a text that is read whole: instances, expectations, matrices. Parsed it may take thirty times as much.
 MAX_TEXT = 1 << 24
@@ -80,7 +85,7 @@ def _opened(path: Path) -> Iterator[tuple[BinaryIO, Format, dict[str, Any]]]:
             path = _in_folder(path)
         if path != DASH and path.exists() and not path.is_file():
             raise UnreadableError("it is a pipe or a device; save it to a file first")
-        with contextlib.nullcontext(spooled()) if path == DASH else path.open("rb") as file:
+        with _file_of(path) as file:
             head = file.read(HEAD)
             file.seek(0)
             if not head:
@@ -89,10 +94,36 @@ def _opened(path: Path) -> Iterator[tuple[BinaryIO, Format, dict[str, Any]]]:
             if form is None:
                 names = ", ".join(form.name for form in FORMATS)
                 hint = "; a .splat file is told by its name alone" if path == DASH else ""
+                if path.suffix.lower() in RAW_SUFFIXES:
+                    hint = "; words alone, as --encoding writes them by this suffix, do not tell what they are"
                 raise UnknownFormatError(f"not a splat file that sparklod reads ({names}){hint}")
+            if head.startswith(ZIP) and path.suffix.lower() == NPZ:
+                raise UnknownFormatError("it holds arrays for a viewer, of which inspect can report, but no scene")
             yield file, form, {"beside": functools.partial(_open_beside, path)} if form.companions else {}
     except OSError as error:
         raise UnreadableError(f"cannot be read: {_reason(error)}") from None
+
+
+def read_arrays(path: Path) -> dump.Arrays | None:
+    """The arrays of a .npz file; None where a file is something else, or cannot be opened.
+
+    Raises:
+        FormatError: an array is damaged, or of no plain numbers.
+    """
+    try:
+        if path != DASH and not path.is_file():
+            return None
+        with _file_of(path) as file:
+            if file.read(len(ZIP)) != ZIP:
+                return None
+            return dump.decode_npz(file)
+    except (OSError, UnreadableError):
+        return None
+
+
+def _file_of(path: Path) -> contextlib.AbstractContextManager[BinaryIO]:
+    """A file that is closed at the end, or standard input, which is not."""
+    return contextlib.nullcontext(spooled()) if path == DASH else path.open("rb")
 
 
 def size_of_input(path: Path) -> int | None:

@@ -374,6 +374,14 @@ def test_instances_stand_where_they_are_put(held: sparklod.Tree) -> None:
     assert [row["instance"] for row in unnamed] == ["total", "scene", "scene 2"]
 
 
+def test_instances_are_of_files_or_scenes(file: Path) -> None:
+    assert sparklod.Instance(str(file)).file == file  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match="not of int"):
+        sparklod.Instance(3)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"shape \(3, 3\); give \(4, 4\)"):
+        sparklod.Instance(file, object_to_world=np.eye(3))
+
+
 def test_plain_scenes_are_not_traversed(scene: sparklod.Scene) -> None:
     with pytest.raises(sparklod.FormatError, match="not a Level-of-Detail tree"):
         sparklod.traverse(scene, [camera()], budget=300)

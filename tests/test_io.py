@@ -37,7 +37,7 @@ def test_the_content_decides_the_format_whatever_the_suffix(kind: str, suffix: s
         (b"ply\n", "the PLY header does not end"),
         (b"\x1f", "not a splat file"),
         (b"\x1f\x8b\x08\x00", "cut short"),
-        (b"PK\x03\x04" + bytes(100), "not a whole zip archive"),
+        (b"PK\x03\x04" + bytes(100), "not a complete zip archive"),
         (b"\x28\xb5\x2f\xfd" + bytes(100), "not a splat file"),  # bare zstd
     ],
 )

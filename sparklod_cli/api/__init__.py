@@ -1,4 +1,4 @@
-"""What `sparklod_cli` hands on as its public functions, and whole-file jobs of the commands beside them.
+"""The public functions of `sparklod_cli`, and `jobs`, the library calls of the commands.
 
 Every function takes `threads` (None for all processors) and `progress` (see `progress.Told`) where that means
 something.

@@ -42,13 +42,13 @@ class Written:
 def read(
     path: Path | str, *, columns: Collection[str] | None = None, threads: int | None = None, progress: Told = None
 ) -> Scene:
-    """Reads a splat file of any known format, which its content tells; a `Tree` where it has a Level-of-Detail tree.
+    """Reads a splat file; its content tells the format. The scene is a `Tree` if the file has a Level-of-Detail tree.
 
     Args:
         path: of a file, or of a folder that holds an unpacked SOG.
         columns: of `Splats`, where not all are needed; the others may be 0.
         threads: to decode on; None for all processors.
-        progress: is told how much is done.
+        progress: called with how much is done.
 
     Raises:
         FormatError: it cannot be read, is of no known format, or broken.
@@ -100,7 +100,7 @@ def write(
         encoding: write the arrays of "packed", "ext", "lodtree" or "texture" as .npz instead, or as the words alone
             where the path ends in .bin or .raw.
         threads: to encode on; None for all processors. The bytes do not depend on it.
-        progress: is told how much is done.
+        progress: called with how much is done.
 
     Raises:
         FormatError: the format cannot hold the scene, or there is no such format.
@@ -149,7 +149,7 @@ def build_lod(
         max_sh: SH degrees above this are left out.
         selection: which splats to keep; all that can be drawn, unless given.
         threads: to work on; None for all processors.
-        progress: is told how much is done.
+        progress: called with how much is done.
 
     Raises:
         FormatError: the scene has a tree already.
@@ -249,7 +249,7 @@ def inspect(
         all_quantities: every quantity of them.
         check: look for what is wrong. A file that cannot be read is a finding, not an error.
         threads: to decode on; None for all processors.
-        progress: is told how much is done.
+        progress: called with how much is done.
     """
     from ..inspection import report
 

@@ -53,7 +53,7 @@ class View:
         settings: what is said over what their file says.
         precision: one of `PRECISIONS`, of the nodes that cuts are found with.
         threads: to work on.
-        progress: is told how much is done.
+        progress: called with how much is done.
     """
 
     instances: Sequence[Instance]
@@ -130,7 +130,7 @@ def draw_files(
         through: one of `rounding.ROUND_TRIPS`, after which splats are drawn.
         reference: the file whose pictures are compared with these: the difference is written.
         overwrite: replace files that exist.
-        ready: is told of cameras and scenes before the first picture is drawn.
+        ready: called with the cameras and the scenes before the first picture is drawn.
 
     Raises:
         UnfitError: the budget is too small for the roots.
@@ -225,7 +225,7 @@ def compare_files(
         asserts: what must hold, each with the place of the budget that it is about; None for all of them.
         plot: file of the charts; None for none.
         overwrite: replace files that exist.
-        ready: is told of cameras and scenes before the first picture is drawn.
+        ready: called with the cameras and the scenes before the first picture is drawn.
         passed: what the bytes of the table are passed through on their way to standard output.
 
     Raises:
@@ -282,7 +282,7 @@ def traverse_files(
         outputs: where the frames go.
         by_instance: make rows of single instances, too.
         asserts: what must hold.
-        ready: is told of cameras and scenes before the first frame.
+        ready: called with the cameras and the scenes before the first frame.
         passed: what the bytes of the table are passed through on their way to standard output.
         bar: tell how many frames are done.
 

@@ -1,4 +1,4 @@
-"""What a caller may give as `progress`: a function that is told, or a class of bars such as `tqdm.tqdm`."""
+"""The argument `progress` of public functions: a callback, or a class of progress bars such as `tqdm.tqdm`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 from ..support.progress import Progress, silent
 
-#: A function `(stage, done, total, unit)`, or a class that makes bars as `tqdm.tqdm` does; None for nobody.
+#: A callback `(stage, done, total, unit)`, a class of bars that is called as `tqdm.tqdm` is, or None.
 Told = Progress | type[Any] | None
 
 
@@ -33,7 +33,7 @@ class _Bars:
 
 @contextlib.contextmanager
 def telling(progress: Told) -> Iterator[Progress]:
-    """What work tells its progress to, until it ends."""
+    """The callback for work inside; bars are closed at its end."""
     if progress is None:
         yield silent
     elif isinstance(progress, type):

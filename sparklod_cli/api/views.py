@@ -23,7 +23,7 @@ from ..render.settings import RenderSettings
 from ..scenes.finder import CutFinder, FixedCut
 from ..scenes.loaded import UNNAMED, Cut, Scenes
 from ..scenes.reading import read_scenes
-from ..support.defaults import BLEND, PRECISIONS, PRESETS
+from ..support.defaults import BLEND, PRECISIONS
 from ..support.errors import FormatError, memory_told
 from ..support.threads import on_threads, thread_count
 from ..tables.comparison import COLUMNS as OF_COMPARISON
@@ -33,7 +33,7 @@ from .results import ComparisonTable, Frames
 if TYPE_CHECKING:
     from ..simulation.streaming import StreamingSettings
 
-#: What is looked at: a scene or a tree, or several and where they stand.
+#: A scene or a tree, or several of them, each with where it stands.
 Viewed = Scene | Instance | Iterable["Scene | Instance"]
 
 #: A count of splats, a share of full detail (a float, 0 to 1), or either as text: "500k", "5%".
@@ -129,7 +129,7 @@ def traverse(
         by_instance: rows of single instances, too.
         precision: see `cut`.
         threads: to find cuts on; None for all processors. Only `traverse_ms` depends on it.
-        progress: is told how much is done.
+        progress: called with how much is done.
 
     Raises:
         FormatError: a scene has no tree.
@@ -168,7 +168,7 @@ def compare(
         render: how pictures are drawn; as Spark 2 does unless given.
         precision: see `cut`.
         threads: to work on; None for all processors. The table does not depend on it.
-        progress: is told how much is done.
+        progress: called with how much is done.
 
     Raises:
         FormatError: what is cut has no tree.
@@ -180,7 +180,7 @@ def compare(
         scenes = _trees(viewed, count, precision)
         full = None if scene is None else scenes_of(scene, count)
         given = [_budget(budget) for budget in budgets]
-        lod = settings or LodSettings(1, pixel_scale_limit=0.0)
+        lod = settings or LodSettings(pixel_scale_limit=0.0)
         comparison = Comparison(scenes, lod, given, render or RenderSettings(), full=full)
         rows = list(comparison.run(_path(cameras), threads=count, progress=told))
     return ComparisonTable(rows, OF_COMPARISON, [budget.text for budget in given])
@@ -216,7 +216,7 @@ def _opaque(a: Image, b: Image, background: float) -> list[Image]:
 
 
 def scenes_of(viewed: Viewed, threads: int | None, precision: str = PRECISIONS[0]) -> Scenes:
-    """What is looked at, prepared; a single scene keeps that for the next time."""
+    """The scenes, prepared for views; a single scene keeps them for the next call."""
     if precision not in PRECISIONS:
         raise ValueError(f"there is no precision {precision!r}; give one of {', '.join(PRECISIONS)}")
     count = thread_count(threads)
@@ -252,7 +252,7 @@ def _trees(viewed: Viewed, threads: int, precision: str) -> Scenes:
 def _lod(
     scenes: Scenes, budget: BudgetLike | None, settings: LodSettings | None, continuous: bool | float
 ) -> LodSettings:
-    settings = settings or LodSettings(next(iter(PRESETS.values())))
+    settings = settings or LodSettings()
     if budget is not None:
         settings = replace(settings, budget=_budget(budget).of(scenes.leaves))
     if continuous:

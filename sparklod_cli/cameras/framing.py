@@ -1,4 +1,4 @@
-"""Where a scene is, and how large, for cameras that are to look at it."""
+"""The place and size of a scene, and cameras that have it in view."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from ..support.defaults import FARTHEST
 from ..support.errors import InvalidSplatsError
 from .camera import Camera, Matrix
 
-#: The share of the splats that a ball around the middle holds, which says how large a scene is.
+#: The share of the splats in the ball around the middle whose radius is the size of a scene.
 SHARE = 0.9
 
-#: The share of the splats that are in view, each with all that it covers: trained scenes have a few that are very far
-#: away, or very large.
+#: The share of the splats that must be in view, each with all that it covers: trained scenes have a few that are very
+#: far away, or very large.
 COVERED = 0.999
 
-#: What is farther from the middle than so many times the ball that most splats are in does not belong to what is shown:
-#: a sky, and what training leaves far out.
+#: Splats farther from the middle than this multiple of the radius of the ball that most splats are in are backdrop,
+#: such as a sky or stray splats of training, and are not framed.
 OUTSIDE = 3.0
 
-#: So many splats are looked at; more make no difference that could be seen.
+#: Sample size, in splats; a larger one makes no visible difference.
 SAMPLE = 1 << 18
 
 #: The share of the picture's width, or height, that is filled.
@@ -34,10 +34,10 @@ FILLED = 0.92
 #: No splat counts as smaller than this share of the scene.
 SPECK = 0.005
 
-#: Steps of float32, as a share of the number, with room for what is computed with them.
+#: Steps of float32, as a share of the number, with room for rounding in what is computed from it.
 STEPS = 1e-6
 
-#: So many cameras of a path are looked through; those between them see as good as the same.
+#: Sample size, in cameras of a path; those between them see nearly the same.
 CAMERAS = 64
 
 Item = TypeVar("Item")
@@ -65,7 +65,7 @@ def framing(center: NDArray[np.floating]) -> tuple[NDArray[np.float64], float]:
 
 
 def covered(scene: Balls) -> Balls:
-    """What cameras are to have in view: of what is no backdrop, all that 99.9 % of the splats cover.
+    """The splats that cameras must have in view: 99.9 % of those that are not backdrop.
 
     Raises:
         InvalidSplatsError: there are no splats with finite numbers.
@@ -85,7 +85,7 @@ def covered(scene: Balls) -> Balls:
 
 
 def middle_of(scene: Balls) -> Matrix:
-    """(3,) the middle of the box of what is in view."""
+    """(3,) the middle of the bounding box of these balls."""
     radius = scene.radius[:, None]
     middle: Matrix = ((scene.center - radius).min(axis=0) + (scene.center + radius).max(axis=0)) / 2
     return middle
@@ -95,7 +95,7 @@ def _support(scene: Balls, camera: Camera) -> tuple[Matrix, Matrix, Matrix]:
     """How far a scene reaches outwards from the sides of a camera's view, if that were at the origin.
 
     A ball is inside where it is behind all four sides, right, left, top and bottom, so the camera sees all of them
-    where its position, times the normal of each side, is no less than what is told here.
+    where its position, times the normal of each side, is at least this reach.
 
     Returns:
         (4,) the reach, world units, and of both pairs of sides, (2,), the share of their normals that is to the side,

@@ -1,4 +1,4 @@
-"""Which values SPZ cannot hold, at which end of its codes, and how far they are beyond."""
+"""Values beyond the ranges of SPZ's codes, which writing clamps."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from . import quantize
 
 @dataclass(frozen=True)
 class Clamp:
-    """Values that become an end of what their code holds.
+    """Values of a column that lie beyond one end of the range of their code.
 
     Attributes:
         column: of `Splats`: scale, rgb or sh.
-        above: they lie above the upper end, else below the lower one.
-        splats: how many have such a value.
-        end: what they lie beyond.
-        farthest: the value that is farthest from there.
+        above: whether they lie above the upper end; otherwise below the lower one.
+        splats: number of splats with such a value.
+        end: the end of the range.
+        farthest: the value farthest beyond the end.
     """
 
     column: str
@@ -32,11 +32,11 @@ class Clamp:
 
 @dataclass(frozen=True)
 class Clamps:
-    """What a file cannot hold.
+    """The values of a scene that writing clamps.
 
     Attributes:
-        splats: by the column of `Splats`, how many have a value beyond either end; columns without any are left out.
-        ends: the ends that values lie beyond.
+        splats: number of splats with a value beyond either end, by column of `Splats`; without zeros.
+        ends: the ends of ranges beyond which values lie.
     """
 
     splats: dict[str, int] = field(default_factory=dict)
@@ -44,7 +44,7 @@ class Clamps:
 
 
 def find(splats: Splats, threads: int = 1) -> Clamps:
-    """What SPZ cannot hold of splats."""
+    """The values of splats that lie beyond the ranges of SPZ."""
     counts, ends = {}, []
     for name, (low, high) in quantize.CLAMPS.items():
         column = getattr(splats, name).reshape(len(splats), -1)

@@ -19,11 +19,13 @@ from . import quantize
 from .ply_header import Header, read_header
 from .stream import decode_rows, rows_of, size_of
 
+#: Splats of a chunk, which share bounds.
 CHUNK_SPLATS = 256
 
-VERTEX = ("packed_position", "packed_rotation", "packed_scale", "packed_color")  # uint32 each
+#: Properties of a splat, uint32 each.
+VERTEX = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 
-#: The bounds of a chunk, by what they are of; old files have none of colours.
+#: Properties of the bounds of a chunk, by what they bound; old files have no bounds of colours.
 BOUNDS = {
     "position": ("min_x", "min_y", "min_z", "max_x", "max_y", "max_z"),
     "scale": ("min_scale_x", "min_scale_y", "min_scale_z", "max_scale_x", "max_scale_y", "max_scale_z"),  # logarithms
@@ -35,7 +37,7 @@ def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> 
     """Reads a compressed PLY file, with or without bounds of colours and SH.
 
     Raises:
-        FormatError: it is not compressed PLY, or cut short.
+        FormatError: the file is not compressed PLY, or cut short.
     """
     size = size_of(file)
     header = read_header(file)
@@ -45,7 +47,7 @@ def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> 
     splats = Splats.empty(count, min(degree, MAX_SH_DEGREE))
     bounds = _read_bounds(file, header, -(-count // CHUNK_SPLATS))
 
-    @np.errstate(invalid="ignore", over="ignore")  # of bounds that no scene has
+    @np.errstate(invalid="ignore", over="ignore")  # absurd bounds overflow
     def unpack(part: slice, rows: NDArray[Any]) -> None:
         words = {name: rows[name].astype(np.uint32) for name in VERTEX}
         splats.center[part] = _within(
@@ -60,7 +62,7 @@ def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> 
         splats.opacity[part] = rgba[:, 3]
 
     def unpack_sh(part: slice, rows: NDArray[Any]) -> None:
-        codes = rows.view(np.uint8).reshape(len(rows), 3, coefficients)  # all of red's come first
+        codes = rows.view(np.uint8).reshape(len(rows), 3, coefficients)  # all of red come first
         splats.sh[part] = quantize.decode_centred_8(codes[:, :, : splats.sh.shape[1]].transpose(0, 2, 1))
 
     decode_rows(_rows(file, header, "vertex"), unpack, count, threads, progress)
@@ -72,10 +74,10 @@ def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> 
 
 
 def _within(bounds: FloatArray | None, part: slice, unit: FloatArray) -> FloatArray:
-    """0..1 of the splats in `part` to between the bounds of their chunks, (chunks, 6): x y z of the least, the most."""
+    """(n, 3) values 0..1 of the splats in `part`, scaled to their chunks' bounds, (chunks, 6): low and high xyz."""
     if bounds is None:
         return unit
-    # A run of rows begins with a chunk: it has 16,384 of them, as the four words of a splat alone are 16 bytes.
+    # Blocks have 16,384 rows, as the four words of a splat alone are 16 bytes; so a block begins with a chunk.
     of_chunks = bounds[part.start // CHUNK_SPLATS : -(-part.stop // CHUNK_SPLATS)]
     low, high = np.split(np.repeat(of_chunks, CHUNK_SPLATS, axis=0)[: len(unit)], 2, axis=1)
     return quantize.between(unit, low, high)
@@ -84,7 +86,7 @@ def _within(bounds: FloatArray | None, part: slice, unit: FloatArray) -> FloatAr
 def _rows(file: BinaryIO, header: Header, name: str) -> Iterator[tuple[slice, NDArray[Any]]]:
     offset, row_type = header.offset(name), header.row_type(name)
     if offset is None or row_type is None:
-        raise FormatError("a compressed PLY has no list properties")
+        raise FormatError("compressed PLY cannot have list properties")
     file.seek(offset)
     return rows_of(file.read, row_type, header.count(name))
 
@@ -99,9 +101,9 @@ def _read_bounds(file: BinaryIO, header: Header, chunks: int) -> dict[str, Float
 
 
 def _checked(header: Header) -> tuple[int, int]:
-    """Splats and SH coefficients a channel, if the elements are those of a compressed PLY."""
+    """Splats, and SH coefficients per channel, after checks of the elements."""
     if header.text:
-        raise FormatError("an ascii compressed PLY; the format is binary")
+        raise FormatError("an ascii compressed PLY, but the format is binary")
     count = header.count("vertex")
     _check_types(header, "vertex", VERTEX, np.uint32)
     chunk_names = {*BOUNDS["position"], *BOUNDS["scale"]}
@@ -116,7 +118,7 @@ def _checked(header: Header) -> tuple[int, int]:
     row_type = header.row_type("sh")
     names = tuple(f"f_rest_{index}" for index in range(len(row_type.names or ()) if row_type else 1))
     if _check_types(header, "sh", names, np.uint8) != names:
-        raise FormatError("the properties of its element sh are not f_rest_0 on, in order")
+        raise FormatError("the properties of its element sh are not f_rest_0, f_rest_1 and so on")
     if len(names) % 3 or header.count("sh") != count:
         rows, splats = count_of(header.count("sh"), "row"), count_of(count, "splat")
         raise FormatError(f"its element sh has {rows} of {len(names)} values for {splats}")
@@ -124,7 +126,7 @@ def _checked(header: Header) -> tuple[int, int]:
 
 
 def _check_types(header: Header, element: str, names: tuple[str, ...], kind: type[np.generic]) -> tuple[str, ...]:
-    """The names of an element's properties, if these are among them, and of this type."""
+    """The names of an element's properties, after a check that these are among them and of this type."""
     row_type = header.row_type(element) if element in header.elements else None
     have: tuple[str, ...] = (row_type.names or ()) if row_type else ()
     bad = [name for name in names if row_type is None or name not in have or row_type[name].newbyteorder("=") != kind]

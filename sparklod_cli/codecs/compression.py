@@ -1,6 +1,6 @@
-"""Compressed bytes: one parallel gzip member out, bounded inflating in.
+"""Compression: writes one gzip member on several threads, and inflates without holding more than was asked for.
 
-Why not the library's own threaded gzip: see docs/decisions.
+docs/decisions says why the library's own threaded gzip is not used.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from ..support.errors import ChecksumError, FormatError, PromiseError, TooLongEr
 from ..support.parallel import ordered_map
 from ..support.progress import Progress
 
-BLOCK = 1 << 18  # bytes that are deflated apart
-WINDOW = 1 << 15  # bytes before a block that it may refer to
-PIECE = 1 << 17  # bytes that are read at a time
+#: Bytes of a block that one thread deflates, bytes before a block that it may refer to (deflate's window), and bytes of
+#: a file that are read at a time.
+BLOCK, WINDOW, PIECE = 1 << 18, 1 << 15, 1 << 17
 
-#: Up to this size a header's promise is not doubted; beyond, a file may expand by at most MAX_RATIO. Real scenes reach
-#: a ratio of 3, a scene of equal splats 1000, which is also deflate's limit.
+#: Bytes up to which the size announced by a header is accepted; beyond, a file may expand by at most `MAX_RATIO`. Real
+#: scenes reach a ratio of 3; deflate's limit is 1000, which a scene of equal splats reaches.
 TRUSTED_SIZE, MAX_RATIO = 1 << 26, 200
 
 _ZlibError: Any = zlib_ng.error  # the stubs take the class for an instance
@@ -34,8 +34,8 @@ _RAW, _GZIP = -zlib_ng.MAX_WBITS, zlib_ng.MAX_WBITS + 16
 def gzip_member(data: NDArray[np.uint8], level: int, threads: int, progress: Progress) -> Iterator[bytes]:
     """One gzip member of `data`, piece by piece; the same bytes for any number of threads.
 
-    As pigz does: blocks are deflated apart, each with the end of the one before as its dictionary, and end on a byte
-    boundary by an empty stored block, so that they join to one deflate stream.
+    As in pigz, blocks are deflated separately, each with the end of the previous one as its dictionary, and end on a
+    byte boundary with an empty stored block, so that together they are one deflate stream.
     """
     view = data.data.cast("B")
     starts = list(range(0, len(view), BLOCK)) or [0]
@@ -56,13 +56,13 @@ def gzip_member(data: NDArray[np.uint8], level: int, threads: int, progress: Pro
 
 
 def check_promise(total: int, file_size: int) -> None:
-    """Raises `FormatError` where a header promises more bytes than the file can honestly expand to."""
+    """Raises `PromiseError` if a header announces more bytes than a file of this size can expand to."""
     if total > TRUSTED_SIZE and total > MAX_RATIO * file_size:
-        raise PromiseError(f"its header promises {total:,} bytes, {file_size:,} bytes of file cannot hold that")
+        raise PromiseError(f"its header announces {total:,} bytes, more than a file of {file_size:,} bytes can hold")
 
 
 class Inflate:
-    """Reads a gzip member from a file without ever holding much more than was asked for."""
+    """Reads a gzip member of a file, holding little more than was asked for."""
 
     def __init__(self, file: BinaryIO) -> None:
         self._file = file
@@ -91,23 +91,23 @@ class Inflate:
         return b"".join(pieces)
 
     def finish(self, *, allow_more: bool) -> None:
-        """Checks that the member ends here and that its checksum holds.
+        """Checks that the member ends here with a correct checksum.
 
         Args:
-            allow_more: bytes may follow in it that are of no interest; then nothing is checked.
+            allow_more: the member may go on with data that are not read; nothing is checked.
 
         Raises:
-            FormatError: it does not.
+            FormatError: the member does not end here, or the checksum is wrong.
         """
         if allow_more:
             return
         if self.read(1):
-            raise TooLongError("more data than its header promises")
+            raise TooLongError("it holds more data than its header announces")
         if not self._unpacker.eof:
             raise TruncatedError("cut short: the gzip checksum is missing")
 
     def behind(self) -> bytes:
-        """The first bytes that follow the member in the file, two where there are so many; empty before its end."""
+        """The first two bytes after the member, or fewer at the end of the file; empty before the member has ended."""
         if not self._unpacker.eof:
             return b""
         rest: bytes = self._unpacker.unused_data
@@ -117,12 +117,12 @@ class Inflate:
         return (rest + more)[:2]
 
     def end(self) -> int:
-        """Where the member ends in the file, once it has been read."""
+        """The position of the end of the member in the file, once it has been read."""
         return self._file.tell() - len(self._unpacker.unused_data)
 
 
 class _Window:
-    """The next `size` bytes of a file, as a file."""
+    """A file of the next `size` bytes of a file."""
 
     def __init__(self, file: BinaryIO, size: int) -> None:
         self._file, self._left = file, size
@@ -134,7 +134,7 @@ class _Window:
 
 
 class Unzstd:
-    """Reads the zstd frame that the next `packed` bytes of a file are, without holding more than was asked for."""
+    """Reads a zstd frame, the next `packed` bytes of a file, holding little more than was asked for."""
 
     def __init__(self, file: BinaryIO, packed: int, name: str) -> None:
         self._name = name
@@ -157,4 +157,4 @@ class Unzstd:
     def finish(self) -> None:
         """Raises `FormatError` unless the stream ends here."""
         if self.read(1):
-            raise TooLongError(f"stream {self._name} is longer than its table says")
+            raise TooLongError(f"stream {self._name} is longer than its table announces")

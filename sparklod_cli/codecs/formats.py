@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
 
-#: Bytes of a file that are looked at to tell its format.
+#: Bytes at the beginning of a file by which its format is recognized.
 HEAD = 1 << 16
 
 
@@ -20,14 +20,14 @@ class Format:
         module: in this package; has `decode(file, *, threads, progress) -> Scene`.
         writable: its module also has `encode(scene, options, *, threads, progress) -> Iterator[bytes]`, and
             `settled(scene, options) -> WriteOptions`, the options with nothing left open, which raises `FormatError`
-            where the scene cannot be written.
-        trees: what is written can be a Level-of-Detail tree.
+            if the scene cannot be written.
+        trees: it can be written with a Level-of-Detail tree.
         suffixes: lower case, with the dot.
-        beginning: a regular expression that the first bytes of its files match; None where they can be anything, and
-            only the suffix tells.
-        companions: its files name others beside them; `decode` takes another argument, `beside`, which opens these.
-        selective: its module also has `examine(file, *, columns, threads, progress) -> Scene`, which decodes columns
-            only and passes a broken tree on.
+        beginning: a regular expression that the first bytes of its files match; None if any bytes are possible, so that
+            only the suffix decides.
+        companions: its files refer to others beside them; `decode` takes another argument, `beside`, which opens those.
+        selective: its module also has `examine(file, *, columns, threads, progress) -> Scene`, which decodes only some
+            columns and accepts a broken tree.
     """
 
     name: str
@@ -44,12 +44,12 @@ class Format:
         return import_module(f".{self.module}", __package__)
 
     def begins(self, head: bytes) -> bool:
-        """Whether a file that begins with `head` is of this format, as far as one can see."""
+        """Whether the first bytes of a file match this format."""
         return self.beginning is not None and re.match(self.beginning, head, re.DOTALL) is not None
 
 
-#: In the order in which they are tried: compressed PLY is PLY, too. A .splat begins with any float, so no beginning may
-#: be of two bytes or less.
+#: The formats in the order in which they are tried: compressed PLY is PLY too. A .splat file begins with any float, so
+#: no beginning may have two bytes or fewer.
 FORMATS = (
     Format(
         "compressed PLY",
@@ -62,7 +62,7 @@ FORMATS = (
     Format("SPZ", "spz", (".spz",), rb"\x1f\x8b\x08[\0-\x1f]|NGSP", writable=True, trees=True, selective=True),
     # A zip, or its meta.json unpacked.
     Format("SOG", "sog", (".sog", ".json"), rb"PK\x03\x04|\s*\{\s*\"\w+\"\s*:", companions=True),
-    Format("KSPLAT", "ksplat", (".ksplat",), rb"\0[\x01-\xff]\0\0"),  # version 0.1 and up; a float would be denormal
+    Format("KSPLAT", "ksplat", (".ksplat",), rb"\0[\x01-\xff]\0\0"),  # version 0.1 on; as a float it would be denormal
     Format("SPLAT", "splat", (".splat",), None, writable=True),
 )
 
@@ -71,9 +71,9 @@ WRITABLE = {suffix: form for form in FORMATS if form.writable for suffix in form
 
 
 def sniff(head: bytes, suffix: str) -> Format | None:
-    """The format of a file that begins with `head`, its first HEAD bytes, judged by that.
+    """The format of a file by its first `HEAD` bytes, or else by its suffix; None if it has no known format.
 
-    The suffix is asked where the content can be anything.
+    The suffix decides only for formats that may begin with any bytes.
     """
     by_content = (form for form in FORMATS if form.begins(head))
     by_suffix = (form for form in FORMATS if form.beginning is None and suffix.lower() in form.suffixes)

@@ -1,6 +1,6 @@
-"""mkkellogg's .ksplat: sections of splats, each with a row of fixed size a splat, centres relative to buckets.
+"""mkkellogg's .ksplat: sections of splats in rows of fixed size, with centres relative to buckets.
 
-Compression level 0 has floats; 1 has halves and 16-bit centres; 2 has bytes of SH besides.
+Compression level 0 uses floats; level 1 half floats and 16-bit centres; level 2 bytes of SH as well.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ HEADER = np.dtype(
         "itemsize": 4096,
         "names": ["major", "minor", "sections", "splats", "level", "least_sh", "most_sh"],
         "formats": ["u1", "u1", "<u4", "<u4", "<u2", "<f4", "<f4"],
-        "offsets": [0, 1, 4, 16, 20, 36, 40],  # between them: counts of what is loaded so far, and the scene's middle
+        "offsets": [0, 1, 4, 16, 20, 36, 40],  # in between: counts for progressive loading, and the centre of the scene
     }
 )
 SECTION = np.dtype(
@@ -43,19 +43,24 @@ SECTION = np.dtype(
     }
 )
 
-#: By level: types of centres, of scales and rotations, and of SH; and steps from the middle of a bucket to its side.
+#: By compression level: types of centres, of scales and rotations, and of SH; steps from the middle of a bucket to its
+#: side.
 LEVELS = (("<f4", "<f4", "<f4", 1), ("<u2", "<f2", "<f2", 32767), ("<u2", "<f2", "u1", 32767))
-MAX_DEGREE = 2
-DEFAULT_SH = 1.5  # bytes of SH are for -1.5 .. 1.5 where the header does not say
 
-#: Where coefficient k of channel c stands among a splat's SH values: all of red's of a degree come first.
+#: Highest SH degree of the format.
+MAX_DEGREE = 2
+
+#: Bytes of SH mean -1.5..1.5 if the header gives no range.
+DEFAULT_SH = 1.5
+
+#: Place of coefficient k of channel c among the SH values of a splat: within a degree all of red come first.
 SH_PLACES = np.array(
     [c * 3 + k for k in range(3) for c in range(3)] + [9 + c * 5 + k for k in range(5) for c in range(3)]
 )
 
 
 def row_type(level: int, sh_degree: int) -> np.dtype[Any]:
-    """The row of a splat."""
+    """The type of a splat's row."""
     center, real, sh, _ = LEVELS[level]
     return np.dtype(
         [
@@ -64,23 +69,24 @@ def row_type(level: int, sh_degree: int) -> np.dtype[Any]:
             ("quat_wxyz", real, 4),
             ("rgb", "u1", 3),  # display-referred, 0..255 for 0..1
             ("opacity", "u1"),  # 0..255 for 0..1
-            ("sh", sh, 3 * COEFFICIENTS[sh_degree]),  # bytes: 0..255 from the header's least to its most
+            ("sh", sh, 3 * COEFFICIENTS[sh_degree]),  # bytes: 0..255 for the range in the header
         ]
     )
 
 
 @dataclass(frozen=True)
 class Section:
-    """Where a section lies, and what decodes its centres.
+    """Where a section lies, and how its centres are decoded.
 
     Attributes:
         first: index of its first splat in the scene.
-        count: of splats.
-        row_type: of a splat.
-        offset, end: of its first row in the file, and behind its last.
-        middles: (buckets, 3) of the buckets.
-        ends: (buckets,) splats up to the end of each bucket.
-        step, steps: width of a step, and how many lead from a bucket's low corner to its middle.
+        count: number of splats.
+        row_type: type of a splat's row.
+        offset, end: positions in the file of its first row and after its last.
+        middles: (buckets, 3) centres of the buckets, world units.
+        ends: (buckets,) number of splats up to the end of each bucket.
+        step: width of a step, world units.
+        steps: from a bucket's low corner to its middle.
     """
 
     first: int
@@ -98,22 +104,22 @@ def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> 
     """Reads a .ksplat file of any compression level.
 
     Raises:
-        FormatError: it is not KSPLAT, not a version, level or SH degree that is known, or cut short.
+        FormatError: the file is not KSPLAT, of an unknown version, level or SH degree, or cut short.
     """
     size = size_of(file)
     header = _read(file, HEADER, 1, "the header")[0]
     level, count = int(header["level"]), int(header["splats"])
     if header["major"] != 0 or header["minor"] < 1:
-        raise VersionError(f"KSPLAT version {header['major']}.{header['minor']} is not known, only 0.1 is")
+        raise VersionError(f"KSPLAT version {header['major']}.{header['minor']} is unknown, only 0.1 is read")
     if level >= len(LEVELS):
-        raise VersionError(f"KSPLAT compression level {level} is not known, only 0 to {len(LEVELS) - 1} are")
+        raise VersionError(f"KSPLAT compression level {level} is unknown, only 0 to {len(LEVELS) - 1} are read")
     sections = list(_read_sections(file, size, int(header["sections"]), level))
     end = sections[-1].end if sections else HEADER.itemsize
     sections = [section for section in sections if section.count]
     firsts = [section.first for section in sections]
     found = sum(section.count for section in sections)
     if found != count:
-        raise FormatError(f"the header promises {count_of(count, 'splat')}, its sections have {found:,}")
+        raise FormatError(f"its header announces {count_of(count, 'splat')}, its sections have {found:,}")
     degrees = [COEFFICIENTS.index(section.row_type["sh"].shape[0] // 3) for section in sections]
     splats = Splats.empty(count, max(degrees, default=0))
     low, high = header["least_sh"] or np.float32(-DEFAULT_SH), header["most_sh"] or np.float32(DEFAULT_SH)
@@ -124,7 +130,7 @@ def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> 
             for part, some in rows_of(file.read, section.row_type, section.count):
                 yield slice(section.first + part.start, section.first + part.stop), some
 
-    @np.errstate(invalid="ignore", over="ignore")  # of numbers that no scene has
+    @np.errstate(invalid="ignore", over="ignore")  # absurd numbers overflow
     def fill(part: slice, some: NDArray[Any]) -> None:
         section = sections[bisect(firsts, part.start) - 1]
         splats.center[part] = _centers(section, part, some["center"]) if level else some["center"]
@@ -137,7 +143,7 @@ def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> 
             values = quantize.of_range(values / np.float32(255), low, high)
         coefficients = values.shape[1] // 3
         splats.sh[part, :coefficients] = values.reshape(len(some), coefficients, 3)
-        splats.sh[part, coefficients:] = 0  # other sections have more
+        splats.sh[part, coefficients:] = 0  # the degree of other sections may be higher
 
     decode_rows(rows(), fill, count, threads, progress)
     return Scene(
@@ -161,30 +167,30 @@ def _read(file: BinaryIO, kind: np.dtype[Any], count: int, what: str) -> NDArray
 def _read_sections(file: BinaryIO, size: int, count: int, level: int) -> Iterator[Section]:
     at = HEADER.itemsize + count * SECTION.itemsize
     if at > size:
-        raise TruncatedError(f"cut short: {count:,} sections are promised")
+        raise TruncatedError(f"cut short: its header announces {count:,} sections")
     first = 0
     for header in _read(file, SECTION, count, "the sections' headers"):
         of = {name: header[name].item() for name in SECTION.names or ()}
         if of["sh_degree"] > MAX_DEGREE:
-            raise VersionError(f"SH degree {of['sh_degree']} is not one that KSPLAT has")
+            raise VersionError(f"KSPLAT has no SH degree {of['sh_degree']}")
         rows = row_type(level, of["sh_degree"])
         buckets, partial = of["buckets"], of["partial_buckets"]
         offset = at + 4 * partial + of["bucket_bytes"] * buckets
         end = offset + of["room"] * rows.itemsize
         if end > size or of["splats"] > of["room"]:
-            raise TruncatedError(f"cut short: a section promises {count_of(int(of['splats']), 'splat')}")
+            raise TruncatedError(f"cut short: a section announces {count_of(int(of['splats']), 'splat')}")
         middles, ends = np.empty((0, 3), np.float32), np.empty(0, np.int64)
         steps = of["steps"] or LEVELS[level][3]
         if level and of["splats"]:
             if of["bucket_bytes"] != 12 or of["full_buckets"] + partial > buckets:
-                raise FormatError("a section's buckets are not those of KSPLAT")
+                raise FormatError("the buckets of a section do not follow KSPLAT")
             file.seek(at)
             part_sizes = _read(file, np.dtype("<u4"), partial, "the buckets")
             middles = _read(file, np.dtype(("<f4", (3,))), buckets, "the buckets")
             sizes = np.concatenate([np.full(of["full_buckets"], of["bucket_splats"], np.int64), part_sizes])
             ends = np.cumsum(sizes)
             if of["splats"] > (ends[-1] if len(ends) else 0):
-                raise FormatError(f"a section's buckets do not hold its {of['splats']:,} splats")
+                raise FormatError(f"the buckets of a section are too small for its {of['splats']:,} splats")
         step = np.float32(of["bucket_width"] / 2 / steps)
         yield Section(first, of["splats"], rows, offset, end, middles, ends, step, steps)
         first += of["splats"]

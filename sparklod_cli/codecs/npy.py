@@ -1,4 +1,4 @@
-"""numpy's .npy files of plain numbers, whose header is matched, not evaluated: it may say anything."""
+"""numpy's .npy files of plain numbers. Their header is Python source, which is matched here, not evaluated."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from ..support.errors import FormatError, TruncatedError
 
 MAGIC = b"\x93NUMPY"
 
-#: Bytes that the length of a header takes, by major version.
+#: Size in bytes of the field with the length of the header, by major version.
 LENGTH_BYTES = {1: 2, 2: 4, 3: 4}
 
-#: Bytes of a header; that of two dimensions takes 118.
+#: Largest header, bytes; that of a two-dimensional array has 118.
 MAX_HEADER = 1 << 12
 
-#: Each key of a header and what it may say, as Python spells that.
+#: Keys of a header and the values that are accepted, as Python writes them.
 KEYS = {
     "descr": r"""['"]([<>|=]?[biufc]\d{1,2})['"]""",
     "fortran_order": r"(True|False)",
@@ -33,12 +33,12 @@ _HEADER = re.compile(
 
 @dataclass(frozen=True)
 class Layout:
-    """What numbers follow, and how.
+    """The layout of an array in a file.
 
     Attributes:
         shape: of the array.
         dtype: of its numbers.
-        fortran_order: the first dimension runs fastest.
+        fortran_order: the first index runs fastest.
     """
 
     shape: tuple[int, ...]
@@ -47,10 +47,10 @@ class Layout:
 
 
 def read_layout(file: BinaryIO) -> Layout | None:
-    """The layout of a .npy file, which is left at its numbers; None, at the beginning, where it is something else.
+    """The layout of a .npy file, which is left at its numbers; None for another file, which is left at its beginning.
 
     Raises:
-        FormatError: the header is not one of an array of plain numbers; its text goes on a sentence about the file.
+        FormatError: the header is not that of an array of plain numbers; the text continues a sentence about the file.
     """
     file.seek(0)
     if file.read(len(MAGIC)) != MAGIC:
@@ -59,12 +59,12 @@ def read_layout(file: BinaryIO) -> Layout | None:
     version = file.read(2)
     size = LENGTH_BYTES.get(version[0]) if len(version) == 2 else None
     if size is None:
-        raise FormatError("is not a .npy file of a version that is known")
+        raise FormatError("is a .npy file of an unknown version")
     length = int.from_bytes(file.read(size), "little")
     header = file.read(min(length, MAX_HEADER))
     found = _HEADER.fullmatch(header.decode("latin-1")) if length <= MAX_HEADER else None
     if found is None:
-        raise FormatError("is not a .npy file of plain numbers: its header says something else")
+        raise FormatError("is not a .npy file of plain numbers: its header has another form")
     try:
         dtype = np.dtype(found[1])
         shape = tuple(int(side) for side in found[3].replace(",", " ").split())
@@ -76,10 +76,10 @@ def read_layout(file: BinaryIO) -> Layout | None:
 
 
 def read_values(file: BinaryIO, layout: Layout) -> NDArray[Any]:
-    """The array that begins where a file is; who calls has found its shape to be what was expected.
+    """The array at the current position of a file. The caller has checked that its shape is the expected one.
 
     Raises:
-        TruncatedError: the file ends before; its text goes on a sentence about the file.
+        TruncatedError: the file is too short; the text continues a sentence about the file.
     """
     size = math.prod(layout.shape) * layout.dtype.itemsize
     data = file.read(size)

@@ -1,9 +1,8 @@
-"""What Spark's in-memory layouts share: rotations as axis and angle, its rounding, its alpha, and checks of arrays.
+"""Shared by Spark's layouts in memory: rotations as axis and angle, rounding, alpha, and checks of arrays.
 
-The formulas are those of Spark 2.2.0's encoders in Rust, in float32 and in the same order of operations, because a code
-that lies half-way between two numbers falls by the last bit. Only the functions that round differently from library to
-library (arc cosine, sine, logarithm, exponential) are taken in float64 and rounded once, so that every machine gives
-the same codes.
+The formulas are those of Spark 2.2.0's encoders in Rust, in float32 and in the same order of operations, because the
+last bit decides between two codes. Only functions that libraries round differently (arc cosine, sine, logarithm,
+exponential) are computed in float64 and rounded once, so that every machine gives the same codes.
 """
 
 from __future__ import annotations
@@ -20,33 +19,33 @@ from ..support.errors import FormatError
 
 Words = NDArray[np.uint32]
 
-#: Steps of the two numbers of the axis and of the angle, in the two layouts.
+#: Largest codes of the axis's two numbers and of the angle, in PackedSplats and in ExtSplats.
 STEPS_8_8_8 = (255, 255)
 STEPS_10_10_12 = (1023, 4095)
 
 _PI = np.float32(np.pi)
-#: Below this the axis of a rotation is noise, and Spark takes the x axis.
+#: Sine of half the angle below which the axis is noise: Spark uses the x axis instead.
 _NO_ROTATION = np.float32(1e-6)
-#: Added before cutting off, this rounds ties up, and unlike 1 / 2 itself it does not lift the float32 below 1 / 2.
+#: Added before truncation, this rounds ties up; unlike 1 / 2 itself it does not round the float32 below 1 / 2 up to 1.
 _ALMOST_HALF = np.nextafter(np.float32(0.5), np.float32(0))
 
 
 def round_half_away(values: FloatArray) -> FloatArray:
-    """Whole float32 numbers, ties away from zero, as Rust's `round` has them and numpy's has not."""
+    """float32 numbers rounded to whole ones, ties away from zero, as Rust's `round` does and numpy's does not."""
     return np.trunc(values + np.copysign(_ALMOST_HALF, values))
 
 
 def to_code(values: FloatArray, most: int) -> NDArray[np.uint32]:
-    """float32 numbers in steps of a code to whole codes 0..most, ties up."""
+    """float32 numbers in units of codes to whole codes, clamped to 0..most, ties up."""
     return (np.clip(values, 0, np.float32(most)) + _ALMOST_HALF).astype(np.uint32)
 
 
 def encode_axis_angle(quat_xyzw: FloatArray, steps: tuple[int, int]) -> tuple[Words, Words, Words]:
     """(N, 4) unit quaternions to three codes, (N,) each: u and v of the axis, 0..steps[0], and the angle, 0..steps[1].
 
-    The axis is that of the turn by 0..pi. It is projected onto the octahedron |x| + |y| + |z| = 1, whose lower half is
-    folded outward over the corners of the square that the upper half covers in x and y: u and v are x and y of that,
-    -1..1. No rotation has the x axis.
+    The axis is that of the rotation by 0..pi. It is projected onto the octahedron |x| + |y| + |z| = 1, whose lower half
+    is folded outward into the corners of the square that the upper half covers in x and y: u and v are x and y of the
+    result, -1..1. A rotation by 0 gets the x axis.
     """
     axis_steps, angle_steps = steps
     x, y, z, w = np.ascontiguousarray(quat_xyzw.T)
@@ -91,13 +90,13 @@ def decode_axis_angle(u: NDArray[Any], v: NDArray[Any], angle: NDArray[Any], ste
 
 
 def encode_lod_alpha(opacity: FloatArray) -> FloatArray:
-    """Linear opacity to Spark's alpha: itself up to 1, above it (D + 3) / 4, so that D = 1..5 becomes 1..2."""
+    """Linear opacity A to Spark's alpha: A up to 1; above, (D + 3) / 4, which maps D = 1..5 to 1..2."""
     d = lod_opacity(opacity)
     return np.where(d > 1, (d + 3) * np.float32(0.25), d)
 
 
 def decode_lod_alpha(alpha: FloatArray) -> FloatArray:
-    """Spark's alpha to linear opacity; D is 4 * alpha - 3 above 1. Largest error: that of float32."""
+    """Spark's alpha to linear opacity A; above 1, D is 4 * alpha - 3. Largest error: that of float32."""
     return linear_opacity(np.where(alpha > 1, 4 * alpha - 3, alpha))
 
 
@@ -105,14 +104,14 @@ def checked_words(arrays: Mapping[str, NDArray[Any]], columns: Mapping[str, int]
     """The arrays of these names, each (N, columns) uint32 with the same N, C-contiguous.
 
     Raises:
-        FormatError: one is missing, or of another shape or type.
+        FormatError: one is missing, or has another shape or type.
     """
     found = {}
     rows = None
     for name, width in columns.items():
         array = arrays.get(name)
         if array is None:
-            raise FormatError(f"no array {name}, only {', '.join(arrays) or 'none at all'}")
+            raise FormatError(f"there is no array {name}, only {', '.join(arrays) or 'none'}")
         rows = len(array) if rows is None and array.ndim else rows
         if array.dtype != np.uint32 or array.shape != (rows, width):
             raise FormatError(f"{name} is {array.dtype}{list(array.shape)}, expected uint32[{rows}, {width}]")

@@ -1,6 +1,6 @@
-"""PLY as 3D Gaussian Splatting writes it: Inria's code, nerfstudio, gsplat, splat-transform and their kin.
+"""PLY of 3D Gaussian Splatting, as Inria's code, nerfstudio, gsplat, splat-transform and others write it.
 
-One vertex a splat, of scalar properties in any order; properties that are not in the table are ignored.
+A vertex is a splat, with scalar properties in any order; properties that are not in the table are ignored.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ from .stream import Rows, decode_rows, rows_of, size_of
 
 Coding = Callable[[FloatArray], FloatArray]
 
-#: Column of `Splats`, the properties that it is made of, and how they are read and written.
+#: Columns of `Splats`, the properties that each consists of, and its decode and encode.
 COLUMNS: tuple[tuple[str, tuple[str, ...], Coding, Coding], ...] = (
     ("center", ("x", "y", "z"), np.asarray, np.asarray),
     ("rgb", ("f_dc_0", "f_dc_1", "f_dc_2"), quantize.decode_dc, quantize.encode_dc),
     ("opacity", ("opacity",), quantize.decode_logit, quantize.encode_logit),
     ("scale", ("scale_0", "scale_1", "scale_2"), quantize.decode_log, quantize.encode_log),
-    ("quat_xyzw", ("rot_1", "rot_2", "rot_3", "rot_0"), normalized_quat, np.asarray),  # w first; of any length
+    ("quat_xyzw", ("rot_1", "rot_2", "rot_3", "rot_0"), normalized_quat, np.asarray),  # rot_0 is w; of any length
 )
 REQUIRED = tuple(name for _, names, _, _ in COLUMNS for name in names)
 
@@ -46,7 +46,7 @@ def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> 
     """Reads a PLY file.
 
     Raises:
-        FormatError: it is not PLY, cut short, or not of Gaussian splats.
+        FormatError: the file is not PLY, cut short, or does not hold splats.
     """
     size = size_of(file)
     header = read_header(file)
@@ -60,7 +60,7 @@ def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> 
     rest = _run([names.index(f"f_rest_{index}") for index in range(3 * coefficients)])  # all of red's come first
     kept = splats.sh.shape[1]
 
-    # Infinite logits and logarithms are what converters write for an opacity of 0 or 1 and a scale of 0.
+    # Converters write infinite logits and logarithms for an opacity of 0 or 1 and a scale of 0.
     @np.errstate(over="ignore", invalid="ignore")
     def fill(part: slice, some: NDArray[Any]) -> None:
         matrix = _matrix(some)
@@ -76,7 +76,7 @@ def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> 
 
 
 def _matrix(rows: NDArray[Any]) -> FloatArray:
-    """(n, properties) float32 of structured rows, without a copy where they are that already."""
+    """(n, properties) float32 of structured rows, without a copy if all their fields are float32."""
     names = rows.dtype.names or ()
     if rows.flags.c_contiguous and all(rows.dtype[name] == np.float32 for name in names):
         return rows.view(np.float32).reshape(len(rows), len(names))
@@ -87,32 +87,32 @@ def _matrix(rows: NDArray[Any]) -> FloatArray:
 
 
 def _run(places: list[int]) -> slice | list[int]:
-    """A slice for places that follow one another, as it makes a view and a list a copy."""
+    """A slice if the places are consecutive, since indexing with it makes no copy; otherwise the list."""
     first = places[0] if places else 0
     run = slice(first, first + len(places))
     return run if places == list(range(run.start, run.stop)) else places
 
 
 def _checked_coefficients(header: Header) -> int:
-    """SH coefficients a channel, if the vertices are splats."""
+    """SH coefficients per channel, after a check that the vertices are splats."""
     if "vertex" not in header.elements:
-        raise NotSplatsError("no vertex element in the PLY header")
+        raise NotSplatsError("its PLY header has no element vertex")
     have = _row_type(header).names or ()
     missing = [name for name in REQUIRED if name not in have]
     if missing:
-        what = "a point cloud or mesh, not Gaussian splats" if "x" in have else "not Gaussian splats"
+        what = "a point cloud or a mesh, not Gaussian splats" if "x" in have else "not Gaussian splats"
         raise NotSplatsError(f"{what}: its vertices have no {', '.join(missing)}")
     rest = sum(1 for name in have if re.fullmatch(r"f_rest_\d+", name))
     expected = {f"f_rest_{index}" for index in range(rest)}
     if rest % 3 or not expected.issubset(have):
-        raise FormatError(f"{rest} f_rest properties; expected f_rest_0 on, in a multiple of 3")
+        raise FormatError(f"{rest} f_rest properties; expected f_rest_0, f_rest_1 and so on, a multiple of 3")
     return rest // 3
 
 
 def _row_type(header: Header) -> np.dtype[Any]:
     row_type = header.row_type("vertex")
     if row_type is None:
-        raise NotSplatsError("the vertices have list properties, splats have none")
+        raise NotSplatsError("its vertices have list properties, which splats do not have")
     return row_type
 
 
@@ -122,7 +122,7 @@ def _binary_rows(file: BinaryIO, header: Header) -> Iterator[Rows]:
         file.seek(offset)
         yield from rows_of(file.read, _row_type(header), header.count("vertex"), "vertices")
         return
-    file.seek(0)  # rows of unknown sizes come before the vertices
+    file.seek(0)  # rows of unknown size come before the vertices
     try:
         data = PlyData.read(file)["vertex"].data
     except (PlyParseError, ValueError) as error:
@@ -132,7 +132,7 @@ def _binary_rows(file: BinaryIO, header: Header) -> Iterator[Rows]:
 
 
 def _text_rows(file: BinaryIO, header: Header) -> Iterator[Rows]:
-    """The vertices of an ascii file in chunks; plyfile's own reader goes value by value in Python."""
+    """The vertices of an ascii file in blocks; plyfile's own reader takes value by value in Python."""
     row_type, vertices = _row_type(header), header.count("vertex")
     file.seek(header.size)
     for name, (_, count) in header.elements.items():
@@ -144,7 +144,7 @@ def _text_rows(file: BinaryIO, header: Header) -> Iterator[Rows]:
         if part.start + len(lines) < part.stop:
             raise TruncatedError(f"cut short after {part.start + len(lines):,} of {vertices:,} vertices")
         if not all(map(bytes.strip, lines)):  # numpy would skip them
-            raise FormatError(f"empty lines among the vertices after {part.start:,}")
+            raise FormatError(f"an empty line among the vertices after vertex {part.start:,}")
         try:
             rows = np.loadtxt(lines, dtype=row_type, ndmin=1, comments=None)
         except ValueError as error:
@@ -153,7 +153,7 @@ def _text_rows(file: BinaryIO, header: Header) -> Iterator[Rows]:
 
 
 def settled(scene: Scene, options: WriteOptions) -> WriteOptions:
-    """These options, of which PLY leaves none open.
+    """These options: PLY has no choices.
 
     Raises:
         FormatError: the scene is a tree, which PLY cannot hold.
@@ -168,7 +168,8 @@ def encode(
 ) -> Iterator[bytes]:
     """The bytes of a binary PLY file in the layout of Inria's trainer, piece by piece.
 
-    Numbers are finite: opacities 0 and 1 and scales 0, whose logarithms are not, get ones that read as them.
+    All numbers are finite: for opacities of 0 and 1 and scales of 0, whose logits and logarithms are infinite, those of
+    `quantize.FAR` are written, which decode to the same values.
 
     Raises:
         FormatError: the scene is a tree, which PLY cannot hold.
@@ -194,7 +195,7 @@ def _inria_properties(coefficients: int) -> list[str]:
 
 
 def _encode(splats: Splats, part: slice, row_type: np.dtype[Any]) -> bytes:
-    rows = np.zeros(part.stop - part.start, row_type)  # normals, which nobody reads, are 0
+    rows = np.zeros(part.stop - part.start, row_type)  # normals are 0: viewers ignore them
     for column, names, _, encoder in COLUMNS:
         for name, values in zip(names, encoder(getattr(splats, column)[part]).reshape(len(rows), -1).T, strict=True):
             rows[name] = values

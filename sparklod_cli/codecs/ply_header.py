@@ -1,4 +1,4 @@
-"""What all kinds of PLY share: the header, and how its elements lie in the file."""
+"""The header of PLY files of all kinds, and where their elements lie."""
 
 from __future__ import annotations
 
@@ -12,15 +12,23 @@ from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
 from ..support.errors import FormatError, PromiseError, TruncatedError
 from ..support.untrusted import quoted
 
+#: Largest header, bytes; that of a splat file has some 1,500.
 MAX_HEADER = 1 << 20
 
-#: Digits of a count; Python makes no number of some thousands.
+#: Most digits of a count: Python refuses to convert numbers of several thousand digits.
 MAX_DIGITS = 100
 
 
 @dataclass(frozen=True)
 class Header:
-    """What comes before the data: element descriptions without their data, and how many rows each has."""
+    """A PLY header.
+
+    Attributes:
+        elements: descriptions of the elements without their data, and the number of rows of each, by name.
+        text: whether the data are ascii.
+        byte_order: "<" or ">" of binary data.
+        size: bytes of the header.
+    """
 
     elements: dict[str, tuple[PlyElement, int]]
     text: bool
@@ -28,17 +36,17 @@ class Header:
     size: int
 
     def count(self, name: str) -> int:
-        """Rows of an element, 0 where there is none of this name."""
+        """Rows of an element; 0 if there is none of this name."""
         return self.elements[name][1] if name in self.elements else 0
 
     def row_type(self, name: str) -> np.dtype[Any] | None:
-        """Type of a row, or None where rows have lists and so no fixed size."""
+        """Type of a row; None if rows have lists, and so no fixed size."""
         element = self.elements[name][0]
         has_list = any(isinstance(prop, PlyListProperty) for prop in element.properties)
         return None if has_list else np.dtype(element.dtype(self.byte_order))
 
     def offset(self, name: str) -> int | None:
-        """Where an element's rows begin in a binary file; None where rows of unknown sizes come before them."""
+        """Where the rows of an element begin in a binary file; None if rows of unknown size come before them."""
         at = self.size
         for other, (_, count) in self.elements.items():
             if other == name:
@@ -50,28 +58,32 @@ class Header:
         return at
 
     def check_size(self, size: int) -> int:
-        """Raises `FormatError` where `size` bytes cannot hold what is promised, before memory is asked for.
+        """Checks that a file of `size` bytes can hold all rows, before memory is allocated for them.
 
-        Returns how many bytes are left over, as far as that can be told.
+        Returns:
+            Bytes after the last row; 0 where their number is unknown.
+
+        Raises:
+            TruncatedError: the file is too small.
         """
         need = self.size
         for name, (element, count) in self.elements.items():
             row_type = self.row_type(name)
             if self.text:
-                need += count * 2 * max(1, len(element.properties))  # a digit and a separator a value
+                need += count * 2 * max(1, len(element.properties))  # at least a digit and a separator for each value
             else:
                 need += count * (row_type.itemsize if row_type else 1)
-        missing = need - size - (1 if self.text else 0)  # the last separator may be missing
+        missing = need - size - (1 if self.text else 0)  # the last separator is optional
         if missing > 0:
-            raise TruncatedError(f"cut short: {missing:,} bytes are missing of what the header promises")
+            raise TruncatedError(f"cut short: {missing:,} bytes are missing of what the header announces")
         return 0 if self.text or any(self.row_type(name) is None for name in self.elements) else -missing
 
 
 def read_header(file: BinaryIO) -> Header:
-    """Reads up to the line end_header, leaving the file behind it.
+    """Reads a header, up to the line end_header, after which the file is left.
 
     Raises:
-        FormatError: it is not a PLY header.
+        FormatError: the file does not begin with a PLY header.
     """
     text = line = b""
     while line.strip() != b"end_header":
@@ -81,15 +93,15 @@ def read_header(file: BinaryIO) -> Header:
             raise FormatError("not a PLY file")
         if not line or len(text) > MAX_HEADER:
             raise TruncatedError("the PLY header does not end")
-    # plyfile gets what it must parse: no comments, which may be in any encoding, and counts of 0, as it would read all
-    # data otherwise, and text value by value.
+    # plyfile gets the header without comments, which may be in any encoding, and with counts of 0: otherwise it would
+    # read all the data, and text value by value.
     lines, counts = [], []
     for words in map(bytes.split, text.splitlines()):
         if words[:1] == [b"element"]:
             if len(words) != 3 or not words[2].isdigit():
-                raise FormatError("bad PLY header: expected element, a name and a count")
+                raise FormatError("bad PLY header: an element needs a name and a count")
             if len(words[2]) > MAX_DIGITS:
-                raise PromiseError(f"the header promises a count of {len(words[2]):,} digits")
+                raise PromiseError(f"its header announces a count of {len(words[2]):,} digits")
             counts.append(int(words[2]))
             words[2] = b"0"
         if words and words[0] not in (b"comment", b"obj_info"):

@@ -1,6 +1,6 @@
-"""Number codings as encode/decode pairs over whole arrays; each decode names its largest error.
+"""Number codings as pairs of encode and decode over whole arrays; each decode states its largest error.
 
-Encoders expect finite numbers and clamp to what the code can hold.
+Encoders take finite numbers and clamp them to the range of the code.
 """
 
 from __future__ import annotations
@@ -16,12 +16,19 @@ from ..model.splats import FloatArray
 
 Bytes = NDArray[np.uint8]
 
-SCALE_STEPS, SCALE_OFFSET = 16, 10  # log scale bytes: steps to a factor of e, and minus the smallest logarithm
-COLOR_GAIN = 0.15  # colour bytes: SH DC coefficients times this, around one half
-SH_BITS = (5, 4, 4)  # bits that are kept of each degree's SH bytes, as Niantic's library writes them
+#: Bytes of logarithmic scales, as SPZ defines them: steps to a factor of e, and minus the smallest logarithm.
+SCALE_STEPS, SCALE_OFFSET = 16, 10
+
+#: Bytes of colours, as SPZ defines them: an SH DC coefficient is multiplied by this, around one half.
+COLOR_GAIN = 0.15
+
+#: Upper bits kept of the SH bytes of each degree, as Niantic's library writes them.
+SH_BITS = (5, 4, 4)
+
+#: Largest code of signed 24-bit fixed point.
 FIXED24_MAX = 2**23 - 1
 
-#: Columns of `Splats` whose codes clamp, and the least and the greatest value that they hold, half a step included.
+#: Smallest and largest value of each column of `Splats` that SPZ rounds to a code instead of clamping it.
 CLAMPS = {
     "scale": (
         float(np.exp(-0.5 / SCALE_STEPS - SCALE_OFFSET)),
@@ -32,48 +39,49 @@ CLAMPS = {
 }
 
 _SQRT_HALF = np.float32(np.sqrt(0.5))
+#: Indices of the three components that remain, by the index of the one that is left out.
 _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 
-
-#: Stands for infinity where a logarithm or a logit is written: its exponential and its sigmoid are exactly 0 and 1 in
-#: float32, and readers that refuse what is not finite take it.
+#: Written in place of an infinite logarithm or logit: in float32 its exponential and sigmoid are exactly those of
+#: infinity, and readers that refuse infinite numbers accept it.
 FAR = np.float32(110)
 
+#: Largest float32.
 LARGEST = np.finfo(np.float32).max
 
 
 def decode_log(values: FloatArray) -> FloatArray:
-    """Natural logarithms to what they are of. Exact up to float32 arithmetic, as are the next two."""
+    """Natural logarithms to values. Exact up to float32 arithmetic."""
     with np.errstate(over="ignore"):
         return np.exp(values)
 
 
 def encode_log(values: FloatArray) -> FloatArray:
-    """Natural logarithms, finite also of 0."""
+    """Values, 0 or more, to natural logarithms, which are finite for 0 too."""
     with np.errstate(divide="ignore"):
         return np.maximum(np.log(values), -FAR)
 
 
 def decode_logit(logit: FloatArray) -> FloatArray:
-    """Logits to 0..1."""
+    """Logits to 0..1. Exact up to float32 arithmetic."""
     with np.errstate(over="ignore"):
         return 1 / (1 + np.exp(-logit))
 
 
 def encode_logit(values: FloatArray) -> FloatArray:
-    """Logits of 0..1, finite also at both ends."""
+    """0..1 to logits, which are finite at both ends too."""
     wide = values.astype(np.float64)
     with np.errstate(divide="ignore"):
         return np.clip(np.log(wide) - np.log1p(-wide), -FAR, FAR).astype(np.float32)
 
 
 def decode_dc(dc: FloatArray) -> FloatArray:
-    """SH DC coefficients to display-referred colours."""
+    """SH DC coefficients to display-referred colours. Exact up to float32 arithmetic."""
     return dc * np.float32(SH_C0) + np.float32(0.5)
 
 
 def encode_dc(rgb: FloatArray) -> FloatArray:
-    """Display-referred colours to SH DC coefficients, finite also where colours are near the end of float32."""
+    """Display-referred colours to SH DC coefficients, clamped to the range of float32."""
     with np.errstate(over="ignore"):
         return np.clip((rgb - np.float32(0.5)) / np.float32(SH_C0), -LARGEST, LARGEST)
 
@@ -98,7 +106,7 @@ def decode_fixed24(codes: Bytes, fractional_bits: int) -> FloatArray:
 
 
 def encode_log_scale(scale: FloatArray) -> Bytes:
-    """Linear scales to a byte each; e ** -10 to e ** 5.94 is what it holds."""
+    """Linear scales to a byte each; its range is e ** -10 to e ** 5.94."""
     with np.errstate(divide="ignore"):
         return _to_byte((np.log(scale) + SCALE_OFFSET) * SCALE_STEPS)
 
@@ -135,7 +143,7 @@ def decode_lod_opacity(codes: Bytes) -> FloatArray:
 
 
 def encode_color(rgb: FloatArray) -> Bytes:
-    """Display-referred colours to bytes of their SH DC coefficients; holds -0.44 .. 1.44."""
+    """Display-referred colours to bytes of their SH DC coefficients; the range is -0.44..1.44."""
     with np.errstate(over="ignore"):
         return _to_byte((rgb - np.float32(0.5)) * np.float32(COLOR_GAIN * 255 / SH_C0) + np.float32(127.5))
 
@@ -146,7 +154,7 @@ def decode_color(codes: Bytes) -> FloatArray:
 
 
 def encode_sh(sh: FloatArray) -> Bytes:
-    """(N, K, 3) coefficients to bytes; the value is rounded to the middle of its bucket of 8 or 16 codes; -1..0.99."""
+    """(N, K, 3) coefficients to bytes, rounded to the middle of buckets of 8 or 16 codes; the range is -1..0.99."""
     degree = np.repeat([0, 1, 2], [3, 5, 7])[: sh.shape[1]]
     bucket = (2.0 ** (8 - np.array(SH_BITS)))[degree].astype(np.float32)[:, None]
     with np.errstate(over="ignore"):
@@ -160,7 +168,7 @@ def decode_sh(codes: Bytes) -> FloatArray:
 
 
 def encode_quat_first_three(quat_xyzw: FloatArray) -> Bytes:
-    """(N, 4) unit quaternions to (N, 3) bytes of x y z, turned so that w is not negative."""
+    """(N, 4) unit quaternions to (N, 3) bytes of x y z, of the one of q and -q whose w is not negative."""
     sign = np.where(quat_xyzw[:, 3:] < 0, np.float32(-127.5), np.float32(127.5))
     return _to_byte(quat_xyzw[:, :3] * sign + np.float32(127.5))
 
@@ -173,8 +181,11 @@ def decode_quat_first_three(codes: Bytes) -> FloatArray:
 
 
 def encode_quat_smallest_three(quat_xyzw: FloatArray) -> Bytes:
-    """(N, 4) unit quaternions to (N, 4) bytes, a little-endian uint32: 2 bits index of the largest component, then of
-    the others in order a sign and 9 bits of magnitude, each over sqrt(1 / 2)."""
+    """(N, 4) unit quaternions to (N, 4) bytes, a little-endian uint32.
+
+    2 bits are the index of the largest component; of each other one, in order, there is a sign and 9 bits of magnitude
+    in units of sqrt(1 / 2) / 511.
+    """
     largest = np.abs(quat_xyzw).argmax(axis=1)[:, None]
     others = np.take_along_axis(quat_xyzw, _OTHERS[largest[:, 0]], axis=1)
     flip = np.take_along_axis(quat_xyzw, largest, axis=1) < 0
@@ -197,13 +208,13 @@ def decode_quat_smallest_three(codes: Bytes) -> FloatArray:
 
 
 def quat_of_others(largest: NDArray[Any], a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
-    """(N, 4) unit quaternions of which the component at `largest`, (N,), is missing, and the others in order are a b c.
+    """(N, 4) unit quaternions from three components, a b c in order; the one at index `largest`, (N,), is missing.
 
-    It is taken as positive.
+    The missing component is taken to be positive.
     """
     square = a * a + b * b + c * c
     rest = np.sqrt(np.maximum(1 - square, 0))
-    over = 1 / np.sqrt(np.maximum(square, 1))  # the others may be longer than 1 together
+    over = 1 / np.sqrt(np.maximum(square, 1))  # rounding may make a b c longer than 1
     quat = np.empty((len(a), 4), np.float32)
     quat[:, 0] = np.where(largest == 0, rest, a) * over
     quat[:, 1] = np.where(largest == 1, rest, np.where(largest < 1, a, b)) * over
@@ -213,7 +224,7 @@ def quat_of_others(largest: NDArray[Any], a: FloatArray, b: FloatArray, c: Float
 
 
 def encode_quat_bytes(quat: FloatArray) -> Bytes:
-    """(N, 4) unit quaternions to a byte a component, 128 times it around 128."""
+    """(N, 4) unit quaternions to a byte for each component c: 128 * c + 128."""
     return _to_byte(quat * 128 + 128)
 
 
@@ -238,32 +249,36 @@ def range_table(low: Any, high: Any, codes: int) -> NDArray[np.float64]:
 
 
 def _unorm(code: NDArray[np.uint32], low: int, bits: int) -> FloatArray:
-    """Bits `low` up of codes, all ones for 1."""
+    """The `bits` bits of codes from bit `low` up as 0..1: all ones are 1."""
     most = (1 << bits) - 1
     return (code >> np.uint32(low) & np.uint32(most)).astype(np.float32) / np.float32(most)
 
 
 def decode_unorm_11_10_11(code: NDArray[np.uint32]) -> FloatArray:
-    """(N,) words to (N, 3) of 0..1, the first in the top bits. Largest error: half of 1 / 2047, 1 / 1023, 1 / 2047."""
+    """(N,) words to (N, 3) in 0..1, the first in the top bits. Largest error: half of 1 / 2047, 1 / 1023, 1 / 2047."""
     return np.stack([_unorm(code, 21, 11), _unorm(code, 11, 10), _unorm(code, 0, 11)], axis=1)
 
 
 def decode_unorm_8888(code: NDArray[np.uint32]) -> FloatArray:
-    """(N,) words to (N, 4) of 0..1, the first in the top bits. Largest error: 1 / 510."""
+    """(N,) words to (N, 4) in 0..1, the first in the top bits. Largest error: 1 / 510."""
     return np.stack([_unorm(code, low, 8) for low in (24, 16, 8, 0)], axis=1)
 
 
 def decode_quat_2_10_10_10(code: NDArray[np.uint32]) -> FloatArray:
-    """(N,) words to (N, 4) unit quaternions w x y z: 2 bits index of the largest component, then the others in order.
+    """(N,) words to (N, 4) unit quaternions w x y z.
 
-    Each has 10 bits for -sqrt(1 / 2) .. sqrt(1 / 2). Largest error: 0.28 degrees of rotation.
+    2 bits are the index of the largest component; each other one, in order, has 10 bits for -sqrt(1 / 2)..sqrt(1 / 2).
+    Largest error: 0.28 degrees of rotation.
     """
     others = [(_unorm(code, low, 10) - np.float32(0.5)) * (2 * _SQRT_HALF) for low in (20, 10, 0)]
     return quat_of_others(code >> np.uint32(30), *others)
 
 
 def decode_centred_8(codes: Bytes) -> FloatArray:
-    """Bytes to -4..4, most at the middles of 256 steps, the first and the last at the ends. Largest error: 1 / 32."""
+    """Bytes to -4..4: the middles of 256 steps, but for the first and the last, which are the ends.
+
+    Largest error: 1 / 32.
+    """
     unit = (np.arange(256) + 0.5) / 256
     unit[0], unit[255] = 0, 1
     return ((unit - 0.5) * 8).astype(np.float32)[codes]

@@ -1,6 +1,6 @@
-"""PlayCanvas's SOG: splats as WebP images, a texel a splat, and a meta.json that says what their bytes mean.
+"""PlayCanvas's SOG: splats as WebP images with a texel per splat, and a meta.json that defines their values.
 
-Comes as a zip (.sog) or unpacked as a folder. Version 2 looks bytes up in codebooks, version 1 has ranges instead.
+A scene is a zip (.sog) or an unpacked folder. Version 2 maps bytes to values by codebooks, version 1 by ranges.
 """
 
 from __future__ import annotations
@@ -21,11 +21,16 @@ from . import quantize
 from .compression import check_promise
 from .sog_files import Files, Meta, Texels
 
-PALETTE_WIDTH = 64  # entries a row of the image of centroids
-MAX_PALETTE = 1 << 16  # a label has 16 bits
-MAX_SPLATS = 1 << 28  # the most texels of a WebP image
+#: Entries in a row of the image of SH centroids.
+PALETTE_WIDTH = 64
 
-#: The alpha of a rotation's texel is this and the index, in w x y z, of the largest component.
+#: Most entries of the palette of SH: a label has 16 bits.
+MAX_PALETTE = 1 << 16
+
+#: Most splats: a WebP image has at most this many texels.
+MAX_SPLATS = 1 << 28
+
+#: Alpha of a rotation's texel minus the index, in w x y z, of the largest component.
 FIRST_TAG = 252
 
 #: One pass over all splats: fills the rows of a slice.
@@ -42,24 +47,24 @@ def decode(
     """Reads a .sog archive, or the meta.json of an unpacked one.
 
     Args:
-        file: either of them.
+        file: the archive or the meta.json.
         threads: to decode with.
-        progress: is told how much is done.
-        beside: opens the files that a meta.json names.
+        progress: called while the images are decoded.
+        beside: opens the files that a meta.json names; None if there are none to open.
 
     Raises:
-        FormatError: it is not SOG, not version 1 or 2, lacks a file, or is corrupt.
+        FormatError: the file is not SOG, not of version 1 or 2, corrupt, or lacks an image.
     """
     files = Files(file, beside)
     meta = files.meta
     version = meta.integer("version") if meta.has("version") else 1
     if version not in (1, 2):
-        raise VersionError(f"SOG version {version} is not known, only 1 and 2 are")
+        raise VersionError(f"SOG version {version} is unknown, only 1 and 2 are read")
     if version == 1 and meta.has("opacities"):
-        raise VersionError("SOG from before version 1, with opacities apart; only versions 1 and 2 are known")
+        raise VersionError("SOG from before version 1, with separate opacities; only versions 1 and 2 are read")
     count = meta.integer("count") if version == 2 else meta.integer("means", "shape", 0)
     if not 0 < count <= MAX_SPLATS:
-        raise FormatError(f"{count:,} splats are not a number that SOG can hold")
+        raise FormatError(f"{count:,} splats, but a SOG holds 1 to {MAX_SPLATS:,}")
     palette = _read_palette(files, version) if meta.has("shN") else None
     degree = COEFFICIENTS.index(palette.shape[1]) if palette is not None else 0
     check_promise(count * 4 * (14 + 3 * COEFFICIENTS[degree]), files.size)
@@ -78,7 +83,7 @@ def decode(
 
 
 def _passes(files: Files, version: int, splats: Splats, palette: FloatArray | None) -> Iterator[Pass]:
-    """The images one after the other, so that no more than two are in memory."""
+    """Decodes the images one after the other, so that at most two are in memory."""
     count = len(splats)
     yield _centers(splats, files.texels("means", 0, count), files.texels("means", 1, count), files.meta)
     yield functools.partial(_fill_quats, splats, files.texels("quats", 0, count))
@@ -94,13 +99,13 @@ def _passes(files: Files, version: int, splats: Splats, palette: FloatArray | No
 
 
 def _look_up(columns: list[FloatArray], texels: Texels, tables: FloatArray, part: slice) -> None:
-    """Each column, (N,), from a channel of the texels by a table of 256 values."""
+    """Fills each column, (N,), from a channel of the texels by a table of 256 values."""
     for channel, (column, table) in enumerate(zip(columns, tables, strict=True)):
         column[part] = table[texels[part, channel]]
 
 
 def _tables(meta: Meta, name: str, version: int, channels: int) -> FloatArray:
-    """(channels, 256) float32: what each byte means. Version 2 has one codebook, version 1 a range a channel."""
+    """(channels, 256) float32 values of each byte: one codebook in version 2, a range per channel in version 1."""
     if version == 2:
         return np.tile(_codebook(meta, name), (channels, 1))
     low, high = meta.numbers(channels, name, "mins"), meta.numbers(channels, name, "maxs")
@@ -112,7 +117,7 @@ def _codebook(meta: Meta, name: str) -> FloatArray:
 
 
 def _centers(splats: Splats, low: Texels, high: Texels, meta: Meta) -> Pass:
-    """16 bits a coordinate, over two images, between the bounds of sign(x) * log(1 + abs(x))."""
+    """Decodes coordinates: 16 bits over two images, between the bounds of sign(x) * log(1 + abs(x))."""
     logs = quantize.range_table(meta.numbers(3, "means", "mins"), meta.numbers(3, "means", "maxs"), 1 << 16)
     with np.errstate(over="ignore"):
         tables = np.copysign(np.expm1(np.abs(logs)), logs).astype(np.float32)
@@ -125,7 +130,7 @@ def _centers(splats: Splats, low: Texels, high: Texels, meta: Meta) -> Pass:
 
 
 def _fill_quats(splats: Splats, texels: Texels, part: slice) -> None:
-    """The three smaller components in r g b; those of a texel without a tag become NaN, which nobody will draw."""
+    """Decodes rotations: three components in r g b. A texel without a tag gives NaN, an invalid splat."""
     others = [(texels[part, k].astype(np.float32) / np.float32(127.5) - 1) * np.float32(np.sqrt(0.5)) for k in range(3)]
     tag = texels[part, 3]
     quat = quantize.quat_of_others(tag.astype(np.int16) - FIRST_TAG, *others)[:, [1, 2, 3, 0]]
@@ -136,12 +141,12 @@ def _fill_quats(splats: Splats, texels: Texels, part: slice) -> None:
 def _fill_sh(splats: Splats, texels: Texels, palette: FloatArray, part: slice) -> None:
     label = texels[part, 0] | texels[part, 1].astype(np.uint16) << np.uint16(8)
     if label.max(initial=0) >= len(palette):
-        raise FormatError(f"SH label {label.max()} is beyond the {len(palette):,} of its palette")
+        raise FormatError(f"SH label {label.max()} is beyond the {len(palette):,} entries of its palette")
     splats.sh[part] = palette[label]
 
 
 def _read_palette(files: Files, version: int) -> FloatArray:
-    """(entries, K, 3) SH coefficients that splats share."""
+    """(entries, K, 3) SH coefficients of the palette."""
     image = files.image("shN", 0, MAX_PALETTE * COEFFICIENTS[3])
     width = image.shape[1]
     coefficients = width // PALETTE_WIDTH

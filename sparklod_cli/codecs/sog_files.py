@@ -1,4 +1,4 @@
-"""What a SOG scene lies in: its meta.json and its images, from a zip or a folder, bounded before they are decoded."""
+"""The files of a SOG scene, meta.json and images, from a zip or a folder; sizes are checked before decoding."""
 
 from __future__ import annotations
 
@@ -22,21 +22,25 @@ from .stream import size_of
 Texels = NDArray[np.uint8]
 
 META = "meta.json"
-MAX_META = 1 << 22  # bytes; codebooks take 15,000
-METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-ENCRYPTED = 1
+
+#: Largest meta.json, bytes; codebooks take 15,000.
+MAX_META = 1 << 22
+
+#: Compression methods of a zip that SOG uses, and the flag of an encrypted member.
+METHODS, ENCRYPTED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED), 1
 
 #: Flag of a WebP file's extended header.
 ANIMATED = 2
 
-#: Writers make images square, or of sides that are powers of two: so many more texels than splats are taken.
+#: Texels that an image may have: a multiple of the splats, and some more, since writers make images square or round
+#: sides up to powers of two.
 SPARE_FACTOR, SPARE_TEXELS = 4, 1 << 16
 
 _ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, ValueError, struct.error)
 
 
 class Meta:
-    """A meta.json whose values are looked at before they are believed; each way to one is a sequence of keys."""
+    """A meta.json whose values are checked when they are read; a sequence of keys leads to each."""
 
     def __init__(self, data: bytes) -> None:
         try:
@@ -44,10 +48,10 @@ class Meta:
         except ValueError as error:
             raise FormatError(f"{META} is not JSON: {error}") from None
         if not isinstance(self.root, dict):
-            raise NotSplatsError(f"{META} is not that of a SOG")
+            raise NotSplatsError(f"its {META} is not that of a SOG")
 
     def has(self, key: str) -> bool:
-        """Whether there is such a key at the top, and not null."""
+        """Whether there is such a key at the top level, with a value other than null."""
         return self.root.get(key) is not None
 
     def _get(self, *way: str | int) -> Any:
@@ -74,13 +78,14 @@ class Meta:
         """(count,) finite numbers.
 
         Args:
-            count: how many there must be.
-            way: to the list.
-            first_may_be_null: as an old writer left it in codebooks; the step to it is taken as the average one.
+            count: required length of the list.
+            way: keys that lead to the list.
+            first_may_be_null: the first number may be null, as an old writer left it in codebooks; it is extrapolated
+                by the mean step.
         """
         values = self._get(*way)
         if not isinstance(values, list) or len(values) != count:
-            raise FormatError(f"{_spell(way)} of {META} is not {count} numbers")
+            raise FormatError(f"{_spell(way)} of {META} is not a list of {count} numbers")
         if first_may_be_null and values[0] is None:
             rest = [_finite(value, way) for value in values[1:]]
             values = [rest[0] + (rest[0] - rest[-1]) / (count - 1), *rest]
@@ -94,7 +99,7 @@ class Meta:
         """A text."""
         value = self._get(*way)
         if not isinstance(value, str):
-            raise FormatError(f"{_spell(way)} of {META} is not a file's name")
+            raise FormatError(f"{_spell(way)} of {META} is not the name of a file")
         return value
 
 
@@ -109,7 +114,7 @@ def _finite(value: Any, way: tuple[str | int, ...]) -> float:
 
 
 def names_beside(data: bytes) -> list[str]:
-    """The files that a meta.json names, as far as it can be understood; none for anything else."""
+    """The files that a meta.json names, as far as it can be parsed; otherwise none."""
     try:
         root = Meta(data).root
     except FormatError:
@@ -122,8 +127,8 @@ class Files:
     """The files of a SOG scene.
 
     Attributes:
-        meta: what meta.json says.
-        size: bytes of all there is, which is what promises are measured by.
+        meta: its meta.json.
+        size: bytes of all its files, which bound the sizes that images may announce.
     """
 
     def __init__(self, file: BinaryIO, beside: Callable[[str], BinaryIO] | None) -> None:
@@ -134,7 +139,7 @@ class Files:
         self._beside = beside
         data = self._archive.read(META) if self._archive else file.read(MAX_META + 1)
         if len(data) > MAX_META:
-            raise FormatError(f"{META} is too large for one of a SOG")
+            raise FormatError(f"{META} has more than {MAX_META:,} bytes, too many for a SOG")
         self.meta = Meta(data)
         if not self._archive:
             self.size += sum(map(self._size_beside, self._names()))
@@ -147,7 +152,7 @@ class Files:
 
     def _open_beside(self, name: str) -> BinaryIO:
         if self._beside is None:
-            raise FormatError(f"{META} names {shown(name)}, which cannot be had here")
+            raise FormatError(f"{META} names {shown(name)}, but other files cannot be opened here")
         return self._beside(name)
 
     def _size_beside(self, name: str) -> int:
@@ -161,7 +166,7 @@ class Files:
             return file.read()
 
     def image(self, texture: str, index: int, most: int) -> Texels:
-        """(height, width, 4) texels of a file of a texture; `FormatError` if there are more than `most`."""
+        """(height, width, 4) texels of one file of a texture; `FormatError` if there are more than `most`."""
         name = self.meta.name(texture, "files", index)
         data = self._read(name)
         width, height = _webp_size(data, name)
@@ -171,7 +176,7 @@ class Files:
         return _decode_webp(data, name)
 
     def texels(self, texture: str, index: int, count: int) -> Texels:
-        """(count, 4) texels of a file of a texture, row by row."""
+        """(count, 4) texels of one file of a texture, row by row."""
         texels = self.image(texture, index, SPARE_FACTOR * count + SPARE_TEXELS).reshape(-1, 4)
         if len(texels) < count:
             name = self.meta.name(texture, "files", index)
@@ -180,14 +185,14 @@ class Files:
 
 
 class _Archive:
-    """A zip that has a meta.json, maybe in a folder, and files beside that."""
+    """A zip with a meta.json, possibly inside a folder, and files beside it."""
 
     def __init__(self, file: BinaryIO, size: int) -> None:
         self._size = size
         try:
             self._zip = zipfile.ZipFile(file)
         except _ZIP_ERRORS as error:
-            raise FormatError(f"not a whole zip archive: {quoted(error)}") from None
+            raise FormatError(f"not a complete zip archive: {quoted(error)}") from None
         names = [name for name in self._zip.namelist() if name == META or name.endswith("/" + META)]
         if not names:
             raise NotSplatsError(f"a zip archive without {META} is not a SOG")
@@ -199,27 +204,27 @@ class _Archive:
         except KeyError:
             raise FormatError(f"{META} names {shown(name)}, which is not in the archive") from None
         if member.compress_type not in METHODS or member.flag_bits & ENCRYPTED:
-            raise FormatError(f"{shown(name)} is packed in a way that SOG has not")
+            raise FormatError(f"{shown(name)} is compressed by a method that SOG does not use, or encrypted")
         check_promise(member.file_size, self._size)
         try:
             with self._zip.open(member) as file:
-                return file.read(member.file_size)  # without a size it would unfold all there is before it counts
+                return file.read(member.file_size)  # without a size it would unpack everything before checking the size
         except _ZIP_ERRORS as error:
             kind = ChecksumError if "CRC" in str(error) else FormatError
             raise kind(f"{shown(name)} cannot be unpacked: {quoted(error)}") from None
 
 
 def _webp_size(data: bytes, name: str) -> tuple[int, int]:
-    """Width and height that the header of a WebP file tells: its first chunk, of whichever kind of the three."""
+    """Width and height from the header of a WebP file: its first chunk, of one of three kinds."""
     kind = data[12:16] if data[:4] == b"RIFF" and data[8:12] == b"WEBP" and len(data) >= 30 else b""
-    if kind == b"VP8X":  # 24 bits each, less one
+    if kind == b"VP8X":  # 24 bits each, minus one
         if data[20] & ANIMATED:
-            raise FormatError(f"{shown(name)} is an animation, of which no frame is the one that SOG means")
+            raise FormatError(f"{shown(name)} is an animation, but SOG needs a still image")
         return 1 + int.from_bytes(data[24:27], "little"), 1 + int.from_bytes(data[27:30], "little")
-    if kind == b"VP8L":  # 14 bits each, less one, behind a byte of signature
+    if kind == b"VP8L":  # 14 bits each, minus one, after a byte of signature
         bits = int.from_bytes(data[21:25], "little")
         return 1 + (bits & 0x3FFF), 1 + (bits >> 14 & 0x3FFF)
-    if kind == b"VP8 ":  # 14 bits each, behind a frame tag and a start code
+    if kind == b"VP8 ":  # 14 bits each, after a frame tag and a start code
         width, height = struct.unpack_from("<HH", data, 26)
         return width & 0x3FFF, height & 0x3FFF
     raise FormatError(f"{shown(name)} is not a WebP image")
@@ -227,7 +232,7 @@ def _webp_size(data: bytes, name: str) -> tuple[int, int]:
 
 def _decode_webp(data: bytes, name: str) -> Texels:
     try:
-        # Not by Image.open, which warns of large images and refuses larger ones: their size has been looked at.
+        # Not by Image.open, which warns of large images and refuses larger ones: the size has been checked above.
         with WebPImageFile(io.BytesIO(data)) as image:
             return np.asarray(image if image.mode == "RGBA" else image.convert("RGBA"))
     except (OSError, ValueError, SyntaxError, EOFError) as error:

@@ -1,4 +1,4 @@
-"""antimatter15's .splat: 32 bytes a splat and nothing else, the most important ones first."""
+"""antimatter15's .splat: 32 bytes per splat without a header, the most important splats first."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ assert ROW.itemsize == 32
 
 
 def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> Scene:
-    """Reads a .splat file. It has no header: any file whose size is a multiple of 32 passes for one.
+    """Reads a .splat file. The format has no header: any file whose size is a multiple of 32 is accepted.
 
     Raises:
-        FormatError: its size is not a multiple of 32.
+        TruncatedError: the size is not a multiple of 32.
     """
     size = size_of(file)
     if size % ROW.itemsize:
@@ -53,13 +53,13 @@ def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> 
 
 
 def importance_order(splats: Splats) -> NDArray[np.intp]:
-    """(N,) indices, the most important splats first: by the product of scales and opacity, as antimatter15 sorts."""
+    """(N,) indices by descending importance, the product of scales and opacity, as antimatter15's converter sorts."""
     importance = splats.scale.astype(np.float64).prod(axis=1) * splats.opacity
     return np.argsort(-importance, kind="stable")
 
 
 def settled(scene: Scene, options: WriteOptions) -> WriteOptions:
-    """These options, of which .splat leaves none open.
+    """These options: .splat has no choices.
 
     Raises:
         FormatError: the scene is a tree, which .splat cannot hold.
@@ -72,7 +72,7 @@ def settled(scene: Scene, options: WriteOptions) -> WriteOptions:
 def encode(
     scene: Scene, options: WriteOptions = DEFAULTS, *, threads: int = 1, progress: Progress = silent
 ) -> Iterator[bytes]:
-    """The bytes of a .splat file, piece by piece, in order of importance. It holds no SH above degree 0.
+    """The bytes of a .splat file, piece by piece, in order of importance and without SH.
 
     Raises:
         FormatError: the scene is a tree, which .splat cannot hold.

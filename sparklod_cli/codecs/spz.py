@@ -32,6 +32,7 @@ HEADER = struct.Struct("<IIIBBBB")  # magic, version, splats, SH degree, fractio
 HEADER_V4 = struct.Struct("<IIIBBBBI12s")  # ..., streams, offset of the table of streams, reserved
 STREAM_SIZES = struct.Struct("<QQ")  # of a version 4 stream: compressed, uncompressed
 
+#: Versions that are read.
 READABLE = (1, 2, 3, 4)
 
 
@@ -39,27 +40,27 @@ def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> 
     """Reads any SPZ file, plain or LoD.
 
     Raises:
-        FormatError: it is not SPZ, not a version or degree that is known, cut short, corrupt, or claims far more splats
-            than its size can hold; an LoD file whose tree is not one.
+        FormatError: the file is not SPZ, of an unknown version or SH degree, cut short or corrupt, announces far more
+            splats than its size can hold, or has a broken tree.
     """
     scene = examine(file, threads=threads, progress=progress)
     if scene.tree is not None:
         try:
             scene.tree.validate()
         except TreeError as error:
-            raise FormatError(f"its LoD tree is broken: {error}") from error
+            raise FormatError(f"its Level-of-Detail tree is broken: {error}") from error
     return scene
 
 
 def examine(
     file: BinaryIO, *, columns: Collection[str] = COLUMNS, threads: int = 1, progress: Progress = silent
 ) -> Scene:
-    """Reads a file to look at it: only these columns, the others are 0; its tree may be broken.
+    """Reads a file for inspection: the given columns of `Splats`, the others are 0; its tree may be broken.
 
-    The header tells of the flags, of the reserved byte, and of bytes behind the data that belong to nothing.
+    The header of the scene has the flags, the reserved byte and the number of bytes after the data.
 
     Raises:
-        FormatError: as `decode`, but for the tree.
+        FormatError: as `decode`, but not for a broken tree.
     """
     size = size_of(file)
     plain = file.read(4) == struct.pack("<I", MAGIC)
@@ -101,7 +102,7 @@ def _column(splats: Splats, tree: LodTree | None, stream: Stream) -> NDArray[Any
 def encode(
     scene: Scene, options: WriteOptions = DEFAULTS, *, threads: int = 1, progress: Progress = silent
 ) -> Iterator[bytes]:
-    """The bytes of a file, piece by piece: an LoD file where the scene has a tree, else a plain one.
+    """The bytes of a file, piece by piece: an LoD file if the scene has a tree, otherwise a plain one.
 
     The same scene and options give the same bytes for any number of threads.
 
@@ -133,13 +134,13 @@ def encode(
 
 
 def _checked(layout: Layout, file_size: int) -> Layout:
-    """The layout, if it is one we read and the file's size makes its claims believable."""
+    """The layout, after checks that it can be read and that the file is large enough for what it announces."""
     if layout.version not in READABLE:
-        raise VersionError(f"SPZ version {layout.version} is not known, only 1 to 4 are")
+        raise VersionError(f"SPZ version {layout.version} is unknown, only 1 to 4 are read")
     if layout.sh_degree > (4 if layout.version == 4 else MAX_SH_DEGREE):
-        raise VersionError(f"SH degree {layout.sh_degree} is not one that SPZ version {layout.version} has")
+        raise VersionError(f"SPZ version {layout.version} has no SH degree {layout.sh_degree}")
     if layout.fractional_bits > 31:
-        raise FormatError(f"{layout.fractional_bits} fractional bits are more than a position has")
+        raise FormatError(f"{layout.fractional_bits} fractional bits; at most 31 can be read")
     compression.check_promise(layout.total, file_size)
     return layout
 
@@ -157,7 +158,7 @@ def _read_gzip(file: BinaryIO, size: int, header: dict[str, int]) -> tuple[Layou
         raise TruncatedError("cut short inside the SPZ header")
     magic, *fields, header["reserved"] = HEADER.unpack(head)
     if magic != MAGIC:
-        raise NotSplatsError("gzip, but not of an SPZ file")
+        raise NotSplatsError("a gzip file, but not of SPZ")
     layout = _checked(Layout(*fields), size)
 
     def rows() -> Iterator[StreamRows]:
@@ -167,11 +168,11 @@ def _read_gzip(file: BinaryIO, size: int, header: dict[str, int]) -> tuple[Layou
         except TruncatedError as error:
             if inflate.behind() == compression.GZIP_MAGIC:
                 raise MembersError(
-                    f"{error}; its data go on in a second gzip member, which Spark does not read"
+                    f"{error}; its data continue in a second gzip member, which Spark does not read"
                 ) from None
             raise
         inflate.finish(allow_more=bool(layout.flags & EXTENSIONS))
-        if layout.flags & EXTENSIONS:  # where the member ends is not looked for
+        if layout.flags & EXTENSIONS:  # the end of the member is not searched for
             return
         header["trailing_bytes"] = size - inflate.end()
         header["trailing_members"] = int(inflate.behind() == compression.GZIP_MAGIC)
@@ -185,11 +186,11 @@ def _read_v4(file: BinaryIO, size: int, header: dict[str, int]) -> tuple[Layout,
         raise TruncatedError("cut short inside the SPZ header")
     _, version, count, sh_degree, bits, flags, streams, table, reserved = HEADER_V4.unpack(head)
     if version != 4:
-        raise VersionError(f"SPZ version {version} is not gzipped, as versions 1 to 3 are")
+        raise VersionError(f"SPZ version {version} must be gzipped, only version 4 is not")
     layout = _checked(Layout(version, count, sh_degree, bits, flags), size)
     expected = layout.streams()
     if streams < len(expected):
-        raise FormatError(f"{streams} streams where SH degree {sh_degree} and flags {flags:#x} need {len(expected)}")
+        raise FormatError(f"{streams} streams, but SH degree {sh_degree} and flags {flags:#x} need {len(expected)}")
     header |= {"reserved": int(any(reserved)), "unknown_streams": streams - len(expected)}
     at = table + streams * STREAM_SIZES.size
     if at > size:
@@ -199,7 +200,7 @@ def _read_v4(file: BinaryIO, size: int, header: dict[str, int]) -> tuple[Layout,
     for stream, (packed, unpacked) in zip(expected, sizes, strict=False):
         if unpacked != stream.size * count:
             raise FormatError(
-                f"stream {stream.name} has {unpacked:,} bytes, {count:,} splats need {stream.size * count:,}"
+                f"stream {stream.name} has {unpacked:,} bytes, but {count:,} splats need {stream.size * count:,}"
             )
         at += packed
         if at > size:

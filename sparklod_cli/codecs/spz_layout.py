@@ -1,4 +1,4 @@
-"""What the streams of an SPZ file are, and how each is coded: one table for reading and for writing."""
+"""The streams of an SPZ file and their codings: one table for reading and writing."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ KNOWN_FLAGS = ANTIALIASED | EXTENSIONS | LOD
 
 
 class Stream(NamedTuple):
-    """One stream of a file: a column of all splats, one after the other.
+    """One stream of a file: one column of all splats in order.
 
     Attributes:
-        name: for people.
-        size: bytes a splat.
+        name: for messages.
+        size: bytes per splat.
         column: of `Splats` or `LodTree`.
         decode: (n, size) bytes to n rows of the column, of any shape.
-        encode: the way back.
+        encode: n rows of the column to bytes.
     """
 
     name: str
@@ -37,13 +37,13 @@ class Stream(NamedTuple):
     encode: Callable[[NDArray[Any]], NDArray[Any]]
 
 
-#: Rows of a stream: which, and (n, size) bytes.
+#: Some rows of a stream: the stream, which rows, and (n, size) bytes.
 StreamRows = tuple[Stream, slice, quantize.Bytes]
 
 
 @dataclass(frozen=True)
 class Layout:
-    """What a header says that decides which streams follow it."""
+    """The fields of a header on which its streams depend."""
 
     version: int
     count: int

@@ -32,7 +32,7 @@ def largest_fractional_bits(center: NDArray[np.float32]) -> int:
     largest = float(np.abs(center).max(initial=0))
     if np.rint(largest) > LAST_CODE:
         reach = f"{largest:.0f}" if largest < 1e7 else f"{largest:.3g}"
-        raise FormatError(f"coordinates reach {reach}, SPZ holds at most {LAST_CODE}: scale the scene")
+        raise FormatError(f"coordinates reach {reach}, SPZ holds at most {LAST_CODE}: scale the scene down")
     bits = MAX_FRACTIONAL_BITS
     while bits and np.rint(largest * 2.0**bits) > LAST_CODE:
         bits -= 1
@@ -58,7 +58,7 @@ def settled(scene: Scene, options: WriteOptions) -> WriteOptions:
         small = float(np.quantile(scale.max(axis=1), SMALL_QUANTILE))
         bits = max(0, min(most, math.ceil(math.log2(STEPS_A_SPLAT / small))))
     if bits > most:
-        raise FormatError(f"a coordinate does not fit {bits} fractional bits, at most {most} would do")
+        raise FormatError(f"a coordinate does not fit {bits} fractional bits; use at most {most}")
     return dataclasses.replace(options, spz_version=version, fractional_bits=bits)
 
 

@@ -1,4 +1,4 @@
-"""Files as streams of rows: decoded chunk by chunk, so that a file never lies in memory as a whole."""
+"""Files as streams of rows, decoded block by block, so that a file is never in memory as a whole."""
 
 from __future__ import annotations
 
@@ -13,28 +13,29 @@ from ..support.errors import TruncatedError
 from ..support.parallel import CHUNK, chunks_of, ordered_map
 from ..support.progress import Progress
 
-#: Narrow rows, such as the columns of SPZ, would otherwise be over before a thread has been handed them.
+#: Least bytes of a block: with narrow rows, such as SPZ's streams, handing a smaller one to a thread costs more than it
+#: saves.
 CHUNK_BYTES = 1 << 18
 
-#: A run of rows: which they are, and their content.
+#: A block of rows: which rows, and their content.
 Rows = tuple[slice, NDArray[Any]]
 
-#: The next `size` bytes, or fewer where the data ends.
+#: Reads the next `size` bytes, or fewer at the end of the data.
 Read = Callable[[int], bytes]
 
 
 def size_of(file: BinaryIO) -> int:
-    """Bytes of a file; leaves it at its beginning."""
+    """Bytes of a file, which is left at its beginning."""
     size = file.seek(0, io.SEEK_END)
     file.seek(0)
     return size
 
 
 def rows_of(read: Read, row_type: np.dtype[Any], count: int, what: str = "splats") -> Iterator[Rows]:
-    """`count` rows in chunks of at least CHUNK rows and CHUNK_BYTES, read as they are asked for.
+    """`count` rows in blocks of at least `CHUNK` rows and `CHUNK_BYTES` bytes, read when they are asked for.
 
     Raises:
-        FormatError: the data ends before that.
+        TruncatedError: the data ends before that.
     """
     for part in chunks_of(count, max(CHUNK, CHUNK_BYTES // row_type.itemsize)):
         data = read((part.stop - part.start) * row_type.itemsize)
@@ -47,7 +48,7 @@ def rows_of(read: Read, row_type: np.dtype[Any], count: int, what: str = "splats
 def decode_rows(
     rows: Iterator[Rows], decode: Callable[[slice, NDArray[Any]], None], count: int, threads: int, progress: Progress
 ) -> None:
-    """Calls `decode` with every run of rows, on several threads; this one reads meanwhile."""
+    """Calls `decode` with every block of rows, on several threads, while this thread reads on."""
 
     def run(item: Rows) -> int:
         part, content = item

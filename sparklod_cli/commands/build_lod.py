@@ -28,13 +28,12 @@ from .options.baking import (
     write_options,
 )
 from .options.common import General, common_options, overwrite_option
-from .paths import InputPath, OutputPath, claim_stdout, keep_apart
+from .paths import InputPath, OutputPath, claim_stdout, keep_apart, stem_of
 from .reports import report_baked, report_extracted
 from .usage import options_of, refuse
 
 if TYPE_CHECKING:
-    from ..bake import Baked
-    from ..extract_leaves import Extracted
+    from ..api.file_jobs import Baked, Extracted
     from .console import Console
 
 #: Suffixes of the formats in which a tree can be written, and the one of files that are given a name.
@@ -92,8 +91,7 @@ class Outputs:
         return self.output or (self.output_dir or source.parent) / self._name(source)
 
     def _name(self, source: Path) -> str:
-        # The meta.json of an unpacked SOG has the name of its folder.
-        stem = source.absolute().parent.name if source.name == "meta.json" else source.stem
+        stem = stem_of(source)
         if self.unlod:
             return f"{stem.removesuffix('-lod')}-unlod{SPZ}"
         return f"{stem}-lod{NPZ if self.encoding else SPZ}"
@@ -197,7 +195,7 @@ def _check(ctx: click.Context, inputs: tuple[Path, ...], outputs: Outputs, gener
 
 def _baking(ctx: click.Context, outputs: Outputs, threads: int, console: Console) -> Callable[[Path, Path], Baked]:
     """What bakes a file and reports it; the point where numpy and numba are loaded."""
-    from ..bake import bake
+    from ..api.file_jobs import bake
 
     settings = bake_settings(ctx, raw=outputs.is_raw)
     console.announce_compiling(settings.method)
@@ -221,7 +219,7 @@ def _extracting(
     ctx: click.Context, outputs: Outputs, threads: int, console: Console
 ) -> Callable[[Path, Path], Extracted]:
     """What writes the leaves of a file and reports it."""
-    from ..extract_leaves import extract_leaves
+    from ..api.file_jobs import extract_leaves
 
     options = write_options(ctx)
 

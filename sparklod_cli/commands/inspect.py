@@ -52,14 +52,19 @@ def inspect(ctx: click.Context, /, files: tuple[Path, ...], **_: Any) -> None:
     keep_apart(ctx)
     check_usage(ctx, len(files), checks, output, as_json=general.as_json)
     with general.console() as console:
-        from ..inspection.checking import CheckSettings, read_original
-        from ..io import check_writable
-        from ..support.threads import on_threads
+        from ..api.file_jobs import CheckSettings, DrawSettings
+        from ..inspection.checking import read_original
 
         console.announce_compiling("inspect")
-        for target in (output.plot, output.html):
-            if target is not None:
-                check_writable(target, overwrite=output.overwrite)
+        drawn = DrawSettings(
+            histograms=output.histogram,
+            plot=output.plot,
+            depth=output.plot_level,
+            by=output.plot_by,
+            html=output.html,
+            overwrite=output.overwrite,
+        )
+        drawn.check()
         expected = checks.expectations()
         original = None
         if checks.leaves_of is not None:
@@ -67,9 +72,8 @@ def inspect(ctx: click.Context, /, files: tuple[Path, ...], **_: Any) -> None:
         settings = CheckSettings(
             _report_settings(checks, output, expected, as_json=general.as_json), expected, original, checks.check
         )
-        job = Job(console, general, output, settings, checks.fail_on)
-        with on_threads(general.threads):
-            worst = max(job.inspect(file) for file in files)
+        job = Job(console, general, output, settings, drawn, checks.fail_on)
+        worst = max(job.inspect(file) for file in files)
         job.write_page()
     if worst:
         ctx.exit(worst)

@@ -30,8 +30,9 @@ def lines(name: str, report: dict[str, Any]) -> Iterator[str]:
         about.append(f"{report['header']['fractional_bits']} fractional bits")
     yield _row("holds", ", ".join(about))
     if report["bytes_per_splat"]:
-        ratio = f"{report['compression_ratio']:.1f} times less than as floats"
-        yield _row("takes", f"{report['bytes_per_splat']:.1f} bytes a {noun}, {ratio}")
+        ratio = report["compression_ratio"]
+        less = "" if ratio is None else f", {ratio:.1f} times less than as floats"
+        yield _row("takes", f"{report['bytes_per_splat']:.1f} bytes a {noun}{less}")
     for note in report["notes"]:
         yield _row("note", note)
     if tree:
@@ -48,7 +49,8 @@ def _tree(tree: dict[str, Any]) -> Iterator[str]:
     inner, levels = count_of(tree["inner"], "inner node"), count_of(tree["depth"] + 1, "level")
     leaves = count_of(tree["leaves"], "leaf", "leaves")
     yield _row("tree", f"{leaves}, {inner}, growth {tree['growth']:.3f}, {levels}")
-    yield _row("", f"{100 * tree['more_than_opaque']:.1f} % of the nodes are more than opaque")
+    if tree["more_than_opaque"] is not None:
+        yield _row("", f"{100 * tree['more_than_opaque']:.1f} % of the nodes are more than opaque")
     chunks = count_of(tree["chunks"], "chunk")
     yield _row("", f"{chunks} of 65,536 nodes, the coarsest cut of as many nodes needs {tree['chunks_of_coarse_cut']}")
     counts = sorted(tree["children"].items(), key=lambda item: -item[1])

@@ -187,6 +187,12 @@ def _folds_case(folder: str) -> bool:
         return False
 
 
+def stem_of(source: Path) -> str:
+    """What outputs made of an input are named after: the input, or its folder where it is an unpacked SOG."""
+    whole = source.absolute()
+    return whole.parent.name if source.name == "meta.json" else whole.stem or whole.name
+
+
 def file_of(text: str) -> Path | None:
     """The file that an option names which takes other texts, too; None where there is none of that name."""
     try:

@@ -14,23 +14,23 @@ if TYPE_CHECKING:
 #: No line is longer; names of frames are cut to fit.
 WIDTH = 100
 
-#: How the quantities are called, and how a number of each is said.
+#: Names of the quantities, and how a number of each is printed.
 QUANTITIES = {
     "selected": ("splats drawn", "count"),
-    "budget_used": ("of the budget", "share"),
+    "budget_used": ("budget used", "share"),
     "pixel_scale_min": ("pixel scale", "plain"),
     "projected_px_p95": ("large splats, px", "fixed"),
     "overdraw_estimate": ("overdraw", "fixed"),
-    "in_frustum_share": ("in the picture", "share"),
+    "in_frustum_share": ("inside the frustum", "share"),
     "chunks_new": ("chunks fetched", "count"),
-    "bytes_new": ("fetched", "bytes"),
+    "bytes_new": ("bytes fetched", "bytes"),
     "missing": ("missing", "count"),
     "complete_in_s": ("complete in", "seconds"),
     "churn": ("churn", "share"),
     "traverse_ms": ("traversal", "ms"),
 }
 
-#: What is to be seen in a frame that is worth a look, with its value.
+#: What a frame is worth a look for, with its value.
 MOMENTS = {
     "churn": ("{} of the splats pop", "share"),
     "bytes": ("{} are fetched", "bytes"),
@@ -40,7 +40,12 @@ MOMENTS = {
     "overdraw": ("{} splats cover a pixel", "fixed"),
 }
 
-STOPS = {"budget": "at the budget", "pixel": "at the pixel limit", "exhausted": "in full detail"}
+STOPS = {
+    "budget": "at the budget",
+    "pixel": "at the pixel limit",
+    "exhausted": "in full detail",
+    "missing": "at missing chunks",
+}
 
 
 def lines(summary: Summary) -> list[str]:

@@ -14,7 +14,8 @@ from PIL import Image, ImageDraw
 from ..images.text import BACKGROUND, FAINT, write_title
 from ..tables.columns import Row
 from ..tables.statistics import numbers
-from .charts import BLUE, DPI, GREEN, INDIGO, ORANGE, PINK, WIDTH, YELLOW, Frames, load_matplotlib, styled
+from .charts import DPI, WIDTH, load_matplotlib, styled
+from .series import BLUE, GREEN, INDIGO, ORANGE, PINK, YELLOW, Frames
 
 #: Heights of a row of charts and of the title above them, in pixels.
 ROW, HEAD = 420, 122

@@ -19,6 +19,7 @@ from ..tables.columns import Row
 from ..tables.statistics import numbers, totals
 from . import charts
 from .camera_path import picture_of_path
+from .series import PINK
 
 #: Labels of the reasons for marking a frame (`simulation.summary.MOMENTS`).
 CALLED = {
@@ -86,7 +87,7 @@ def _head(title: str, frames: Sequence[Row], marked: Mapping[str, int]) -> Image
     lines = [(_about(frames), FAINT)]
     said = ", ".join(f"{CALLED[reason]}: frame {number:,}" for reason, number in marked.items())
     if said:
-        lines.append((said, charts.PINK))
+        lines.append((said, PINK))
     image = Image.new("RGB", (charts.WIDTH, 96 + 26 * len(lines)), BACKGROUND)
     write_title(ImageDraw.Draw(image), 1.0, _one_line(title), lines)
     return image

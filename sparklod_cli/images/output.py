@@ -57,12 +57,12 @@ class Output:
             check_writable(path, overwrite=overwrite)
 
 
-def output_for(name: Path | None, default: str, cameras: int, *, sheet: bool) -> Output:
+def output_for(name: Path | None, default: Path, cameras: int, *, sheet: bool) -> Output:
     """Where the pictures of some cameras go.
 
     Args:
-        name: that was asked for; "-" for standard output; None for one made of `default`, in the current directory.
-        default: the name of the scene.
+        name: that was asked for; "-" for standard output; None for one made of `default`.
+        default: a file without its suffix.
         cameras: how many there are.
         sheet: all in one picture.
 
@@ -75,7 +75,7 @@ def output_for(name: Path | None, default: str, cameras: int, *, sheet: bool) ->
             raise ValueError(f"standard output takes one picture, not {cameras:,}; name a file with --output")
         return Output(None, "png", "sheet" if sheet else "picture")
     if name is None:
-        name = Path(f"{default.replace('%', '_')}{'.%04d' if several else ''}.png")
+        name = default.with_name(f"{default.name.replace('%', '_')}{'.%04d' if several else ''}.png")
     form = name.suffix.lower().removeprefix(".")
     form = SUFFIXES.get(form, form)
     if form not in STILL + MOVING:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..cameras.frame import DEFAULT_FPS
 from ..io import write_stdout, write_whole
 from ..render.renderer import Renderer
-from ..support.defaults import OF_PIXELS
+from ..render.settings import OF_PIXELS
 from ..support.parallel import ordered_map
 from ..support.progress import Progress, silent
 from ..support.threads import on_threads

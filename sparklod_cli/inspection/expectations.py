@@ -16,7 +16,12 @@ from ..support.untrusted import QUOTED, parse_json, parse_toml, quoted, shown
 from ..tables.conditions import BadAssertionError, Condition, is_number, number_text, parse
 from ..tables.files import near
 from .findings import Finding
-from .report import Report
+from .report import NoFieldError, Report, value_at
+
+
+class ExpectationError(SparklodError):
+    """An expectation cannot be understood."""
+
 
 #: Short names for what most assertions are about, beside the fields of the report, and how a report gives them.
 NAMES: dict[str, Callable[[dict[str, Any]], Any]] = {
@@ -46,10 +51,6 @@ KEYS = {
     "lod": ("lod", "=="),
     "max_growth": ("growth", "<="),
 }
-
-
-class ExpectationError(SparklodError):
-    """An expectation cannot be understood."""
 
 
 @dataclass(frozen=True)
@@ -162,28 +163,13 @@ def _flat(table: dict[str, Any], path: str, prefix: str = "") -> Iterator[tuple[
         yield name, wanted
 
 
-def value_at(report: dict[str, Any], name: str) -> Any:
-    """The value of a field: keys and indices with dots between ("tree.levels.0.nodes").
-
-    Raises:
-        ExpectationError: there is none.
-    """
-    value: Any = report
-    try:
-        for key in name.split("."):
-            value = value[int(key)] if isinstance(value, list) else value[key]
-    except (KeyError, IndexError, TypeError, ValueError):
-        raise ExpectationError(f"the report has no {printable(name, QUOTED)}") from None
-    return value
-
-
-def _value(report: dict[str, Any], name: str) -> Any:
+def _value(plain: dict[str, Any], name: str) -> Any:
     if name not in NAMES:
-        return value_at(report, name)
+        return value_at(plain, name)
     try:
-        return NAMES[name](report)
+        return NAMES[name](plain)
     except TypeError:
-        raise ExpectationError("the file has no tree") from None
+        raise NoFieldError("the file has no tree") from None
 
 
 def check(report: Report, expected: Expectations) -> list[Finding]:
@@ -197,7 +183,7 @@ def check(report: Report, expected: Expectations) -> list[Finding]:
         text = printable(condition.text, QUOTED)
         try:
             value = _value(plain, condition.name)
-        except ExpectationError as error:
+        except NoFieldError as error:
             found.append(Finding(code, f"{text}: {error}"))
             continue
         if not condition.holds(value):

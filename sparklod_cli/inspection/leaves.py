@@ -61,7 +61,7 @@ def check(scene: Scene, original: Scene) -> list[Finding]:
         return [Finding("expect.leaves", f"the original: {error}")]
     if len(leaves) != len(splats):
         found, expected = count_of(len(leaves), "leaf", "leaves"), count_of(len(splats), "splat")
-        return [Finding("expect.leaves", f"{found}, but the original has {expected} that can be drawn")]
+        return [Finding("expect.leaves", f"{found}, but {expected} of the original can be drawn")]
     if leaves.sh_degree != splats.sh_degree:
         return [Finding("expect.leaves", f"SH degree {leaves.sh_degree}, but the original has {splats.sh_degree}")]
     bits, version = int(scene.header["fractional_bits"]), max(2, int(scene.header["version"]))

@@ -8,13 +8,15 @@ from pathlib import Path
 from typing import Any
 
 from ..codecs.spz_layout import KNOWN_FLAGS
-from ..io import examine_scene, size_of_input
+from ..io import examine_scene, read_arrays, size_of_input
 from ..model.scene import Scene
 from ..model.sh import COEFFICIENTS
 from ..model.splats import COLUMNS
-from ..support.errors import FormatError
+from ..support.errors import FormatError, SparklodError
+from ..support.printable import printable
 from ..support.progress import Progress, silent
-from . import tree, values
+from ..support.untrusted import QUOTED
+from . import arrays, tree, values
 from .findings import Finding
 
 #: Version of the report: counts up when a field changes its meaning or is removed. schema.json describes this one.
@@ -22,6 +24,10 @@ SCHEMA_VERSION = 1
 
 #: Columns that the facts of a tree are computed from.
 TREE_COLUMNS = ("scale", "opacity")
+
+
+class NoFieldError(SparklodError):
+    """A report has no such field."""
 
 
 @dataclass(frozen=True)
@@ -72,12 +78,35 @@ class Report:
     values: values.ValueFacts | None = None
     findings: list[Finding] | None = None
 
+    def fails(self, severity: str) -> bool:
+        """Whether it has a finding of this severity, or an error."""
+        return any(found.severity in ("error", severity) for found in self.findings or [])
+
+    def value_at(self, name: str) -> Any:
+        """The value of a field, see `value_at`."""
+        return value_at(self.as_dict(), name)
+
     def as_dict(self) -> dict[str, Any]:
         """The report as plain values, for JSON."""
         plain = {"schema_version": SCHEMA_VERSION} | dataclasses.asdict(self)
         if self.findings is not None:
             plain["findings"] = [{"severity": found.severity} | dataclasses.asdict(found) for found in self.findings]
         return plain
+
+
+def value_at(plain: dict[str, Any], name: str) -> Any:
+    """The value of a field of a report as JSON: keys and indices with dots between ("tree.levels.0.nodes").
+
+    Raises:
+        NoFieldError: there is none.
+    """
+    value: Any = plain
+    try:
+        for key in name.split("."):
+            value = value[int(key)] if isinstance(value, list) else value[key]
+    except (KeyError, IndexError, TypeError, ValueError):
+        raise NoFieldError(f"the report has no {printable(name, QUOTED)}") from None
+    return value
 
 
 def inspect(
@@ -96,6 +125,10 @@ def inspect(
     columns = COLUMNS if settings.values or settings.check else TREE_COLUMNS
     size = size_of_input(path)
     try:
+        held = read_arrays(path)
+        if held is not None:
+            facts_of_arrays, scene_of_arrays = arrays.examine(held, settings, threads=threads)
+            return Report(**arrays.as_report_fields(facts_of_arrays, path, size, settings)), scene_of_arrays
         scene = examine_scene(path, columns=columns, threads=threads, progress=progress)
     except FormatError as error:
         return Report(str(path), size, findings=[Finding(error.code, str(error))]), None

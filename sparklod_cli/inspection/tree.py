@@ -70,7 +70,7 @@ class TreeFacts:
     levels: list[Level]
     levels_left_out: int
     children: dict[str, int]
-    more_than_opaque: float
+    more_than_opaque: float | None
     chunks: int
     chunks_of_coarse_cut: int
 

@@ -1,11 +1,11 @@
 """Cuts that do not pop: nodes fade into their children as the camera comes nearer.
 
-An ordinary cut divides a node or does not, by whether its *limit* L, the least pixel scale on the way to it from the
-root, is above a threshold T. Here a node is divided by a share that rises smoothly from 0 to 1,
+An ordinary cut refines a node if its *limit* L, the least pixel scale on the way to it from the root, is above a
+threshold T. Here a node is refined by a share that rises smoothly from 0 to 1,
 
     t(n) = smoothstep(ln(L(n) / T) / ln(width)),      0 where L <= T, 1 where L >= width * T, always 0 for a leaf,
 
-and drawn with the weight by which its parent is divided and it is not:
+and drawn with the weight by which its parent is refined and it is not:
 
     weight(n) = t(parent of n) - t(n),                1 - t(n) for a root.
 
@@ -50,7 +50,7 @@ class BlendedCut:
         node: (S,) uint32 index in its tree; ascending within an instance.
         instance: (S,) uint16, ascending.
         weight: (S,) float64, above 0 and at most 1.
-        threshold: pixel scale at or under which nothing is divided; 0 where all is.
+        threshold: pixel scale at or below which nothing is refined; 0 where everything is.
     """
 
     node: NDArray[np.uint32]
@@ -81,8 +81,8 @@ class ContinuousCuts:
             view: where the camera is.
             budget: what the weights sum to, all instances together, unless `smallest` or the leaves come first; at
                 least as many as there are instances. More nodes are drawn, for those that fade are, too.
-            smallest: nodes of this pixel scale are not divided; see `settings.pixel_limit`.
-            width: nodes of so many times the threshold are divided wholly; above 1.
+            smallest: nodes of this pixel scale or less are not refined; see `settings.pixel_limit`.
+            width: nodes of this multiple of the threshold are refined wholly; above 1.
         """
         views = views_of(self._forest, self._instances, view)
         inner = [self._inner[instance.tree] for instance in self._instances]
@@ -99,11 +99,11 @@ class ContinuousCuts:
 
 
 def shares(limit: Shares, threshold: float, width: float) -> Shares:
-    """By how much nodes are divided, 0..1: t(n) above.
+    """By how much nodes are refined, 0..1: t(n) above.
 
     Args:
         limit: (M,) of nodes with children; at least 0.
-        threshold: at least 0; at 0, all of a limit above that are divided.
+        threshold: at least 0; at 0, all nodes of a limit above 0 are refined.
         width: above 1.
     """
     with np.errstate(divide="ignore"):
@@ -179,13 +179,13 @@ class _Inner:
         return np.minimum(limit, np.finfo(np.float32).max).astype(np.float64)
 
     def blended(self, share: Shares) -> tuple[NDArray[np.uint32], Shares]:
-        """The nodes of a weight above 0, ascending, and their weights; share: (M,) by how much each is divided."""
+        """The nodes of a weight above 0, ascending, and their weights; share: (M,) by how much each is refined."""
         if not len(share):
             return np.zeros(1, np.uint32), np.ones(1)
-        divided = np.flatnonzero(share > 0)
-        count = self._count[divided]
-        node = np.concatenate([[0], _ranges(self._start[divided], count)])
-        weight = np.concatenate([[1.0], np.repeat(share[divided], count)])
+        refined = np.flatnonzero(share > 0)
+        count = self._count[refined]
+        node = np.concatenate([[0], _ranges(self._start[refined], count)])
+        weight = np.concatenate([[1.0], np.repeat(share[refined], count)])
         own = self._place[node]
         weight -= np.where(own >= 0, share[own], 0)
         drawn = np.flatnonzero(weight > 0)
@@ -194,7 +194,7 @@ class _Inner:
 
 
 def _ranges(start: NDArray[np.int64], count: NDArray[np.int64]) -> NDArray[np.int64]:
-    """start[0], start[0] + 1, ..., so many as `count` says, then those of the next."""
+    """count[0] numbers from start[0] on, then count[1] numbers from start[1] on, and so on."""
     first = np.cumsum(count) - count
     return np.repeat(start - first, count) + np.arange(count.sum())
 

@@ -22,9 +22,9 @@ class Measured:
     Attributes:
         selected, leaves: how many, and of them those without children.
         frontier: those that wait in the queue when it stops.
-        in_frustum, outside, behind: by where their centres are: in the picture, beside it, behind the camera.
-        level_min, level_mean, level_max: links from the root; None where nothing is selected.
-        px_p50, px_p95: percentiles of the sizes of those in the picture, pixels; None where there are none.
+        in_frustum, outside, behind: by where their centres are: inside, outside and behind the frustum.
+        level_min, level_mean, level_max: depth, in edges from the root; None where nothing is selected.
+        px_p50, px_p95: percentiles of the sizes of those inside the frustum, pixels; None where there are none.
         overdraw: how many of them cover a pixel, in the mean.
     """
 
@@ -51,15 +51,15 @@ def measure(
     size: tuple[int, int],
     by_instance: bool = False,
 ) -> tuple[Measured, list[Measured]]:
-    """A cut as a whole and, if they are wanted, each of its instances.
+    """Statistics of a cut as a whole and, if asked for, of each of its instances.
 
     Args:
         forest: its trees.
-        level: (nodes,) links from the root, of all trees.
+        level: (nodes,) depth of the nodes of all trees, in edges from the root.
         cut: what was found for `view`.
         view: the camera.
         size: of the picture, pixels.
-        by_instance: each instance is wanted, too.
+        by_instance: with each instance.
     """
     width, height = size
     counts = np.empty((len(cut.views), kernels.COUNTS), np.int64)

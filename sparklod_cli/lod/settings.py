@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 
 from ..model.foveation import SPARK, Foveation
+from ..support.defaults import PRESETS
 
 
 @dataclass(frozen=True)
@@ -13,7 +14,7 @@ class LodSettings:
     """How a viewer finds its cuts.
 
     Attributes:
-        budget: the most splats that are drawn, all instances together.
+        budget: the most splats that are drawn, all instances together; Spark 2's on a desktop by default.
         foveation: how much nodes count by direction, where an instance has no foveation of its own;
             Spark 2's by default.
         pixel_scale_limit: nodes of this pixel scale or less are not refined; None for the pixel scale of a pixel.
@@ -22,7 +23,7 @@ class LodSettings:
             children, above 1 (see `continuous`); None for ordinary cuts.
     """
 
-    budget: int
+    budget: int = PRESETS["desktop"]
     foveation: Foveation = SPARK
     pixel_scale_limit: float | None = None
     render_scale: float = 1.0

@@ -29,7 +29,7 @@ VISITS = 2
 #: vain costs less than another round.
 GUESS = 0.97
 
-#: Why a cut has no more nodes, by the number that the kernel tells.
+#: Why a cut has no more nodes, by the kernel's code.
 REASONS = {
     cut_arrays.BUDGET: "budget",
     cut_arrays.PIXEL: "pixel",
@@ -109,13 +109,13 @@ class TreeCut:
         node: (S,) uint32 index in its tree.
         instance: (S,) uint16.
         limit: (S,) float32, the least pixel scale from the root to it; negative for one that the queue took out, since
-            it has no children or they are not there.
+            it has no children or they are missing.
         reason: why there are no more: a value of `REASONS`.
-        missing: of the nodes, those that would be divided if their children were there; and roots that are not there.
-        least: the least pixel scale down to which everything has been divided; infinite if nothing was.
+        missing: the number of nodes that would be refined if their children were resident, and of missing roots.
+        least: the pixel scale down to which everything is refined; infinite if nothing is.
         stop: (pixel scale, instance, index) of the node that would have exceeded the budget, None if none did.
-        wanted: (chunks,) float32, for each chunk of all trees how large the nodes are whose children are in it and
-            wanted, 0 for one that nobody wants.
+        wanted: (chunks,) float32, for each chunk of all trees the largest pixel scale of the nodes that want children
+            from it; 0 where none does.
     """
 
     views: NDArray[np.void]
@@ -136,7 +136,7 @@ class TreeCut:
         return [np.sort(self.node[self.instance == number]) for number in range(len(self.views))]
 
     def chunks(self) -> list[int]:
-        """The chunks that finding the cut looks into or wants to, of all trees, the most wanted first."""
+        """The chunks, of all trees, that the cut needs to be found: resident and missing, the most wanted first."""
         wanted = np.flatnonzero(self.wanted > 0)
         order: list[int] = wanted[np.argsort(-self.wanted[wanted], kind="stable")].tolist()
         return order
@@ -166,7 +166,7 @@ class Traversal:
             view: where the camera is.
             budget: how many splats may be drawn, all instances together; one for each instance at least.
             smallest: nodes of this pixel scale or less are not refined; see `settings.pixel_limit`.
-            resident: (chunks,) which chunks of all trees are there; all unless given.
+            resident: (chunks,) which chunks of all trees are resident; all unless given.
         """
         views = views_of(self.forest, self.instances, view)
         present = self._all if resident is None else resident
@@ -205,7 +205,7 @@ class Traversal:
 
     def _work(self, slots: int) -> _Work:
         """Buffers of this thread, at least so long as is asked for or as could be needed."""
-        slots = min(slots, 2 * self._most)  # a node is looked at by its threshold, and once more by the queue
+        slots = min(slots, 2 * self._most)  # a node is visited by its threshold, and once more by the queue
         work: _Work | None = getattr(self._local, "work", None)
         if work is None or len(work.slots.node) < slots:
             work = self._local.work = _Work(slots)

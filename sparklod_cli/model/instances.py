@@ -24,11 +24,15 @@ class Instance:
     """A scene and where it stands.
 
     Attributes:
-        source: a splat file, or a scene in memory.
-        name: for people and tables; unique among the instances of a run.
+        source: a splat file (a path, which may be a string), or a scene in memory.
+        name: its name in messages and tables; unique among the instances of a run.
         object_to_world: (4, 4) rotation, uniform scale and translation.
         lod_scale: multiplies the pixel scales of its nodes; above 1 it gets more of the budget than others.
         foveation: its own; None for that of the viewer.
+
+    Raises:
+        TypeError: the source is neither.
+        ValueError: the matrix has another shape.
     """
 
     source: Path | Scene
@@ -36,6 +40,16 @@ class Instance:
     object_to_world: Matrix = field(default_factory=lambda: np.eye(4))
     lod_scale: float = 1.0
     foveation: Foveation | None = None
+
+    def __post_init__(self) -> None:
+        if isinstance(self.source, str):
+            object.__setattr__(self, "source", Path(self.source))
+        if not isinstance(self.source, (Path, Scene)):
+            raise TypeError(f"an instance is of a file or a scene, not of {type(self.source).__name__}")
+        matrix = np.asarray(self.object_to_world, np.float64)
+        if matrix.shape != (4, 4):
+            raise ValueError(f"object_to_world has the shape {matrix.shape}; give (4, 4)")
+        object.__setattr__(self, "object_to_world", matrix)
 
     @property
     def file(self) -> Path | None:

@@ -1,4 +1,4 @@
-"""What colours mean where they are not the splats' own: numbers of splats, or of pixels, on a scale."""
+"""Color scales of pictures: numbers of splats, or of pixels, as colours."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ from .color_scales import (
 )
 from .settings import RasterSettings
 
-#: So many splats and cameras are looked at to find the ends of a scale.
+#: Sample sizes, splats and cameras, to find the ends of a scale.
 SAMPLE, CAMERAS = 1 << 18, 64
 
-#: So many cuts are found for that, which takes longer.
+#: The most cuts that are found for it, which takes longer.
 CUTS = 16
 
 #: Marks nearer to an end of a scale than this would touch its own.
@@ -58,7 +58,7 @@ class Scale:
     log: bool = False
 
     def rgb(self, values: FloatArray) -> NDArray[np.float32]:
-        """(..., 3) colours, 0..1, of numbers; what is not a number has the first."""
+        """(..., 3) colours, 0..1, of numbers; NaN has the first colour."""
         values = np.asarray(values, np.float64)
         if self.log:
             values = np.log10(np.clip(values, 1e-30, 1e30))
@@ -87,7 +87,7 @@ def scale_of_splats(by: str, source: CutSource, cameras: Sequence[Camera], progr
         by: "level", "lod-opacity", "size" or "chunk".
         source: of the splats.
         cameras: that see them.
-        progress: is told how many cuts were looked at.
+        progress: called with the number of cuts that were examined.
 
     Raises:
         SparklodError: by level, where no file is a tree.
@@ -118,7 +118,7 @@ def scale_of_depth(source: CutSource, cameras: Sequence[Camera], settings: Raste
         seen.append(depth[inside])
     depths = np.concatenate(seen)
     low, high = np.percentile(depths, [CLIPPED, 100 - CLIPPED]) if len(depths) else (settings.near, settings.near + 1)
-    # A scene that is as good as flat gets no more contrast than there is.
+    # The depth of a nearly flat scene is not stretched over all colours.
     high = max(high, low + 1e-3 * abs(low))
     return _linear("depth", float(low), float(high), tuple(reversed(PLASMA)), ends=True)
 
@@ -141,7 +141,8 @@ def _whole(by: str, source: CutSource, cameras: Sequence[Camera], progress: Prog
     ends = ends or [(0, 0)]
     low, high = min(low for low, _ in ends), max(high for _, high in ends)
     beyond = int(every > 1)
-    return Scale(whole_numbers(by, np.arange(low - beyond, high + 1 + beyond), low, high), low, high)
+    title = "tree depth" if by == "level" else by
+    return Scale(whole_numbers(title, np.arange(low - beyond, high + 1 + beyond), low, high), low, high)
 
 
 def numbers_of(by: str, scene: LoadedScene, index: Index) -> NDArray[np.int64]:

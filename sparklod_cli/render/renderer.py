@@ -45,11 +45,11 @@ class Renderer:
     Args:
         source: what is drawn.
         settings: how.
-        cameras: that will see it; colours that mean something mean the same in the pictures of all of them.
-        progress: is told how many of the cameras were looked at for that.
+        cameras: that will be drawn; a color scale is the same in the pictures of all of them.
+        progress: called with the number of cameras that were examined for that.
 
     Attributes:
-        scale: what the colours mean; None where they are those of the splats.
+        scale: the color scale; None where splats have their own colours.
 
     Raises:
         SparklodError: there is nothing to colour by.
@@ -117,7 +117,7 @@ class Renderer:
         return averaged(counts[..., None], self.settings.supersample)[..., 0]
 
     def _depth(self, cut: Cut, camera: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """(H, W) the mean depth of what is seen, world units, NaN where that is nothing; and alpha."""
+        """(H, W) the mean depth of the visible splats, world units, NaN where there is none; and (H, W) alpha."""
         raster, fine = self.settings.raster, finer(camera, self.settings.supersample)
         with _KERNELS:
             shaded = self._shaded(cut, fine)
@@ -141,7 +141,7 @@ class Renderer:
 
 
 def finer(camera: Camera, times: int) -> Camera:
-    """The same camera with so many pixels a pixel along each side."""
+    """The same camera with `times` as many pixels along each side."""
     if times == 1:
         return camera
     return dataclasses.replace(
@@ -154,7 +154,7 @@ def finer(camera: Camera, times: int) -> Camera:
 
 
 def averaged(image: Image, times: int) -> Image:
-    """(H, W, C) the means of squares of so many pixels a side."""
+    """(H, W, C) means of squares of `times` x `times` pixels."""
     if times == 1:
         return image
     height, width = image.shape[0] // times, image.shape[1] // times

@@ -21,11 +21,21 @@ MIN_ALPHA = 0.5 / 255
 #: No splat is drawn farther from its centre, in pixels of the picture that is shown: Spark's `maxPixelRadius`.
 MAX_PIXEL_RADIUS = 512.0
 
-#: Splats whose centres are so many times farther out than the picture's edges are not drawn: Spark's `clipXY`.
+#: A splat is drawn only if its centre is within this multiple of the picture's half width and height: Spark's `clipXY`.
 CLIP = 1.4
 
 #: How opacity falls off from the centre of a splat that is more than opaque.
 PROFILES = ("spark", "shifted")
+
+#: What is drawn: splats; opaque points of a pixel; discs of one opacity, in the order of the file or from far to near.
+STYLES = ("splats", "points", "billboards", "sorted-billboards")
+
+#: What colours can mean instead of being those of the splats; those of `OF_PIXELS` are of pixels, the others of splats.
+COLOR_BY = ("level", "lod-opacity", "size", "chunk", "overdraw", "depth")
+OF_PIXELS = ("overdraw", "depth")
+
+#: How the backend osmesa sorts splats: by their depths, or by 16 bits of them, as antimatter15's viewer does.
+SORTINGS = ("exact", "counting16")
 
 #: What splats are sorted by: the distance from the camera, or along its axis.
 SORTS = ("radial", "z")
@@ -56,9 +66,9 @@ class RenderSettings:
 
     Attributes:
         raster: how splats become pixels.
-        style: one of `defaults.STYLES`.
+        style: one of `STYLES`.
         backend: a name in `backends.BACKENDS`.
-        color_by: one of `defaults.COLOR_BY`; None for the colours of the splats.
+        color_by: one of `COLOR_BY`; None for the colours of the splats.
         supersample: samples along each side of a pixel, which is their mean.
         max_sh: degrees of spherical harmonics above this are left out.
         options: of the backend.

@@ -51,7 +51,7 @@ def draw(
     """What a camera sees; the image is that of `rasterizer.draw`.
 
     Args:
-        style: one of `defaults.STYLES`. "points" are opaque, a pixel each, "billboards" discs of one opacity, as wide
+        style: one of `settings.STYLES`. "points" are opaque, a pixel each, "billboards" discs of one opacity, as wide
             as the splats; both are drawn in the order of the file. "sorted-billboards" are drawn from far to near, as
             "splats" are.
         backend: one of `BACKENDS`, which draws splats.
@@ -92,7 +92,7 @@ def draw(
 
 
 def on_screen(splats: ShadedSplats, camera: Camera, settings: RasterSettings) -> OnScreen:
-    """The splats between near and far whose centres are in the picture, or as far beside it as splats are drawn."""
+    """The splats between near and far whose centres are inside the picture, or within `CLIP` of it."""
     local = (splats.center - camera.position.astype(np.float32)) @ camera.camera_to_world[:3, :3].astype(np.float32)
     depth = -local[:, 2]
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):

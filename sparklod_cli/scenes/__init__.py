@@ -1,5 +1,5 @@
 """Scenes where they stand: files read once each, what a camera sees of them, and the splats of that.
 
-This is the one loader of files that are looked at, and the one way from a cut to splats: traversals, pictures and
+The one loader of scenes that are viewed, and the one way from a cut to splats: traversals, pictures and
 comparisons all go through it.
 """

@@ -36,7 +36,7 @@ class InstancesFileError(SparklodError):
 
 
 def read_instances(path: Path) -> list[Instance]:
-    """The instances of a file; the trees that it names lie beside it.
+    """Reads the instances of a file; paths in it are relative to its folder.
 
     Raises:
         InstancesFileError: it says something that is not an instance; names the file and the instance.

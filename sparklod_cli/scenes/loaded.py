@@ -1,4 +1,4 @@
-"""`Scenes`: scenes in memory where they stand, and `Cut`: what is drawn of them, with its splats."""
+"""`Scenes`, the scenes of instances, and `Cut`, the splats of them that are drawn."""
 
 from __future__ import annotations
 

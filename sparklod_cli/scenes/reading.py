@@ -33,16 +33,16 @@ def read_scenes(
 ) -> Scenes:
     """Reads the scenes of instances, each once.
 
-    Splats that cannot be drawn are left out of scenes without trees; `Scenes.notes` tells how many.
+    Splats that cannot be drawn are left out of scenes without trees; `Scenes.notes` has their number.
 
     Args:
         instances: at least one.
-        columns: of `Splats` that are read; with `trees_only` only, for all are looked at where there is no tree.
+        columns: of `Splats` that are read; only with `trees_only`; of scenes without trees all are read.
         trees_only: refuse scenes without trees.
         through: one of `rounding.ROUND_TRIPS`, a coding after which splats are drawn; cuts are those of the scene.
         precision: one of `PRECISIONS`, of the nodes that cuts are found with.
         threads: to decode on.
-        progress: is told how much is done.
+        progress: called with how much is done.
 
     Raises:
         FormatError: a file cannot be read, is no tree but has to be, or does not fit the coding; names the file.

@@ -52,7 +52,7 @@ def by_priority(chunks: NDArray[np.integer], pixel_scales: NDArray[np.floating])
 
     Args:
         chunks: (N,) which are looked into, any number of times each.
-        pixel_scales: (N,) of what is looked for there. NaN counts as the largest, as it does in the traversal.
+        pixel_scales: (N,) of the nodes whose children are in them. NaN counts as the largest, as in the traversal.
     """
     if not len(chunks):
         return []

@@ -33,7 +33,7 @@ class Frame:
         number: on the path.
         camera: of it.
         cut: what is drawn.
-        rows: that of all instances, then those of each, if they are wanted.
+        rows: that of all instances together, then those of each, if asked for.
         in_front: the share of all that is drawn that lies in front of the camera.
     """
 
@@ -92,7 +92,7 @@ class Simulation:
         """The frames of a path, in order.
 
         Cuts are found on several threads, some frames ahead; what depends on the frame before is done in order. Where
-        chunks are missing, the cut is found once more with what is there.
+        chunks are missing, the cut is found once more with those that are resident.
         """
         stream = self._stream(path.cameras[0].time)
         changes = Changes(self.scenes.forest, self._traversal.instances)
@@ -130,7 +130,7 @@ class Simulation:
         return _Found(cut, whole, parts, seconds)
 
     def _fetched(self, camera: Camera, ideal: _Found, stream: Stream) -> tuple[_Found, Row]:
-        """What is drawn with the chunks that are there, and the cells that tell of them."""
+        """The cut with the resident chunks, and the cells of the row about chunks."""
         wanted = ideal.cut.chunks()
         instant = self._streaming.network.instant
         if instant:
@@ -152,7 +152,7 @@ class Simulation:
     def _rows(
         self, number: int, camera: Camera, drawn: _Found, changes: Sequence[tuple[int, int | None, int]]
     ) -> list[Row]:
-        """The row of all instances, but for its chunks, and those of each, if they are wanted."""
+        """The row of all instances together, without cells about chunks, and those of each, if asked for."""
         cut, settings = drawn.cut, self.settings
         where: Row = {"frame": number, "time_s": camera.time, "name": camera.name}
         for name, vector in (("position", camera.position), ("forward", camera.forward)):

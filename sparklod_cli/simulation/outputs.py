@@ -112,7 +112,7 @@ def write_frames(
         path: of the camera.
         outputs: where they go.
         threads: to find cuts on.
-        progress: is told how many frames are done.
+        progress: called with the number of frames that are done.
         passed: what the bytes of the table are passed through on their way to standard output.
 
     Raises:

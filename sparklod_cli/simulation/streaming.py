@@ -58,14 +58,14 @@ class StreamingSettings:
 
 
 class Stream:
-    """Fetches what is wanted and keeps it in a cache.
+    """Fetches the chunks that a viewer wants and keeps them in a cache.
 
     For each frame: `advance` to its time, `want` what it looks into, `take_arrivals` to see what is new; then
     `cache.resident()` is what can be drawn.
 
     A fetcher that is free takes the most important of the admitted chunks that is neither here nor under way. Nothing
-    under way is cancelled, as in Spark; what is no longer wanted when it arrives goes into the cache if there is room,
-    or something that has not been used for longer. Decoding takes no time here, and nothing fails.
+    under way is cancelled, as in Spark; a chunk that is no longer wanted when it arrives goes into the cache if there
+    is room, or in place of one that has not been used for longer. Decoding takes no time here, and nothing fails.
 
     State changes at events only, so the same happens whether time advances in one step or in many.
 
@@ -76,7 +76,7 @@ class Stream:
         start: seconds, the time it begins at.
 
     Attributes:
-        cache: what is here.
+        cache: the resident chunks.
         now: seconds.
 
     Raises:
@@ -133,7 +133,7 @@ class Stream:
         return arrived
 
     def complete_in(self, wanted: Iterable[int]) -> float | None:
-        """Seconds until all of this is here if nothing else is wanted from now on.
+        """Seconds until all these chunks are resident if nothing else is wanted from now on.
 
         Returns:
             0 if it is here already; None if it never will be, because it does not fit into the cache.

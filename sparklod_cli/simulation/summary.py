@@ -13,7 +13,7 @@ from .columns import COLUMNS
 
 UNITS = {column.name: column.unit for column in COLUMNS}
 
-#: The share of the cut that is in the picture, which is no column, but two.
+#: The share of the cut inside the frustum; a quotient of two columns.
 IN_FRUSTUM = "in_frustum_share"
 
 #: What statistics are made of, in this order.
@@ -138,7 +138,7 @@ def _rounded(value: Number) -> Number:
 
 
 def coarseness(row: Row) -> Number | None:
-    """How many times the limit the pixel scale is, down to which everything has been divided; None without either."""
+    """The pixel scale down to which everything is refined, as a multiple of the limit; None without either."""
     scale, limit = row["pixel_scale_min"], row["pixel_scale_limit"]
     return scale / limit if isinstance(scale, (int, float)) and isinstance(limit, (int, float)) and limit else None
 

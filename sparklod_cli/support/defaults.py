@@ -3,9 +3,6 @@
 #: Growth of the voxel grid from level to level.
 MIN_BASE, MAX_BASE, DEFAULT_BASE = 1.1, 2.0, 1.5
 
-#: How to build a tree; the first is the default.
-METHODS = ("quick", "quality")
-
 #: Nodes for each leaf that the quality builder may make. Two would keep every node of its binary tree.
 MIN_GROWTH, MAX_GROWTH, DEFAULT_GROWTH = 1.05, 2.0, 1.4
 
@@ -24,26 +21,8 @@ MAX_FRACTIONAL_BITS = 24
 #: Deflate levels, and the one that is used; docs/decisions has the measurement.
 MIN_COMPRESSION, MAX_COMPRESSION, DEFAULT_COMPRESSION = 1, 9, 5
 
-#: What files of plain splats can be written as, by suffix.
-PLAIN_SUFFIXES = (".spz", ".ply", ".splat")
-
-#: What files of nothing but words are called, besides those without a suffix.
-RAW_SUFFIXES = (".bin", ".raw")
-
-#: In-memory layouts of viewers that a tree can be dumped in.
-ENCODINGS = ("packed", "ext", "lodtree", "texture")
-
 #: What colours can mean in a picture of `inspect`.
 PLOT_BY = ("level", "opacity", "size", "chunk")
-
-#: What `render` draws splats with, as what, in which colours but their own, and after which encoding.
-BACKENDS = ("numba", "osmesa", "open3d")
-STYLES = ("splats", "points", "billboards", "sorted-billboards")
-COLOR_BY = ("level", "lod-opacity", "size", "chunk", "overdraw", "depth")
-THROUGH = ("packed", "ext", "spz")
-
-#: Colours that are of pixels rather than of splats.
-OF_PIXELS = ("overdraw", "depth")
 
 #: Pixels a pixel along a side.
 MAX_SUPERSAMPLE = 4
@@ -62,9 +41,6 @@ PRESETS = {
 #: Numbers that nodes can be read in: as the file has them, or as Spark's traversal holds them in memory.
 PRECISIONS = ("float32", "float16")
 
-#: Formats of a simulation's table.
-TABLES = ("csv", "json", "parquet")
-
 #: Spark 2's foveation: full angles of its cones in degrees, weights at the outer one and behind the camera.
 CONE_FOV0, CONE_FOV, CONE_FOVEATE, BEHIND_FOVEATE = 90.0, 120.0, 0.4, 0.2
 
@@ -73,9 +49,6 @@ FETCHERS = 3
 
 #: Ratio of the pixel scales between which continuous cuts blend a node and its children.
 BLEND = 1.25
-
-#: How the backend osmesa sorts splats.
-SORTINGS = ("exact", "counting16")
 
 #: No far plane is farther away, world units, so that it is a float32.
 FARTHEST = 1e37

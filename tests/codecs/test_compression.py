@@ -136,7 +136,7 @@ def test_a_promised_size_is_bounded_by_the_size_of_the_file(total: int, file_siz
     if allowed:
         compression.check_promise(total, file_size)
     else:
-        with pytest.raises(FormatError, match="its header promises"):
+        with pytest.raises(FormatError, match="its header announces"):
             compression.check_promise(total, file_size)
 
 
@@ -161,7 +161,7 @@ def test_a_zstd_frame_gives_what_is_asked_for_and_must_end_there(with_size: bool
     for size in (0, 99):
         reader = unzstd(packed)
         reader.read(size)
-        with pytest.raises(FormatError, match="stream sh is longer than its table says"):
+        with pytest.raises(FormatError, match="stream sh is longer than its table announces"):
             reader.finish()
 
 

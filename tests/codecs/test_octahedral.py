@@ -175,7 +175,7 @@ def test_decoding_lod_alpha_gives_the_opacity_back(opacity: np.ndarray) -> None:
 @pytest.mark.parametrize(
     ("arrays", "text"),
     [
-        ({}, "no array b, only none at all"),
+        ({}, "no array b, only none"),
         ({"a": np.zeros((3, 2), np.uint32)}, "no array b, only a"),
         ({"b": np.zeros((3, 4), np.int32)}, r"b is int32\[3, 4\], expected uint32\[3, 4\]"),
         ({"b": np.zeros((3, 5), np.uint32)}, r"expected uint32\[3, 4\]"),

@@ -215,15 +215,15 @@ REFUSED: dict[str, tuple[Callable[[], bytes], str]] = {
     "no end of the header": (lambda: edited("end_header", "end_heading"), "does not end"),
     "not ascii": (lambda: edited("property float nx", "property float ü"), "bad PLY header"),
     "not PLY": (lambda: b"plain text\nthat goes on\n", "not a PLY file"),
-    "no vertex": (lambda: NO_VERTEX, "no vertex element"),
-    "point cloud": (lambda: (FIXTURES / "points.ply").read_bytes(), "a point cloud or mesh, not Gaussian splats"),
+    "no vertex": (lambda: NO_VERTEX, "no element vertex"),
+    "point cloud": (lambda: (FIXTURES / "points.ply").read_bytes(), "a point cloud or a mesh, not Gaussian splats"),
     "five f_rest": (lambda: by_hand.ply(columns() | {f"f_rest_{i}": [0] * 5 for i in range(5)}), "5 f_rest properties"),
     "six f_rest": (lambda: by_hand.ply(columns() | {f"f_rest_{i}": [0] * 5 for i in range(6)}), "2 SH coefficients"),
-    "f_rest from 1": (lambda: by_hand.ply(columns() | {f"f_rest_{i}": [0] * 5 for i in range(1, 10)}), "f_rest_0 on"),
+    "f_rest from 1": (lambda: by_hand.ply(columns() | {f"f_rest_{i}": [0] * 5 for i in range(1, 10)}), "expected f_rest_0"),
     "cut short": (lambda: by_hand.ply(columns())[:-1], "cut short: 1 bytes are missing"),
     "ascii cut short": (lambda: TEXT[: TEXT.rindex(b"\n", 0, -1) + 1], "cut short after 4 of 5 vertices"),
     "a short row": (lambda: TEXT[:-3].rsplit(b" ", 2)[0], "bad PLY data"),
-    "rows of spaces": (lambda: TEXT[: TEXT.index(b"end_header") + 11] + (b" " * 60 + b"\n") * 5, "empty lines"),
+    "rows of spaces": (lambda: TEXT[: TEXT.index(b"end_header") + 11] + (b" " * 60 + b"\n") * 5, "an empty line"),
     "a word": (lambda: TEXT[:-5] + b" nul\n", "bad PLY data"),
 }
 
@@ -251,7 +251,7 @@ def test_a_count_must_be_digits(count: str) -> None:
 @pytest.mark.parametrize("digits", [101, 5_000, 900_000])
 def test_a_count_of_too_many_digits_is_refused(digits: int) -> None:
     head = b"ply\nformat binary_little_endian 1.0\nelement vertex " + b"9" * digits + b"\nend_header\n"
-    with pytest.raises(FormatError, match=f"promises a count of {digits:,} digits"):
+    with pytest.raises(FormatError, match=f"announces a count of {digits:,} digits"):
         ply.decode(io.BytesIO(head))
 
 

@@ -125,7 +125,7 @@ def test_sh_are_looked_up_by_label_row_and_coefficient() -> None:
     np.testing.assert_array_equal(sh[:, :, 0], [[0, 1, 2], [252, 253, 254], [0, 1, 2], [8, 9, 10]])
     np.testing.assert_array_equal(sh[:, :, 1], [[0] * 3, [0] * 3, [9] * 3, [0] * 3])
     np.testing.assert_array_equal(sh[:, :, 2], np.full((4, 3), 7))
-    with pytest.raises(FormatError, match="SH label 64 is beyond the 64 of its palette"):
+    with pytest.raises(FormatError, match="SH label 64 is beyond the 64 entries of its palette"):
         decode(with_meta(json.loads(files["meta.json"]) | {"shN": shn | {"count": 64}}, files))
 
 
@@ -284,23 +284,23 @@ def animation(frames: int) -> bytes:
 
 
 REFUSED: dict[str, tuple[Callable[[], Files], str]] = {
-    "version 3": (lambda: changed("version", value=3), "SOG version 3 is not known"),
+    "version 3": (lambda: changed("version", value=3), "SOG version 3 is unknown"),
     "no splats": (lambda: changed("count", value=0), "0 splats"),
     "more splats than pixels": (lambda: changed("count", value=65), "64 texels for 65 splats"),
     "a count of a half": (lambda: changed("count", value=59.5), "count of meta.json is not a whole number"),
     "no count": (lambda: changed("count", value=...), "meta.json has no count"),
     "no means": (lambda: changed("means", value=...), "meta.json has no means"),
-    "two axes": (lambda: changed("means", "mins", value=[0, 0]), "means.mins of meta.json is not 3 numbers"),
+    "two axes": (lambda: changed("means", "mins", value=[0, 0]), "means.mins of meta.json is not a list of 3 numbers"),
     "bounds of no number": (lambda: changed("means", "maxs", value=[0, "1", 2]), "'1', which is not a finite number"),
     "infinite bounds": (lambda: changed("means", "maxs", value=[0, 1, float("inf")]), "not a finite number"),
-    "a short codebook": (lambda: changed("scales", "codebook", value=[0] * 255), "is not 256 numbers"),
+    "a short codebook": (lambda: changed("scales", "codebook", value=[0] * 255), "is not a list of 256 numbers"),
     "a null in a codebook": (
         lambda: changed("scales", "codebook", value=[0, None] + [0] * 254),
         "'None', which is not a finite number",
     ),
     "a name of no text": (
         lambda: changed("quats", "files", value=[7]),
-        "quats.files.0 of meta.json is not a file's name",
+        "quats.files.0 of meta.json is not the name of a file",
     ),
     "no second file": (lambda: changed("means", "files", value=["means_l.webp"]), "no means.files.1"),
     "other bands": (lambda: changed("shN", "bands", value=2), "has 3 coefficients, not those of 2 bands"),

@@ -182,7 +182,7 @@ def test_extent_limits_auto_and_refuses_more_by_name(reach: float, most: int) ->
     assert bits_of(splats, most) == most
     assert bits_of(splats, 0) == 0
     if most < 24:
-        with pytest.raises(FormatError, match=rf"does not fit {most + 1} fractional bits, at most {most} would do"):
+        with pytest.raises(FormatError, match=rf"does not fit {most + 1} fractional bits; use at most {most}"):
             bits_of(splats, most + 1)
 
 
@@ -281,20 +281,20 @@ def with_byte(data: bytes, at: int, value: int) -> bytes:
 
 
 REFUSED: dict[str, tuple[Callable[[], bytes], str]] = {
-    "version 0": (lambda: gzipped(0), "SPZ version 0 is not known"),
-    "version 5": (lambda: gzipped(5), "SPZ version 5 is not known"),
-    "version 3 without gzip": (lambda: zstd(version=3), "version 3 is not gzipped"),
-    "SH degree 4 before version 4": (lambda: gzipped(3, degree=4), "SH degree 4 is not one that SPZ version 3 has"),
-    "SH degree 5": (lambda: with_byte(zstd(), 12, 5), "SH degree 5 is not one"),
+    "version 0": (lambda: gzipped(0), "SPZ version 0 is unknown"),
+    "version 5": (lambda: gzipped(5), "SPZ version 5 is unknown"),
+    "version 3 without gzip": (lambda: zstd(version=3), "version 3 must be gzipped"),
+    "SH degree 4 before version 4": (lambda: gzipped(3, degree=4), "SPZ version 3 has no SH degree 4"),
+    "SH degree 5": (lambda: with_byte(zstd(), 12, 5), "SPZ version 4 has no SH degree 5"),
     "32 fractional bits": (lambda: gzipped(bits=32), "32 fractional bits"),
     "more splats than data": (lambda: gzipped(count=4), "cut short after 1 of 4 scales"),
-    "more data than splats": (lambda: gzipped(more=b"!"), "more data than its header promises"),
-    "gzip of something else": (lambda: gzip.compress(b"something else that is long"), "not of an SPZ file"),
+    "more data than splats": (lambda: gzipped(more=b"!"), "more data than its header announces"),
+    "gzip of something else": (lambda: gzip.compress(b"something else that is long"), "not of SPZ"),
     "gzip of little": (lambda: gzip.compress(b"NGSP"), "inside the SPZ header"),
     "wrong checksum": (lambda: with_byte(gzipped(), len(gzipped()) - 8, gzipped()[-8] ^ 1), "corrupt gzip data"),
     "no checksum": (lambda: gzipped()[:-8], "checksum is missing"),
     "a table past the end": (lambda: with_byte(zstd(), 18, 1), "inside the table of streams"),
-    "too few streams": (lambda: with_byte(zstd(), 15, 4), "4 streams where"),
+    "too few streams": (lambda: with_byte(zstd(), 15, 4), "4 streams, but"),
     "a wrong size in the table": (lambda: zstd(sizes=[27, 4, 9, 9, 12]), "stream alphas has 4 bytes"),
     "a frame that is too short": (
         lambda: zstd(streams=[b"", *by_hand.hand_streams(4, 0)[1:]], sizes=[27, 3, 9, 9, 12]),
@@ -302,10 +302,10 @@ REFUSED: dict[str, tuple[Callable[[], bytes], str]] = {
     ),
     "a frame that is too long": (
         lambda: zstd(streams=[bytes(28), *by_hand.hand_streams(4, 0)[1:]], sizes=[27, 3, 9, 9, 12]),
-        "stream positions is longer than its table says",
+        "stream positions is longer than its table announces",
     ),
-    "no tree in an LoD file": (lambda: gzipped(flags=0x80, more=struct.pack("<3H3I", *[0] * 6)), "LoD tree is broken"),
-    "an LoD file without splats": (lambda: by_hand.spz_gzip(2, 0, 0, 12, 0x80, []), "LoD tree is broken"),
+    "no tree in an LoD file": (lambda: gzipped(flags=0x80, more=struct.pack("<3H3I", *[0] * 6)), "Level-of-Detail tree is broken"),
+    "an LoD file without splats": (lambda: by_hand.spz_gzip(2, 0, 0, 12, 0x80, []), "Level-of-Detail tree is broken"),
 }
 
 

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import re
 
+import numpy as np
 import pytest
 
 from sparklod_cli.simulation.columns import COLUMNS
 from sparklod_cli.simulation.summary import MOMENTS, QUANTITIES
 from sparklod_cli.tables.assertions import check, parse
 from tests.conftest import ROOT
+from tests.docs.traverse_picture import example
 from tests.tables.rows import flight
 
 PAGE = ROOT / "docs" / "traverse.md"
@@ -39,6 +42,17 @@ def test_assertions_on_the_page_are_understood(text: str) -> None:
 def test_the_page_names_what_is_in_the_summary() -> None:
     names = set(re.findall(r"`(\w+)`", PAGE.read_text().partition("\n## Summary\n")[2].partition("\n## ")[0]))
     assert set(QUANTITIES) | set(MOMENTS) <= names
+
+
+def test_the_biker_of_the_picture_stands_upright() -> None:
+    """Its file has y up, unlike the others: half a turn about x takes that to -y, and a turn about y keeps it."""
+    instances, arguments = example()
+    assert "city.json" in arguments
+    bikers = [each for each in json.loads(instances)["instances"] if each["file"].startswith("biker")]
+    assert len(bikers) == 2
+    for biker in bikers:
+        x, y, z, w = biker["rotation"]
+        assert np.allclose([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], [0, -1, 0], atol=1e-6)
 
 
 if __name__ == "__main__":

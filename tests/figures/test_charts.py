@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from sparklod_cli.figures import charts
+from sparklod_cli.figures import charts, panels, series
 from sparklod_cli.tables.columns import Row
 from tests.figures.flights import count_of, marked, pixels, plotted
 from tests.tables.rows import flight, row
@@ -21,7 +21,7 @@ def test_ticks_of_counts_are_integers(most: int, charting: None) -> None:
     matplotlib.backends.backend_agg.FigureCanvasAgg(figure)
     axes = figure.subplots()
     axes.set_ylim(0, 1.22 * most or 1)
-    charts._counted(axes, matplotlib)
+    panels._counted(axes, matplotlib)
     figure.canvas.draw()
     texts = [text.get_text() for text in axes.get_yticklabels()]
     assert len(texts) >= 2
@@ -36,15 +36,15 @@ class TestCharts:
     def test_a_chart_has_its_width(self) -> None:
         image = pixels(plotted(flight(60)).png)
         assert image.shape[1] == charts.WIDTH
-        assert image.shape[0] > charts.ROW * len(charts.PANELS) / 2
+        assert image.shape[0] > charts.ROW * len(panels.PANELS) / 2
 
     def test_frames_to_look_at_are_marked(self) -> None:
         quiet = flight(60)
         for each in quiet:
             each |= dict.fromkeys(("churn", "bytes_new", "missing", "complete_in_s", "overdraw_estimate"), 0)
             each["pixel_scale_min"] = each["pixel_scale_limit"]
-        assert count_of(pixels(plotted(flight(60)).png), charts.PINK) > 500
-        assert count_of(pixels(plotted(quiet).png), charts.PINK) == 0
+        assert count_of(pixels(plotted(flight(60)).png), series.PINK) > 500
+        assert count_of(pixels(plotted(quiet).png), series.PINK) == 0
 
     def test_empty_columns_leave_their_panel_out(self) -> None:
         rows = flight(60)
@@ -53,8 +53,8 @@ class TestCharts:
         fewer = charts.draw([each | dict.fromkeys(("traverse_ms", "complete_in_s"), None) for each in rows], {})
         assert fewer.shape[0] == charts.ROW * 4
 
-    @pytest.mark.parametrize("panel", charts.PANELS, ids=lambda panel: panel.title)
-    def test_each_panel_shows_its_columns(self, panel: charts.Panel, monkeypatch: pytest.MonkeyPatch) -> None:
+    @pytest.mark.parametrize("panel", panels.PANELS, ids=lambda panel: panel.title)
+    def test_each_panel_shows_its_columns(self, panel: panels.Panel, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(charts, "PANELS", (panel,))
         rows = flight(60)
         before = charts.draw(rows, marked(rows))

@@ -35,7 +35,7 @@ def written(folder: Path, count: int, budget: int = 900) -> Pictures:
     return write_pictures(
         finders[0],
         path_of(count),
-        output_for(folder / "x.%d.png", "x", count, sheet=False),
+        output_for(folder / "x.%d.png", Path("x"), count, sheet=False),
         RenderSettings(),
         PictureSettings(background=(0.0, 0.0, 0.0)),
         reference=finders[1],
@@ -74,7 +74,7 @@ def test_pictures_too_large_to_keep_come_out_the_same(tmp_path: Path, monkeypatc
 def test_progress_tells_of_the_cuts_that_colours_are_found_with(tmp_path: Path) -> None:
     told: list[tuple[str, int, int, str]] = []
     finder = CutFinder(read_scenes(instances_of([TOWN])), LodSettings(900))
-    output = output_for(tmp_path / "x.%d.png", "x", 40, sheet=False)
+    output = output_for(tmp_path / "x.%d.png", Path("x"), 40, sheet=False)
     write_pictures(
         finder,
         path_of(40),

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from sparklod_cli.cli import run
-from sparklod_cli.inspection.expectations import ExpectationError, Expectations, check, value_at
-from sparklod_cli.inspection.report import Report, ReportSettings, inspect
+from sparklod_cli.inspection.expectations import Expectations, check
+from sparklod_cli.inspection.report import NoFieldError, Report, ReportSettings, inspect
 from tests.conftest import FIXTURES
 from tests.inspection.expected import DEPTH, LEAVES, NODES, PLAIN, TREE, written
 
@@ -100,17 +100,17 @@ def test_a_minimum_of_a_value_that_is_not_a_number_fails(tree: Report) -> None:
 
 @pytest.mark.parametrize("way", ["", "nothing", "tree.", "tree.levels.99", "tree.levels.x", "splats.0", "format.0"])
 def test_a_path_that_the_report_has_not_is_an_error(tree: Report, way: str) -> None:
-    with pytest.raises(ExpectationError, match=f"the report has no {way}"):
-        value_at(tree.as_dict(), way)
+    with pytest.raises(NoFieldError, match=f"the report has no {way}"):
+        tree.value_at(way)
 
 
 def test_a_path_leads_to_a_value_of_the_report(tree: Report) -> None:
     plain = tree.as_dict()
-    assert value_at(plain, "tree.levels.0") == plain["tree"]["levels"][0]
-    assert value_at(plain, "tree.levels.2.leaves") == 5
-    assert value_at(plain, "tree.children.2") == 1
-    assert value_at(plain, "values.box.min.2") == 1.0
-    assert value_at(plain, "findings") is None
+    assert tree.value_at("tree.levels.0") == plain["tree"]["levels"][0]
+    assert tree.value_at("tree.levels.2.leaves") == 5
+    assert tree.value_at("tree.children.2") == 1
+    assert tree.value_at("values.box.min.2") == 1.0
+    assert tree.value_at("findings") is None
 
 
 OPTIONS = [
@@ -143,7 +143,7 @@ def test_leaves_can_be_those_of_another_file(tmp_path: Path, capsys: pytest.Capt
     assert run(["inspect", str(TREE), "--leaves-of", str(PLAIN)]) == 3
     assert (
         capsys.readouterr().out
-        == f"{TREE}: error: expect.leaves: 6 leaves, but the original has 60 splats that can be drawn\n"
+        == f"{TREE}: error: expect.leaves: 6 leaves, but 60 splats of the original can be drawn\n"
     )
 
 

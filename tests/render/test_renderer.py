@@ -10,11 +10,10 @@ import pytest
 
 from sparklod_cli.render.backends import BACKENDS
 from sparklod_cli.render.renderer import Drawn, Renderer
-from sparklod_cli.render.settings import RasterSettings, RenderSettings
+from sparklod_cli.render.settings import COLOR_BY, STYLES, RasterSettings, RenderSettings
 from sparklod_cli.render.shading import shade
 from sparklod_cli.render.styles import BILLBOARD_ALPHA
 from sparklod_cli.scenes.finder import CutFinder
-from sparklod_cli.support.defaults import COLOR_BY, STYLES
 from sparklod_cli.support.errors import SparklodError
 from tests.render.sceneries import balls, camera, plain
 from tests.scenes import random_splats

@@ -20,7 +20,7 @@ def test_statistics_of_a_summary_are_those_of_assertions() -> None:
         if quantity.name == IN_FRUSTUM:
             continue
         for name in ("min", "p50", "p95", "max"):
-            (outcome,) = check([parse(f"{quantity.name}_{name}<0")], rows)
+            (outcome,) = check([parse(f"{quantity.name}_{name}<0", COLUMNS)], rows)
             assert getattr(quantity, name) == pytest.approx(outcome.value, rel=1e-8)
 
 

@@ -1,4 +1,4 @@
-"""The data texture of antimatter15's viewer and of those that follow it: RGBA32UI, 2048 texels wide, 2 a splat."""
+"""The data texture of antimatter15's viewer and its descendants: RGBA32UI, 2048 texels wide, 2 texels per splat."""
 
 from __future__ import annotations
 
@@ -30,19 +30,19 @@ SPLAT = np.dtype(
 )
 assert SPLAT.itemsize == 32
 
-#: What the covariance is multiplied by, and the largest number that a float16 holds of the product.
+#: Factor of the covariance in the texture, and the largest float16, which bounds the product.
 GAIN, LARGEST = 4, 65504
 
 
 def pack(splats: Splats, *, threads: int = 1) -> dict[str, Words]:
-    """Splats as the viewer uploads them: "texture" (H, 2048, 4) uint32, H = ceil(N / 1024), at least 1; the rest is 0.
+    """Splats as the viewer uploads them: "texture" (H, 2048, 4) uint32, H = ceil(N / 1024), at least 1; unused is 0.
 
     The viewer multiplies M^T M with M = diag(scale) R. Its R, by rows, is the transpose of the matrix that turns local
     into world axes, so that M^T M is the covariance A diag(scale ** 2) A^T with A local to world, as here.
 
-    Colour and opacity are clamped to 0..1; SH is not held. A splat wider than a float16 takes, a standard deviation of
-    127.97 along a world axis, is shrunk to that, in its shape, where the viewer's own would be infinite. float16s are
-    rounded to the nearest, and the rotation is the splat's own; the viewer cuts both off to fewer bits.
+    Colour and opacity are clamped to 0..1; SH is left out. A splat wider than float16 can express, 127.97 standard
+    deviations in world units along an axis, is shrunk to that without changing its shape; the viewer's own would be
+    infinite. float16s are rounded to the nearest and rotations are not quantized, where the viewer truncates both.
     """
     height = max(1, -(-len(splats) // SPLATS_A_ROW))
     texture = np.zeros((height, WIDTH, 4), np.uint32)
@@ -62,13 +62,13 @@ def pack(splats: Splats, *, threads: int = 1) -> dict[str, Words]:
 
 
 def dump(scene: Scene, *, threads: int = 1) -> dict[str, Words]:
-    """The texture of a scene; it holds no links of a tree."""
+    """The texture of a scene; it does not hold the children of a tree."""
     return pack(scene.splats, threads=threads)
 
 
 @dataclass(frozen=True)
 class Texels:
-    """What a texture holds of N splats, float32.
+    """The contents of a texture of N splats, float32.
 
     Attributes:
         center: (N, 3) world units.
@@ -88,16 +88,16 @@ def unpack(arrays: Mapping[str, NDArray[Any]], count: int) -> Texels:
     splats that were not shrunk; 1 / 510 of each channel of rgba.
 
     Raises:
-        FormatError: the array is missing, of another shape or type, or has no room for `count` splats.
+        FormatError: the array is missing, has another shape or type, or is too small for `count` splats.
     """
     texture = arrays.get("texture")
     if texture is None:
-        raise FormatError(f"no array texture, only {', '.join(arrays) or 'none at all'}")
+        raise FormatError(f"there is no array texture, only {', '.join(arrays) or 'none'}")
     if texture.dtype != np.uint32 or texture.ndim != 3 or texture.shape[1:] != (WIDTH, 4):
         raise FormatError(f"texture is {texture.dtype}{list(texture.shape)}, expected uint32[H, {WIDTH}, 4]")
     room = len(texture) * SPLATS_A_ROW
     if not 0 <= count <= room:
-        raise FormatError(f"{count:,} splats of a texture that has room for {room:,}")
+        raise FormatError(f"{count:,} splats, but the texture has room for {room:,}")
     texels = np.ascontiguousarray(texture).reshape(-1, 8).view(SPLAT)[:count, 0]
     return Texels(
         texels["center"].astype(np.float32),
@@ -107,6 +107,6 @@ def unpack(arrays: Mapping[str, NDArray[Any]], count: int) -> Texels:
 
 
 def _encode_covariance(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Times 4, and smaller where that is more than a float16 holds; no element exceeds the largest of the diagonal."""
+    """Covariances times `GAIN`, scaled down to `LARGEST` where necessary; the largest element is on the diagonal."""
     stored = values * GAIN
     return stored * (LARGEST / np.maximum(stored.max(axis=1, keepdims=True), LARGEST))

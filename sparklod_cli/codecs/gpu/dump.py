@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import io
+import zipfile
 from collections.abc import Iterator
 from importlib import import_module
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...model.scene import Scene
+from ...support.errors import FormatError
+from ...support.untrusted import quoted, shown
+from .. import npy
 from .table import ENCODINGS
 
 Arrays = dict[str, NDArray[Any]]
@@ -34,3 +38,36 @@ def encode_raw(arrays: Arrays) -> Iterator[bytes]:
     """The little-endian words of all the arrays, one after the other."""
     for words in arrays.values():
         yield words.astype("<u4", copy=False).tobytes()
+
+
+def decode_npz(file: BinaryIO) -> Arrays | None:
+    """The arrays of a .npz file; None where a file is something else.
+
+    Raises:
+        FormatError: an array is compressed, cut short or of no plain numbers.
+    """
+    try:
+        with zipfile.ZipFile(file) as archive:
+            members = archive.infolist()
+            if not members or not all(member.filename.endswith(".npy") for member in members):
+                return None
+            return {member.filename.removesuffix(".npy"): _member(archive, member) for member in members}
+    except zipfile.BadZipFile:
+        return None
+
+
+def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[Any]:
+    # Stored members cannot claim more than the file has; compressed ones could, and build-lod writes none.
+    if member.compress_type != zipfile.ZIP_STORED or member.flag_bits & 1:
+        raise FormatError(f"its member {shown(member.filename)} is compressed, which those of --encoding are not")
+    try:
+        with archive.open(member) as file:
+            data = io.BytesIO(file.read())
+        layout = npy.read_layout(data)
+        if layout is None:
+            raise FormatError("is not a .npy file")
+        return npy.read_values(data, layout)
+    except (zipfile.BadZipFile, EOFError, OSError, NotImplementedError) as error:
+        raise FormatError(f"its member {shown(member.filename)} is damaged: {quoted(error)}") from None
+    except FormatError as error:
+        raise type(error)(f"its member {shown(member.filename)} {error}") from None

@@ -1,6 +1,7 @@
-"""ExtSplats, Spark's 32 bytes a splat in memory, and its arrays of spherical harmonics.
+"""ExtSplats, Spark's layout of 32 bytes per splat, with its arrays of spherical harmonics.
 
-Words, rounding and clamping are those of the encoder in Spark 2.2.0's worker; its page on LoD rendering has the layout.
+Words, rounding and clamping are those of the encoder in Spark 2.2.0's worker; its page on LoD rendering describes the
+layout.
 """
 
 from __future__ import annotations
@@ -33,19 +34,19 @@ SPLAT_1 = np.dtype(
 )
 assert SPLAT_0.itemsize == SPLAT_1.itemsize == 16
 
-#: SH arrays, each of 4 words a splat, and the least degree that has them. A word is a coefficient, and they follow each
-#: other through the arrays in this order; what words are left over at the end are 0.
+#: SH arrays, each of 4 words per splat, and the lowest degree that has them. A word is a coefficient; coefficients run
+#: through the arrays in this order, and unused words at the end are 0.
 SH_ARRAYS = {"sh1": 1, "sh2": 2, "sh3a": 3, "sh3b": 3}
 
-#: The exponent that the channels of an SH coefficient share: what is stored of it is 0..31, 15 more than it is.
+#: Shared exponent of an SH coefficient's channels: stored plus this bias, and the largest stored exponent.
 EXPONENT_BIAS, EXPONENT_MOST = 15, 31
-#: Bits of a word of SH: of r g b the byte of magnitude and the sign, and the exponent.
+#: Bit positions in a word of SH: byte of magnitude and sign of r, g and b, and the exponent.
 _BITS = tuple((np.uint32(byte), np.uint32(sign)) for byte, sign in ((0, 24), (8, 25), (16, 26)))
 _EXPONENT = np.uint32(27)
 
 
 def pack(splats: Splats, *, threads: int = 1) -> dict[str, Words]:
-    """Splats as Spark holds them: "ext0" and "ext1" (N, 4) uint32, and by SH degree "sh1", "sh2", "sh3a" and "sh3b".
+    """Splats in Spark's layout: "ext0" and "ext1" (N, 4) uint32, and by SH degree "sh1", "sh2", "sh3a" and "sh3b".
 
     A colour of 65520 or more becomes infinite, as in Spark. The formulas are those of Spark's `encode_ext_splat` and
     `encode_ext_rgb`.
@@ -59,7 +60,7 @@ def pack(splats: Splats, *, threads: int = 1) -> dict[str, Words]:
         first["center"] = splats.center[part]
         first["alpha"] = octahedral.encode_lod_alpha(splats.opacity[part])
         second["rgb"] = splats.rgb[part]
-        # Through float32, as Spark has it, or a tie might fall to another side.
+        # Rounded to float32 first, as in Spark, which decides ties.
         second["log_scale"] = np.log(splats.scale[part].astype(np.float64)).astype(np.float32)
         u, v, angle = octahedral.encode_axis_angle(splats.quat_xyzw[part], STEPS_10_10_12)
         second["rotation"] = u | v << np.uint32(10) | angle << np.uint32(20)
@@ -73,14 +74,14 @@ def pack(splats: Splats, *, threads: int = 1) -> dict[str, Words]:
 
 
 def dump(scene: Scene, *, threads: int = 1) -> dict[str, Words]:
-    """The arrays of a scene; those of a tree are no different."""
+    """The arrays of a scene, with or without a tree."""
     return pack(scene.splats, threads=threads)
 
 
 def unpack(arrays: Mapping[str, NDArray[Any]], *, threads: int = 1) -> Splats:
-    """The splats that `pack` made the arrays of; the SH arrays among them tell the degree.
+    """Splats of the arrays of `pack`; the SH arrays present determine the degree.
 
-    Largest errors, beside float32's own:
+    Largest errors, apart from that of float32:
 
     - center: exact.
     - scale: a factor of e ** (2 ** -11 * abs(ln(scale))), at most 0.4 % from e ** -16 to e ** 16; exact for 0.
@@ -90,7 +91,7 @@ def unpack(arrays: Mapping[str, NDArray[Any]], *, threads: int = 1) -> Splats:
     - sh: see `decode_sh`.
 
     Raises:
-        FormatError: an array is missing, or of another shape or type.
+        FormatError: an array is missing, or has another shape or type.
     """
     degree = max((degree for name, degree in SH_ARRAYS.items() if name in arrays), default=0)
     sh_names = _sh_names(degree)
@@ -98,7 +99,7 @@ def unpack(arrays: Mapping[str, NDArray[Any]], *, threads: int = 1) -> Splats:
     first, second = found["ext0"].view(SPLAT_0)[:, 0], found["ext1"].view(SPLAT_1)[:, 0]
     splats = Splats.empty(len(first), degree)
 
-    @np.errstate(over="ignore", invalid="ignore")  # words that nobody packed may be anything
+    @np.errstate(over="ignore", invalid="ignore")  # arbitrary words may overflow
     def decode(part: slice) -> None:
         splats.center[part] = first["center"][part]
         splats.opacity[part] = octahedral.decode_lod_alpha(first["alpha"][part].astype(np.float32))
@@ -120,10 +121,11 @@ def _sh_names(degree: int) -> list[str]:
 
 
 def encode_sh(sh: FloatArray) -> Words:
-    """(N, K, 3) SH coefficients to (N, K) words: a byte of magnitude a channel, their signs, and a shared exponent.
+    """(N, K, 3) SH coefficients to (N, K) words: a byte of magnitude and a sign per channel, and a shared exponent.
 
-    The exponent is the largest channel's rounded down, between -15 and 16, and the bytes are 0..2 ** exponent in 255
-    steps; so what exceeds a power of two is cut off, up to half of the largest channel. Spark's loss, kept as it is.
+    The exponent is that of the largest channel rounded down, between -15 and 16, and the bytes are 0..2 ** exponent in
+    255 steps. So a magnitude above that power of two is clamped to it, which loses up to half of the largest channel.
+    Spark does the same.
     """
     channels = np.ascontiguousarray(np.moveaxis(sh, 2, 0))
     magnitudes = np.abs(channels)
@@ -142,7 +144,7 @@ def decode_sh(words: Words) -> FloatArray:
     """(N, K) words to (N, K, 3) SH coefficients.
 
     Largest error: let m be the largest channel of a coefficient, between 2 ** -15 and 2 ** 17, and p the power of two
-    not above it. A channel up to p is off by p / 510, one above p comes back as p: less than m / 2 is lost.
+    not above it. A channel up to p is off by at most p / 510; one above p becomes p, which is off by less than m / 2.
     """
     step = np.ldexp(np.float32(1), (words >> _EXPONENT).astype(np.int32) - EXPONENT_BIAS) / np.float32(255)
     sh = np.empty((*words.shape, 3), np.float32)

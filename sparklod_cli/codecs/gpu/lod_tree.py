@@ -1,4 +1,4 @@
-"""LodTree, Spark's 16 bytes a node in memory: what its traversal reads of each splat of a Level-of-Detail tree."""
+"""LodTree, Spark's layout of 16 bytes per node: what its traversal reads of a Level-of-Detail tree."""
 
 from __future__ import annotations
 
@@ -31,20 +31,19 @@ assert NODE.itemsize == 16
 def pack(
     splats: Splats, tree: LodTree, *, size: Callable[[Splats], FloatArray] = spark_size, threads: int = 1
 ) -> dict[str, Words]:
-    """Splats and their tree as Spark's traversal has them: "lod_tree" (N, 4) uint32.
+    """Splats and their tree in the layout of Spark's traversal: "lod_tree" (N, 4) uint32.
 
-    Spark measures the splats that it holds, after their coding: give this what `unpack` of `ext_splats` or of
-    `packed_splats` makes of their `pack`, and the words are Spark's own. A coordinate or a size of 65520 or more
-    becomes infinite, as in Spark.
+    Spark measures splats after their coding: for the same words as Spark's, pass splats that were packed and unpacked
+    by `ext_splats` or `packed_splats`. A coordinate or a size of 65520 or more becomes infinite, as in Spark.
 
     Args:
-        size: makes (N,) world units of splats: `spark_size`, or `design_size` to see what the pages' would do.
+        size: computes (N,) feature sizes, world units: `spark_size`, or `design_size` of Spark's pages for comparison.
 
     Raises:
-        FormatError: there are not as many nodes as splats, or a node has more children than a uint16 holds.
+        FormatError: the numbers of nodes and splats differ, or a node has more children than a uint16 holds.
     """
     if len(tree) != len(splats):
-        raise FormatError(f"{len(tree):,} nodes but {len(splats):,} splats")
+        raise FormatError(f"{len(tree):,} nodes, but {len(splats):,} splats")
     _check_child_count(tree.child_count)
     words = np.empty((len(splats), 4), np.uint32)
 
@@ -72,12 +71,12 @@ def dump(scene: Scene, *, threads: int = 1) -> dict[str, Words]:
 
 
 def unpack(arrays: Mapping[str, NDArray[Any]]) -> Nodes:
-    """The nodes that `pack` made the array of.
+    """The nodes of the array of `pack`.
 
-    Largest errors: 2 ** -11 of each coordinate and of the size, or 2 ** -25 if that is more; the links are exact.
+    Largest errors: 2 ** -11 of each coordinate and of the size, or 2 ** -25 if that is more; children are exact.
 
     Raises:
-        FormatError: the array is missing, or of another shape or type; a node has more children than a uint16 holds.
+        FormatError: the array is missing or has another shape or type, or a node has more children than a uint16 holds.
     """
     rows = checked_words(arrays, {"lod_tree": 4})["lod_tree"].view(NODE)[:, 0]
     _check_child_count(rows["child_count"])
@@ -88,4 +87,4 @@ def unpack(arrays: Mapping[str, NDArray[Any]]) -> Nodes:
 def _check_child_count(child_count: NDArray[Any]) -> None:
     if child_count.max(initial=0) > MAX_CHILDREN:
         node = int(np.argmax(child_count > MAX_CHILDREN))
-        raise FormatError(f"node {node} has {child_count[node]:,} children, at most {MAX_CHILDREN:,} fit a uint16")
+        raise FormatError(f"node {node} has {child_count[node]:,} children, a uint16 holds at most {MAX_CHILDREN:,}")

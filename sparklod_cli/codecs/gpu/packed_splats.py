@@ -1,7 +1,7 @@
-"""PackedSplats, Spark's 16 bytes a splat in memory, and its arrays of spherical harmonics.
+"""PackedSplats, Spark's layout of 16 bytes per splat, with its arrays of spherical harmonics.
 
-Words, rounding and clamping are those of Spark 2.2.0's own encoder, the one in its worker, but for one thing: a scale
-between 0 and e ** -30 is a true zero here, as Spark's pages and its JavaScript have it, and e ** -12 in its worker.
+Words, rounding and clamping are those of the encoder in Spark 2.2.0's worker, with one exception: a scale between 0 and
+e ** -30 becomes 0 here, as in Spark's documentation and its JavaScript, and e ** -12 in its worker.
 """
 
 from __future__ import annotations
@@ -33,24 +33,25 @@ SPLAT = np.dtype(
 )
 assert SPLAT.itemsize == 16
 
-#: Words a splat, and bits a number, of the SH arrays of degree 1 to 3. The 3 * (2 * degree + 1) numbers, coefficient by
-#: coefficient with r g b innermost, lie bit after bit in two's complement: -sh_max..sh_max in 2 ** bits - 2 steps.
+#: Words per splat and bits per number of the SH arrays of degree 1 to 3. The 3 * (2 * degree + 1) numbers, coefficient
+#: by coefficient with r g b innermost, are packed bit by bit in two's complement: -sh_max..sh_max in 2 ** bits - 2
+#: steps.
 SH_WORDS = {1: 2, 2: 4, 3: 4}
 SH_BITS = {1: 7, 2: 8, 3: 6}
 
-#: Smaller scales are a true zero: e ** -30.
+#: Scales below this are encoded as 0: e ** -30.
 SCALE_ZERO = np.float32(np.exp(-30))
 
 
 @dataclass(frozen=True)
 class Encoding:
-    """The ranges that the codes span: Spark's `splatEncoding`, with its defaults.
+    """The ranges of the codes: Spark's `splatEncoding`, with its defaults.
 
     Attributes:
         rgb_min, rgb_max: colours of code 0 and 255.
         ln_scale_min, ln_scale_max: logarithms of the scales of code 1 and 255.
         sh1_max, sh2_max, sh3_max: largest SH coefficient of each degree.
-        lod_opacity: alpha holds 0..2, where 1..2 stands for D = 1..5: what Spark sets for an LoD tree.
+        lod_opacity: alpha is 0..2, where 1..2 stands for D = 1..5, as Spark sets it for an LoD tree.
     """
 
     rgb_min: float = 0
@@ -64,9 +65,9 @@ class Encoding:
 
     def __post_init__(self) -> None:
         if not (self.rgb_min < self.rgb_max and self.ln_scale_min < self.ln_scale_max):
-            raise ValueError(f"an empty range: {self}")
+            raise ValueError(f"a range is empty: {self}")
         if not min(self.sh1_max, self.sh2_max, self.sh3_max) > 0:
-            raise ValueError(f"a largest SH coefficient that is not positive: {self}")
+            raise ValueError(f"the largest SH coefficients must be positive: {self}")
 
     @property
     def alpha_max(self) -> int:
@@ -87,10 +88,11 @@ def of_scene(scene: Scene) -> Encoding:
 
 
 def pack(splats: Splats, encoding: Encoding = DEFAULT, *, threads: int = 1) -> dict[str, Words]:
-    """Splats as Spark holds them: "packed" (N, 4) uint32, and by degree "sh1" (N, 2), "sh2" (N, 4) and "sh3" (N, 4).
+    """Splats in Spark's layout: "packed" (N, 4) uint32, and by degree "sh1" (N, 2), "sh2" (N, 4) and "sh3" (N, 4).
 
-    What a code cannot hold is clamped; a coordinate of 65520 or more becomes infinite, as in Spark. The formulas are
-    those of Spark's `encode_packed_splat` and `encode_sh1` to `encode_sh3`, which its page on PackedSplats describes.
+    Values are clamped to the ranges of their codes; a coordinate of 65520 or more becomes infinite, as in Spark. The
+    formulas are those of Spark's `encode_packed_splat` and `encode_sh1` to `encode_sh3`, described on its page about
+    PackedSplats.
     """
     degrees = range(1, splats.sh_degree + 1)
     arrays = {"packed": np.empty((len(splats), 4), np.uint32)}
@@ -121,9 +123,9 @@ def dump(scene: Scene, *, threads: int = 1) -> dict[str, Words]:
 
 
 def unpack(arrays: Mapping[str, NDArray[Any]], encoding: Encoding = DEFAULT, *, threads: int = 1) -> Splats:
-    """The splats that `pack` made the arrays of; those of SH may be left out from the highest degree down.
+    """Splats of the arrays of `pack`; arrays of SH may be missing from the highest degree down.
 
-    Largest errors, inside the ranges and beside float32's own:
+    Largest errors inside the ranges, apart from that of float32:
 
     - center: 2 ** -11 of each coordinate, or 2 ** -25 if that is more.
     - scale: a factor of e ** ((ln_scale_max - ln_scale_min) / 508), 4.3 %; exact for 0.
@@ -133,11 +135,11 @@ def unpack(arrays: Mapping[str, NDArray[Any]], encoding: Encoding = DEFAULT, *, 
     - sh: sh1_max / 126, sh2_max / 254 and sh3_max / 62.
 
     Raises:
-        FormatError: an array is missing, or of another shape or type.
+        FormatError: an array is missing, or has another shape or type.
     """
     present = tuple(degree for degree in SH_WORDS if f"sh{degree}" in arrays)
     if present != tuple(range(1, len(present) + 1)):
-        raise FormatError(f"SH arrays of degree {present}, and none of a lower one")
+        raise FormatError(f"SH arrays of degree {present}, but not of all lower degrees")
     found = octahedral.checked_words(arrays, {"packed": 4} | {f"sh{degree}": SH_WORDS[degree] for degree in present})
     packed = found["packed"].view(SPLAT)[:, 0]
     splats = Splats.empty(len(packed), len(present))
@@ -169,7 +171,7 @@ def _decode_linear(codes: NDArray[np.uint8], low: float, high: float) -> FloatAr
 
 
 def encode_log_scale(scale: FloatArray, encoding: Encoding = DEFAULT) -> Words:
-    """Linear scales to codes 0..255, where 0 is for scales below e ** -30 and 1..255 are steps of the logarithm."""
+    """Linear scales to codes: 0 for scales below e ** -30, 1..255 for steps of the logarithm."""
     low = np.float32(encoding.ln_scale_min)
     width = np.float32(encoding.ln_scale_max) - low
     zero = scale < SCALE_ZERO
@@ -190,7 +192,7 @@ def decode_log_scale(codes: NDArray[np.uint8], encoding: Encoding = DEFAULT) -> 
 
 
 def encode_sh(values: FloatArray, bits: int, most: np.float32) -> Words:
-    """(N, numbers) SH coefficients to (N, words), `bits` each in two's complement, bit after bit; -most..most."""
+    """(N, numbers) SH coefficients, clamped to -most..most, to (N, words) with `bits` bits each in two's complement."""
     top = np.float32(2 ** (bits - 1) - 1)
     steps = np.clip(values * (top / most), -top, top)
     codes = octahedral.round_half_away(steps).astype(np.int32).view(np.uint32) & np.uint32(2**bits - 1)
@@ -213,5 +215,5 @@ def decode_sh(words: Words, bits: int, most: np.float32, numbers: int) -> FloatA
         if offset + bits > 32:
             codes[index] |= columns[word + 1] << np.uint32(32 - offset)
     unused = np.int32(32 - bits)
-    signed = codes.view(np.int32) << unused >> unused  # the shift back brings the sign along
+    signed = codes.view(np.int32) << unused >> unused  # an arithmetic shift extends the sign
     return signed.T.astype(np.float32) * (most / np.float32(2 ** (bits - 1) - 1))

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ...codecs.rounding import ROUND_TRIPS
-from ...render.settings import PROFILES, SORTS, RasterSettings, RenderSettings
+from ...render.backends import BACKENDS
+from ...render.settings import COLOR_BY, OF_PIXELS, PROFILES, SORTINGS, SORTS, STYLES, RasterSettings, RenderSettings
 from ...support import defaults
-from ...support.defaults import OF_PIXELS
 from ..command import COMMON, option
 from ..usage import exclude, is_given, require
 from .common import Command
@@ -67,13 +67,13 @@ class Appearance:
         alpha: keep alpha.
         supersample: samples along each side of a pixel.
         near, far: world units.
-        style: one of `defaults.STYLES`.
-        color_by: one of `defaults.COLOR_BY`.
+        style: one of `STYLES`.
+        color_by: one of `COLOR_BY`.
         no_bar: leave the colour bar out.
         through: a key of `rounding.ROUND_TRIPS`.
         profile: one of `PROFILES`.
         sort: one of `SORTS`.
-        backend: one of `defaults.BACKENDS`.
+        backend: one of `BACKENDS`.
         sorting, sort_throttle: of the backend osmesa.
     """
 
@@ -171,15 +171,15 @@ def appearance_options(command: Command) -> Command:
             ),
             add(
                 "--color-by",
-                type=click.Choice(defaults.COLOR_BY),
+                type=click.Choice(COLOR_BY),
                 help="Colour splats by a quantity, unlit, with a colour bar beside the picture.  [default: their own"
                 " colours]",
             ),
             add("--no-bar", is_flag=True, help="Leave out the colour bar of --color-by or --diff."),
             add(
                 "--style",
-                type=click.Choice(defaults.STYLES),
-                default=defaults.STYLES[0],
+                type=click.Choice(STYLES),
+                default=STYLES[0],
                 help="Shape of each splat: its Gaussian, one opaque pixel (points), or an opaque disc, in the order of"
                 " the file (billboards) or from far to near (sorted-billboards).",
             ),
@@ -222,13 +222,13 @@ def appearance_options(command: Command) -> Command:
             ),
             add(
                 "--backend",
-                type=click.Choice(defaults.BACKENDS),
-                default=defaults.BACKENDS[0],
+                type=click.Choice(list(BACKENDS)),
+                default=next(iter(BACKENDS)),
                 help="Renderer: numba is the reference, osmesa is OpenGL in software, open3d is a quick look.",
             ),
             add(
                 "--sorting",
-                type=click.Choice(defaults.SORTINGS),
+                type=click.Choice(SORTINGS),
                 help="With --backend osmesa: sort exactly, or by 16 bits of the depth as antimatter15's viewer does"
                 " (counting16).  [default: exact]",
             ),

@@ -17,7 +17,7 @@ from .common import Command
 from .types import AutoOr, Ball, Numbers, Real
 
 if TYPE_CHECKING:
-    from ...bake import BakeSettings
+    from ...api.file_jobs import BakeSettings
     from ...codecs.options import WriteOptions
 
 TREE, SELECTION, PLACE, FORMAT = "Tree", "Selection", "Rotation, scale and position", "File format"
@@ -188,7 +188,7 @@ def bake_settings(ctx: click.Context, *, raw: bool) -> BakeSettings:
         ctx: of the command.
         raw: write the words of --encoding alone.
     """
-    from ...bake import BakeSettings
+    from ...api.file_jobs import BakeSettings
     from ...model.selection import Selection
     from ...model.transforms import Transform
 

@@ -12,7 +12,7 @@ import click
 
 from ...images.defaults import JPEG_QUALITY, THUMBNAIL_SIZE, THUMBNAIL_SUPERSAMPLE
 from ..command import COMMON, option
-from ..paths import OutputPath
+from ..paths import OutputPath, stem_of
 from ..usage import exclude, require
 from .common import Command, overwrite_option
 
@@ -65,7 +65,7 @@ class Pictures:
 
         Args:
             ctx: of the command.
-            scene: by whose name an output is called that has none.
+            scene: the file beside which an output goes that has no name, and whose name it has.
             cameras: how many there are.
             sheet: they are put on a contact sheet.
 
@@ -74,7 +74,7 @@ class Pictures:
         """
         from ...images.output import output_for
 
-        name = (scene.stem or scene.name) + ("-thumbnail" if self.thumbnail else "")
+        name = scene.parent / (stem_of(scene) + ("-thumbnail" if self.thumbnail else ""))
         try:
             output = output_for(self.output, name, cameras, sheet=sheet)
         except ValueError as error:
@@ -127,7 +127,7 @@ def picture_options(command: Command) -> Command:
                 type=OutputPath(),
                 help="Write a .png, .jpg, .webp or .npy (floats), or with out.%04d.png one for each camera; a .mp4,"
                 " .webm, .gif or .webp for an animation; with --compare a .csv, .json or .parquet; - is standard"
-                " output.  [default: NAME.png in the current directory; with --compare standard output]",
+                " output.  [default: NAME.png beside the first FILE; with --compare standard output]",
             ),
             overwrite_option,
             option(

@@ -11,9 +11,6 @@ from ..rasterizer import world_to_camera
 from ..settings import CLIP, MIN_ALPHA, RasterSettings
 from ..shading import ShadedSplats
 
-#: By the distance itself, or by 65,536 steps of it.
-SORTINGS = ("exact", "counting16")
-
 Indices = NDArray[np.uint32]
 
 
@@ -21,7 +18,7 @@ class Order:
     """Which splats to draw, from near to far, for a camera that moves.
 
     Args:
-        sorting: one of `SORTINGS`.
+        sorting: one of `settings.SORTINGS`.
         throttle: splats are not sorted again while the cosine between where the camera looked when they were and where
             it looks now is above 1 - throttle; antimatter15's viewer has 0.01, an angle of 8.1 degrees. 0 sorts for
             each camera. With `RasterSettings.sort` "radial", where what counts is the camera's place, they are also

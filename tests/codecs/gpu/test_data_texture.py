@@ -148,11 +148,11 @@ def test_threads_and_chunks_do_not_change_a_texel() -> None:
 @pytest.mark.parametrize(
     ("packed", "count", "text"),
     [
-        ({}, 0, "no array texture, only none at all"),
+        ({}, 0, "no array texture, only none"),
         ({"texture": np.zeros((1, 2048, 4), np.uint8)}, 0, "texture is uint8"),
         ({"texture": np.zeros((1, 1024, 4), np.uint32)}, 0, r"expected uint32\[H, 2048, 4\]"),
         ({"texture": np.zeros((2048, 4), np.uint32)}, 0, r"texture is uint32\[2048, 4\]"),
-        ({"texture": np.zeros((2, 2048, 4), np.uint32)}, 2049, "2,049 splats of a texture that has room for 2,048"),
+        ({"texture": np.zeros((2, 2048, 4), np.uint32)}, 2049, "2,049 splats, but the texture has room for 2,048"),
         ({"texture": np.zeros((2, 2048, 4), np.uint32)}, -1, "-1 splats"),
     ],
 )

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import json
 import shutil
+import zipfile
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from sparklod_cli.images.metrics import psnr
+from sparklod_cli.render import settings
 from sparklod_cli.render.backends import BACKENDS
-from sparklod_cli.support import defaults
 from tests.commands.render.runs import AT, DEMO, PLAIN, SIZE, TOWN, TREE, Said, floats, pixels, render
 from tests.conftest import FIXTURES
 
@@ -29,13 +30,22 @@ def test_a_tree_is_drawn_to_a_png(built: Path, tmp_path: Path, capsys: Said) -> 
     assert [path.name for path in tmp_path.iterdir()] == ["preview.png"]
 
 
-def test_the_default_output_is_named_after_the_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert render(PLAIN, *SIZE, "-q") == 0
-    assert render(TOWN, *SIZE, "-q", "--orbit", 2, "--budget", "1k") == 0
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["sh2.png", "town.0000.png", "town.0001.png"]
-    assert render(PLAIN, *SIZE, "-q") == 1
-    assert render(PLAIN, *SIZE, "-q", "--overwrite") == 0
+def test_without_a_name_the_picture_is_beside_the_scene_and_has_its_name(tmp_path: Path) -> None:
+    plain, town = tmp_path / "plain.ply", tmp_path / "town 100%.spz"
+    shutil.copy(PLAIN, plain)
+    shutil.copy(TOWN, town)
+    assert render(plain, *SIZE, "-q") == 0
+    assert render(town, plain, *SIZE, "-q", "--orbit", 2, "--budget", "1k") == 0
+    made = {"plain.png", "town 100_.0000.png", "town 100_.0001.png"}
+    assert {path.name for path in tmp_path.glob("*.png")} == made
+    assert render(plain, *SIZE, "-q") == 1
+    assert render(plain, *SIZE, "-q", "--overwrite") == 0
+    folder = tmp_path / "unpacked"
+    with zipfile.ZipFile(FIXTURES / "golden" / "sh2-v1.sog") as archive:
+        archive.extractall(folder)
+    assert render(folder, *SIZE, "-q") == render(folder / "meta.json", *SIZE, "-q") == 0
+    assert (tmp_path / "unpacked.png").is_file()
+    assert (folder / "unpacked.png").is_file()
 
 
 @pytest.mark.parametrize(
@@ -103,7 +113,7 @@ def test_two_renders_give_the_same_bytes(tmp_path: Path) -> None:
     assert len(made) == 1
 
 
-@pytest.mark.parametrize("by", defaults.COLOR_BY)
+@pytest.mark.parametrize("by", settings.COLOR_BY)
 def test_color_by_draws_a_color_scale(by: str, tmp_path: Path) -> None:
     how = (TOWN, "--budget", "4k", "--size", "480x270", "-q", "--color-by", by)
     assert render(*how, "-o", tmp_path / "bar.png") == 0
@@ -117,7 +127,7 @@ def test_color_by_draws_a_color_scale(by: str, tmp_path: Path) -> None:
     assert image.shape == ((270, 480) if by in ("overdraw", "depth") else (270, 480, 4))
 
 
-@pytest.mark.parametrize("style", defaults.STYLES)
+@pytest.mark.parametrize("style", settings.STYLES)
 def test_every_style_draws_something(style: str, tmp_path: Path) -> None:
     assert render(TOWN, "--budget", "4k", *SIZE, "-q", "--style", style, "-o", tmp_path / "x.png") == 0
     assert pixels(tmp_path / "x.png").any()
@@ -163,5 +173,7 @@ def test_other_backends_draw_or_say_what_is_missing(backend: str, tmp_path: Path
         assert list(tmp_path.iterdir()) == []
 
 
-def test_names_are_those_of_the_backends() -> None:
-    assert tuple(BACKENDS) == defaults.BACKENDS
+def test_every_backend_can_be_named(capsys: Said) -> None:
+    assert render("--help") == 0
+    said = capsys.readouterr().out
+    assert f"[{'|'.join(BACKENDS)}]" in said

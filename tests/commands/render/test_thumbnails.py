@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 from pathlib import Path
 
@@ -18,17 +19,19 @@ def test_a_thumbnail_is_the_whole_scene_made_small(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Said
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert render(DEMO, "--thumbnail", "--jobs", 1) == 0
+    shutil.copy(DEMO, tmp_path)
+    demo = "demo.ply"
+    assert render(demo, "--thumbnail", "--jobs", 1) == 0
     assert capsys.readouterr().err.startswith("demo-thumbnail.png  512 x 512, ")
     width, height = THUMBNAIL_SIZE
     by_hand = ("--size", f"{width}x{height}", "--supersample", THUMBNAIL_SUPERSAMPLE)
-    assert render(DEMO, *by_hand, "-o", "hand.png", "-q") == 0
+    assert render(demo, *by_hand, "-o", "hand.png", "-q") == 0
     assert np.array_equal(pixels(tmp_path / "demo-thumbnail.png"), pixels(tmp_path / "hand.png"))
-    assert render(DEMO, "--thumbnail") == 1
+    assert render(demo, "--thumbnail") == 1
     assert "demo-thumbnail.png exists" in capsys.readouterr().err
-    assert render(DEMO, "--thumbnail", "-f", "-q", "--alpha", "--color-by", "size", "--no-bar") == 0
+    assert render(demo, "--thumbnail", "-f", "-q", "--alpha", "--color-by", "size", "--no-bar") == 0
     assert pixels(tmp_path / "demo-thumbnail.png").shape == (512, 512, 4)
-    assert render(DEMO, "--thumbnail", "-o", "small.jpg", "-q") == 0
+    assert render(demo, "--thumbnail", "-o", "small.jpg", "-q") == 0
     with Image.open("small.jpg") as picture:
         assert (picture.format, picture.size) == ("JPEG", (512, 512))
 

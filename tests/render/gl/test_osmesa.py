@@ -14,7 +14,7 @@ from sparklod_cli.codecs.gpu import data_texture
 from sparklod_cli.io import read_scene
 from sparklod_cli.model.gaussian import normalized_quat
 from sparklod_cli.model.splats import FloatArray
-from sparklod_cli.render import rasterizer
+from sparklod_cli.render import rasterizer, settings
 from sparklod_cli.render.backends import BACKENDS, BackendError
 from sparklod_cli.render.gl import order, osmesa, texture
 from sparklod_cli.render.rasterizer import Image
@@ -179,7 +179,7 @@ def test_one_splat_is_the_gaussian_of_the_textbook(precision: str) -> None:
 
 @needs_opengl
 @pytest.mark.parametrize("precision", texture.PRECISIONS)
-@pytest.mark.parametrize("sorting", order.SORTINGS)
+@pytest.mark.parametrize("sorting", settings.SORTINGS)
 @pytest.mark.parametrize("throttle", [0.0, 0.01])
 def test_a_picture_of_no_splats_is_empty(precision: str, sorting: str, throttle: float) -> None:
     image = osmesa.draw(
@@ -222,7 +222,7 @@ def test_of_equally_distant_splats_the_last_is_in_front() -> None:
             for pair in zip(_columns(one(lod_opacity=[1])), _columns(one(rgb=[0, 1, 0])), strict=True)
         )
     )
-    for sorting in order.SORTINGS:
+    for sorting in settings.SORTINGS:
         image = osmesa.draw(both, CAMERAS["front"], RasterSettings(), sorting=sorting)
         assert psnr(image, rasterizer.draw(both, CAMERAS["front"], RasterSettings())) >= FLOAT
 
@@ -313,7 +313,7 @@ def test_sorting_by_16_bits_hardly_changes_a_picture() -> None:
     for name in ("plausible", "merged"):
         images = [
             osmesa.draw(SPLATS[name], CAMERAS["beside"], RasterSettings(), sorting=sorting)
-            for sorting in order.SORTINGS
+            for sorting in settings.SORTINGS
         ]
         assert psnr(*images) >= 60
 

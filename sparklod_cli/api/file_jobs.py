@@ -1,0 +1,136 @@
+"""Whole-file jobs of `build-lod` and `inspect`, from reading to writing.
+
+Those of `build-lod` are `bake` and `extract_leaves`, as the library has them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ..bake import Baked as Baked
+from ..bake import BakeSettings as BakeSettings
+from ..bake import bake as bake
+from ..extract_leaves import Extracted as Extracted
+from ..extract_leaves import extract_leaves as extract_leaves
+from ..inspection import checking
+from ..inspection.checking import CheckSettings as CheckSettings
+from ..io import check_writable, write_whole
+from ..support.errors import SparklodError, memory_told
+from ..support.progress import Progress, silent
+from ..support.threads import on_threads
+
+if TYPE_CHECKING:
+    from ..figures.tree_plot import Picture
+    from ..inspection.html import Section
+    from ..inspection.report import Report
+    from ..model.scene import Scene
+
+
+@dataclass(frozen=True)
+class DrawSettings:
+    """What is drawn of a file that is inspected.
+
+    Attributes:
+        histograms: quantities that are drawn as text.
+        plot: file of a picture.
+        depth: of the nodes in the picture; None for the leaves.
+        by: what its colours show, one of `PLOT_BY`.
+        html: file of a page, which `write_page` writes.
+        overwrite: replace files that exist.
+    """
+
+    histograms: tuple[str, ...]
+    plot: Path | None
+    depth: int | None
+    by: str
+    html: Path | None
+    overwrite: bool
+
+    def check(self) -> None:
+        """Raises an `OutputError` where a file cannot be written, before anything is read."""
+        for target in (self.plot, self.html):
+            if target is not None:
+                check_writable(target, overwrite=self.overwrite)
+
+
+@dataclass(frozen=True)
+class Inspected:
+    """What came of a file.
+
+    Attributes:
+        report: on it.
+        histograms: as text, by quantity; those that the file does not have are left out.
+        picture: in words, and the bytes of its file; None where none was written.
+        section: of the page; None where none is wanted.
+        problem: why there is no picture, where one is wanted.
+    """
+
+    report: Report
+    histograms: dict[str, str]
+    picture: tuple[str, int] | None
+    section: Section | None
+    problem: str | None
+
+
+def inspect_file(
+    path: Path, settings: CheckSettings, drawn: DrawSettings, *, threads: int = 1, progress: Progress = silent
+) -> Inspected:
+    """Reports on a file, checks it and draws it.
+
+    Args:
+        path: of a file that is read, or of a .npz of arrays; - is standard input.
+        settings: what to look for.
+        drawn: what to draw.
+        threads: to work on.
+        progress: is told how much is done.
+
+    Raises:
+        OutOfMemoryError: it does not fit into memory.
+        OutputError: `drawn.plot` cannot be written.
+    """
+    with memory_told(), on_threads(threads):
+        report, scene = checking.inspect(path, settings, threads=threads, progress=progress)
+        picture, problem = _picture(report, scene, drawn)
+        size = None
+        if picture is not None and drawn.plot is not None:
+            size = picture.description, write_whole(drawn.plot, [picture.png], overwrite=drawn.overwrite)
+        section = None
+        if drawn.html is not None:
+            from ..inspection.html import section_of
+
+            section = section_of(report, scene, picture)
+        return Inspected(report, _histograms(scene, drawn.histograms), size, section, problem)
+
+
+def _picture(report: Report, scene: Scene | None, drawn: DrawSettings) -> tuple[Picture | None, str | None]:
+    """The picture that is wanted, or why there is none."""
+    if (drawn.plot is None and drawn.html is None) or report.format is None:
+        return None, None
+    if scene is None:
+        return None, "it does not hold all of its splats, so they cannot be drawn"
+    from ..figures import tree_plot
+
+    try:
+        return tree_plot.plot(scene, by=drawn.by, depth=drawn.depth), None
+    except SparklodError as error:
+        return None, str(error)
+
+
+def _histograms(scene: Scene | None, names: Sequence[str]) -> dict[str, str]:
+    if scene is None or not names:
+        return {}
+    from ..inspection import values
+    from ..tables.histograms import as_text
+
+    held = values.names_of(scene.splats)
+    return {name: as_text(values.histogram_of(scene.splats, name)) for name in names if name in held}
+
+
+def write_page(path: Path, sections: Sequence[Section], *, overwrite: bool) -> int:
+    """Writes the page of some files, and returns its bytes."""
+    from ..inspection.html import page
+
+    return write_whole(path, [page(sections).encode()], overwrite=overwrite)

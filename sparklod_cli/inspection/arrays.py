@@ -1,0 +1,111 @@
+"""The report on a .npz file of `build-lod --encoding`: what its arrays tell of a tree, and no more."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..codecs.gpu import data_texture, ext_splats, lod_tree, packed_splats
+from ..codecs.gpu.dump import Arrays
+from ..model.scene import Scene
+from ..model.splats import Splats
+from ..support.errors import FormatError
+from . import tree, values
+from .findings import Finding
+
+if TYPE_CHECKING:
+    from .report import ReportSettings
+
+#: What cannot be told of a tree whose nodes lie in an array without their children.
+NO_CHILDREN = "its splats are the nodes of a tree, whose children it does not hold: which are leaves cannot be told"
+
+
+@dataclasses.dataclass(frozen=True)
+class Facts:
+    """What arrays tell, under the names that `report.Report` has."""
+
+    format: str
+    splats: int
+    sh_degree: int
+    notes: list[str]
+    tree: tree.TreeFacts | None = None
+    values: values.ValueFacts | None = None
+    findings: list[Finding] = dataclasses.field(default_factory=list)
+
+
+def examine(arrays: Arrays, settings: ReportSettings, *, threads: int = 1) -> tuple[Facts, Scene | None]:
+    """What the arrays of one of `gpu.table.ENCODINGS` tell, and the splats if they hold all of them.
+
+    Args:
+        arrays: by their names, which tell the encoding.
+        settings: what to look at.
+        threads: to decode on.
+
+    Raises:
+        FormatError: the arrays are of no encoding, or of another shape than theirs.
+    """
+    if "packed" in arrays:
+        # build-lod writes trees, of which Spark has LoD opacities; the file does not say so.
+        splats = packed_splats.unpack(arrays, packed_splats.Encoding(lod_opacity=True), threads=threads)
+        return _of_splats("PackedSplats", splats, settings)
+    if "ext0" in arrays:
+        return _of_splats("ExtSplats", ext_splats.unpack(arrays, threads=threads), settings)
+    if "lod_tree" in arrays:
+        return _of_tree(arrays, settings), None
+    if "texture" in arrays:
+        return _of_texture(arrays), None
+    raise FormatError(f"its arrays ({', '.join(arrays)}) are of no encoding that build-lod writes")
+
+
+def _of_splats(name: str, splats: Splats, settings: ReportSettings) -> tuple[Facts, Scene]:
+    scene = Scene(splats, format=f"NPZ of {name}")
+    opaque = dataclasses.replace(splats, opacity=np.minimum(splats.opacity, np.float32(1)))  # merged splats have more
+    return Facts(
+        format=scene.format,
+        splats=len(splats),
+        sh_degree=splats.sh_degree,
+        notes=[NO_CHILDREN],
+        values=values.examine(splats, all_quantities=settings.all_quantities) if settings.values else None,
+        findings=values.check(Scene(opaque)) if settings.check else [],
+    ), scene
+
+
+def _of_tree(arrays: Arrays, settings: ReportSettings) -> Facts:
+    nodes = lod_tree.unpack(arrays)
+    count = len(nodes.tree)
+    facts: tree.TreeFacts | None = None
+    findings: list[Finding] = []
+    if count:
+        # Opaque balls that have the sizes of the nodes: their scales and opacities are not held.
+        balls = Splats.zeros(count, 0)
+        balls.scale[:] = nodes.size[:, None] / 2
+        balls.opacity[:] = 1
+        facts, findings = tree.examine(balls, nodes.tree, check=settings.check)
+        facts = dataclasses.replace(facts, more_than_opaque=None)
+    elif settings.check:
+        findings = [Finding("values.empty", "there are no splats")]
+    note = "it holds centres, sizes and children of nodes; opacities, colours and shapes cannot be told"
+    return Facts("NPZ of LodTree", count, 0, [note], tree=facts, findings=findings)
+
+
+def _of_texture(arrays: Arrays) -> Facts:
+    room = data_texture.SPLATS_A_ROW * len(arrays["texture"]) if arrays["texture"].ndim else 0
+    data_texture.unpack(arrays, room)  # refuses what has another shape
+    used = np.flatnonzero(np.ascontiguousarray(arrays["texture"]).reshape(room, 8).any(axis=1))
+    note = "it holds centres, covariances and colours of nodes; opacities above 1, SH and children cannot be told"
+    return Facts("NPZ of a data texture", int(used[-1]) + 1 if len(used) else 0, 0, [note])
+
+
+def as_report_fields(facts: Facts, path: Path, size: int | None, settings: ReportSettings) -> dict[str, Any]:
+    """The arguments of a `report.Report`."""
+    plain = {field.name: getattr(facts, field.name) for field in dataclasses.fields(facts)}
+    return plain | {
+        "file": str(path),
+        "bytes": size,
+        "antialiased": False,
+        "bytes_per_splat": round(size / facts.splats, 3) if size and facts.splats else None,
+        "findings": facts.findings if settings.check else None,
+    }
