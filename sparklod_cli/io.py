@@ -1,4 +1,4 @@
-"""The only module that opens paths: what a file is, scenes in, files out whole or not at all."""
+"""The only module that opens paths: tells formats, reads scenes, and writes files whole or not at all."""
 
 from __future__ import annotations
 
@@ -11,9 +11,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
-import numpy as np
-
-from .codecs import npy
+from .codecs import rgba
 from .codecs.formats import FORMATS, HEAD, Format, sniff
 from .codecs.gpu import dump
 from .codecs.gpu.table import NPZ, RAW_SUFFIXES
@@ -25,7 +23,6 @@ from .support.errors import FormatError, OutputError, StdoutError, UnknownFormat
 from .support.progress import Progress, silent
 from .support.stdin import DASH, spooled
 from .support.stdout import ReaderGoneError, told
-from .support.units import count_of
 from .support.untrusted import shown
 
 #: How a .npz begins, which is a zip.
@@ -57,7 +54,7 @@ def read_scene(path: Path, *, threads: int = 1, progress: Progress = silent) -> 
 def examine_scene(
     path: Path, *, columns: Collection[str] = COLUMNS, threads: int = 1, progress: Progress = silent
 ) -> Scene:
-    """Reads a splat file to look at it: its tree may be broken, and columns that are not asked for may be 0.
+    """Reads a splat file for a report on it: its tree may be broken, and columns that are not asked for may be 0.
 
     Args:
         path: as for `read_scene`.
@@ -217,7 +214,7 @@ def _in_folder(folder: Path) -> Path:
 
 
 def _leads_away(name: str) -> bool:
-    """Whether a name could be that of something else than a file in the same folder."""
+    """Whether a name could mean something else than a file in the same folder."""
     return name in ("", ".", "..") or any(mark in name for mark in "/\\:") or not is_file_name(name)
 
 
@@ -237,7 +234,7 @@ def _open_beside(first: Path, name: str) -> BinaryIO:
 
 
 def is_file_name(text: str) -> bool:
-    """Whether a file can be called so; no system takes the byte 0, nor half of a surrogate pair."""
+    """Whether a text can be a file name: no system takes the byte 0 or half of a surrogate pair."""
     try:
         return b"\0" not in os.fsencode(text)
     except UnicodeEncodeError:
@@ -245,41 +242,20 @@ def is_file_name(text: str) -> bool:
 
 
 def read_rgba(path: Path, count: int) -> FloatArray:
-    """Colours and opacities for the `count` splats of a scene: (count, 4) float32, 0..1.
-
-    Reads .npy files of uint8 or floats, and raw files of uint8 or float32 (little-endian), told by their size.
+    """Colours and opacities for the `count` splats of a scene, see `rgba.decode`: (count, 4) float32, 0..1.
 
     Raises:
-        FormatError: it is neither, of another length, or has values that are not 0..1; names the file.
+        FormatError: it cannot be read or is not such a file; names it.
     """
     try:
         if path.exists() and not path.is_file():
             raise FormatError("cannot be read: it is a directory, a pipe or a device")
         with path.open("rb") as file:
-            layout = npy.read_layout(file) or _raw_layout(path.stat().st_size, count)
-            shape, dtype = layout.shape, layout.dtype
-            if len(shape) != 2 or shape[1] != 4 or (dtype != np.uint8 and dtype.kind != "f"):
-                raise FormatError(f"has {dtype}{list(shape)}, expected uint8 or floats [{count}, 4]")
-            if shape[0] != count:
-                raise FormatError(f"has colours for {count_of(shape[0], 'splat')}, the scene has {count:,}")
-            values = npy.read_values(file, layout)
+            return rgba.decode(file, count)
     except OSError as error:
         raise FormatError(f"{path} cannot be read: {_reason(error)}") from None
     except FormatError as error:
         raise type(error)(f"{path} {error}") from None
-    most = 255 if values.dtype == np.uint8 else 1
-    if not ((values >= 0) & (values <= most)).all():
-        raise FormatError(f"{path} has values that are not 0..1")
-    return np.ascontiguousarray(values, np.float32) / np.float32(most)
-
-
-def _raw_layout(size: int, count: int) -> npy.Layout:
-    """What a file without a header has, told by its bytes."""
-    if size == 16 * count:
-        return npy.Layout((count, 4), np.dtype("<f4"))
-    if size % 4:
-        raise FormatError(f"has {size:,} bytes, which are not four a splat")
-    return npy.Layout((size // 4, 4), np.dtype(np.uint8))
 
 
 def check_writable(path: Path, *, overwrite: bool) -> None:
@@ -327,7 +303,7 @@ def write_whole(path: Path, pieces: Iterable[bytes], *, overwrite: bool) -> int:
 
 
 def sink(path: Path, *, overwrite: bool) -> Sink:
-    """What writes an output, and is known to be able to as far as that can be told before; - is standard output.
+    """The function that writes an output; - is standard output. Fails now if the output cannot be written later.
 
     Raises:
         OutputError: see `check_writable`.
@@ -339,7 +315,7 @@ def sink(path: Path, *, overwrite: bool) -> Sink:
 
 
 def write_stdout(pieces: Iterable[bytes]) -> int:
-    """Writes to standard output and returns how many bytes; raises `StdoutError` where nobody reads them."""
+    """Writes to standard output and returns the number of bytes; raises `StdoutError` if they cannot be written."""
     size = 0
     with told():
         try:

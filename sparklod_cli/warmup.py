@@ -1,7 +1,4 @@
-"""Compiling ahead: what each job needs of kernels, and how to have them all in the cache before anybody waits for them.
-
-What `sparklod warmup` calls, and a program can call.
-"""
+"""Compiling kernels in advance: which ones each job needs, and how they get into the cache."""
 
 from __future__ import annotations
 
@@ -28,24 +25,24 @@ from .support import jit
 from .support.errors import SparklodError
 from .support.progress import Progress, silent
 
-#: Seconds from look to look at what has been compiled.
+#: Seconds between two counts of the kernels that are in the cache, for the progress bar.
 PATIENCE = 0.1
 
 
 @dataclass(frozen=True)
 class Job:
-    """Something that needs kernels.
+    """A job that needs kernels.
 
     Attributes:
-        kernels: that Python calls meanwhile, as `jit.is_cached` names them.
-        commands: that call them all, of files that `_write_inputs` makes.
+        kernels: the kernels that Python code of the job calls, as `jit.is_cached` names them.
+        commands: command lines that call all of them, on the files of `_write_inputs`.
     """
 
     kernels: tuple[str, ...]
     commands: tuple[str, ...]
 
 
-#: By what it is, in the order in which several processes share least of the work.
+#: The jobs by name, in the order in which processes that work at the same time compile the fewest kernels twice.
 JOBS = {
     "quick": Job(
         (
@@ -91,7 +88,7 @@ JOBS = {
 
 
 class _Children:
-    """Processes that are ended together; none is started afterwards."""
+    """Child processes that are stopped together; none starts afterwards."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -99,7 +96,7 @@ class _Children:
         self._stopped = False
 
     def start(self, line: list[str], **how: Any) -> subprocess.Popen[str] | None:
-        """Another one; None where all have been stopped."""
+        """Starts a process; None if all have been stopped."""
         with self._lock:
             if self._stopped:
                 return None
@@ -115,22 +112,22 @@ class _Children:
 
 
 def missing(jobs: Iterable[str]) -> set[str]:
-    """The kernels of some of `JOBS` that no cache has."""
+    """The kernels of some of `JOBS` that are not in the cache."""
     return {name for job in jobs for name in JOBS[job].kernels if not jit.is_cached(name)}
 
 
 def warm_up(*, processes: int, progress: Progress = silent) -> int:
-    """Compiles all kernels that are missing, and returns how many those were.
+    """Compiles all kernels that are missing, and returns their number.
 
     Args:
-        processes: to do it in, each of which takes a job at a time.
-        progress: is told how many there are.
+        processes: number of processes to compile in; each works on one job at a time.
+        progress: is told how many kernels are in the cache.
 
     Raises:
         SparklodError: no cache can be written, or a job failed.
     """
     if jit.CACHE_FOLDER is None:
-        raise SparklodError("no cache can be written; set NUMBA_CACHE_DIR to a folder where it can")
+        raise SparklodError("no cache can be written; set NUMBA_CACHE_DIR to a folder that can be written")
     wanted = missing(JOBS)
     if not wanted:
         return 0
@@ -150,12 +147,12 @@ def warm_up(*, processes: int, progress: Progress = silent) -> int:
             job.result()
     left = missing(JOBS)
     if left:
-        raise SparklodError(f"{len(left)} of {len(wanted)} kernels did not reach the cache in {jit.CACHE_FOLDER}")
+        raise SparklodError(f"{len(left)} of {len(wanted)} kernels are still not in the cache in {jit.CACHE_FOLDER}")
     return len(wanted)
 
 
 def _do(job: str, folder: Path, children: _Children) -> None:
-    """Runs the commands of a job in processes of their own, since numba compiles one kernel at a time.
+    """Runs the commands of a job in child processes, since numba compiles one kernel at a time in each.
 
     Raises:
         SparklodError: one failed.
@@ -177,7 +174,7 @@ def _do(job: str, folder: Path, children: _Children) -> None:
 
 
 def _write_inputs(folder: Path) -> None:
-    """A scene of a few splats, and a tree of them that no builder made, since that would take kernels."""
+    """Writes a scene of a few splats and a tree of them, without a builder, which would need kernels."""
     rng = np.random.default_rng(0)
     count = 64
     leaves = Splats(

@@ -1,4 +1,4 @@
-"""What commands say while kernels are compiled, which happens once on a machine."""
+"""Messages while kernels are compiled, which happens once on a machine."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from .console import count_of
 if TYPE_CHECKING:
     from .console import Console
 
-#: Seconds that a kernel takes, as a rule: on a fast machine and on a slow one. docs/performance.md has all of them.
+#: Seconds that compiling a kernel takes on a fast machine and on a slow one; docs/performance.md has measurements.
 SECONDS = (1, 3)
 
 
 class Reporter:
-    """Announces the first kernel that is compiled, shows a bar, and says at the end how long all of them took.
+    """Announces the first kernel that is compiled, shows a bar, and prints at the end how long all of them took.
 
     Args:
-        console: to say it on.
-        jobs: of `warmup.JOBS` that are about to be done, which tells how many kernels there will be.
+        console: prints it.
+        jobs: the jobs of `warmup.JOBS` that follow, which tell how many kernels there will be.
     """
 
     def __init__(self, console: Console, jobs: Sequence[str]) -> None:
@@ -29,7 +29,7 @@ class Reporter:
         self._troubles: set[str] = set()
 
     def listen(self) -> Callable[[], None]:
-        """Begins; returns what ends it."""
+        """Starts listening to the compiler; returns the function that stops it."""
         from ..support import jit
 
         stop = jit.listen(self._begin, self._end, self._say_once)
@@ -42,7 +42,7 @@ class Reporter:
         return close
 
     def _say_once(self, trouble: str) -> None:
-        """What is wrong with the cache is wrong for one kernel after another."""
+        """Prints each trouble once: what is wrong with the cache is wrong for every kernel."""
         if trouble not in self._troubles:
             self._troubles.add(trouble)
             self._console.say(trouble)
@@ -59,8 +59,12 @@ class Reporter:
 
         self._total = len({name, *missing(self._jobs)})
         about = " to ".join(f"{max(1, round(self._total * seconds))}" for seconds in SECONDS)
-        often = "once; sparklod warmup does it ahead" if jit.CACHE_FOLDER else "every time, as no cache can be written"
-        self._console.say(f"Compiling {count_of(self._total, 'kernel')} for this machine, some {about} s ({often}) ...")
+        often = (
+            "once; sparklod warmup does it in advance" if jit.CACHE_FOLDER else "in every run: no cache can be written"
+        )
+        self._console.say(
+            f"Compiling {count_of(self._total, 'kernel')} for this machine, about {about} s ({often}) ..."
+        )
 
     def _end(self, seconds: float) -> None:
         self._done += 1

@@ -1,4 +1,4 @@
-"""What commands say to a person, on standard error: lines and progress bars."""
+"""Messages and progress bars, on standard error."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ..support.units import count_of as count_of
 
 @dataclass
 class Verbosity:
-    """Whether -v was given, for who ends a run after its command is gone; `cli.run` hands one to click."""
+    """Whether -v was given: `cli.run` reads it where a command has failed and its context is gone."""
 
     verbose: bool = False
 
@@ -30,24 +30,24 @@ def size_of(size: int) -> str:
 
 
 def is_terminal(stream: TextIO | None) -> bool:
-    """Whether a person sits at a stream; one that is closed is None."""
+    """Whether a stream is a terminal; one that is closed is None."""
     return stream is not None and stream.isatty()
 
 
 def say(text: str) -> None:
-    """One line on standard error, if that is not closed; shortened, and without what a terminal would act on."""
+    """Prints one line on standard error unless that is closed, shortened and without control characters."""
     _echo(printable(text, MOST))
 
 
 def say_error(text: str) -> None:
-    """One line on standard error, in colour where that is a terminal that wants it (no-color.org)."""
+    """Prints an error on standard error, in colour on terminals unless NO_COLOR is set (no-color.org)."""
     plain = os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb"
     prefix = "error:" if plain else click.style("error:", fg="red", bold=True)
     _echo(f"{prefix} {printable(text, MOST)}")
 
 
 def say_usage_error(error: click.ClickException) -> None:
-    """How the command is called, where its help is, and in the last line what is wrong."""
+    """Prints the usage of the command, how to get its help, and in the last line what is wrong."""
     ctx = error.ctx if isinstance(error, click.UsageError) else None
     if ctx is not None:
         _echo(f"{ctx.get_usage()}\nTry '{ctx.command_path} --help'.\n")
@@ -67,7 +67,7 @@ def _meant(error: click.NoSuchOption) -> str:
 
 
 def for_screen(pieces: Iterable[bytes]) -> Iterator[bytes]:
-    """The lines of a table as a terminal may be shown them, a piece at a time."""
+    """The lines of a table without control characters, a piece at a time."""
     for piece in pieces:
         yield "\n".join(printable(line) for line in piece.decode("utf-8", "replace").split("\n")).encode()
 
@@ -79,7 +79,7 @@ def _echo(text: str) -> None:
 
 @contextlib.contextmanager
 def _unheard() -> Iterator[None]:
-    """Work goes on where nobody hears of it: standard error may be closed, gone or full."""
+    """Ignores failures to print: work goes on where standard error is closed, gone or full."""
     try:
         yield
     except OSError:
@@ -87,7 +87,7 @@ def _unheard() -> Iterator[None]:
 
 
 class Console:
-    """Says lines on standard error, and shows a bar for each stage of work where that is a terminal.
+    """Prints lines on standard error, and a progress bar for each stage of work if that is a terminal.
 
     Used as a context manager, which clears the bar. Its `progress` is a `sparklod_cli.support.progress.Progress`.
     """
@@ -107,11 +107,11 @@ class Console:
 
     @property
     def quiet(self) -> bool:
-        """Whether a person wants to hear of errors alone."""
+        """Whether only errors are printed."""
         return self._quiet
 
     def clear(self) -> None:
-        """Takes the bar away."""
+        """Removes the progress bar."""
         if self._bar is not None:
             self._bar.close()
             self._bar = None
@@ -126,7 +126,7 @@ class Console:
             say(text)
 
     def detail(self, text: str) -> None:
-        """Something only `--verbose` wants to know."""
+        """Prints a line with `--verbose` only."""
         if self._verbose:
             self.say(text)
 
@@ -142,10 +142,10 @@ class Console:
         self._bar.update(done - self._bar.n)
 
     def announce_compiling(self, *jobs: str) -> None:
-        """Says what is compiled, until this console ends, with a bar, and how long it took.
+        """Prints messages about kernels that are compiled, until this console ends.
 
         Args:
-            jobs: of `warmup.JOBS` that are about to be done.
+            jobs: the jobs of `warmup.JOBS` that follow.
         """
         from .compiling import Reporter
 

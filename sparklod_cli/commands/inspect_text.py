@@ -14,8 +14,8 @@ if TYPE_CHECKING:
 #: Numbers of children that get a row of their own.
 MOST_ROWS = 8
 
-#: Levels of a tree that are listed; a good one has some twenty.
-MOST_LEVELS = 64
+#: Depths that get a row of their own; a good tree has some twenty.
+MOST_DEPTHS = 64
 
 
 def lines(name: str, report: dict[str, Any]) -> Iterator[str]:
@@ -46,24 +46,26 @@ def _row(name: str, text: str) -> str:
 
 
 def _tree(tree: dict[str, Any]) -> Iterator[str]:
-    inner, levels = count_of(tree["inner"], "inner node"), count_of(tree["depth"] + 1, "level")
+    inner = count_of(tree["inner"], "inner node")
     leaves = count_of(tree["leaves"], "leaf", "leaves")
-    yield _row("tree", f"{leaves}, {inner}, growth {tree['growth']:.3f}, {levels}")
+    yield _row("tree", f"{leaves}, {inner}, growth {tree['growth']:.3f}, depth {tree['depth']}")
     if tree["more_than_opaque"] is not None:
-        yield _row("", f"{100 * tree['more_than_opaque']:.1f} % of the nodes are more than opaque")
+        yield _row("", f"{100 * tree['more_than_opaque']:.1f} % of the nodes have a LoD opacity above 1")
     chunks = count_of(tree["chunks"], "chunk")
-    yield _row("", f"{chunks} of 65,536 nodes, the coarsest cut of as many nodes needs {tree['chunks_of_coarse_cut']}")
+    yield _row(
+        "", f"{chunks} of 65,536 nodes, {tree['chunks_of_coarse_cut']} of them for the coarsest cut of that many nodes"
+    )
     counts = sorted(tree["children"].items(), key=lambda item: -item[1])
     shown = ", ".join(f"{children}: {count:,}" for children, count in counts[:MOST_ROWS])
     yield _row(
         "children", shown + (f", and {len(counts) - MOST_ROWS} other numbers" if len(counts) > MOST_ROWS else "")
     )
-    yield _row("levels", f"{'edges':>5} {'nodes':>12} {'leaves':>12} {'size':>10}")
-    for depth, level in enumerate(tree["levels"][:MOST_LEVELS]):
+    yield _row("by depth", f"{'depth':>5} {'nodes':>12} {'leaves':>12} {'size':>10}")
+    for depth, level in enumerate(tree["levels"][:MOST_DEPTHS]):
         size = "" if level["size"] is None else f"{level['size']:.4g}"
         yield _row("", f"{depth:>5} {level['nodes']:>12,} {level['leaves']:>12,} {size:>10}")
-    if tree["depth"] >= MOST_LEVELS:
-        yield _row("", f"and {tree['depth'] + 1 - MOST_LEVELS:,} more")
+    if tree["depth"] >= MOST_DEPTHS:
+        yield _row("", f"and {tree['depth'] + 1 - MOST_DEPTHS:,} more")
 
 
 def _values(values: dict[str, Any]) -> Iterator[str]:

@@ -1,4 +1,4 @@
-"""Parameters that name files, and the one check that no output of a command replaces what it reads."""
+"""Parameters that are paths, and the one check that no output of a command replaces one of its inputs."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+://")
 
 
 class _NamedPath(click.Path):
-    """A path as it was written. Whether it can be opened is for those to tell who open it, file by file."""
+    """A path as it was given. Whether it can be opened turns out when it is opened, so that one file fails alone."""
 
     _to_do = ""
 
@@ -69,17 +69,17 @@ class OutputPath(_NamedPath):
 
 
 def keep_apart(ctx: click.Context, stands_for: Mapping[str, Iterable[Path]] | None = None) -> None:
-    """Raises a `click.UsageError` where an output of a command would replace an input of it, or another output.
+    """Raises a `click.UsageError` if an output of a command is also an input or another output of it.
 
-    Then also where the name of an output promises something else than what is written.
+    Also raises one if the suffix of an output is that of another format than what is written.
 
-    Files are told by what they are, so by links and by names in other letters, too. What a pipe or a device is given
-    replaces nothing.
+    Compares the files themselves, so that links and other spellings of a name do not matter. Pipes and devices are
+    never replaced.
 
     Args:
-        ctx: of the command, whose parameters of `InputPath` and `OutputPath` are looked at.
-        stands_for: by the name of a parameter, the files that are meant by it: which an input names besides itself, and
-            which an output is filled with in place of itself.
+        ctx: of the command; its parameters of type `InputPath` and `OutputPath` are checked.
+        stands_for: by the name of a parameter, other files that it means: those which an input names besides itself,
+            and those that are written into an output folder.
     """
     stands_for = stands_for or {}
     inputs: list[Path] = []
@@ -96,7 +96,7 @@ def keep_apart(ctx: click.Context, stands_for: Mapping[str, Iterable[Path]] | No
     _keep_apart(outputs, inputs)
     for parameter, kind, path in promised:
         if path == DASH:
-            raise click.BadParameter("this does not go to standard output; name a file or folder", ctx, parameter)
+            raise click.BadParameter("it cannot go to standard output; name a file or folder", ctx, parameter)
         if kind.suffixes and path.suffix.lower() not in ("", *kind.suffixes):
             raise click.BadParameter(
                 f"{str(path)!r} does not end in {' or '.join(kind.suffixes)}, which is what is written", ctx, parameter
@@ -137,12 +137,12 @@ def _keep_apart(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:
         if taken == OUTPUT:
             raise click.UsageError(f"two outputs would be written to {path}; give each a name of its own")
         if taken is not None:
-            raise click.UsageError(f"{path} is {taken}; write elsewhere")
+            raise click.UsageError(f"{path} is {taken}; name another output")
         places[place] = OUTPUT
 
 
 def _all_read(paths: Iterable[Path]) -> Iterator[Path]:
-    """Each path, and the files that are read with it."""
+    """Each path and its companion files."""
     from ..cameras.formats.table import NAMES
     from ..io import companions
 
@@ -154,7 +154,7 @@ def _all_read(paths: Iterable[Path]) -> Iterator[Path]:
 
 
 def _identity(path: Path) -> tuple[int, int] | None:
-    """What a file is, whatever it is called; None where there is none."""
+    """Device and inode of a file; None if it does not exist."""
     try:
         found = path.stat()
     except (OSError, ValueError):
@@ -171,7 +171,7 @@ def _is_stream(path: Path) -> bool:
 
 
 def _place(path: Path) -> str:
-    """Where a file is, or would be: the same for all ways to it, whether or not it is there."""
+    """The path of a file that exists or not: the same for all links and spellings."""
     place = os.path.realpath(path)
     folder = os.path.dirname(place)  # noqa: PTH120
     return os.path.join(folder, os.path.basename(place).casefold()) if _folds_case(folder) else place  # noqa: PTH118, PTH119
@@ -179,7 +179,7 @@ def _place(path: Path) -> str:
 
 @functools.lru_cache(256)
 def _folds_case(folder: str) -> bool:
-    """Whether names in a folder are the same in large and small letters, as far as its own name tells."""
+    """Whether a folder ignores the case of names, judged by its own name."""
     path = Path(folder)
     try:
         return path.name.swapcase() != path.name and path.samefile(path.with_name(path.name.swapcase()))
@@ -194,7 +194,7 @@ def stem_of(source: Path) -> str:
 
 
 def file_of(text: str) -> Path | None:
-    """The file that an option names which takes other texts, too; None where there is none of that name."""
+    """The file that the text of an option names; None if there is no such file, as the text means something else."""
     try:
         return Path(text) if Path(text).is_file() else None
     except (OSError, ValueError):

@@ -1,4 +1,4 @@
-"""`sparklod warmup`: compiles all kernels ahead."""
+"""`sparklod warmup`: compiles all kernels in advance."""
 
 from __future__ import annotations
 
@@ -36,18 +36,18 @@ Examples:
 @verbose_option("Print which kernels are missing.")
 @click.version_option(__version__, package_name="sparklod")
 def warmup(jobs: int, as_json: bool, quiet: bool, verbose: bool) -> None:
-    """Compile all inner loops for this machine, so that no later command has to.
+    """Compile all kernels for this machine, so that no later command has to.
 
-    sparklod is Python whose inner loops are compiled for the processor that they run on, when they are first called.
-    This does all of it at once and keeps the result in the cache that later commands read: beside the package or, where
-    that is read-only, in your cache directory; NUMBA_CACHE_DIR names another. What is there already is left alone.
+    The inner loops of sparklod, its kernels, are compiled for the processor when they are first called. This command
+    compiles all of them at once and keeps them in the cache that later commands read: beside the package or, where that
+    is read-only, in your cache folder; NUMBA_CACHE_DIR names another one. Kernels that are in the cache stay there.
     """
     with Console(quiet=quiet, verbose=verbose) as console:
         from ..support import jit
         from ..warmup import JOBS, missing, warm_up
 
         for name in sorted(missing(JOBS)):
-            console.detail(f"  {name} is to be compiled")
+            console.detail(f"  {name} must be compiled")
         start = time.perf_counter()
         compiled = warm_up(processes=jobs, progress=console.progress)
         seconds = time.perf_counter() - start

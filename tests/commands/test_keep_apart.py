@@ -98,7 +98,7 @@ def test_an_output_that_is_an_input_is_refused(
     arguments = [source if argument == "X" else argument for argument in INPUTS[command][given]]
     arguments += [target if argument == "Y" else argument for argument in OUTPUTS[command][written]]
     assert run([command, *map(str, arguments), "--overwrite"]) == 2
-    assert f"{target} is an input; write elsewhere" in capsys.readouterr().err
+    assert f"{target} is an input; name another output" in capsys.readouterr().err
     assert source.read_bytes() == target.read_bytes() == before
 
 

@@ -23,13 +23,13 @@ def test_a_person_gets_a_report_on_standard_output(capsys: Said) -> None:
     for fact in (
         "9 nodes, SH 0",
         "12 fractional bits",
-        "6 leaves, 3 inner nodes, growth 1.500, 3 levels",
+        "6 leaves, 3 inner nodes, growth 1.500, depth 2",
         "3: 2, 2: 1",
     ):
         assert fact in tree
     for fact in ("60 splats, SH 2", "box", "scale", "opacity", "anisotropy"):
         assert fact in plain
-    assert "levels" not in plain
+    assert "depth" not in plain
 
 
 def test_stats_adds_quantities(capsys: Said) -> None:

@@ -127,7 +127,7 @@ def test_render_never_writes_over_its_inputs(tmp_path: Path, capsys: Said) -> No
         (PLAIN, "--camera-path", path, "-o", tmp_path / "%04d.png"),
     ):
         assert render(*said, "--overwrite") == 2
-        assert "is an input; write elsewhere" in capsys.readouterr().err
+        assert "is an input; name another output" in capsys.readouterr().err
     assert {each: each.read_bytes() for each in before} == before
 
 

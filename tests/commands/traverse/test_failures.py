@@ -97,7 +97,7 @@ def test_traverse_never_writes_over_its_inputs(tmp_path: Path, capsys: Said) -> 
         (tree, "--plot", tree),
     ):
         assert traverse(*said, "--overwrite") == 2
-        assert "is an input; write elsewhere" in capsys.readouterr().err
+        assert "is an input; name another output" in capsys.readouterr().err
     assert traverse(tree, "-o", tmp_path / "x", "--plot", tmp_path / "x") == 2
     assert "two outputs would be written to" in capsys.readouterr().err
     assert {path: path.read_bytes() for path in before} == before
