@@ -185,7 +185,7 @@ def test_foveation_is_that_of_all_or_its_own() -> None:
         (FIXTURES / "sh2.ply", FormatError, "it is not a Level-of-Detail tree; bake it first with sparklod build-lod"),
         (FIXTURES / "golden" / "sh3-v3.spz", FormatError, "it is not a Level-of-Detail tree"),
         (FIXTURES / "faults" / "tree-cycle.spz", TreeError, "its tree is broken: node"),
-        (FIXTURES / "faults" / "tree-orphan.spz", TreeError, "its tree is broken: node 9 is nobody's child"),
+        (FIXTURES / "faults" / "tree-orphan.spz", TreeError, "its tree is broken: node 9 has no parent"),
         (FIXTURES / "faults" / "spz-flipped-bit.spz", FormatError, "corrupt gzip data"),
         (FIXTURES / "faults" / "missing.spz", FormatError, "cannot be read: no such file or directory"),
         (FIXTURES / "points.ply", FormatError, ""),

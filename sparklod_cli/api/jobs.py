@@ -44,13 +44,13 @@ class UnfitError(ValueError):
 
 
 @dataclass(frozen=True)
-class View:
-    """Files, and the cameras that look at them.
+class ViewedFiles:
+    """Splat files, and the cameras that look at them.
 
     Attributes:
         instances: at least one.
-        cameras: where they come from.
-        settings: what is said over what their file says.
+        cameras: the source of the cameras.
+        settings: override those of a camera file.
         precision: one of `PRECISIONS`, of the nodes that cuts are found with.
         threads: to work on.
         progress: called with how much is done.
@@ -79,8 +79,8 @@ class View:
         """The cameras; scenes are asked for only where cameras are chosen for them."""
         return self.cameras.cameras(self.settings, lambda: scenes().balls())
 
-    def reaching(self, render: RenderSettings, path: CameraPath, scenes: Callable[[], Scenes]) -> RenderSettings:
-        """Settings with near and far moved apart for cameras that are as far away as the scenes ask for."""
+    def with_planes(self, render: RenderSettings, path: CameraPath, scenes: Callable[[], Scenes]) -> RenderSettings:
+        """Settings whose near and far planes enclose the scenes, where the cameras are chosen for them."""
         if not self.cameras.fits_scene:
             return render
         near, far = reach(render.raster.near, render.raster.far, path.cameras, scenes().balls())
@@ -105,13 +105,13 @@ class Drawn:
 
 
 def draw_files(
-    view: View,
+    files: ViewedFiles,
     budget: Budget | None,
     lod: LodSettings,
     render: RenderSettings,
     place: Callable[[CameraPath], tuple[Output, PictureSettings]],
     *,
-    fitted: bool,
+    fit_planes: bool,
     through: str | None = None,
     reference: Path | None = None,
     overwrite: bool = False,
@@ -120,13 +120,13 @@ def draw_files(
     """Draws files and writes the pictures.
 
     Args:
-        view: files and cameras.
+        files: splat files, and the cameras that look at them.
         budget: of the cuts; None draws full detail.
         lod: settings of the cuts, but for the budget.
         render: how pictures are drawn.
         place: tells where the pictures of some cameras go and how they become files; is asked before a file is read,
             if the cameras do not depend on one.
-        fitted: move near and far apart where cameras are chosen for the scenes.
+        fit_planes: move the near and the far plane apart where cameras are chosen for the scenes.
         through: one of `rounding.ROUND_TRIPS`, after which splats are drawn.
         reference: the file whose pictures are compared with these: the difference is written.
         overwrite: replace files that exist.
@@ -138,19 +138,19 @@ def draw_files(
     """
     from ..images.sequence import write_pictures
 
-    scenes = functools.cache(lambda: view.read(through=through))
-    path = view.path(scenes)
-    if fitted:
-        render = view.reaching(render, path, scenes)
+    scenes = functools.cache(lambda: files.read(through=through))
+    path = files.path(scenes)
+    if fit_planes:
+        render = files.with_planes(render, path, scenes)
     output, settings = place(path)
     ready(path, scenes())
     other = None
     source = _finder(scenes(), budget, lod)
     if reference is not None:
-        plain = dataclasses.replace(view, instances=instances_of([reference]))
+        plain = dataclasses.replace(files, instances=instances_of([reference]))
         other = _finder(plain.read(), budget, lod)
     pictures = write_pictures(
-        source, path, output, render, settings, reference=other, overwrite=overwrite, progress=view.progress
+        source, path, output, render, settings, reference=other, overwrite=overwrite, progress=files.progress
     )
     return Drawn(pictures, path, output, render)
 
@@ -200,13 +200,13 @@ class Traversed:
 
 
 def compare_files(
-    view: View,
+    files: ViewedFiles,
     budgets: Sequence[Budget],
     lod: LodSettings,
     render: RenderSettings,
     table: TableOutput,
     *,
-    fitted: bool,
+    fit_planes: bool,
     asserts: Sequence[tuple[int | None, Assertion]] = (),
     plot: Path | None = None,
     overwrite: bool = False,
@@ -216,13 +216,13 @@ def compare_files(
     """Measures how far cuts of files are from full detail, and writes the table and the charts.
 
     Args:
-        view: files and cameras.
+        files: splat files, and the cameras that look at them.
         budgets: at least one.
         lod: settings of the cuts, but for the budget.
         render: how pictures are drawn.
         table: where the rows go, at once when all are known.
-        fitted: move near and far apart where cameras are chosen for the scenes.
-        asserts: what must hold, each with the place of the budget that it is about; None for all of them.
+        fit_planes: move the near and the far plane apart where cameras are chosen for the scenes.
+        asserts: assertions, each with the index of its budget; None for all budgets.
         plot: file of the charts; None for none.
         overwrite: replace files that exist.
         ready: called with the cameras and the scenes before the first picture is drawn.
@@ -235,10 +235,10 @@ def compare_files(
     from ..tables.assertions import check
     from ..tables.comparison import rows_by_budget, summarize
 
-    scenes = view.read(trees_only=True)
-    path = view.path(lambda: scenes)
-    if fitted:
-        render = view.reaching(render, path, lambda: scenes)
+    scenes = files.read(trees_only=True)
+    path = files.path(lambda: scenes)
+    if fit_planes:
+        render = files.with_planes(render, path, lambda: scenes)
     table.check()
     if plot is not None:
         from ..figures.charts import load_matplotlib
@@ -247,9 +247,9 @@ def compare_files(
         check_writable(plot, overwrite=overwrite)
         load_matplotlib()
     ready(path, scenes)
-    with on_threads(view.threads):
+    with on_threads(files.threads):
         comparison = Comparison(scenes, lod, budgets, render)
-        rows = list(comparison.run(path, threads=view.threads, progress=view.progress))
+        rows = list(comparison.run(path, threads=files.threads, progress=files.progress))
     table.write(rows, passed=passed)
     if plot is not None:
         write_charts(plot, rows, budgets, scenes.title, overwrite=overwrite)
@@ -260,7 +260,7 @@ def compare_files(
 
 
 def traverse_files(
-    view: View,
+    files: ViewedFiles,
     budget: Budget,
     lod: LodSettings,
     streaming: StreamingSettings,
@@ -275,13 +275,13 @@ def traverse_files(
     """Simulates what a viewer draws of files along a path, and writes what is made of the frames.
 
     Args:
-        view: files and cameras.
+        files: splat files, and the cameras that look at them.
         budget: of the cuts.
         lod: settings of the cuts, but for the budget.
         streaming: how chunks get to the viewer.
         outputs: where the frames go.
         by_instance: make rows of single instances, too.
-        asserts: what must hold.
+        asserts: assertions on the table.
         ready: called with the cameras and the scenes before the first frame.
         passed: what the bytes of the table are passed through on their way to standard output.
         bar: tell how many frames are done.
@@ -297,14 +297,14 @@ def traverse_files(
     from ..tables.assertions import check
 
     outputs.check()
-    scenes = view.read(trees_only=True, plain=outputs.plot is not None)
-    path = view.path(lambda: scenes)
+    scenes = files.read(trees_only=True, plain=outputs.plot is not None)
+    path = files.path(lambda: scenes)
     settings = dataclasses.replace(lod, budget=budget.of(scenes.leaves))
     try:
         simulation = Simulation(scenes, settings, streaming, by_instance=by_instance)
     except ValueError as error:
         raise UnfitError(str(error)) from None
     ready(path, scenes)
-    progress = view.progress if bar else silent
-    frames = write_frames(simulation, path, outputs, threads=view.threads, progress=progress, passed=passed)
+    progress = files.progress if bar else silent
+    frames = write_frames(simulation, path, outputs, threads=files.threads, progress=progress, passed=passed)
     return Traversed(frames, path, summarize(frames.rows), check(asserts, frames.rows, empty=EMPTY))

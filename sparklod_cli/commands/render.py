@@ -21,7 +21,7 @@ from .paths import claim_stdout, keep_apart
 from .usage import exclude, given, options_of
 
 if TYPE_CHECKING:
-    from ..api.jobs import View
+    from ..api.jobs import ViewedFiles
     from ..cameras.path import CameraPath
     from ..images.output import Output
     from ..images.sequence import PictureSettings
@@ -49,8 +49,8 @@ HEADINGS = (
 
 
 @dataclass(frozen=True)
-class Asked:
-    """What the options of the command were given, group by group."""
+class RenderOptions:
+    """The values of the options of the command, group by group."""
 
     inputs: inputs.Inputs
     cameras: cameras.PictureCameras
@@ -61,8 +61,8 @@ class Asked:
     general: General
 
     @classmethod
-    def of(cls, ctx: click.Context) -> Asked:
-        """The groups of a command line that are in order.
+    def of(cls, ctx: click.Context) -> RenderOptions:
+        """The groups of a command line, checked.
 
         Raises:
             click.UsageError: options contradict each other, or have nothing to do.
@@ -109,7 +109,7 @@ def render(ctx: click.Context, /, **_: Any) -> None:
 
     Coordinates are those of the files; --up, --world-transform and --camera-axes bring cameras into them.
     """
-    asked = Asked.of(ctx)
+    asked = RenderOptions.of(ctx)
     if asked.comparison.compare:
         from .render_compare import compare
 
@@ -117,13 +117,14 @@ def render(ctx: click.Context, /, **_: Any) -> None:
     _draw(ctx, asked)
 
 
-def _draw(ctx: click.Context, asked: Asked) -> None:
+def _draw(ctx: click.Context, asked: RenderOptions) -> None:
     """Draws pictures."""
     start = time.perf_counter()
     look, general = asked.appearance, asked.general
     budget = None if asked.cut.full else asked.cut.one_budget()
     instances = asked.inputs.instances()
-    _output(ctx, asked, instances, asked.cameras.least())  # before much is read, what is wrong with the output already
+    # What is wrong with the output is said before much is read.
+    _output(ctx, asked, instances, asked.cameras.least_count())
     with general.console() as console:
         from ..api.jobs import draw_files
         from .render_text import report
@@ -137,20 +138,20 @@ def _draw(ctx: click.Context, asked: Asked) -> None:
             notes = [*path.notes, *scenes.notes, *_upside_down(asked, scenes)]
             unused = given(ctx, cut.CUTS)
             if unused and not scenes.trees:
-                whatever = " and ".join(unused)
-                notes.append(f"no file is a Level-of-Detail tree, so all splats are drawn, whatever {whatever}")
+                unused_flags = ", ".join(unused)
+                notes.append(f"no file is a Level-of-Detail tree, so all splats are drawn; no effect: {unused_flags}")
             for note in notes:
                 console.say(note)
             console.detail(f"  read in {time.perf_counter() - start:.2f} s")
 
-        with told(asked):
+        with usage_errors(asked):
             drawn = draw_files(
-                view(asked, instances, console),
+                viewed_files(asked, instances, console),
                 budget,
                 asked.cut.settings(budget=1),
                 look.settings(),
                 place,
-                fitted=fitted(ctx),
+                fit_planes=fit_planes(ctx),
                 through=look.through,
                 reference=asked.comparison.diff,
                 overwrite=asked.pictures.overwrite,
@@ -160,13 +161,13 @@ def _draw(ctx: click.Context, asked: Asked) -> None:
         report(console, drawn, time.perf_counter() - start, as_json=general.as_json)
 
 
-def view(asked: Asked, instances: list[Instance], console: Console) -> View:
+def viewed_files(asked: RenderOptions, instances: list[Instance], console: Console) -> ViewedFiles:
     """The files and the cameras that look at them."""
-    from ..api.jobs import View
+    from ..api.jobs import ViewedFiles
 
-    return View(
+    return ViewedFiles(
         instances,
-        asked.cameras.where(),
+        asked.cameras.camera_source(),
         asked.cameras.settings(),
         asked.cut.precision,
         asked.general.threads,
@@ -174,39 +175,39 @@ def view(asked: Asked, instances: list[Instance], console: Console) -> View:
     )
 
 
-def fitted(ctx: click.Context) -> bool:
-    """Whether near and far may be moved apart, so that nothing of a scene is left out that cameras are chosen for."""
+def fit_planes(ctx: click.Context) -> bool:
+    """Whether the near and the far plane may move apart, so that a view of the whole scene clips nothing."""
     return not given(ctx, ["near", "far"])
 
 
 @contextlib.contextmanager
-def told(asked: Asked) -> Iterator[None]:
-    """Errors about what was asked for are errors of usage."""
+def usage_errors(asked: RenderOptions) -> Iterator[None]:
+    """Turns errors that the values of options cause into usage errors."""
     from ..api.jobs import UnfitError
 
     try:
-        with asked.cameras.told():
+        with asked.cameras.usage_errors():
             yield
     except UnfitError as error:
         raise click.UsageError(str(error)) from None
 
 
-def _upside_down(asked: Asked, scenes: Scenes) -> list[str]:
-    """Notes on files whose y is up by their format, for cameras that take it to be down.
+def _upside_down(asked: RenderOptions, scenes: Scenes) -> list[str]:
+    """Notes on files whose format has y up, where cameras assume that it is down.
 
-    No other up is taken for them: SPZ files converted from trained PLY often keep its axes, and so do our own.
+    The default stays: SPZ files converted from trained PLY often keep y down, and so do those of build-lod.
     """
     if asked.cameras.up is not None or asked.cameras.camera_path is not None:
         return []
     plain = (loaded for loaded in scenes.loaded if loaded.scene.format.startswith("SPZ") and not loaded.is_tree)
     return [
-        f"{loaded.name}: y is up in SPZ by its specification, and down in scenes as training leaves them; give"
-        " --up 0,1,0 if this one stands on its head"
+        f"{loaded.name}: SPZ has y up by its specification, but cameras assume y down, as in trained scenes; give"
+        " --up 0,1,0 if the scene is upside down"
         for loaded in plain
     ]
 
 
-def _output(ctx: click.Context, asked: Asked, instances: list[Instance], cameras: int) -> Output:
+def _output(ctx: click.Context, asked: RenderOptions, instances: list[Instance], cameras: int) -> Output:
     """Where the pictures of some cameras go."""
     scene = asked.inputs.scene or instances[0].file
     assert scene is not None
@@ -214,7 +215,7 @@ def _output(ctx: click.Context, asked: Asked, instances: list[Instance], cameras
 
 
 def _place(
-    ctx: click.Context, asked: Asked, instances: list[Instance], path: CameraPath
+    ctx: click.Context, asked: RenderOptions, instances: list[Instance], path: CameraPath
 ) -> tuple[Output, PictureSettings]:
     """Where the pictures of a path go, and how they become files.
 
@@ -229,7 +230,7 @@ def _place(
     if output.form == "npy":
         exclude(ctx, look.of_pictures(), "a .npy, which holds numbers")
     settings = PictureSettings(
-        background=look.behind(ctx, output.form),
+        background=look.background_for(ctx, output.form),
         bar=not look.no_bar,
         gain=asked.comparison.gain,
         jpeg_quality=asked.pictures.jpeg_quality,
@@ -238,13 +239,13 @@ def _place(
     )
     bar = (look.color_by is not None or asked.comparison.diff is not None) and settings.bar
     pictures.check_sizes(output, path.cameras, look.supersample, bar=bar)
-    keep_apart(ctx, {**read_besides(asked, instances), "output": output.paths(path.numbers)})
+    keep_apart(ctx, {**files_read(asked, instances), "output": output.paths(path.numbers)})
     output.check(path.numbers, overwrite=asked.pictures.overwrite)
     if output.kind == "animation":
         animation.check(output.form, frame_rate(path))
     return output, settings
 
 
-def read_besides(asked: Asked, instances: list[Instance]) -> dict[str, list[Path]]:
-    """For `keep_apart`, the files that are read without being parameters themselves."""
+def files_read(asked: RenderOptions, instances: list[Instance]) -> dict[str, list[Path]]:
+    """For `keep_apart`: by the name of an option, the files that it names without being one."""
     return {"scene": asked.inputs.read(instances), "world_transform": asked.cameras.files()}

@@ -23,19 +23,19 @@ if TYPE_CHECKING:
     from ..scenes.loaded import Scenes
     from ..tables.comparison import BudgetSummary
     from ..tables.output import TableOutput
-    from .render import Asked
+    from .render import RenderOptions
 
 
-def compare(ctx: click.Context, asked: Asked) -> int:
-    """Compares, writes the table and the charts, and says what they come to; the exit status."""
+def compare(ctx: click.Context, asked: RenderOptions) -> int:
+    """Compares, writes the table and the charts, and prints the summary; returns the exit status."""
     budgets = asked.comparison.budgets(asked.cut.budget)
     asserts = asked.comparison.assertions(budgets)
     table = _table(asked)
     instances = asked.inputs.instances()
     from ..api.jobs import compare_files
-    from .render import fitted, read_besides, told, view
+    from .render import files_read, fit_planes, usage_errors, viewed_files
 
-    keep_apart(ctx, read_besides(asked, instances))
+    keep_apart(ctx, files_read(asked, instances))
     with asked.general.console() as console:
         console.announce_compiling("render")
         start = time.perf_counter()
@@ -48,14 +48,14 @@ def compare(ctx: click.Context, asked: Asked) -> int:
             console.clear()  # a bar and a table do not go together on one screen
             return for_screen(pieces) if is_terminal(sys.stdout) and table.form != "parquet" else pieces
 
-        with told(asked):
+        with usage_errors(asked):
             compared = compare_files(
-                view(asked, instances, console),
+                viewed_files(asked, instances, console),
                 budgets,
                 _limited(asked),
                 asked.appearance.settings(max_sh=asked.comparison.max_sh),
                 table,
-                fitted=fitted(ctx),
+                fit_planes=fit_planes(ctx),
                 asserts=asserts,
                 plot=asked.comparison.plot,
                 overwrite=asked.pictures.overwrite,
@@ -67,8 +67,8 @@ def compare(ctx: click.Context, asked: Asked) -> int:
         return _report(console, asked, compared, [at for at, _ in asserts])
 
 
-def _table(asked: Asked) -> TableOutput:
-    """Where the table goes: nowhere where a terminal, or JSON, gets the summary alone."""
+def _table(asked: RenderOptions) -> TableOutput:
+    """Where the table goes: nowhere if only the summary is printed, to a terminal or as JSON."""
     from ..tables.comparison import COLUMNS
     from ..tables.output import TableOutput
 
@@ -82,27 +82,27 @@ def _table(asked: Asked) -> TableOutput:
     )
 
 
-def _on_screen(asked: Asked) -> bool:
-    """Whether the summary takes the place of a table that would scroll by on a terminal, and nobody asked for."""
+def _on_screen(asked: RenderOptions) -> bool:
+    """Whether the summary is printed instead of the table, which would scroll by on a terminal."""
     return asked.pictures.output is None and not asked.general.as_json and is_terminal(sys.stdout)
 
 
-def _limited(asked: Asked) -> LodSettings:
-    """Settings whose cuts go down to the budget, not to the size of a pixel, unless a limit was given."""
+def _limited(asked: RenderOptions) -> LodSettings:
+    """Settings of cuts that only the budget limits, not the size of a pixel, unless a limit was given."""
     settings = asked.cut.settings(budget=1)
     if settings.pixel_scale_limit is None and settings.render_scale == 1:
         return dataclasses.replace(settings, pixel_scale_limit=0.0)
     return settings
 
 
-def _report(console: Console, asked: Asked, compared: Compared, about: Sequence[int | None]) -> int:
-    """Says what the comparison comes to; the exit status.
+def _report(console: Console, asked: RenderOptions, compared: Compared, about: Sequence[int | None]) -> int:
+    """Prints the results of a comparison; returns the exit status.
 
     Args:
-        console: says it.
-        asked: on the command line.
-        compared: what was found.
-        about: of each assertion, the place of the budget that it is about; None for all of them.
+        console: prints them.
+        asked: values of the options.
+        compared: the results.
+        about: for each assertion the index of its budget; None for all budgets.
     """
     summary, outcomes = compared.summary, compared.outcomes
     if asked.general.as_json:

@@ -1,4 +1,4 @@
-"""What `sparklod render` says of the pictures that it drew."""
+"""The report of `sparklod render` on its pictures."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ if TYPE_CHECKING:
 
 
 def report(console: Console, drawn: Drawn, seconds: float, *, as_json: bool) -> None:
-    """A line, or one JSON object as well, and a warning where nothing is to be seen.
+    """Prints a line on the pictures, with `as_json` an object too, and a warning if nothing is visible.
 
     Args:
-        console: says it.
-        drawn: what was drawn.
-        seconds: of the whole command.
-        as_json: print an object on standard output.
+        console: prints the line.
+        drawn: the pictures.
+        seconds: duration of the whole command.
+        as_json: print one JSON object on standard output.
     """
     written, output, settings = drawn.pictures, drawn.output, drawn.render
     if written.empty:

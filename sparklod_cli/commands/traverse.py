@@ -77,7 +77,7 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
     asserts = place.assertions()
     start = time.perf_counter()
     with general.console() as console:
-        from ..api.jobs import UnfitError, View, traverse_files
+        from ..api.jobs import UnfitError, ViewedFiles, traverse_files
 
         def ready(path: CameraPath, scenes: Scenes) -> None:
             for note in path.notes:
@@ -86,11 +86,13 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
 
         console.announce_compiling("traverse")
         screen = outputs.table.on_stdout and is_terminal(sys.stdout)
-        view = View(instances, where.where(), where.settings(), lod.precision, general.threads, console.progress)
+        files_viewed = ViewedFiles(
+            instances, where.camera_source(), where.settings(), lod.precision, general.threads, console.progress
+        )
         try:
-            with where.told():
+            with where.usage_errors():
                 traversed = traverse_files(
-                    view,
+                    files_viewed,
                     budget,
                     lod.settings(budget=1),
                     network.settings(),
@@ -118,14 +120,14 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
 
 
 def _report(console: Console, traversed: Traversed, summary: bool | None, *, as_json: bool, on_stdout: bool) -> int:
-    """Says what is asked for; the exit status.
+    """Prints the results of a traversal; returns the exit status.
 
     Args:
-        console: says it.
-        traversed: what was found.
-        summary: whether to print it; None where a person reads standard error.
+        console: prints them on standard error.
+        traversed: the results.
+        summary: print the summary; None prints it if standard error is a terminal.
         as_json: print it as JSON on standard output.
-        on_stdout: print it on standard output, in place of the table.
+        on_stdout: print it on standard output, instead of the table.
     """
     from .traverse_text import lines
 

@@ -1,7 +1,7 @@
-"""Cuts that do not pop: nodes fade into their children as the camera comes nearer.
+"""Continuous cuts, which do not pop: nodes fade into their children as the camera comes nearer.
 
-An ordinary cut refines a node if its *limit* L, the least pixel scale on the way to it from the root, is above a
-threshold T. Here a node is refined by a share that rises smoothly from 0 to 1,
+An ordinary cut refines a node or not, by whether its *limit* L, the least pixel scale on the path from the root to it,
+is above a threshold T. Here a node is refined by a share that rises smoothly from 0 to 1,
 
     t(n) = smoothstep(ln(L(n) / T) / ln(width)),      0 where L <= T, 1 where L >= width * T, always 0 for a leaf,
 
@@ -9,15 +9,15 @@ and drawn with the weight by which its parent is refined and it is not:
 
     weight(n) = t(parent of n) - t(n),                1 - t(n) for a root.
 
-L does not grow from a node to its children, so t does not either, and no weight is negative; on the way from the root
-to any leaf the weights sum to 1, for they telescope. Sizes over distances, their least and T are continuous in the
-camera's position, hence the weights are: if no pixel scale changes by more than a factor of exp(d), no weight changes
-by more than 6 * d / ln(width). (A smoothstep is at most 1.5 times as steep as its argument, L and T move by d each, and
-a weight has two shares.) Of foveations that holds for cones, unless both are one, but not for a frustum, which jumps at
-its edges; directions count as positions do.
+L does not rise from a node to its children, so t does not either, and no weight is negative; on the path from the root
+to any leaf the weights sum to 1, as the sum telescopes. Pixel scales, their minima and T are continuous in the camera's
+position, hence the weights are: if no pixel scale changes by more than a factor of exp(d), no weight changes by more
+than 6 * d / ln(width). (The slope of a smoothstep is at most 1.5, ln L and ln T change by at most d each, and a weight
+is the difference of two shares.) With foveation this holds for two different cones, but not for a frustum, whose weight
+jumps at its edges, nor for cones of the same angle; it holds for directions as it does for positions.
 
 With a budget, T is where the weights sum to it. They sum to W(T) = roots + sum of t(n) * (children of n - 1), which is
-continuous and falls with T; so there is such a T, and it moves by no more than the pixel scales do.
+continuous and falls with T; so there is such a T, and ln T changes by no more than the pixel scales' logarithms do.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from ..support.defaults import BLEND
 from .kernels.pixel_scale import pixel_scales
 from .traversal import Traversal, View, views_of
 
-#: Halvings of the interval in which the threshold is, which is no longer than the width.
+#: Bisections of the threshold's interval, whose ends differ by a factor of the width; 40 leave a share of 1e-12 of it.
 HALVINGS = 40
 
 Shares = NDArray[np.float64]
@@ -50,7 +50,7 @@ class BlendedCut:
         node: (S,) uint32 index in its tree; ascending within an instance.
         instance: (S,) uint16, ascending.
         weight: (S,) float64, above 0 and at most 1.
-        threshold: pixel scale at or below which nothing is refined; 0 where everything is.
+        threshold: pixel scale at or below which no node is refined; 0 if all are.
     """
 
     node: NDArray[np.uint32]
@@ -66,7 +66,7 @@ class ContinuousCuts:
     """Finds continuous cuts.
 
     Args:
-        traversal: whose trees and instances they are of.
+        traversal: has the trees and instances.
     """
 
     def __init__(self, traversal: Traversal) -> None:
@@ -79,10 +79,10 @@ class ContinuousCuts:
 
         Args:
             view: where the camera is.
-            budget: what the weights sum to, all instances together, unless `smallest` or the leaves come first; at
-                least as many as there are instances. More nodes are drawn, for those that fade are, too.
+            budget: sum of the weights, all instances together, unless `smallest` or the leaves are reached before; at
+                least the number of instances. More nodes are drawn, as those that fade are drawn, too.
             smallest: nodes of this pixel scale or less are not refined; see `settings.pixel_limit`.
-            width: nodes of this multiple of the threshold are refined wholly; above 1.
+            width: nodes of this many times the threshold are refined completely; above 1.
         """
         views = views_of(self._forest, self._instances, view)
         inner = [self._inner[instance.tree] for instance in self._instances]
@@ -99,11 +99,11 @@ class ContinuousCuts:
 
 
 def shares(limit: Shares, threshold: float, width: float) -> Shares:
-    """By how much nodes are refined, 0..1: t(n) above.
+    """(M,) the shares by which nodes are refined, 0..1: t(n) above.
 
     Args:
         limit: (M,) of nodes with children; at least 0.
-        threshold: at least 0; at 0, all nodes of a limit above 0 are refined.
+        threshold: at least 0; at 0, all nodes with a limit above 0 are refined.
         width: above 1.
     """
     with np.errstate(divide="ignore"):
@@ -118,12 +118,12 @@ def _smoothstep(x: Shares) -> Shares:
 
 
 def find_threshold(limit: Shares, more: NDArray[np.int64], room: int, width: float) -> float:
-    """The threshold at which `shares` of nodes add as many as there is room for; 0 where there is room for all.
+    """The threshold at which `shares` of nodes add `room` to the sum of weights; 0 if all nodes can be refined.
 
     Args:
         limit: (M,) of nodes with children.
-        more: (M,) by how many their children are more than one.
-        room: what may be added to the roots.
+        more: (M,) number of children minus 1.
+        room: the budget minus the number of roots.
         width: above 1.
     """
     order = np.argsort(-limit, kind="stable")
@@ -131,7 +131,7 @@ def find_threshold(limit: Shares, more: NDArray[np.int64], room: int, width: flo
     over = int(np.searchsorted(total, room, side="right"))
     if over == len(order) or not limit[order[over]]:
         return 0.0
-    # At the limit of the first node that is too many, nodes above it are not; `width` times lower it is one of them.
+    # At the limit of the first node that exceeds it, the shares add too little; `width` times lower, too much.
     most = float(limit[order[over]])
     undecided = (limit * width > most) & (limit < most * width)
     room -= int(more[limit >= most * width].sum())
@@ -147,10 +147,10 @@ def find_threshold(limit: Shares, more: NDArray[np.int64], room: int, width: flo
 
 
 class _Inner:
-    """The nodes of a tree that have children, from the root on, level by level.
+    """The M inner nodes of a tree, by depth.
 
     Attributes:
-        more: (M,) by how many their children are more than one.
+        more: (M,) number of children minus 1.
     """
 
     def __init__(self, nodes: NDArray[np.void]) -> None:
@@ -161,7 +161,7 @@ class _Inner:
         self._count = tree.child_count[self._node].astype(np.int64)
         self._start = tree.child_start[self._node].astype(np.int64)
         self.more = self._count - 1
-        self._place = np.full(len(tree), -1, np.int64)  # of each node among these; -1 for a leaf
+        self._place = np.full(len(tree), -1, np.int64)  # of each node among the inner nodes; -1 for a leaf
         self._place[self._node] = np.arange(len(self._node))
         above = np.zeros(len(tree), np.int64)
         above[_ranges(self._start, self._count)] = np.repeat(np.arange(len(self._node)), self._count)
@@ -171,7 +171,7 @@ class _Inner:
         self._nodes = nodes
 
     def limits(self, views: NDArray[np.void], number: int) -> Shares:
-        """(M,) the least pixel scale on the way from the root to each, as one of the views has it."""
+        """(M,) the least pixel scale on the path from the root to each node, in the view of an instance."""
         limit = np.empty(len(self._node), np.float32)
         pixel_scales(self._nodes, self._node, views, number, limit)
         for level in self._levels:
@@ -179,7 +179,7 @@ class _Inner:
         return np.minimum(limit, np.finfo(np.float32).max).astype(np.float64)
 
     def blended(self, share: Shares) -> tuple[NDArray[np.uint32], Shares]:
-        """The nodes of a weight above 0, ascending, and their weights; share: (M,) by how much each is refined."""
+        """The nodes with a weight above 0, ascending, and their weights, of (M,) shares by which nodes are refined."""
         if not len(share):
             return np.zeros(1, np.uint32), np.ones(1)
         refined = np.flatnonzero(share > 0)
@@ -194,17 +194,17 @@ class _Inner:
 
 
 def _ranges(start: NDArray[np.int64], count: NDArray[np.int64]) -> NDArray[np.int64]:
-    """count[0] numbers from start[0] on, then count[1] numbers from start[1] on, and so on."""
+    """start[0], start[0] + 1, ..., count[0] numbers in all, then those of start[1] and so on."""
     first = np.cumsum(count) - count
     return np.repeat(start - first, count) + np.arange(count.sum())
 
 
 def faded(opacity: FloatArray, weight: Shares) -> FloatArray:
-    """(N,) linear opacities of splats that are drawn with a weight: that of D times the weight, Spark's parameter.
+    """(N,) linear opacities of splats drawn with a weight: those of D times the weight.
 
-    A parent and children of half the weight let more through than either alone; two opaque ones a quarter, where each
-    lets through nothing. Ways to make up for that were tried, and pop no less; see docs/decisions. Linear opacity times
-    the weight pops as little, too, but a splat of 1000 would be opaque at a thousandth of it.
+    A parent and children of half the weight each let more through than either alone: a quarter, if both are opaque.
+    Ways to compensate for that were tried, and pop no less; see docs/decisions. Linear opacity times the weight pops as
+    little, but a splat of linear opacity 1000 would still be opaque at a weight of a thousandth.
     """
     fading: FloatArray = np.where(weight < 1, linear_opacity(lod_opacity(opacity) * weight), opacity)
     return fading.astype(np.float32)

@@ -1,4 +1,4 @@
-"""What a cut is like: how fine, where its nodes are on the screen, and what changed since the one before."""
+"""Statistics of a cut: its depths and sizes, where its nodes are on the screen, and what changed since the last cut."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from .traversal import Forest, TreeCut, TreeInstance, View
 
 @dataclass(frozen=True)
 class Measured:
-    """What some nodes of a cut are like.
+    """Statistics of a cut, or of one instance's nodes in it.
 
     Attributes:
-        selected, leaves: how many, and of them those without children.
-        frontier: those that wait in the queue when it stops.
-        in_frustum, outside, behind: by where their centres are: inside, outside and behind the frustum.
-        level_min, level_mean, level_max: depth, in edges from the root; None where nothing is selected.
-        px_p50, px_p95: percentiles of the sizes of those inside the frustum, pixels; None where there are none.
-        overdraw: how many of them cover a pixel, in the mean.
+        selected, leaves: numbers of nodes, and of those without children.
+        frontier: number of nodes left in the queue when it stops.
+        in_frustum, outside, behind: numbers of nodes by their centres: inside the frustum, outside, behind the camera.
+        level_min, level_mean, level_max: depth, edges from the root; None if no node is selected.
+        px_p50, px_p95: percentiles of the feature sizes inside the frustum, pixels; None if there are none.
+        overdraw: mean number of nodes inside the frustum that cover a pixel.
     """
 
     selected: int
@@ -51,15 +51,15 @@ def measure(
     size: tuple[int, int],
     by_instance: bool = False,
 ) -> tuple[Measured, list[Measured]]:
-    """Statistics of a cut as a whole and, if asked for, of each of its instances.
+    """Statistics of a cut as a whole and, optionally, of each instance in it.
 
     Args:
-        forest: its trees.
-        level: (nodes,) depth of the nodes of all trees, in edges from the root.
-        cut: what was found for `view`.
+        forest: the trees.
+        level: (nodes,) int32 depths, edges from the root, of all trees.
+        cut: a cut found for `view`.
         view: the camera.
-        size: of the picture, pixels.
-        by_instance: with each instance.
+        size: width and height of the picture, pixels.
+        by_instance: whether statistics of each instance are computed.
     """
     width, height = size
     counts = np.empty((len(cut.views), kernels.COUNTS), np.int64)
@@ -104,7 +104,7 @@ def _measured(row: NDArray[np.int64], sizes: NDArray[np.float32], pixels: int) -
 
 
 def _percentile(ascending: NDArray[np.float32], share: float) -> float | None:
-    """Between two numbers it is interpolated linearly; None where there is no number."""
+    """A percentile, interpolated linearly between two numbers; None if there are none."""
     if not len(ascending):
         return None
     at = share * (len(ascending) - 1)
@@ -118,13 +118,13 @@ class Changes:
 
     Args:
         forest: the trees.
-        instances: of them.
+        instances: instances of them.
     """
 
     def __init__(self, forest: Forest, instances: Sequence[TreeInstance]) -> None:
         sizes = np.diff(forest.node_base)
         bits = [int(sizes[instance.tree]) for instance in instances]
-        # Each instance begins a word of its own.
+        # Each instance begins with a new word.
         ends = np.cumsum([-(-count // 32) * 32 for count in bits])
         self._base = np.concatenate([[0], ends[:-1]]).astype(np.int64)
         self._drawn = np.zeros(int(ends[-1]) // 32, np.uint32)
@@ -132,9 +132,9 @@ class Changes:
         self._counts = np.zeros(len(bits), np.int64)
 
     def next(self, cut: TreeCut) -> list[tuple[int, int | None, int]]:
-        """For each instance how many nodes it has, how many of them the last cut had, and how many that had.
+        """For each instance: nodes in this cut, nodes in both this and the last cut, and nodes in the last cut.
 
-        The second is None for the first cut, which nothing can be compared with.
+        The second is None for the first cut.
         """
         kept = np.zeros(len(self._base), np.int64)
         old = self._last or (cut.node[:0], cut.instance[:0])

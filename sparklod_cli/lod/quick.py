@@ -140,7 +140,7 @@ def _sort_leaves(
     splats: Splats, steps: NDArray[np.float64], low: NDArray[np.float64], high: NDArray[np.float64], threads: int
 ) -> tuple[Nodes, Offsets]:
     """The splat of each leaf, by level and then along a curve, and where each level ends."""
-    grid = max(float((high - low).max()) / (2**CURVE_BITS - 2), float(steps[0]))
+    grid = max(float((high - low).max()) / (2**CURVE_BITS - 2), float(steps[0]))  # one cell to spare at either end
     low_cell = np.floor(low / grid).astype(np.int64)
     level_bits = len(steps).bit_length()
     keys, levels = level_keys(splats.center, splats.scale, steps, grid, low_cell, 3 * CURVE_BITS)

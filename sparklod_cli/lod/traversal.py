@@ -17,7 +17,7 @@ from .kernels.cut import find_cut
 
 Matrix = NDArray[np.float64]
 
-#: Nodes of a chunk, as Spark streams them; as a power of 2.
+#: Nodes of a chunk, in which Spark streams trees; as a power of 2.
 CHUNK_BITS = 16
 CHUNK_NODES = 1 << CHUNK_BITS
 
@@ -25,11 +25,11 @@ CHUNK_NODES = 1 << CHUNK_BITS
 #: other trees the buffers grow.
 VISITS = 2
 
-#: The first threshold for a cut, of the last one of the cut before it: a little lower, for looking at a few nodes in
-#: vain costs less than another round.
+#: The first threshold for a cut, as a share of the last cut's: a little lower, as visiting some nodes in vain costs
+#: less than another round. Chosen; cuts do not depend on it.
 GUESS = 0.97
 
-#: Why a cut has no more nodes, by the kernel's code.
+#: Why a cut has no more nodes, by the kernel's number.
 REASONS = {
     cut_arrays.BUDGET: "budget",
     cut_arrays.PIXEL: "pixel",
@@ -43,10 +43,10 @@ class TreeInstance:
     """A tree of a forest and where it stands.
 
     Attributes:
-        tree: which tree of its `Forest`.
+        tree: index of the tree in its `Forest`.
         object_to_world: (4, 4) rotation, uniform scale and translation.
-        lod_scale: how much its pixel scales count against those of others.
-        foveation: how they count by direction.
+        lod_scale: factor for its pixel scales.
+        foveation: weights of its pixel scales by direction.
     """
 
     tree: int = 0
@@ -57,7 +57,7 @@ class TreeInstance:
 
 @dataclass(frozen=True)
 class View:
-    """A camera, as far as the traversal cares.
+    """A camera for the traversal.
 
     Attributes:
         camera_to_world: (4, 4), axes of OpenGL: x to the right, y up, looking along -z.
@@ -70,12 +70,12 @@ class View:
 
 
 class Forest:
-    """Trees ready to be traversed.
+    """Trees in the layout that the traversal reads.
 
     Attributes:
         nodes: `pixel_scale.NODE` of all trees, one after the other.
-        node_base: (trees + 1,) int64, where the nodes of each begin.
-        chunk_base: (trees + 1,) int64, where the chunks of each begin.
+        node_base: (trees + 1,) int64 index of each tree's first node.
+        chunk_base: (trees + 1,) int64 index of each tree's first chunk.
     """
 
     def __init__(self, trees: Sequence[Nodes]) -> None:
@@ -96,7 +96,7 @@ class Forest:
 
     @property
     def chunks(self) -> int:
-        """Of all trees."""
+        """Number of chunks of all trees."""
         return int(self.chunk_base[-1])
 
 
@@ -108,14 +108,14 @@ class TreeCut:
         views: (instances,) `pixel_scale.VIEW`.
         node: (S,) uint32 index in its tree.
         instance: (S,) uint16.
-        limit: (S,) float32, the least pixel scale from the root to it; negative for one that the queue took out, since
-            it has no children or they are missing.
-        reason: why there are no more: a value of `REASONS`.
-        missing: the number of nodes that would be refined if their children were resident, and of missing roots.
-        least: the pixel scale down to which everything is refined; infinite if nothing is.
-        stop: (pixel scale, instance, index) of the node that would have exceeded the budget, None if none did.
-        wanted: (chunks,) float32, for each chunk of all trees the largest pixel scale of the nodes that want children
-            from it; 0 where none does.
+        limit: (S,) float32, the least pixel scale from the root to the node; negative if the queue took it out, because
+            it has no children or they are not resident.
+        reason: why there are no more nodes, a value of `REASONS`.
+        missing: number of nodes that would be refined if their children were resident, and of roots that are not.
+        least: the least limit of a refined node; infinite if none was refined.
+        stop: (pixel scale, instance, index) of the node that would have exceeded the budget, or None.
+        wanted: (chunks,) float32, for each chunk of all trees the largest limit of the nodes that are, or should be,
+            refined and have children in it; 0 if there is none.
     """
 
     views: NDArray[np.void]
@@ -136,18 +136,18 @@ class TreeCut:
         return [np.sort(self.node[self.instance == number]) for number in range(len(self.views))]
 
     def chunks(self) -> list[int]:
-        """The chunks, of all trees, that the cut needs to be found: resident and missing, the most wanted first."""
+        """The chunks of all trees that finding the cut reads, or would read if they were resident, by priority."""
         wanted = np.flatnonzero(self.wanted > 0)
         order: list[int] = wanted[np.argsort(-self.wanted[wanted], kind="stable")].tolist()
         return order
 
 
 class Traversal:
-    """Finds cuts; buffers are kept from one to the next, for each thread its own.
+    """Finds cuts. Each thread has buffers of its own, which are kept from one cut to the next.
 
     Args:
         forest: the trees.
-        instances: of them, at most 65,535.
+        instances: instances of them, at most 65,535.
     """
 
     def __init__(self, forest: Forest, instances: Sequence[TreeInstance]) -> None:
@@ -163,10 +163,10 @@ class Traversal:
         """The cut that a viewer draws.
 
         Args:
-            view: where the camera is.
-            budget: how many splats may be drawn, all instances together; one for each instance at least.
+            view: the camera.
+            budget: the most splats, all instances together; at least one for each instance.
             smallest: nodes of this pixel scale or less are not refined; see `settings.pixel_limit`.
-            resident: (chunks,) which chunks of all trees are resident; all unless given.
+            resident: (chunks,) bool, of all trees; all chunks are resident unless given.
         """
         views = views_of(self.forest, self.instances, view)
         present = self._all if resident is None else resident
@@ -198,13 +198,13 @@ class Traversal:
         )
 
     def forget(self) -> None:
-        """Begins the next cut on this thread without knowing of the last one. Its result is the same either way."""
+        """Begins this thread's next cut without the threshold of the last one. The cut is the same either way."""
         work: _Work | None = getattr(self._local, "work", None)
         if work is not None:
             work.guess = 0.0
 
     def _work(self, slots: int) -> _Work:
-        """Buffers of this thread, at least so long as is asked for or as could be needed."""
+        """Buffers of this thread with this many slots, or as many as can be needed if those are fewer."""
         slots = min(slots, 2 * self._most)  # a node is visited by its threshold, and once more by the queue
         work: _Work | None = getattr(self._local, "work", None)
         if work is None or len(work.slots.node) < slots:
@@ -213,7 +213,7 @@ class Traversal:
 
 
 class _Work:
-    """Buffers to find a cut with, and where the last one ended."""
+    """Working memory for finding a cut, and the threshold at which the last one ended."""
 
     def __init__(self, slots: int) -> None:
         self.slots = cut_arrays.Slots(
@@ -235,7 +235,7 @@ class _Work:
 
 
 def views_of(forest: Forest, instances: Sequence[TreeInstance], view: View) -> NDArray[np.void]:
-    """(instances,) `pixel_scale.VIEW`: the camera in the space of each instance, in the precision that Spark has."""
+    """(instances,) `pixel_scale.VIEW`: the camera in the space of each instance, in Spark's precision."""
     views = np.zeros(len(instances), pixel_scale.VIEW)
     for row, instance in zip(views, instances, strict=True):
         view_to_object = (np.linalg.inv(instance.object_to_world) @ view.camera_to_world).astype(np.float32)
@@ -255,7 +255,7 @@ def views_of(forest: Forest, instances: Sequence[TreeInstance], view: View) -> N
 
 
 def _unit(vector: NDArray[np.float32]) -> NDArray[np.float32]:
-    """A unit vector as Spark's library makes it: over the length, in float32."""
+    """A unit vector as glam, Spark's library, computes it: divided by its length, in float32."""
     x, y, z = vector
     unit: NDArray[np.float32] = vector / np.sqrt((x * x + y * y) + z * z)
     return unit

@@ -81,13 +81,13 @@ def rotation_matrices(quat_xyzw: FloatArray) -> NDArray[np.float64]:
 
 
 def moved(points: FloatArray, matrix: NDArray[np.float64]) -> FloatArray:
-    """(N, 3) float32 points, multiplied by a (4, 4) matrix that ends in 0 0 0 1."""
+    """(N, 3) float32 points under a (4, 4) affine transform."""
     result: FloatArray = (points @ matrix[:3, :3].T + matrix[:3, 3]).astype(np.float32)
     return result
 
 
 def placed(splats: Splats, matrix: NDArray[np.float64]) -> Splats:
-    """Splats under a (4, 4) rotation, uniform scale and translation; their SH are not turned."""
+    """Splats under a (4, 4) rotation, uniform scale and translation; their SH are not rotated."""
     size = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
     turn = quat_of_rotation(matrix[:3, :3] / size)
     x, y, z, w = splats.quat_xyzw.T

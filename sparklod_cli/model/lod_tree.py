@@ -1,4 +1,4 @@
-"""`LodTree`, the links between the nodes of a Level-of-Detail tree, and its invariants."""
+"""`LodTree`: the child columns of a Level-of-Detail tree, and their invariants."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 
 from ..support.errors import TreeError
 
-#: The child count is stored as a uint16.
+#: The most children of a node: child counts are uint16 in Spark's nodes and in SPZ files.
 MAX_CHILDREN = 65535
 
 
 @dataclass(frozen=True)
 class LodTree:
-    """The children of each of M nodes: `child_start .. child_start + child_count`, consecutive.
+    """The children of M nodes; those of a node are `child_start` to `child_start + child_count - 1`.
 
     Attributes:
         child_count: (M,) uint16, 0 for a leaf.
@@ -30,14 +30,11 @@ class LodTree:
 
     @property
     def is_leaf(self) -> NDArray[np.bool_]:
-        """(M,) true where a node has no children."""
+        """(M,) bool, true for nodes without children."""
         return self.child_count == 0
 
     def depths(self) -> NDArray[np.int32]:
-        """(M,) number of edges from the root to each node.
-
-        Follows the tree level by level, so it wants a tree that `validate` has passed.
-        """
+        """(M,) int32 number of edges from the root to each node, of a tree that `validate` accepts."""
         depth = np.zeros(len(self), np.int32)
         frontier = np.zeros(1, np.int64)
         level = 0
@@ -51,12 +48,12 @@ class LodTree:
         return depth
 
     def validate(self) -> None:
-        """Checks that this is one tree with its root at 0; linear time.
+        """Checks that this is one tree with root 0, in linear time.
 
-        Every node but the root is the child of exactly one node, which comes before it; a leaf starts at 0.
+        Each node but the root is the child of exactly one node, which comes before it; a leaf's `child_start` is 0.
 
         Raises:
-            TreeError: naming the first node that breaks an invariant.
+            TreeError: an invariant does not hold; it names the first such node.
         """
         if len(self.child_count) != len(self.child_start):
             raise TreeError(f"{len(self.child_count)} child counts but {len(self.child_start)} child starts")
@@ -68,14 +65,14 @@ class LodTree:
         self._fail_at(np.flatnonzero(self.is_leaf & (self.child_start != 0)), "is a leaf with a child_start")
         self._fail_at(node[start <= node], "comes after one of its children")
         self._fail_at(node[end > len(self)], "has children past the last node")
-        # Runs of children that are sorted by their start tile 1..M exactly when each begins where the last one ended.
+        # Ranges of children, sorted by their start, cover 1..M just once if each begins where the last one ended.
         by_start = np.argsort(start, kind="stable")
         expected = np.concatenate([[1], end[by_start]])
         self._fail_at(
             node[by_start[start[by_start] != expected[:-1]]], "shares children with another node or skips some"
         )
         if expected[-1] != len(self):
-            raise TreeError(f"node {expected[-1]} is nobody's child")
+            raise TreeError(f"node {expected[-1]} has no parent")
 
     @staticmethod
     def _fail_at(nodes: NDArray[np.int64], what: str) -> None:

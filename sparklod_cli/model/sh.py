@@ -1,4 +1,4 @@
-"""Spherical harmonics: constants and the table of degrees."""
+"""Spherical harmonics (SH): normalisations, and numbers of coefficients by degree."""
 
 from __future__ import annotations
 
@@ -22,12 +22,16 @@ SH_C3 = (
     -0.5900435899266435,
 )
 
-#: Coefficients a colour channel above the constant term, by degree: (degree + 1) ** 2 - 1.
+#: Coefficients per colour channel above the constant term, by degree: (degree + 1) ** 2 - 1.
 COEFFICIENTS = (0, 3, 8, 15, 24)
 
 
 def degree_of(coefficients: int) -> int:
-    """The degree that has this many coefficients a channel; `FormatError` where there is none."""
+    """The degree with this many coefficients per channel above the constant term.
+
+    Raises:
+        FormatError: there is none.
+    """
     try:
         return COEFFICIENTS.index(coefficients)
     except ValueError:
@@ -36,5 +40,5 @@ def degree_of(coefficients: int) -> int:
 
 
 def notes_on_degree(degree: int) -> tuple[str, ...]:
-    """What a reader says of a file of this degree: that it is cut, where it is."""
+    """A reader's notes on a file of this degree: that coefficients above MAX_SH_DEGREE are left out, if any are."""
     return (f"SH degree {degree} is cut to {MAX_SH_DEGREE}",) if degree > MAX_SH_DEGREE else ()

@@ -1,4 +1,4 @@
-"""`Splats`, the one data model that every codec, builder and renderer shares."""
+"""`Splats`, the data model that all codecs, builders and renderers share."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from .sh import COEFFICIENTS, degree_of
 
 FloatArray = NDArray[np.floating[Any]]
 
-#: What makes a splat invalid, in the order in which it is looked for, and how a report says it: no Gaussian has such
-#: numbers, so nothing can be computed with them. A splat of opacity 0 or scale 0 is valid; it only cannot be seen.
+#: Kinds of invalid splats, in the order in which they are checked, and their words in reports. No Gaussian has such
+#: numbers, so nothing can be computed with them. A splat of opacity 0 or scale 0 is valid, but invisible.
 INVALID = {
     "non_finite": "not finite",
     "bad_rotation": "rotation not of length 1",
@@ -24,8 +24,8 @@ INVALID = {
     "negative_opacity": "negative opacity",
 }
 
-#: How far the square of a rotation's length may be from 1: codings with a byte a component are normalized when they are
-#: read, so that only float32 rounds.
+#: Largest difference between a rotation's squared length and 1. Codings with a byte per component are normalized when
+#: they are read, so that only the rounding of float32 is left, some 1e-7. Chosen.
 UNIT_TOLERANCE = 1e-3
 
 
@@ -79,24 +79,24 @@ class Splats:
 
     @classmethod
     def zeros(cls, count: int, sh_degree: int) -> Splats:
-        """Columns of zeros, which take no memory until something else is written to them."""
+        """Columns of zeros, which take no memory until they are written to."""
         columns = cls.empty(0, sh_degree)
         return cls(**{name: np.zeros((count, *getattr(columns, name).shape[1:]), np.float32) for name in COLUMNS})
 
     @classmethod
     def concat(cls, parts: Sequence[Splats]) -> Splats:
-        """All the parts in order; they must have the same SH degree."""
+        """All parts in order; they must have the same SH degree."""
         return cls(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in COLUMNS})
 
     def take(self, index: NDArray[Any] | slice) -> Splats:
-        """The splats at an index array, a boolean mask or a slice: the one way to filter, permute and truncate."""
+        """The splats of an index array, a boolean mask or a slice: the one way to filter, permute and truncate."""
         return Splats(**{name: np.ascontiguousarray(getattr(self, name)[index]) for name in COLUMNS})
 
     def invalid(self) -> dict[str, NDArray[np.bool_]]:
-        """(N,) masks of the splats that are invalid, by the kinds of `INVALID` that occur; a splat is in one at most.
+        """(N,) masks of invalid splats, by the kinds of `INVALID` that occur; a splat is in one mask at most.
 
-        This is the one definition of a valid splat: readers give what a file holds, and whoever takes splats refuses or
-        leaves out these.
+        This is the one definition of a valid splat. Readers return what a file holds; users of splats refuse or leave
+        out invalid ones.
         """
         finite = self._is_finite()
         with np.errstate(over="ignore", invalid="ignore"):
@@ -115,7 +115,7 @@ class Splats:
         return found
 
     def is_valid(self) -> NDArray[np.bool_]:
-        """(N,) whether a splat is none of `INVALID`."""
+        """(N,) bool, false for invalid splats."""
         valid = np.ones(len(self), np.bool_)
         for mask in self.invalid().values():
             valid &= ~mask
@@ -125,8 +125,8 @@ class Splats:
         finite = np.ones(len(self), np.bool_)
         for name in COLUMNS:
             column = getattr(self, name).reshape(len(self), math.prod(getattr(self, name).shape[1:]))
-            # A sum is finite only if all its terms are, unless huge ones overflow: first the sum of all, which is fast,
-            # then those of rows, and the rows that are suspect are looked at one by one.
+            # A finite sum has finite terms only; an infinite one may be an overflow. The sum of the whole column is
+            # fast, then come the sums of rows, and only rows whose sum is not finite are checked one by one.
             with np.errstate(over="ignore", invalid="ignore"):
                 if np.isfinite(column.sum()):
                     continue
@@ -135,7 +135,7 @@ class Splats:
         return finite
 
     def with_max_sh(self, degree: int) -> Splats:
-        """These splats with the SH coefficients above `degree` left out."""
+        """These splats without the SH coefficients above `degree`."""
         keep = COEFFICIENTS[degree]
         if keep >= self.sh.shape[1]:
             return self

@@ -1,4 +1,4 @@
-"""How sparklod compiles: the one place that configures numba."""
+"""Compiling kernels: the one place that configures numba."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-# Threads of OpenMP wait for one another at the end of every parallel loop. By default they spin for milliseconds, which
-# on a busy machine takes the processor from the very thread that they wait for: four bakes at once then take twice as
-# long as one after another. These are read when numba first starts its threads; docs/performance.md has what was
-# measured. Whoever sets one of them keeps it.
+#: How long OpenMP's threads spin while they wait for one another at the end of a parallel loop. By default that is
+#: milliseconds, which on a busy machine takes the processor from the thread that is waited for: four bakes at once then
+#: take 1.5 times as long as one after another (docs/decisions/2026-11-21-kernels.md). The variables are read when numba
+#: starts its threads; those that are set already are left alone.
 WAITING = {
-    "GOMP_SPINCOUNT": "1000",  # GNU's: looks that often, some 20 microseconds, then sleeps
+    "GOMP_SPINCOUNT": "1000",  # GNU's: iterations, some 20 microseconds
     "KMP_BLOCKTIME": "0",  # LLVM's and Intel's: milliseconds
 }
 if "OMP_WAIT_POLICY" not in os.environ:
@@ -27,13 +27,15 @@ from numba.core import event  # noqa: E402
 
 from .jit_cache import KernelCache, Trouble, is_whole, pattern_of, stem_of  # noqa: E402
 
-#: Is told the name of a kernel that is being compiled, and how many seconds that took.
+#: Called with the name of a kernel when its compilation begins, and with the seconds that it took when it ends.
 Begun = Callable[[str], None]
 Done = Callable[[float], None]
 
-SMALL = 4096  # rows that one thread works through before another would have woken up
+#: Rows from which on work is spread over threads: one thread is through with fewer before another has woken up. Chosen;
+#: no difference was measured up to 65,536 (docs/decisions/2026-11-21-kernels.md).
+PARALLEL_ROWS = 4096
 
-#: All that compiled code is made of: kernels, and the modules whose constants and functions they use.
+#: Sources of compiled code: kernels, and the modules whose constants and functions they use. They name the cache.
 SOURCES = (
     "model/gaussian.py",
     "model/lod_tree.py",
@@ -51,10 +53,10 @@ SOURCES = (
 
 
 def _cache_folder() -> Path | None:
-    """Where compiled code is kept, or None where nothing can be written.
+    """The folder for compiled code, or None where none can be written.
 
-    numba looks at the file of a kernel alone to tell whether what it has is of the same source; a kernel also consists
-    of those that it calls and of constants that it uses. So the folder's name is of all the source there is.
+    numba's own cache compares the file of a kernel alone with the source that it compiled. A kernel also consists of
+    the kernels that it calls and the constants that it uses, so the folder is named by a digest of all SOURCES.
     """
     package = Path(__file__).parents[1]
     sources = [path for pattern in SOURCES for path in sorted(package.glob(pattern))]
@@ -62,7 +64,7 @@ def _cache_folder() -> Path | None:
     given = os.environ.get("NUMBA_CACHE_DIR")
     places = [Path(given)] if given else [package / "__pycache__"]
     if not given:
-        with contextlib.suppress(RuntimeError):  # nobody's home
+        with contextlib.suppress(RuntimeError):  # no home directory
             places.append(Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sparklod")
     for place in places:
         folder = place / f"kernels-{digest}"
@@ -73,7 +75,7 @@ def _cache_folder() -> Path | None:
     return None
 
 
-#: None: kernels are compiled in every process.
+#: The folder for compiled code; None if kernels have to be compiled in every process.
 CACHE_FOLDER = _cache_folder()
 
 
@@ -82,14 +84,14 @@ def kernel(
 ) -> Callable[[Callable[..., Any]], Any]:
     """Decorator for a compiled function.
 
-    No fastmath: results must not depend on the number of threads. The machine code is cached beside the source, or in
-    the user's cache directory where the package is read-only; where neither can be written it is compiled every time.
+    Without fastmath, as results must not depend on the number of threads. Machine code is cached beside the source, or
+    in the user's cache directory if the package is read-only; if neither can be written, each process compiles it.
 
     Args:
-        parallel: has loops that run on the threads of `use_threads`.
-        nogil: lets other threads of this process run meanwhile.
-        contract: a product and a sum may be rounded once instead of twice, where the processor can.
-        inline: becomes part of the kernels that call it; LLVM does not do that by itself with all that deserve it.
+        parallel: the function has loops that run on the threads of `use_threads`.
+        nogil: other threads of this process may run meanwhile.
+        inline: the function becomes part of the kernels that call it, which LLVM does not always do by itself.
+        contract: a product and a sum may be rounded once instead of twice, on processors that can.
     """
 
     def decorate(function: Callable[..., Any]) -> Any:
@@ -108,7 +110,7 @@ def kernel(
 
 
 def is_cached(name: str) -> bool:
-    """Whether this process finds compiled code of a kernel; its name is that of its module, a point, and its own."""
+    """Whether this process can load the compiled code of a kernel, which is named "module.function"."""
     if CACHE_FOLDER is None:
         return False
     with contextlib.suppress(OSError):
@@ -117,26 +119,26 @@ def is_cached(name: str) -> bool:
 
 
 def use_threads(count: int) -> None:
-    """Runs kernels on `count` threads, or as many as there are if that is fewer."""
+    """Runs kernels on `count` threads, or on all that numba has if those are fewer."""
     numba.set_num_threads(min(count, numba.config.NUMBA_NUM_THREADS))
 
 
 @contextlib.contextmanager
 def threads_for(rows: int) -> Iterator[int]:
-    """Runs kernels on one thread inside where there is little to do, and tells how many threads that leaves.
+    """Runs kernels inside on one thread if there are fewer than PARALLEL_ROWS rows; yields the number of threads.
 
-    Waking the other threads costs more than a few thousand rows, and on a busy machine, where they are not awake to be
-    waited for, a thousand times more.
+    Waking the other threads takes longer than a few thousand rows do, and on a busy machine, where they sleep, a
+    thousand times longer.
     """
     threads = numba.get_num_threads()
-    use_threads(1 if rows < SMALL else threads)
+    use_threads(1 if rows < PARALLEL_ROWS else threads)
     try:
         yield numba.get_num_threads()
     finally:
         use_threads(threads)
 
 
-#: Who is told of what keeps the cache from working.
+#: Called with what keeps the cache from working.
 _troubled: list[Trouble] = []
 
 
@@ -146,7 +148,7 @@ def _tell_trouble(text: str) -> None:
 
 
 class _OnCompile(event.Listener):
-    """Tells of kernels that Python calls, not of those that they are made of."""
+    """Reports the compilation of kernels that Python calls, not of those that they call."""
 
     def __init__(self, begun: Begun, done: Done) -> None:
         self._begun, self._done = begun, done
@@ -165,15 +167,15 @@ class _OnCompile(event.Listener):
 
 
 def listen(begun: Begun, done: Done, trouble: Trouble) -> Callable[[], None]:
-    """Listens to what happens when kernels are called for the first time.
+    """Reports what happens when kernels are called for the first time.
 
     Args:
-        begun: called with the name of each kernel that is compiled because no cache has it, see `is_cached`.
-        done: called when it is compiled, with the seconds that took.
+        begun: called with the name of each kernel that is compiled, as it is not in the cache; see `is_cached`.
+        done: called with the seconds that took.
         trouble: called with a line on what keeps the cache from working.
 
     Returns:
-        what ends that.
+        a function that ends the reports.
     """
     listener = _OnCompile(begun, done)
     event.register("numba:compile", listener)
@@ -187,16 +189,16 @@ def listen(begun: Begun, done: Done, trouble: Trouble) -> Callable[[], None]:
 
 
 def threads_in_use() -> int:
-    """How many threads kernels run on."""
+    """The number of threads that kernels run on."""
     threads: int = numba.get_num_threads()
     return threads
 
 
 def threading_layer() -> str:
-    """What runs the loops of parallel kernels: omp, tbb or workqueue; starts their threads.
+    """The layer that runs parallel loops: omp, tbb or workqueue. Starts its threads.
 
     Raises:
-        ValueError: none of them loads.
+        ValueError: none of them can be loaded.
     """
     from numba.np.ufunc.parallel import _launch_threads
 

@@ -1,4 +1,4 @@
-"""Where compiled kernels are kept: a cache that outlives damage, full disks and processes that race for it."""
+"""The cache of compiled kernels, which survives damage, full disks and races between processes."""
 
 from __future__ import annotations
 
@@ -18,30 +18,30 @@ from numba.core.serialize import dumps
 from . import atomic
 from .errors import out_of_memory
 
-#: Ends the name of every file of a compiled kernel.
+#: Suffix of the files of compiled kernels.
 SUFFIX = ".kernel"
 
-#: Bytes of the checksum that a file begins with.
+#: Bytes of the checksum at the start of a file. 16 make an accidental match impossible in practice.
 CHECKSUM = 16
 
-#: Is told in a line of whatever keeps the cache from working; see `jit.listen`.
+#: Called with a line on what keeps the cache from working; see `jit.listen`.
 Trouble = Callable[[str], None]
 
 
 class KernelCache(caching._Cache):
-    """What numba asks for the compiled code of one function, instead of its own cache.
+    """The cache of one function's compiled code, in place of numba's own.
 
-    numba's trusts what it finds: an empty file ends as an `EOFError`, a flipped bit as an error of LLVM or a crash, a
-    full disk as an `OSError`; and two processes that compile two signatures of one function at the same time can each
+    numba's cache trusts its files: an empty one ends in an `EOFError`, a flipped bit in an error of LLVM or a crash, a
+    full disk in an `OSError`; and two processes that compile two signatures of one function at the same time can each
     take the other's file for its own. Here each signature has a file of its own, named by all that its code depends on
-    but the source, which names the folder (`jit.CACHE_FOLDER`). It appears whole or not at all and begins with a
-    checksum. Whatever is wrong with a file, the kernel is compiled again; whatever is wrong with the folder, the
+    except the source, which names the folder (`jit.CACHE_FOLDER`). A file appears whole or not at all and begins with a
+    checksum. If anything is wrong with a file, the kernel is compiled again; if anything is wrong with the folder, the
     kernel is compiled and not kept.
 
     Args:
-        function: that is compiled.
-        folder: for the files.
-        trouble: is told what is wrong.
+        function: the Python function.
+        folder: folder of the files.
+        trouble: called with a line on what is wrong.
     """
 
     def __init__(self, function: Callable[..., Any], folder: Path, trouble: Trouble) -> None:
@@ -64,7 +64,7 @@ class KernelCache(caching._Cache):
             path.unlink(missing_ok=True)
 
     def load_overload(self, signature: Any, target_context: Any) -> Any:
-        """The compiled function, or None where it has to be compiled."""
+        """The compiled function, or None if it has to be compiled."""
         target_context.refresh()
         path = self._path(signature, target_context.codegen())
         try:
@@ -77,7 +77,7 @@ class KernelCache(caching._Cache):
             try:
                 return compiler.CompileResult._rebuild(target_context, *pickle.loads(content[CHECKSUM:]))
             except Exception as error:
-                # What has been kept as it was written can still be of no use, such as types of another numpy.
+                # A file that is whole may still be of no use, such as one with types of another numpy.
                 if out_of_memory(error):
                     raise
         self._trouble(f"compiled code in {self._folder} is damaged; what is damaged is compiled again")
@@ -86,7 +86,7 @@ class KernelCache(caching._Cache):
         return None
 
     def save_overload(self, signature: Any, compiled: Any) -> None:
-        """Keeps a compiled function, if that can be."""
+        """Writes a compiled function to the cache, if it can be cached."""
         if not self._enabled or compiled.lifted or compiled.library.has_dynamic_globals:
             return
         payload = dumps(compiled._reduce())
@@ -102,7 +102,7 @@ class KernelCache(caching._Cache):
 
 
 def pattern_of(stem: str) -> str:
-    """What the files of a kernel match that this process can use, on this processor, by this numba and Python."""
+    """Glob pattern of a kernel's files that this process can load: of this processor, numba and Python."""
     return f"{stem}-{_digest(*_machine(cpu_target.target_context.codegen()))}-*{SUFFIX}"
 
 
@@ -115,12 +115,12 @@ def _digest(*depends_on: Any) -> str:
 
 
 def stem_of(function: Callable[..., Any]) -> str:
-    """What the names of a function's files begin with: module of the package, a point, and its name."""
+    """What a function's files are named by, "module.function", without the package."""
     return f"{function.__module__.rpartition('.')[2]}.{function.__name__}"
 
 
 def is_whole(content: bytes) -> bool:
-    """Whether a file has what was written to it."""
+    """Whether the content of a file matches its checksum."""
     return content[:CHECKSUM] == _checksum(content[CHECKSUM:])
 
 

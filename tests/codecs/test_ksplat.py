@@ -137,7 +137,10 @@ REFUSED: dict[str, tuple[Callable[[], bytes], str]] = {
     "more room than bytes": (lambda: edited(SECTION + 1024 + 4, "I", 25), "cut short"),
     "other buckets": (lambda: edited(SECTION + 20, "H", 16), "buckets of a section do not follow KSPLAT"),
     "fewer buckets than are full": (lambda: edited(SECTION + 32, "I", 99), "buckets of a section do not follow KSPLAT"),
-    "buckets that hold too little": (lambda: edited(SECTION + 8, "I", 1), "buckets of a section are too small for its 36 splats"),
+    "buckets that hold too little": (
+        lambda: edited(SECTION + 8, "I", 1),
+        "buckets of a section are too small for its 36 splats",
+    ),
     "more sections than bytes": (lambda: edited(4, "I", 10), "10 sections"),
     "no header": (lambda: GOLDEN[0].read_bytes()[:4095], "cut short inside the header"),
     "no rows": (lambda: GOLDEN[0].read_bytes()[: 4096 + 2048], "cut short"),

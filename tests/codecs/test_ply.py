@@ -219,7 +219,10 @@ REFUSED: dict[str, tuple[Callable[[], bytes], str]] = {
     "point cloud": (lambda: (FIXTURES / "points.ply").read_bytes(), "a point cloud or a mesh, not Gaussian splats"),
     "five f_rest": (lambda: by_hand.ply(columns() | {f"f_rest_{i}": [0] * 5 for i in range(5)}), "5 f_rest properties"),
     "six f_rest": (lambda: by_hand.ply(columns() | {f"f_rest_{i}": [0] * 5 for i in range(6)}), "2 SH coefficients"),
-    "f_rest from 1": (lambda: by_hand.ply(columns() | {f"f_rest_{i}": [0] * 5 for i in range(1, 10)}), "expected f_rest_0"),
+    "f_rest from 1": (
+        lambda: by_hand.ply(columns() | {f"f_rest_{i}": [0] * 5 for i in range(1, 10)}),
+        "expected f_rest_0",
+    ),
     "cut short": (lambda: by_hand.ply(columns())[:-1], "cut short: 1 bytes are missing"),
     "ascii cut short": (lambda: TEXT[: TEXT.rindex(b"\n", 0, -1) + 1], "cut short after 4 of 5 vertices"),
     "a short row": (lambda: TEXT[:-3].rsplit(b" ", 2)[0], "bad PLY data"),

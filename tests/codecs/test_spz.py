@@ -304,7 +304,10 @@ REFUSED: dict[str, tuple[Callable[[], bytes], str]] = {
         lambda: zstd(streams=[bytes(28), *by_hand.hand_streams(4, 0)[1:]], sizes=[27, 3, 9, 9, 12]),
         "stream positions is longer than its table announces",
     ),
-    "no tree in an LoD file": (lambda: gzipped(flags=0x80, more=struct.pack("<3H3I", *[0] * 6)), "Level-of-Detail tree is broken"),
+    "no tree in an LoD file": (
+        lambda: gzipped(flags=0x80, more=struct.pack("<3H3I", *[0] * 6)),
+        "Level-of-Detail tree is broken",
+    ),
     "an LoD file without splats": (lambda: by_hand.spz_gzip(2, 0, 0, 12, 0x80, []), "Level-of-Detail tree is broken"),
 }
 

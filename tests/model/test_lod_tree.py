@@ -55,7 +55,7 @@ def test_any_single_change_is_noticed(tree: LodTree, data: st.DataObject) -> Non
     ("counts", "starts", "message"),
     [
         ([], [], "no node"),
-        ([0, 0], [0, 0], "node 1 is nobody's child"),
+        ([0, 0], [0, 0], "node 1 has no parent"),
         ([1, 1], [1, 1], "node 1 comes after one of its children"),
         ([2, 0, 0], [0, 0, 0], "node 0 comes after one of its children"),
         ([3, 0, 0], [1, 0, 0], "node 0 has children past the last node"),

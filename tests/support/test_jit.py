@@ -109,11 +109,11 @@ def test_threads_do_not_spin_unless_the_environment_says_so(given: dict[str, str
 
 def test_small_work_runs_on_one_thread_and_large_on_all() -> None:
     before = numba.get_num_threads()
-    with jit.threads_for(jit.SMALL - 1) as threads:
+    with jit.threads_for(jit.PARALLEL_ROWS - 1) as threads:
         assert threads == numba.get_num_threads() == 1
-        with jit.threads_for(10 * jit.SMALL) as inner:
+        with jit.threads_for(10 * jit.PARALLEL_ROWS) as inner:
             assert inner == 1
-    with jit.threads_for(jit.SMALL) as threads:
+    with jit.threads_for(jit.PARALLEL_ROWS) as threads:
         assert threads == before
     with pytest.raises(KeyError), jit.threads_for(1):
         raise KeyError

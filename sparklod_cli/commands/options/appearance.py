@@ -1,4 +1,4 @@
-"""How pictures look: what is drawn for each splat, in which colours, by which backend, before which background."""
+"""The look of pictures: shape and colours of splats, renderer, background."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class Background(click.ParamType):
 
 @dataclass(frozen=True)
 class Appearance:
-    """What the options of `appearance_options` were given; None where one was not.
+    """The values of the options of `appearance_options`; None for those not given.
 
     Attributes:
         background: red, green and blue, 0..1; None for none.
@@ -112,8 +112,8 @@ class Appearance:
         """Whether pictures of pixels keep alpha."""
         return self.alpha or self.background is None
 
-    def behind(self, ctx: click.Context, form: str) -> Color | None:
-        """What is behind the splats; None keeps alpha, which floats do unless a background is given.
+    def background_for(self, ctx: click.Context, form: str) -> Color | None:
+        """The background of a file of some form; None keeps alpha, as floats do unless a background is given.
 
         Raises:
             click.UsageError: a file of this form has no alpha.

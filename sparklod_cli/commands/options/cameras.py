@@ -1,4 +1,4 @@
-"""The cameras that look at a scene: where they come from, and what is said over what their file says."""
+"""The cameras that look at a scene: their source, and settings that override those of their file."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ SOURCES = ("camera_path", "orbit", "dolly", "look_at", "keyframes", "views")
 #: Sources that are paths: their cameras follow each other in time.
 PATHS = ("camera_path", "orbit", "dolly", "keyframes")
 
-#: What stands for no source at all: cameras around the scene.
+#: Name of the default source: cameras around the scene.
 AROUND = "around"
 
 #: Options that only mean something with some sources, AROUND among them.
@@ -53,13 +53,13 @@ ONLY_WITH = {
 #: Options that say which frames a path has.
 OF_PATHS = ("fps", "every")
 
-#: What numbers with commas between are made of; anything else names a file.
+#: Characters of a --world-transform given as numbers; any other text names a file.
 NUMERIC = set("0123456789+-.,eE ")
 
 
 @dataclass(frozen=True)
 class Cameras:
-    """What the options of `camera_options` were given; None where one was not.
+    """The values of the options of `camera_options`; None for those not given.
 
     Attributes:
         camera_path, orbit, dolly, look_at, keyframes: sources of cameras.
@@ -119,8 +119,8 @@ class Cameras:
         if self.up is not None and not any(self.up):
             raise click.UsageError("--up 0,0,0 is no direction; give another one")
 
-    def least(self) -> int:
-        """How many cameras there are, or are at least, as far as can be told before a file is read."""
+    def least_count(self) -> int:
+        """The number of cameras, or the least number as far as it is known before a file is read."""
         if self.each_view:
             return len(self.each_view)
         if self.dolly or self.keyframes:
@@ -128,12 +128,12 @@ class Cameras:
         return -(-(self.orbit or 1) // self.every)
 
     def files(self) -> list[Path]:
-        """Files that are read without being parameters themselves."""
+        """The file that the text of --world-transform names, if it does."""
         matrix = self.world_transform and file_of(self.world_transform)
         return [matrix] if matrix else []
 
-    def where(self) -> CameraSource:
-        """The source as the library has it."""
+    def camera_source(self) -> CameraSource:
+        """The source of the cameras, for the library."""
         from ...cameras import generators, sources
 
         elevation = ELEVATION if self.elevation is None else self.elevation
@@ -153,7 +153,7 @@ class Cameras:
         return sources.Orbit(self.orbit or (1 if self.still else ORBIT), self.center, self.distance, elevation)
 
     def settings(self) -> Settings:
-        """What is said over what a file says.
+        """Settings that override those of a camera file.
 
         Raises:
             click.UsageError: the numbers of --world-transform are no transform.
@@ -172,8 +172,8 @@ class Cameras:
         )
 
     @contextlib.contextmanager
-    def told(self) -> Iterator[None]:
-        """Raises a `click.UsageError` that names the option where it asks for too many cameras."""
+    def usage_errors(self) -> Iterator[None]:
+        """Turns the error that an option asks for too many cameras into a usage error that names the option."""
         try:
             yield
         except TooManyCamerasError as error:
@@ -185,7 +185,7 @@ class Cameras:
 
 @dataclass(frozen=True)
 class PictureCameras(Cameras):
-    """Those of `camera_options` with `still`: `--view`, and one camera that sees the whole scene without a source."""
+    """The values of `camera_options` with `still`: without a source there is one camera, and there is `--view`."""
 
     views: tuple[Any, ...] = ()
 
@@ -197,7 +197,7 @@ class PictureCameras(Cameras):
 
 
 def _world(value: str) -> Matrix:
-    """(4, 4) of the text of --world-transform, or of the file that it names."""
+    """The (4, 4) matrix of --world-transform, which is a text of numbers or names a file."""
     from ...cameras.sources import read_world_transform
     from ...cameras.world_transform import similarity
 

@@ -1,4 +1,4 @@
-"""How far pictures are from others: cuts from full detail (`--compare`), and one file from another (`--diff`)."""
+"""Comparison of pictures: of cuts with full detail (`--compare`), and of one file with another (`--diff`)."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 HEADING = "Comparison"
 
-#: What is compared unless told otherwise.
+#: The budgets to compare, unless others are given.
 DEFAULT_BUDGETS = "2%,5%,10%,25%,50%"
 
 #: Options that only --compare knows.
@@ -37,17 +37,17 @@ NOT_COMPARED = (
     *("through", "diff", "gain", "sheet", "jobs", "thumbnail", "jpeg_quality"),
 )
 
-#: Between the budget that an assertion is about and the rest of it.
+#: Separates the budget of an assertion from the rest of it.
 ABOUT = ":"
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """What the options of `comparison_options` were given; None where one was not.
+    """The values of the options of `comparison_options`; None for those not given.
 
     Attributes:
         compare: measure cuts, in place of drawing pictures.
-        asserts: texts of what must hold.
+        asserts: texts of the assertions.
         plot: file of the charts.
         max_sh: degrees of spherical harmonics above this are left out.
         diff: the other file.
@@ -77,13 +77,13 @@ class Comparison:
             raise click.UsageError("--diff compares pictures without alpha; name a --background such as black")
 
     def budgets(self, budgets: Sequence[Budget] | None) -> Sequence[Budget]:
-        """What is compared: the budgets that were given, or `DEFAULT_BUDGETS`."""
+        """The budgets to compare: those given, or `DEFAULT_BUDGETS`."""
         from ...lod.budget import parse_budgets
 
         return parse_budgets(DEFAULT_BUDGETS) if budgets is None else budgets
 
     def assertions(self, budgets: Sequence[Budget]) -> list[tuple[int | None, Assertion]]:
-        """What must hold, each with the place of the budget that it is about; None for all of them.
+        """The assertions, each with the index of its budget; None for all budgets.
 
         Raises:
             click.UsageError: an assertion cannot be understood.

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 HEADING = "Cut"
 
-#: The options of `cut_options`, which say nothing where full detail is drawn.
+#: The options of `cut_options` that have no effect where full detail is drawn.
 CUTS = (
     "budget",
     "preset",
@@ -38,7 +38,7 @@ CUTS = (
     "blend",
 )
 
-#: Options of the cones, in place of which --outside-foveate is.
+#: Options of the cones, which --outside-foveate replaces.
 CONES = ("cone_fov0", "cone_fov", "cone_foveate")
 
 #: Options of numbers that the traversal multiplies in float32, and the most that each may be.
@@ -54,7 +54,7 @@ def _budgets(text: str) -> tuple[Budget, ...]:
 
 @dataclass(frozen=True)
 class Cut:
-    """What the options of `cut_options` were given; None where one was not.
+    """The values of the options of `cut_options`; None for those not given.
 
     Attributes:
         budget: counts of splats, or shares of the leaves; one, but for comparisons.
@@ -114,7 +114,7 @@ class Cut:
         return scaled
 
     def settings(self, budget: int) -> LodSettings:
-        """How a viewer of a budget finds its cuts."""
+        """Settings of the cuts, with a budget in splats."""
         from ...lod.settings import LodSettings
 
         return LodSettings(
@@ -142,7 +142,7 @@ class Cut:
 
 @dataclass(frozen=True)
 class PictureCut(Cut):
-    """What the options of `cut_options` with `pictures` were given.
+    """The values of the options of `cut_options` with `pictures`.
 
     Attributes:
         full: draw full detail.

@@ -21,10 +21,10 @@ HEADING = "Inputs"
 
 @dataclass(frozen=True)
 class Inputs:
-    """What the options of `input_options` were given.
+    """The values of the options of `input_options`.
 
     Attributes:
-        files: each is an instance, where it has its splats.
+        files: splat files, each an instance.
         scene: an instances file; None for none.
     """
 
@@ -32,7 +32,7 @@ class Inputs:
     scene: Path | None
 
     def instances(self) -> list[Instance]:
-        """What stands where: each FILE once, as it is, or all that --scene says.
+        """The instances: each FILE once, untransformed, or those of the instances file.
 
         Raises:
             click.UsageError: there is neither, or there are both.
@@ -50,7 +50,7 @@ class Inputs:
         return instances_of(self.files)
 
     def read(self, instances: Sequence[Instance]) -> list[Path]:
-        """The splat files, which are read without being parameters themselves where --scene names them."""
+        """The splat files of instances, for `keep_apart`: an instances file names them in place of the command line."""
         return [instance.file for instance in instances if instance.file is not None]
 
 

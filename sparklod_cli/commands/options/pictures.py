@@ -1,4 +1,4 @@
-"""Where the pictures of `sparklod render` go, and as what."""
+"""Outputs of `sparklod render`: files of pictures, and their formats."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ NO_THUMBNAIL = (
 
 @dataclass(frozen=True)
 class Pictures:
-    """What the options of `picture_options` were given; None where one was not.
+    """The values of the options of `picture_options`; None for those not given.
 
     Attributes:
         output: a file, a name with a place for a number, or -.

@@ -26,7 +26,7 @@ OF_BANDWIDTH = ("latency", "fetchers")
 
 @dataclass(frozen=True)
 class Streaming:
-    """What the options of `streaming_options` were given; None where one was not.
+    """The values of the options of `streaming_options`; None for those not given.
 
     Attributes:
         chunk_cache: chunks that fit into memory.

@@ -1,4 +1,4 @@
-"""Where the table of `sparklod traverse` goes, what is in it, and what else is made of the frames."""
+"""Outputs of `sparklod traverse`: the table, the summary, charts, and the nodes of each cut."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ OF_TABLES = ("form", "per_instance", "no_timing")
 
 @dataclass(frozen=True)
 class Table:
-    """What the options of `table_options` were given; None where one was not.
+    """The values of the options of `table_options`; None for those not given.
 
     Attributes:
         output: file of the table, or -.
@@ -39,7 +39,7 @@ class Table:
         per_instance: rows for single instances, too.
         no_timing: leave out the column of the time that traversals took.
         summary: print what the frames come to.
-        asserts: texts of what must hold.
+        asserts: texts of the assertions.
         plot: file of the charts.
         indices_out: folder of the nodes of each cut.
         padded: fill their files up to rows of Spark's index texture.
@@ -64,12 +64,12 @@ class Table:
             require(ctx, ["padded"], "--indices-out")
 
     def summary_on_stdout(self, ctx: click.Context, *, as_json: bool) -> bool:
-        """Whether the summary takes the place of a table that would scroll by on a terminal, and nobody asked for."""
+        """Whether the summary is printed instead of the table, which would scroll by on a terminal."""
         asked = self.output is not None or as_json or self.summary is False or given(ctx, OF_TABLES)
         return not asked and is_terminal(sys.stdout)
 
     def outputs(self, ctx: click.Context, *, as_json: bool) -> FrameOutputs:
-        """Where the table and all else that is made of the frames goes.
+        """Where the table and the other outputs go.
 
         Raises:
             click.UsageError: the suffix of --output promises something else.
@@ -88,7 +88,7 @@ class Table:
         return FrameOutputs(table, self.indices_out, self.padded, self.plot, self.overwrite)
 
     def assertions(self) -> list[Assertion]:
-        """What must hold.
+        """The assertions.
 
         Raises:
             click.UsageError: an assertion cannot be understood.

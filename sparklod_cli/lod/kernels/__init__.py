@@ -1,1 +1,1 @@
-"""Compiled inner loops: plain arrays in and out."""
+"""Compiled inner loops of the builders, the traversal and inspection: arrays, or NamedTuples of them, in and out."""

@@ -1,4 +1,4 @@
-"""The shaders, in GLSL 4.2: what kernels/project.py and kernels/raster.py do, step by step, for OpenGL to draw.
+"""The shaders, in GLSL 4.2: kernels/project.py, kernels/falloff.py and kernels/raster.py, step by step, for OpenGL.
 
 `precise` keeps compilers from reordering what they could: what is left of the covariances of thin splats are small
 differences of large numbers, which come out visibly different when rounded in another order.
@@ -8,13 +8,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..kernels.project import MAX_D
+from ..kernels.falloff import LEAST_EXPONENT, LEAST_REST, MINUS_HALF_LOG2E
+from ..kernels.project import LEAST_COVARIANCE, MAX_D, MAX_VARIANCE
 from ..settings import BLUR, CLIP, MAX_STD_DEV, MIN_ALPHA, STD_DEV_PER_D
 
 
 def _literal(value: float) -> str:
     """A float32 in all its digits."""
-    return f"{np.float32(value):.9g}" + ("" if "." in f"{np.float32(value):.9g}" else ".0")
+    text = f"{np.float32(value):.9g}"
+    return text if "." in text or "e" in text else f"{text}.0"
 
 
 _CONSTANTS = "\n".join(
@@ -23,9 +25,14 @@ _CONSTANTS = "\n".join(
         "BLUR": BLUR,
         "CLIP": CLIP,
         "E": np.e,
-        "MAX_STD_DEV": MAX_STD_DEV,
-        "MIN_ALPHA": MIN_ALPHA,
+        "LEAST_COVARIANCE": float(LEAST_COVARIANCE),
+        "LEAST_EXPONENT": float(LEAST_EXPONENT),
+        "LEAST_REST": float(LEAST_REST),
         "MAX_D": float(MAX_D),
+        "MAX_STD_DEV": MAX_STD_DEV,
+        "MAX_VARIANCE": float(MAX_VARIANCE),
+        "MINUS_HALF_LOG2E": float(MINUS_HALF_LOG2E),
+        "MIN_ALPHA": MIN_ALPHA,
         "STD_DEV_PER_D": STD_DEV_PER_D,
     }.items()
 )
@@ -124,7 +131,7 @@ void main() {
     // Sums of what is not negative: c.x * c.z - c.y * c.y would leave nothing of the determinants of needles.
     precise float before = c.w, det = before + BLUR * (c.x + c.z) + BLUR * BLUR;
     precise float xx = c.x + BLUR, yy = c.z + BLUR, xy = c.y;
-    if (!(det > 0.0 && xx < 1e18 && yy < 1e18)) return;
+    if (!(det > 0.0 && xx < MAX_VARIANCE && yy < MAX_VARIANCE)) return;
     float deviations = MAX_STD_DEV + STD_DEV_PER_D * max(d - 1.0, 0.0);
     d *= sqrt(before / det);
     if (!(d >= MIN_ALPHA)) return;
@@ -133,7 +140,7 @@ void main() {
     precise float spread = sqrt(max(mean * mean - det, 0.0));
     if (deviations * sqrt(mean + spread) > max_radius) {  // squeezed, each axis by itself
         precise vec2 axis = xx >= yy ? vec2(1.0, 0.0) : vec2(0.0, 1.0);
-        if (abs(xy) > 1e-3) axis = vec2(xy, mean + spread - xx);
+        if (abs(xy) > LEAST_COVARIANCE) axis = vec2(xy, mean + spread - xx);
         precise float norm = 1.0 / sqrt(axis.x * axis.x + axis.y * axis.y);
         precise float ax = axis.x * norm, ay = axis.y * norm;
         precise float most = max_radius / deviations;
@@ -174,7 +181,6 @@ flat in vec4 rgb_power;
 
 out vec4 color;
 
-const float HALF_LOG2E = -0.721347520;
 const int ROOT_HALF = 0x3F3504F3;  // the bits of sqrt(1 / 2)
 
 // The rasterizer's: to 4e-7 of itself near 1 as well, which logarithms of drivers need not be.
@@ -195,13 +201,13 @@ void main() {
     float d = end_opacity.y, alpha;
     if (z2 > end_opacity.x) discard;
     if (d <= 1.0) {
-        alpha = d * exp2(HALF_LOG2E * z2);
+        alpha = d * exp2(MINUS_HALF_LOG2E * z2);
     } else if (shifted) {
         float beyond = max(sqrt(max(z2, 0.0)) - (d - 1.0), 0.0);
-        alpha = exp2(HALF_LOG2E * d * beyond * beyond);
+        alpha = exp2(MINUS_HALF_LOG2E * d * beyond * beyond);
     } else {
-        float rest = max(1.0 - exp2(HALF_LOG2E * z2), 1e-30);
-        alpha = 1.0 - exp2(max(rgb_power.w * log2_exactly(rest), -120.0));
+        float rest = max(1.0 - exp2(MINUS_HALF_LOG2E * z2), LEAST_REST);
+        alpha = 1.0 - exp2(max(rgb_power.w * log2_exactly(rest), LEAST_EXPONENT));
     }
     if (alpha < MIN_ALPHA) discard;
     color = vec4(min(alpha * rgb_power.rgb, 1.0), alpha);

@@ -109,7 +109,10 @@ def test_a_tree_of_no_nodes_is_an_empty_array() -> None:
         ({}, "no array lod_tree"),
         ({"lod_tree": np.zeros((3, 3), np.uint32)}, "lod_tree is"),
         ({"lod_tree": np.zeros((3, 4), np.int64)}, "lod_tree is int64"),
-        ({"lod_tree": np.uint32([[0, 0, 1, 1], [0, 0, 65536, 2]])}, "node 1 has 65,536 children, a uint16 holds at most 65,535"),
+        (
+            {"lod_tree": np.uint32([[0, 0, 1, 1], [0, 0, 65536, 2]])},
+            "node 1 has 65,536 children, a uint16 holds at most 65,535",
+        ),
     ],
 )
 def test_arrays_that_are_not_a_tree_are_refused(change: dict[str, np.ndarray], text: str) -> None:
