@@ -42,13 +42,13 @@ def small_forest(seed: int) -> tuple[Scenes, list[twin.Instance]]:
         made.append(LoadedScene(Path(f"{number}.spz"), 1000, Scene(splats, tree.tree), splats, number))
     cones = twin.cones(of_all.fov0, of_all.fov, of_all.foveate, of_all.behind)
     weighting = [cones, twin.frustum(own.outside, own.behind), cones]
-    instances = [
+    twins = [
         twin.Instance(as_nodes[tree], spot, weight, how)
         for tree, spot, weight, how in zip(of, spots, weights, weighting, strict=True)
     ]
     scenes = Scenes(instances, made, [made[tree] for tree in of])
     scenes.__dict__["forest"] = Forest(trees)  # of other sizes than those of the splats
-    return scenes, instances
+    return scenes, twins
 
 
 @pytest.mark.parametrize("seed", range(6))
