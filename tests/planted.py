@@ -1,4 +1,4 @@
-"""A target for tests of the fuzzers themselves: what is planted is what PLANTED says."""
+"""A fuzz target for tests of the fuzzers: it plants the fault that the environment variable PLANTED names."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def writes_much() -> None:
     Path("page.html").write_bytes(bytes(30 << 20))
 
 
-#: Faults, with the kind of finding that each must be.
+#: The faults, with the kind of finding that each must give.
 FAULTS: dict[Callable[[], None], str] = {
     raises: "exception",
     hangs: "hang",

@@ -1,4 +1,4 @@
-"""`Axes`: what the numbers of a pose mean. Imports nothing heavy, because the command line names them in its help."""
+"""`Axes`: conventions of pose matrices. Imports nothing heavy: `--help` names them."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from enum import Enum
 
 
 class Axes(Enum):
-    """Which way a camera's own axes point, and which way its matrix leads.
+    """Directions of a camera's own axes, and direction of its matrix.
 
-    In OpenGL's axes, which are those of Blender, three.js and nerfstudio, y is up and the camera looks along -z. In
-    OpenCV's, which are those of COLMAP, y is down and it looks along +z. x is to the right in both. A matrix leads from
-    the camera to the world (its last column is where the camera is), or from the world to the camera.
+    In OpenGL's axes, also those of Blender, three.js and nerfstudio, y points up and the camera looks along -z. In
+    OpenCV's, also those of COLMAP, y points down and the camera looks along +z. In both x points right. A matrix
+    transforms from camera to world (its last column is the position of the camera) or from world to camera.
     """
 
     OPENGL_C2W = "opengl-c2w"
@@ -20,10 +20,10 @@ class Axes(Enum):
 
     @property
     def opencv(self) -> bool:
-        """Whether y is down."""
+        """Whether y points down and the camera looks along +z."""
         return self in (Axes.OPENCV_C2W, Axes.OPENCV_W2C)
 
     @property
     def from_world(self) -> bool:
-        """Whether the matrix leads from the world to the camera."""
+        """Whether the matrix transforms from world to camera."""
         return self in (Axes.OPENGL_W2C, Axes.OPENCV_W2C)

@@ -1,4 +1,4 @@
-"""What parsers of camera paths hand on: poses in the axes of their format, and what the file says of the lens."""
+"""Frames, which parsers of camera paths return: poses in the axes of their format, and lenses as the file has them."""
 
 from __future__ import annotations
 
@@ -14,36 +14,37 @@ from ..support.errors import TooManyCamerasError
 from .axes import Axes
 from .camera import Camera, Matrix
 
+#: Image size in pixels, vertical field of view in radians and frame rate where neither file nor user gives one.
 DEFAULT_SIZE = (1280, 720)
 DEFAULT_FOV_Y = math.radians(60)
 DEFAULT_FPS = 30.0
 
-#: So many cameras are taken of a file that has them all; an hour at 60 frames a second has fewer.
+#: Most cameras of a file that lists them all; an hour at 60 frames a second has fewer.
 MAX_FRAMES = 1 << 20
 
-#: So many are made where a few numbers ask for them; half an hour at 30 frames a second has fewer.
+#: Most cameras of a path that is computed from a few numbers; half an hour at 30 frames a second has fewer.
 MAX_MADE = 1 << 16
 
-#: Pixels that a focal length has, and how far away the principal point is: what float32 holds, and products of it.
+#: Largest focal length and coordinate of a principal point, pixels: float32 holds them and their products.
 MOST_PIXELS = 1e15
 
-#: Numbers of frames are below this, so that they are whole numbers as floats, too.
+#: Numbers of frames are below this, so that float64 holds them exactly.
 NUMBERED = 1 << 53
 
-#: y is down in scenes as training leaves them.
+#: Up axis of cameras without one: y points down in scenes as training leaves them.
 DEFAULT_UP = (0.0, -1.0, 0.0)
 
 
 @dataclass(frozen=True)
 class Lens:
-    """What is known of a camera's image; None is what a file does not say.
+    """What a file says about a camera's image; None where it says nothing.
 
     Attributes:
         size: width and height, pixels.
-        focal: fx, fy in pixels; means something with a size only.
+        focal: fx, fy in pixels; only used together with a size.
         principal: cx, cy in pixels.
-        fov: field of view in radians, where there is no focal length.
-        fov_along: what `fov` is measured along: "x", "y", or "longer", which is the longer side of the image.
+        fov: field of view in radians, used without a focal length.
+        fov_along: side of the image that `fov` spans: "x", "y" or "longer".
     """
 
     size: tuple[int, int] | None = None
@@ -53,7 +54,7 @@ class Lens:
     fov_along: str = "y"
 
 
-#: Of a file that says nothing.
+#: The lens of a file that says nothing about it.
 NO_LENS = Lens()
 
 
@@ -64,9 +65,9 @@ class Frame:
     Attributes:
         matrix: (4, 4), in the axes of its format.
         lens: of the camera.
-        time: seconds, from any moment on; None where the file has none.
+        time: seconds from an arbitrary start; None if the file has no times.
         name: for people; may be empty.
-        axes: of this very matrix, where they are beyond doubt: it was made of an eye and a target.
+        axes: of this matrix if they are certain, since it was computed from an eye and a target; otherwise None.
     """
 
     matrix: Matrix
@@ -78,11 +79,11 @@ class Frame:
 
 @dataclass(frozen=True)
 class Sampled(Sequence[Frame]):
-    """Frames that are worked out where they are asked for: a few keys can make any number of them.
+    """Frames that are computed when they are asked for, as a few keys can yield any number of them.
 
     Attributes:
-        length: how many there are.
-        at: makes those of some numbers, (K,) int64, each below `length`.
+        length: number of frames.
+        at: computes the frames of (K,) int64 numbers, each below `length`.
     """
 
     length: int
@@ -108,10 +109,14 @@ class Sampled(Sequence[Frame]):
 
 
 def sampled(count: float, at: Callable[[NDArray[np.int64]], list[Frame]]) -> Sampled:
-    """Frames of a count that a formula gives, rounded up.
+    """Computed frames, `count` rounded up and at least one.
+
+    Args:
+        count: number of frames, the result of a formula.
+        at: see `Sampled`.
 
     Raises:
-        TooManyCamerasError: it is more than can be counted, or no number.
+        TooManyCamerasError: the count is `NUMBERED` or more, or not a number.
     """
     if not count < NUMBERED:
         raise TooManyCamerasError(f"{count:.3g} frames are more than {MAX_MADE:,}")
@@ -120,16 +125,16 @@ def sampled(count: float, at: Callable[[NDArray[np.int64]], list[Frame]]) -> Sam
 
 @dataclass(frozen=True)
 class Settings:
-    """What a user says about a path, over what its file says; None leaves it to the file.
+    """What a user says about a path; it overrides the file, and None leaves it to the file.
 
     Attributes:
         axes: of the file's matrices.
         world: (4, 4) from the file's world to that of the splats: a rotation, a uniform scale and a translation.
-        size: width and height of the images, pixels. The vertical field of view stays as it is.
+        size: width and height of the images, pixels. The vertical field of view does not change.
         fov_y: vertical field of view, radians.
-        fps: frames a second; times are then counted from the first frame on.
-        every: only every so many frames are kept.
-        up: x, y, z of what is up for a camera of which only eye and target are known.
+        fps: frames a second; times are then computed from the numbers of the frames.
+        every: keep every n-th frame only.
+        up: x, y, z of the up axis of cameras that have only an eye and a target.
     """
 
     axes: Axes | None = None
@@ -142,10 +147,10 @@ class Settings:
 
 
 def camera_of(pose: Matrix, lens: Lens, time: float, name: str, settings: Settings) -> Camera:
-    """A camera of a rigid pose in OpenGL's axes, with defaults for what nobody says.
+    """The camera of a rigid pose in OpenGL's axes, with defaults for what neither file nor user says.
 
     Raises:
-        ValueError: the lens has no sense; its text goes on a sentence about the camera.
+        ValueError: the lens makes no sense; the text continues a sentence about the camera.
     """
     size = lens.size or settings.size or DEFAULT_SIZE
     focal = lens.focal if lens.size and lens.focal else _focal_of(lens, size)
@@ -153,14 +158,14 @@ def camera_of(pose: Matrix, lens: Lens, time: float, name: str, settings: Settin
     _check(focal, principal)
     if settings.fov_y is not None:
         fy = size[1] / (2 * math.tan(settings.fov_y / 2))
-        focal = (focal[0] * fy / focal[1], fy)  # pixels keep their shape
+        focal = (focal[0] * fy / focal[1], fy)  # pixels keep their aspect
     if settings.size and settings.size != size:
         zoom = settings.size[1] / size[1]
         focal = (focal[0] * zoom, focal[1] * zoom)
-        # How far off the centre it is scales with the picture.
-        off = [(principal[k] - size[k] / 2) * zoom for k in (0, 1)]
+        # The offset from the centre scales with the image.
+        offset = [(principal[k] - size[k] / 2) * zoom for k in (0, 1)]
         size = settings.size
-        principal = (size[0] / 2 + off[0], size[1] / 2 + off[1])
+        principal = (size[0] / 2 + offset[0], size[1] / 2 + offset[1])
     _check(focal, principal)
     return Camera(pose, *size, focal, principal, time, name)
 
@@ -169,12 +174,12 @@ def _check(focal: tuple[float, float], principal: tuple[float, float]) -> None:
     if not min(focal) > 0 or not all(abs(number) <= MOST_PIXELS for number in (*focal, *principal)):
         raise ValueError(
             f"has a focal length of {focal[0]:g}, {focal[1]:g} and a principal point at {principal[0]:g},"
-            f" {principal[1]:g}, of which one is not a sensible number"
+            f" {principal[1]:g}, one of which is not positive or too large"
         )
 
 
 def _focal_of(lens: Lens, size: tuple[int, int]) -> tuple[float, float]:
-    """Of square pixels."""
+    """fx, fy of square pixels for the field of view of a lens."""
     fov = lens.fov if lens.fov is not None else DEFAULT_FOV_Y
     if not 0 < fov < math.pi:
         raise ValueError(f"has a field of view of {math.degrees(fov):g} degrees")

@@ -1,4 +1,4 @@
-"""Camera paths that need no file: around a scene, towards it, a single view, and smoothly from key to key."""
+"""Camera paths without a file: orbits, dollies, single views, and splines through keyframes."""
 
 from __future__ import annotations
 
@@ -17,22 +17,23 @@ from .frame import DEFAULT_FOV_Y, DEFAULT_FPS, NO_LENS, NUMBERED, Frame, Lens, S
 from .pose import look_at, normalized
 from .spline import catmull_rom_tangents, centripetal_knots, hermite
 
-#: Seconds from one key to the next, on average, where the keys have no times.
+#: Mean seconds from one key to the next, if the keys have no times.
 SECONDS = 2.0
 
-#: A dolly begins so many times as far away as the scene fits the image, and ends where it is this much larger.
+#: Distance at the start of a dolly, in multiples of that at which the scene fits the image, and how many times larger
+#: the scene is at its end.
 DOLLY_START, DOLLY_ZOOM = 4.0, 16.0
 
 
 @dataclass(frozen=True)
 class Key:
-    """Where a camera must pass.
+    """A keyframe: a view through which the camera must pass.
 
     Attributes:
         eye, target: x, y, z in the world.
-        up: x, y, z; None for the up of the path.
-        fov: radians; None leaves it to the lens.
-        time: seconds; all keys of a path have one, or none has.
+        up: x, y, z; None for the up axis of the path.
+        fov: field of view in radians; None for that of the lens.
+        time: seconds; either all keys of a path have a time or none.
     """
 
     eye: tuple[float, ...]
@@ -45,7 +46,7 @@ class Key:
 def frame_looking(
     eye: ArrayLike, target: ArrayLike, up: ArrayLike, lens: Lens = NO_LENS, time: float | None = None, name: str = ""
 ) -> Frame:
-    """A frame at `eye`, (3,), that looks at `target`, (3,), with `up`, (3,), upwards.
+    """A frame at `eye`, (3,), that looks at `target`, (3,), with `up`, (3,), pointing up in the image.
 
     Raises:
         CameraPathError: eye and target are the same point.
@@ -57,14 +58,14 @@ def frame_looking(
 
 
 def orbit(count: int, center: ArrayLike, distance: float, elevation: float, up: ArrayLike) -> Sampled:
-    """`count` frames once around, counter-clockwise as seen from above.
+    """`count` frames once around a point, counter-clockwise seen from above.
 
     Args:
-        count: of frames.
-        center: (3,) that all look at.
-        distance: of each from it, world units.
-        elevation: above it, radians.
-        up: (3,) the axis.
+        count: number of frames.
+        center: (3,) point that all look at.
+        distance: from it, world units.
+        elevation: angle above it, radians.
+        up: (3,) axis of the orbit.
     """
     axis = normalized(up)
     front = _front(axis)
@@ -79,14 +80,14 @@ def orbit(count: int, center: ArrayLike, distance: float, elevation: float, up: 
 
 
 def dolly(count: float, center: ArrayLike, far: float, near: float, elevation: float, up: ArrayLike) -> Sampled:
-    """`count` frames straight towards a point; from each to the next, what is there grows by the same factor.
+    """`count` frames straight towards a point; from frame to frame its surroundings grow by the same factor.
 
     Args:
-        count: of frames, at least 2.
-        center: (3,) that all look at.
-        far, near: distance of the first and the last from it, world units.
-        elevation: above it, radians.
-        up: (3,)
+        count: number of frames, at least 2.
+        center: (3,) point that all look at.
+        far, near: distances of the first and the last frame from it, world units.
+        elevation: angle above it, radians.
+        up: (3,) up axis.
     """
     axis = normalized(up)
     offset = math.cos(elevation) * _front(axis) + math.sin(elevation) * axis
@@ -99,7 +100,7 @@ def dolly(count: float, center: ArrayLike, far: float, near: float, elevation: f
 
 
 def _looking_at(center: ArrayLike, distance: Matrix, offset: Matrix, up: Matrix) -> list[Frame]:
-    """Frames that look at a point, (3,), from (N,) distances along (N, 3) unit vectors."""
+    """N frames that look at a point, (3,), from (N,) distances along (N, 3) unit vectors."""
     target = np.asarray(center, np.float64)
     with np.errstate(over="ignore", invalid="ignore"):
         eyes = target + distance[:, None] * offset
@@ -111,23 +112,23 @@ def between(
 ) -> Sampled:
     """Frames from the first key to the last, on a Catmull-Rom spline through all of them.
 
-    Eye, target, up and field of view each have theirs, so that what two keys look at stays in view between them. The
-    spline's parameter is the time. Where the keys have none it is shared out centripetally, by the square roots of the
-    distances between keys (Yuksel, Schaefer and Keyser 2011), which makes no loops and no cusps.
+    Eye, target, up axis and field of view are interpolated separately, so that a target of two keys stays in view
+    between them. The parameter of the spline is time. Keys without times are spaced centripetally, by the square roots
+    of the distances between them (Yuksel, Schaefer and Keyser 2011), which avoids loops and cusps.
 
     Args:
         keys: at least two.
-        fps: frames a second; None is the default.
-        up: (3,) for keys that have none.
-        lens: for what keys do not say.
-        seconds: from key to key on average, where keys have no times.
+        fps: frames a second; None for `DEFAULT_FPS`.
+        up: (3,) up axis of keys without one.
+        lens: of keys without a field of view.
+        seconds: mean time from key to key, if keys have no times.
 
     Raises:
         CameraPathError: there are too few keys, or too many frames; times are missing, or do not increase.
     """
     rate = fps or DEFAULT_FPS
     if len(keys) < 2:
-        raise CameraPathError("a path of keyframes takes two of them, or more")
+        raise CameraPathError("a path needs at least two keyframes")
     ups = [normalized(key.up or up) for key in keys]
     known = lens.fov if lens.fov is not None else DEFAULT_FOV_Y
     fovs = [key.fov if key.fov is not None else known for key in keys]
@@ -155,27 +156,27 @@ def along(curve: Callable[[Matrix], Matrix], at: Matrix) -> Matrix:
     """(N, K) points of a curve.
 
     Args:
-        curve: from parameters to points.
+        curve: maps parameters to points.
         at: (N,) parameters.
 
     Raises:
-        CameraPathError: some are no numbers: keys are too far apart, or too near in time.
+        CameraPathError: some points are not finite: keys are too far apart, or too close in time.
     """
     with np.errstate(all="ignore"):
         points = curve(at)
     if not np.isfinite(points).all():
-        raise CameraPathError("its keyframes have numbers so large that what is between them is no number")
+        raise CameraPathError("its keyframes are too far apart, or too close in time, to interpolate between them")
     return points
 
 
 def _times(keys: Sequence[Key], values: Matrix, seconds: float) -> Matrix:
-    """(keys,) seconds."""
+    """(keys,) seconds of the keys."""
     times = [key.time for key in keys]
     if all(time is None for time in times):
         knots = centripetal_knots(values[:, :6])
         return knots * (seconds * (len(keys) - 1) / knots[-1])
     if any(time is None for time in times):
-        raise CameraPathError("some of its keyframes have a time, and some have none")
+        raise CameraPathError("some of its keyframes have a time and some have none; give a time to all or to none")
     knots = np.array(times, np.float64)
     with np.errstate(all="ignore"):
         if not (np.diff(knots) > 0).all():
@@ -184,7 +185,7 @@ def _times(keys: Sequence[Key], values: Matrix, seconds: float) -> Matrix:
 
 
 def _front(up: Matrix) -> Matrix:
-    """(3,) the side of a scene from which it is first seen: -z where -y is up, +z where y is, -y where z is."""
+    """(3,) direction from which a scene is seen first: -z if -y is up, +z if y is up, -y if z is up."""
     across = np.cross([1.0, 0.0, 0.0], up)
     return normalized(across if np.linalg.norm(across) > 1e-6 else np.cross([0.0, 1.0, 0.0], up))
 

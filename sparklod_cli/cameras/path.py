@@ -1,4 +1,4 @@
-"""Camera paths, from any file: what parsers found becomes cameras in OpenGL's axes, in one place and one way."""
+"""Camera paths: turns the frames of a parser or a generator into cameras in OpenGL's axes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from .formats.table import FORMATS, PathFormat
 from .frame import DEFAULT_FPS, MAX_FRAMES, MAX_MADE, Sampled, Settings, camera_of
 from .pose import rigid, to_opengl
 
-#: What is said of cameras that come from no file.
+#: Formats of cameras that come from options instead of a file.
 GENERATED = {
     name: PathFormat(name, title, "", Axes.OPENGL_C2W)
     for name, title in {
@@ -32,13 +32,13 @@ GENERATED = {
 
 @dataclass(frozen=True, repr=False)
 class CameraPath:
-    """Cameras in the order in which they are passed.
+    """Cameras in the order of a path.
 
     Attributes:
-        cameras: at least one; in OpenGL's axes, camera-to-world, in the world of the splats.
-        format: where they come from, for people.
-        notes: what was left out or assumed, a sentence each, for people.
-        numbers: of each camera, its number in the file or on the whole path, from 0 on.
+        cameras: at least one; camera-to-world in OpenGL's axes, in the world of the splats.
+        format: their origin, for people.
+        notes: what was ignored or assumed, one sentence each, for people.
+        numbers: number of each camera in the file or on the whole path, from 0.
     """
 
     cameras: tuple[Camera, ...]
@@ -64,47 +64,52 @@ def read(files: Files, *, format: str | None = None, settings: Settings | None =
 
     Args:
         files: the file, and those that belong to it.
-        format: its name in `FORMATS`; None tells it by the content.
+        format: name of a row of `FORMATS`; None recognizes the format by the content.
         settings: what the user says.
 
     Raises:
-        CameraPathError: the file is of no known format, or broken, or a camera makes no sense.
+        CameraPathError: the file has no known format or is broken, or a camera makes no sense.
     """
     settings = settings or Settings()
     if not any(files.contents.values()):
         raise CameraPathError("it is empty")
     form = _known(files) if format is None else next(form for form in FORMATS if form.name == format)
     if settings.axes and form.axes is None:
-        raise CameraPathError(f"{form.title} says itself where cameras look, so --camera-axes cannot be used with it")
+        raise CameraPathError(f"{form.title} has targets instead of axes, so --camera-axes cannot be used with it")
     parsed = form.parser().parse(files, settings)
     if settings.up is not None and (parsed.turned or not form.looking):
-        raise CameraPathError("its cameras say themselves which way is up, so --up cannot be used with them")
+        raise CameraPathError("its cameras have their own up axes, so --up cannot be used with them")
     return cameras_of(parsed, form, settings)
 
 
 def _known(files: Files) -> PathFormat:
     form = next((form for form in FORMATS if form.parser().recognises(files)), None)
     if form is None and own_csv.resembles(files):
-        form = next(form for form in FORMATS if form.parser() is own_csv)  # which says what it lacks
+        form = next(form for form in FORMATS if form.parser() is own_csv)  # whose error names the missing columns
     if form is None:
         names = ", ".join(form.name for form in FORMATS)
-        raise CameraPathError(f"it is of no format that is known by its content; see --camera-format ({names})")
+        raise CameraPathError(f"its content is of no known format; name the format with --camera-format ({names})")
     return form
 
 
 def cameras_of(parsed: Parsed, form: PathFormat, settings: Settings) -> CameraPath:
-    """The cameras of frames, whoever made them.
+    """The cameras of frames from a file or a generator.
+
+    Args:
+        parsed: the frames.
+        form: their format.
+        settings: what the user says.
 
     Raises:
-        CameraPathError: there is none, or one makes no sense; the text names it.
-        TooManyCamerasError: there are too many of them.
+        CameraPathError: there are none, or one makes no sense; the text names it.
+        TooManyCamerasError: there are too many.
     """
     numbers = range(0, len(parsed.frames), settings.every)
     if not numbers:
         raise CameraPathError("it has no cameras")
     most = MAX_MADE if isinstance(parsed.frames, Sampled) else MAX_FRAMES
     if len(numbers) > most:
-        raise TooManyCamerasError(f"it has {len(numbers):,} cameras, more than {most:,}; see --every")
+        raise TooManyCamerasError(f"it has {len(numbers):,} cameras, more than {most:,}; leave some out with --every")
     frames = parsed.frames[:: settings.every]
     first = frames[0].time
     world = np.eye(4) if settings.world is None else settings.world
@@ -127,7 +132,7 @@ def cameras_of(parsed: Parsed, form: PathFormat, settings: Settings) -> CameraPa
     if form.world and settings.world is None:
         notes += (form.world,)
     if not all(a.time <= b.time for a, b in itertools.pairwise(cameras)):
-        notes += ("Its times go back and forth; --fps counts them anew.",)
+        notes += ("Its times do not increase; --fps replaces them.",)
     if not all(math.isfinite(camera.time) for camera in cameras):
-        raise CameraPathError("it has times that are too far apart")
+        raise CameraPathError("its times are too far apart")
     return CameraPath(tuple(cameras), form.title, notes, tuple(numbers))

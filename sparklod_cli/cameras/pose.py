@@ -1,4 +1,4 @@
-"""Poses as 4x4 matrices: made of quaternions and of eyes and targets, turned to OpenGL's axes, and made rigid."""
+"""Poses as (4, 4) matrices: from quaternions or eye and target, converted to OpenGL's axes, and made rigid."""
 
 from __future__ import annotations
 
@@ -9,13 +9,14 @@ from ..model.gaussian import rotation_matrix
 from .axes import Axes
 from .camera import Matrix
 
-#: How far R^T R may be from a multiple of the identity. Files that round to three decimals stay well below it.
+#: Largest deviation of an element of R^T R from a multiple of the identity. Files that round to three decimals stay
+#: well below it.
 SKEW = 0.02
 
-#: From OpenCV's axes to OpenGL's, and back: y and z turn around.
+#: From OpenCV's axes to OpenGL's and back: y and z change their sign.
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
-#: Beyond this a coordinate is no float32, which is what splats are placed by.
+#: Largest coordinate, world units: that of a float32, the type of centres.
 FARTHEST = float(np.finfo(np.float32).max)
 
 
@@ -23,11 +24,11 @@ def to_opengl(matrix: Matrix, axes: Axes) -> Matrix:
     """A pose as camera-to-world in OpenGL's axes.
 
     Args:
-        matrix: (4, 4), with 0 0 0 1 below; may have a uniform scale.
-        axes: what it means.
+        matrix: (4, 4), with 0 0 0 1 as its last row; may have a uniform scale.
+        axes: its convention.
 
     Raises:
-        ValueError: it cannot be inverted; its text goes on a sentence about it.
+        ValueError: it cannot be inverted; the text continues a sentence about it.
     """
     if axes.from_world:
         try:
@@ -39,37 +40,37 @@ def to_opengl(matrix: Matrix, axes: Axes) -> Matrix:
 
 
 def rigid(matrix: Matrix) -> Matrix:
-    """A camera-to-world matrix without its scale, its rotation the nearest there is.
+    """A camera-to-world matrix without its scale, and with the nearest exact rotation.
 
     Args:
         matrix: (4, 4).
 
     Raises:
-        ValueError: it is no rotation, position and uniform scale; its text goes on a sentence about it.
+        ValueError: it is not a rotation, a uniform scale and a position; the text continues a sentence about it.
     """
     with np.errstate(all="ignore"):
         if not np.isfinite(matrix).all() or np.abs(matrix[:3, 3]).max() > FARTHEST:
             raise ValueError("has numbers that are not finite, or too large")
         if np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-4:
-            raise ValueError("has a matrix that does not end in a row of 0 0 0 1")
+            raise ValueError("has a matrix whose last row is not 0 0 0 1")
         rotation = matrix[:3, :3]
         volume = np.linalg.det(rotation)
         if not np.isfinite(volume) or volume == 0:
-            raise ValueError("has a matrix that flattens")
+            raise ValueError("has a matrix of determinant 0")
         if volume < 0:
             raise ValueError("has a matrix that mirrors")
         rotation = rotation / np.cbrt(volume)
         if not np.abs(rotation.T @ rotation - np.eye(3)).max() <= SKEW:
-            raise ValueError("has axes that are not at right angles, or not of one length")
+            raise ValueError("has axes that are not at right angles, or not of the same length")
     left, _, right = np.linalg.svd(rotation)
     result = np.eye(4)
-    result[:3, :3] = left @ right  # the rotation that is nearest, in the sense of least squares
+    result[:3, :3] = left @ right  # the nearest rotation in the sense of least squares
     result[:3, 3] = matrix[:3, 3]
     return result
 
 
 def pose(rotation: ArrayLike, position: ArrayLike) -> Matrix:
-    """(4, 4) of a (3, 3) rotation and a (3,) position."""
+    """The (4, 4) matrix of a (3, 3) rotation and a (3,) position."""
     matrix = np.eye(4)
     matrix[:3, :3] = rotation
     matrix[:3, 3] = position
@@ -77,14 +78,14 @@ def pose(rotation: ArrayLike, position: ArrayLike) -> Matrix:
 
 
 def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike) -> Matrix:
-    """Camera-to-world, in OpenGL's axes, of a camera at `eye` that looks at `target`.
+    """The (4, 4) camera-to-world matrix, in OpenGL's axes, of a camera at `eye` that looks at `target`.
 
     Args:
-        eye, target, up: (3,) in the world. Where `up` is along the line of sight, another direction takes its place.
+        eye, target: (3,) world units.
+        up: (3,) up axis; another direction replaces it if it is along the line of sight.
 
     Raises:
-        ValueError: eye and target are the same point, or farther apart than numbers go; its text goes on a sentence
-            about the camera.
+        ValueError: eye and target are the same point, or too far apart; the text continues a sentence about the camera.
     """
     eye, target = np.asarray(eye, np.float64), np.asarray(target, np.float64)
     with np.errstate(over="ignore", invalid="ignore"):
@@ -93,7 +94,7 @@ def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike) -> Matrix:
         raise ValueError("looks at a point that is too far away")
     back = normalized(back)
     if not np.isfinite(back).all():
-        raise ValueError("looks at the point where it is")
+        raise ValueError("looks at its own position")
     right = np.cross(normalized(up), back)
     if not np.linalg.norm(right) > 1e-6:
         right = np.cross(np.eye(3)[np.argmin(np.abs(back))], back)
@@ -102,7 +103,7 @@ def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike) -> Matrix:
 
 
 def normalized(vector: ArrayLike) -> Matrix:
-    """A (K,) vector of length 1; of NaN where it had none."""
+    """A (K,) vector scaled to length 1; NaN if its length is 0 or not finite."""
     array = np.asarray(vector, np.float64)
     with np.errstate(all="ignore"):
         array = array / np.abs(array).max()  # so that squares neither overflow nor vanish
@@ -110,10 +111,10 @@ def normalized(vector: ArrayLike) -> Matrix:
 
 
 def rotation_of(quat_wxyz: ArrayLike) -> Matrix:
-    """(3, 3) of a quaternion w x y z of any length but 0.
+    """The (3, 3) rotation of a quaternion w x y z of any length but 0.
 
     Raises:
-        ValueError: its length is 0 or not finite; its text goes on a sentence about it.
+        ValueError: its length is 0 or not finite; the text continues a sentence about it.
     """
     w, x, y, z = unit = normalized(quat_wxyz)
     if not np.isfinite(unit).all():

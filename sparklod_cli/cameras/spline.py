@@ -6,15 +6,15 @@ import numpy as np
 
 from .camera import Matrix
 
-#: A step between points counts as at least this share of the average one, so that none takes no time.
+#: Smallest step between knots as a share of the mean step, so that no step takes no time.
 SHORTEST = 1e-3
 
 
 def centripetal_knots(points: Matrix) -> Matrix:
-    """(n,) parameters from 0 on, one a point, that differ by the square roots of the distances between points.
+    """(n,) knots from 0 on that differ by the square roots of the distances between points.
 
     Args:
-        points: (n, D), n at least 2. Where all are the same, the steps are, too.
+        points: (n, D), n at least 2. If all are the same, the steps are 1.
     """
     with np.errstate(over="ignore"):
         steps = np.sqrt(np.linalg.norm(np.diff(points, axis=0), axis=1))
@@ -23,9 +23,9 @@ def centripetal_knots(points: Matrix) -> Matrix:
 
 
 def catmull_rom_tangents(knots: Matrix, points: Matrix) -> Matrix:
-    """(n, D) tangents of the Catmull-Rom spline of any knots (Barry and Goldman 1988).
+    """(n, D) tangents of the Catmull-Rom spline with arbitrary knots (Barry and Goldman 1988).
 
-    Each is that of the parabola through a point and its neighbours, at the ends through the last three.
+    Each is the tangent of the parabola through a point and its neighbours; at the ends, through the last three points.
 
     Args:
         knots: (n,) increasing, n at least 2.
@@ -40,7 +40,7 @@ def catmull_rom_tangents(knots: Matrix, points: Matrix) -> Matrix:
 
 
 def cardinal_tangents(knots: Matrix, points: Matrix) -> Matrix:
-    """(n, D) tangents along the line from the point before to the point after, which is what SuperSplat has.
+    """(n, D) tangents along the line from the previous to the next point, as SuperSplat has them.
 
     Args:
         knots: (n,) increasing, n at least 2.
@@ -52,13 +52,13 @@ def cardinal_tangents(knots: Matrix, points: Matrix) -> Matrix:
 
 
 def hermite(knots: Matrix, points: Matrix, tangents: Matrix, at: Matrix) -> Matrix:
-    """(m, D) points of the curve of cubic pieces that has these points and tangents at the knots.
+    """(m, D) points of the piecewise cubic curve with these points and tangents at the knots.
 
     Args:
         knots: (n,) increasing, n at least 2.
         points: (n, D).
-        tangents: (n, D), by the parameter.
-        at: (m,) parameters, each from the first knot to the last.
+        tangents: (n, D) derivatives by the parameter.
+        at: (m,) parameters between the first and the last knot.
     """
     piece = np.clip(np.searchsorted(knots, at, side="right") - 1, 0, len(knots) - 2)
     step = np.diff(knots)[piece, None]

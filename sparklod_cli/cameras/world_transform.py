@@ -1,4 +1,4 @@
-"""A matrix that leads from one world to another."""
+"""`--world-transform`: a matrix from the world of cameras to that of splats."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from .pose import rigid
 
 
 def similarity(text: str) -> Matrix:
-    """(4, 4): a rotation, a uniform scale and a translation, of 16 numbers row by row.
+    """A (4, 4) matrix of a rotation, a uniform scale and a translation from 16 numbers, row by row.
 
     Args:
-        text: the numbers, with commas or white space between, or JSON: a list of them, or of rows of them.
+        text: the numbers, separated by commas or white space, or JSON: a list of them or of rows.
 
     Raises:
-        CameraPathError: they are something else; its text goes on a sentence about them.
+        CameraPathError: the text is something else; that of the error continues a sentence about it.
     """
     words = re.split(r"[\s,;]+", text.strip())
     try:

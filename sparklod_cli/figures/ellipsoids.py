@@ -56,7 +56,7 @@ def sphere(rounds: int) -> Mesh:
 
 
 def rotation(quat_xyzw: FloatArray) -> FloatArray:
-    """(N, 4) unit quaternions to (N, 3, 3) matrices: splat, world axis, local axis."""
+    """(N, 4) unit quaternions to (N, 3, 3) float32 rotations: splat, world axis, local axis."""
     return np.stack(rotation_matrix(*quat_xyzw.T), axis=1).reshape(-1, 3, 3)
 
 

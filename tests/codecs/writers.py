@@ -1,4 +1,4 @@
-"""Every way to write each format of the table, and what it keeps of a scene: what the shared laws run on."""
+"""Every way to write each format, and the precision with which it keeps a scene: the input of the shared laws."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ Content = bytes | dict[str, bytes]
 
 @dataclass(frozen=True)
 class Precision:
-    """What a way to write may change, and the ranges that it clamps to."""
+    """By how much a way of writing may change each column at most, and the ranges that it clamps to."""
 
     center: float | Array = 0.0
     log_scale: float | Array = 2e-6
     degrees: float = 1e-3
     opacity: float = 1e-6
-    merged: float = 1e-6  # in D, above 1
+    merged: float = 1e-6  # of an LoD opacity D above 1
     rgb: float | Array = 1e-6
     sh: tuple[float, float] = (0.0, 0.0)  # degree 1, degrees above
     scale_range: tuple[float, float] = (0.0, np.inf)
@@ -52,11 +52,11 @@ class Case:
     """A way to write a format.
 
     Attributes:
-        format: what the reader must say of it.
-        write: the file of a scene; or the files of a folder, by their names.
-        precision: what may change in a scene.
-        lod: the scene is to be a tree.
-        held: the splats that the file is to hold, in its order.
+        format: the name of the format that the reader must give.
+        write: makes the file of a scene, or the files of a folder by their names.
+        precision: by how much the columns of a scene may change.
+        lod: whether the scene must have a tree.
+        held: the splats that the file must hold, in its order.
     """
 
     format: str
@@ -67,7 +67,7 @@ class Case:
 
 
 def put(content: Content, directory: Path, form: str) -> Path:
-    """Writes a scene under a name that tells as little as possible; its path."""
+    """Writes a file under a name that says as little as possible of its format; returns its path."""
     if isinstance(content, bytes):
         path = directory / ("scene.splat" if form == "SPLAT" else "scene.bin")
         path.write_bytes(content)
@@ -80,21 +80,22 @@ def put(content: Content, directory: Path, form: str) -> Path:
 
 
 def linear(source: Scene) -> dict[str, Array]:
-    """The splats as the writers by hand take them."""
+    """Returns the splats as arguments of the writers in `fixtures`."""
     splats = source.splats
     columns = {name: getattr(splats, name).astype(np.float64) for name in ("center", "scale", "opacity", "rgb", "sh")}
     return columns | {"quat_wxyz": splats.quat_xyzw[:, [3, 0, 1, 2]].astype(np.float64) * 7}
 
 
 def rounding(values: Array) -> float:
-    """What float32 may do to values like these in a calculation or two."""
+    """Bounds the error of one or two float32 operations on values like these."""
     return 4 * float(np.spacing(np.float32(np.abs(values).max())))
 
 
 def largest_dropped_degrees(steps: int) -> float:
-    """The most that a rotation is off where all but the largest component have so many steps for +-sqrt(1 / 2).
+    """Bounds the error of rotations, in degrees, that hold all but the largest component in `steps` for +-sqrt(1 / 2).
 
-    Each of the three is off by half a step; the largest, which follows from them, by up to sqrt(3) times all that.
+    Each of the three is off by up to half a step; the largest, which follows from them, by up to sqrt(3) times their
+    error together.
     """
     return float(np.degrees(2 * 2 * 3**0.5 * (2**0.5 / steps / 2))) * 1.001
 
@@ -128,7 +129,7 @@ PLY = {
 
 
 def half_steps(values: Array, steps: float | Array) -> Array:
-    """(N, 3) half a step of each value between the bounds of its 256."""
+    """Returns (N, 3): half a step between the bounds of each splat's chunk of 256."""
     chunks = [values[start : start + 256] for start in range(0, len(values), 256)]
     return np.concatenate([np.ones((len(chunk), 1)) * np.ptp(chunk, axis=0) / steps / 2 for chunk in chunks])
 
@@ -169,7 +170,7 @@ def spz_precision(source: Scene, version: int) -> Precision:
     return Precision(
         center=0.5 * 2.0**-bits,
         log_scale=1.001 / 32,
-        # The first three are worse near half a turn than the docstring says; test_quantize.py holds it to its word.
+        # Near half a turn the first three are less exact than their docstring says, which test_quantize.py checks.
         degrees=max(stated_degrees(coding), 13.4) if version == 2 else stated_degrees(coding),
         opacity=1.001 / 255 if source.tree else 1.001 / 510,
         merged=4.004 / 255,
@@ -200,7 +201,7 @@ def sog_precision(source: Scene, version: int) -> Precision:
     center, log_scale = values["center"], np.log(values["scale"])
     half_log_step = np.ptp(np.sign(center) * np.log1p(np.abs(center)), axis=0) / 65535 / 2
     logit = np.log(values["opacity"] / (1 - values["opacity"]))
-    book = 1.3 / 255 / 2 * 1.001  # the steps of the codebook are this much larger at its end
+    book = 1.3 / 255 / 2 * 1.001  # half the largest step of the codebook, at its end
     sh = np.ptp(values["sh"]) * (book if version == 2 else 1.001 / 510) + 1e-6 if values["sh"].size else 0.0
     return Precision(
         center=(1 + np.abs(center)) * np.expm1(half_log_step * 1.001 + 4e-6),
@@ -229,13 +230,13 @@ SOG = {
 
 # --- KSPLAT -----------------------------------------------------------------------------------------------------------
 
-#: Where sections end, and their SH degrees.
+#: For each section, the share of the splats at which it ends, and its SH degree.
 SECTIONS: Mapping[str, tuple[tuple[float, int], ...]] = {"": ((1.0, 2),), " sections": ((0.3, 1), (0.6, 0), (1.0, 2))}
 SH_RANGE = (-0.9, 0.8)
 
 
 def block(splats: Splats) -> float:
-    """The side of a bucket that any of the splats would fit into, wherever its centre."""
+    """Returns the side of a bucket that holds all of the splats, wherever its centre is."""
     return float(np.float32(2.1 * np.ptp(splats.center, axis=0).max() + 0.001))
 
 
@@ -267,7 +268,7 @@ def ksplat_precision(source: Scene, level: int, sections: str) -> Precision:
 
 
 def held_by_ksplat(splats: Splats, sections: str) -> Splats:
-    """Up to degree 2, and zeros where a section has less than others."""
+    """Returns the splats with SH up to degree 2, and zeros where a section has a lower degree."""
     cut = by_hand_ksplat.parts(len(splats), SECTIONS[sections])
     held = splats.take(slice(None)).with_max_sh(max(degree for _, degree in cut))
     for part, degree in cut:
@@ -290,7 +291,7 @@ KSPLAT = {
 
 
 def splat_precision(source: Scene) -> Precision:
-    """Four bytes a rotation: each is off by half a step of 1 / 128, which is twice as much in an angle."""
+    """Of four bytes of a rotation each is off by up to half a step of 1 / 128; the angle is off by twice that."""
     return Precision(degrees=float(np.degrees(2 * 2 / 256)), opacity=1.001 / 510, rgb=1.001 / 510, rgb_range=(0, 1))
 
 

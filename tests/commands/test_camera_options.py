@@ -173,7 +173,7 @@ def test_wrong_camera_options_are_errors_that_name_them() -> None:
     assert "--world-transform can only be used with" in usage_error("--orbit", "3", "--world-transform", TURN)
     for wrong, said in {
         TURN.replace("-1", "1", 1): "has a matrix that mirrors",
-        TURN.replace("-1", "-2", 1): "has axes that are not at right angles, or not of one length",
+        TURN.replace("-1", "-2", 1): "has axes that are not at right angles, or not of the same length",
         TURN[:-2]: "has 15 numbers, not 16",
     }.items():
         output = usage_error("--look-at", "0,0,0:0,0,1", "--world-transform", wrong)
@@ -220,7 +220,7 @@ def test_too_many_generated_cameras_are_refused(options: tuple[str, ...], monkey
     monkeypatch.setattr(generators, "frame_looking", counted)
     output = " ".join(usage_error(*options).split())
     assert f"{options[0]}: it has 1," in output
-    assert "cameras, more than 65,536; see --every" in output
+    assert "cameras, more than 65,536; leave some out with --every" in output
     assert made == []
     count = 10**6 if options[0] == "--orbit" else 10**12
     path = cameras(*options, "--every", str(count // 4), scene=no_scene)

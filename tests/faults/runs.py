@@ -1,4 +1,4 @@
-"""Runs the command in processes of their own, and says what must hold of them however they end."""
+"""Runs commands as processes, and checks what must hold however they end."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from tests.conftest import FIXTURES, ROOT
 DEMO = FIXTURES / "demo.ply"
 SMALL = FIXTURES / "sh3.ply"
 TREE = FIXTURES / "golden" / "tree-v3.spz"
-#: What is in this folder takes the place of packages that take seconds to load.
+#: Modules in this folder replace packages that take seconds to load.
 WITHOUT = Path(__file__).parent / "without"
 ENVIRONMENT = {**os.environ, "NO_COLOR": "1", "PYTHONPATH": f"{WITHOUT}{os.pathsep}{ROOT}"}
 
-#: What each command is given, and the name of what it writes.
+#: The arguments of each command, and the name of its output, which is added to them.
 WRITERS: dict[str, tuple[Sequence[object], str]] = {
     "build-lod": (["build-lod", DEMO, "-o"], "demo.spz"),
     "traverse": (["traverse", TREE, "--orbit", "300", "--no-timing", "-o"], "table.csv"),
@@ -33,24 +33,24 @@ WRITERS: dict[str, tuple[Sequence[object], str]] = {
 
 
 def command(*arguments: object) -> list[str]:
-    """The command line of a run."""
+    """Returns the command line of a run."""
     return [sys.executable, "-m", "sparklod_cli", *map(str, arguments)]
 
 
 def sparklod(*arguments: object, **how: object) -> subprocess.CompletedProcess[str]:
-    """A run to its end."""
+    """Runs sparklod to its end."""
     settings = {"capture_output": True, "text": True, "check": False, "env": ENVIRONMENT, "timeout": 300} | how
     return subprocess.run(command(*arguments), **settings)
 
 
 def shell(script: str, *arguments: object, **how: object) -> subprocess.CompletedProcess[str]:
-    """A run in a shell: `script` has "$@" where the command line belongs."""
+    """Runs sparklod in a shell; `script` has "$@" in place of the command line."""
     settings = {"capture_output": True, "text": True, "check": False, "env": ENVIRONMENT, "timeout": 300} | how
     return subprocess.run(["bash", "-c", script, "bash", *command(*arguments)], **settings)
 
 
 def said_one_error(err: str) -> str:
-    """The one line on standard error, beside what is said of compiling."""
+    """Asserts that standard error has one error, apart from messages about compilation; returns its line."""
     lines = [line for line in err.splitlines() if "ompil" not in line]
     assert len(lines) == 1, err
     assert lines[0].lower().startswith("error: "), err
@@ -58,7 +58,7 @@ def said_one_error(err: str) -> str:
 
 
 def check_whole(path: Path) -> None:
-    """A file that a command wrote is complete."""
+    """Asserts that an output is complete."""
     if path.suffix == ".spz":
         scene = read_scene(path)
         assert scene.tree is not None
@@ -78,7 +78,7 @@ def check_whole(path: Path) -> None:
 
 @contextlib.contextmanager
 def mounted(folder: Path, options: str) -> Iterator[Path]:
-    """A file system in memory, of its own; skips the test where this process may not mount one."""
+    """Mounts a file system in memory; skips the test if this process may not mount one."""
     folder.mkdir()
     try:
         done = subprocess.run(

@@ -1,4 +1,4 @@
-"""Disks that are full and folders that cannot be written: an error of one line, and nothing under the final name."""
+"""Full disks and read-only folders: each is an error of one line, and no file has the final name."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="Windows has oth
 FULL = Path("/dev/full")
 needs_full = pytest.mark.skipif(not FULL.exists(), reason="there is no /dev/full here")
 
-#: Writers whose output is larger than a page of memory, the least that such a disk has.
+#: Commands whose output is larger than a page of memory, the smallest size of such a disk.
 LARGE = {
     "build-lod": WRITERS["build-lod"],
     "traverse": WRITERS["traverse"],
@@ -68,7 +68,7 @@ def test_a_full_device_is_one_error_that_names_it(name: str) -> None:
     assert str(FULL) in line
 
 
-#: What goes to standard output.
+#: Commands that write to standard output.
 PRINTERS = {
     "build-lod": ["build-lod", SMALL, "-o", "-"],
     "build-lod --json": ["build-lod", SMALL, "-o", "/dev/null", "--overwrite", "--json"],

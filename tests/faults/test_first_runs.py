@@ -1,4 +1,4 @@
-"""Processes that start at once, with a cache of kernels that they share and that is empty."""
+"""Processes that start at once and share an empty cache of kernels."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from sparklod_cli.support.jit_cache import SUFFIX
 from tests.conftest import ROOT
 from tests.faults.runs import ENVIRONMENT
 
-#: A small set of kernels, called from one another; says how many were compiled, and what came of it.
+#: Calls a few kernels that call each other; prints the cache folder, the number of compilations, and the results.
 SCRIPT = """
 import numpy as np
 from numba.core import event
@@ -44,7 +44,7 @@ def start(cache: Path) -> subprocess.Popen[str]:
 
 
 def finish(process: subprocess.Popen[str]) -> tuple[str, int, str]:
-    """Folder of the cache, kernels that were compiled, and results."""
+    """Returns the folder of the cache, the number of compilations, and the results of a process."""
     out, err = process.communicate(timeout=300)
     assert (process.returncode, err) == (0, "")
     folder, count, results = out.strip().split(" ", 2)
@@ -57,5 +57,5 @@ def test_first_runs_side_by_side_share_an_empty_cache(tmp_path: Path) -> None:
     assert len({(folder, results) for folder, _, results in ends}) == 1
     assert Path(ends[0][0]).parent == cache
     assert any(count for _, count, _ in ends)
-    assert finish(start(cache)) == (ends[0][0], 0, ends[0][2])  # what they left is whole
+    assert finish(start(cache)) == (ends[0][0], 0, ends[0][2])  # the cache that they left is complete
     assert not [path for path in cache.rglob("*") if path.suffix != SUFFIX and path.is_file()]

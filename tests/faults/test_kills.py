@@ -1,4 +1,4 @@
-"""kill -9 at any moment: what has a final name is whole, and the next run leaves nothing but its outputs."""
+"""kill -9 at any moment: files with a final name are whole, and the next run leaves only its outputs."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.faults.runs import ENVIRONMENT, TREE, WRITERS, check_whole, command, 
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="there is no kill -9 on Windows")
 
-#: One output, and many.
+#: Commands with one output, and with many.
 CASES = {
     "build-lod": [*WRITERS["build-lod"][0], "demo.spz"],
     "many cuts": ["traverse", TREE, "--orbit", "200", "--indices-out", "cuts", "-o", "table.csv"],
@@ -24,7 +24,7 @@ CASES = {
 
 
 def run_again(arguments: list[object], folder: Path) -> None:
-    """The next run succeeds, and what is there then is what a run makes."""
+    """Asserts that files are whole, and that the next run succeeds and leaves nothing but whole outputs."""
     before = {path for path in folder.rglob("*") if path.is_file()}
     for path in before:
         if not path.name.startswith(".") and not path.name.endswith(".part"):
@@ -59,7 +59,7 @@ def test_a_run_killed_at_random_leaves_only_whole_files(name: str, tmp_path: Pat
 
 
 def is_writing(process: int, folder: Path) -> bool:
-    """Whether a process has a file of a folder open; one without a name, too."""
+    """Whether a process has a file of a folder open, even one without a name."""
     with contextlib.suppress(OSError):
         for descriptor in Path(f"/proc/{process}/fd").iterdir():
             with contextlib.suppress(OSError):

@@ -19,7 +19,7 @@ pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no 
 def test_a_limit_of_file_size_is_one_error_or_a_small_file(name: str, tmp_path: Path) -> None:
     arguments, output = WRITERS[name]
     done = shell('ulimit -f 1; "$@"', *arguments, tmp_path / output)
-    if done.returncode == 0:  # it is small
+    if done.returncode == 0:  # the output is small
         check_whole(tmp_path / output)
         assert (tmp_path / output).stat().st_size <= 1024
         return
@@ -49,12 +49,12 @@ def test_many_files_are_not_open_at_a_time(tmp_path: Path) -> None:
     assert len(list(tmp_path.iterdir())) == 40
 
 
-#: Prints how much address space a process has that has done what all commands do first.
+#: Runs a command and prints the peak of its address space in kB, with the thread that every command starts.
 BASELINE = """
 import re, sys
 from sparklod_cli.support import interrupts
 from sparklod_cli.cli import run
-interrupts.handle()  # by a thread, whose stack and heap count
+interrupts.handle()  # starts a thread, whose stack and heap count
 code = run(sys.argv[1:])
 text = open("/proc/self/status").read()
 print("peak", re.search(r"VmPeak:\\s*(\\d+) kB", text)[1], code)
@@ -62,7 +62,7 @@ print("peak", re.search(r"VmPeak:\\s*(\\d+) kB", text)[1], code)
 
 
 def address_space(*arguments: object) -> int:
-    """kB that a run takes."""
+    """Returns the address space of a run, in kB."""
     done = subprocess.run(
         [sys.executable, "-c", BASELINE, *map(str, arguments)],
         capture_output=True,

@@ -1,4 +1,4 @@
-"""Readers that go away and streams that are closed: no traceback, and an exit status that says so."""
+"""Readers that go away and closed streams: no traceback, and an exit status that shows the failure."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="these are pipes
 
 
 def nobody_reads() -> int:
-    """The writing end of a pipe whose other end is closed."""
+    """Returns the writing end of a pipe whose reading end is closed."""
     reading, writing = os.pipe()
     os.close(reading)
     return writing
@@ -45,7 +45,7 @@ def test_a_pipe_without_a_reader_is_exit_code_1(name: str) -> None:
 def test_a_reader_that_stops_early_causes_no_traceback(arguments: list[object]) -> None:
     done = shell('set -o pipefail; "$@" | head -c 10 | wc -c', *arguments)
     assert done.stdout.strip() == "10"
-    assert done.returncode in (0, 1)  # what is short is in the pipe before its reader goes
+    assert done.returncode in (0, 1)  # a short output is in the pipe before its reader goes away
     assert "Traceback" not in done.stderr
     assert "Exception ignored" not in done.stderr
 

@@ -1,4 +1,4 @@
-"""Gets the real Spark and the other programs that read and write splat files, or skips where that cannot be."""
+"""Fixtures that start the real Spark and other programs for splat files, or skip the test if they are missing."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from tests.interop.foreign import PACKAGES, Foreign
 from tests.interop.page import Page
 from tests.interop.spark import Spark
 
-#: The version that these tests were tried with; layouts and file names inside the package may change with it.
+#: The version that these tests were written for; other versions may have other layouts and file names.
 SPARK = {"@sparkjsdev/spark": "2.2.0"}
-#: What Spark draws with, and what drives the browser that it draws in.
+#: Packages for pictures: Spark, three.js, which it draws with, and the driver of the browser.
 PAGE = {**SPARK, "three": "0.187.0", "playwright-core": "1.65.1"}
 
 
 @pytest.fixture(scope="session")
 def spark_dir(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder whose node_modules has Spark: the one that SPARK_DIR names, or one of ours."""
+    """A folder whose node_modules has Spark: the one that SPARK_DIR names, or one that is installed here."""
     return npm.folder_with(SPARK, variable="SPARK_DIR", request=request, tmp_path_factory=tmp_path_factory)
 
 
@@ -44,7 +44,7 @@ def page(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
         pytest.skip("Chromium is not installed (Debian's package chromium)")
     if shutil.which("node") is None:
         pytest.skip("Node is not installed")
-    if given := os.environ.get("SPARK_DIR"):  # one with Spark alone will do for all other tests
+    if given := os.environ.get("SPARK_DIR"):  # it may have Spark alone, which all other tests can do with
         missing = [name for name in PAGE if not (Path(given) / "node_modules" / name).is_dir()]
         if missing:
             pytest.skip(f"SPARK_DIR has no {' and no '.join(missing)}")
@@ -56,7 +56,7 @@ def page(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
 
 @pytest.fixture(scope="session")
 def foreign_dir(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder whose node_modules has `PACKAGES`: the one that FOREIGN_DIR names, or one of ours."""
+    """A folder whose node_modules has `PACKAGES`: the one that FOREIGN_DIR names, or one that is installed here."""
     return npm.folder_with(PACKAGES, variable="FOREIGN_DIR", request=request, tmp_path_factory=tmp_path_factory)
 
 

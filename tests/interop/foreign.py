@@ -13,7 +13,7 @@ from sparklod_cli.model.sh import COEFFICIENTS, SH_C0
 from sparklod_cli.model.splats import Splats
 from tests.interop.node import Node
 
-#: What these tests were tried with. playcanvas is a peer of splat-transform, three.js one of mkkellogg's viewer.
+#: The versions that these tests were written for. splat-transform needs playcanvas, mkkellogg's viewer needs three.js.
 PACKAGES = {
     "@playcanvas/splat-transform": "2.7.1",
     "playcanvas": "2.23.3",
@@ -24,7 +24,7 @@ PACKAGES = {
 
 
 class Foreign:
-    """One Node process with the other programs in it; what they can do, `foreign.mjs` says."""
+    """One Node process with the other programs; `foreign.mjs` describes its requests."""
 
     def __init__(self, packages: Path, scratch: Path) -> None:
         self._scratch = scratch
@@ -32,12 +32,12 @@ class Foreign:
         self.close = self._node.close
 
     def write(self, action: str, source: Path, path: Path, **options: Any) -> Path:
-        """Has `path` written of what is in `source`; returns `path`."""
+        """Has another program write the splats of `source` to `path`; returns `path`."""
         self._node.ask({"do": action, "source": str(source), "path": str(path), **options})
         return path
 
     def read(self, path: Path) -> Splats:
-        """What splat-transform decodes, in the axes of PLY files."""
+        """Has splat-transform decode a file; returns the splats in the axes of PLY files."""
         answer = self._node.ask({"do": "read", "path": str(path), "out": str(self._scratch / "column")})
         columns = {}
         for name, file in answer["columns"].items():
@@ -48,7 +48,7 @@ class Foreign:
 
 
 def _splats(columns: dict[str, NDArray[np.float32]]) -> Splats:
-    """The columns of a PLY file as `Splats`."""
+    """Converts the columns of a PLY file to `Splats`."""
 
     def stack(*names: str) -> NDArray[np.float64]:
         return np.stack([columns[name] for name in names], axis=1).astype(np.float64)
@@ -62,7 +62,7 @@ def _splats(columns: dict[str, NDArray[np.float32]]) -> Splats:
         "quat_xyzw": stack("rot_1", "rot_2", "rot_3", "rot_0"),
         "opacity": 1 / (1 + np.exp(-columns["opacity"].astype(np.float64))),
         "rgb": SH_C0 * stack("f_dc_0", "f_dc_1", "f_dc_2") + 0.5,
-        "sh": sh.reshape(len(sh), 3, rest // 3).transpose(0, 2, 1),  # a channel after the other
+        "sh": sh.reshape(len(sh), 3, rest // 3).transpose(0, 2, 1),  # all coefficients of a channel together
     }
     arrays = {name: np.ascontiguousarray(values, np.float32) for name, values in linear.items()}
     arrays["quat_xyzw"] = np.ascontiguousarray(normalized_quat(arrays["quat_xyzw"]), np.float32)

@@ -1,4 +1,4 @@
-"""What must hold between a scene, the file that sparklod makes of it and what Spark makes of that file."""
+"""Checks that Spark reads a file of sparklod as the scene that it was written from."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from tests.interop.spark import ExtSplats, Spark
 
 Floats = NDArray[np.floating]
 
-#: Relative rounding error of a float16: half of its last of 11 bits. Absolute below its normal numbers, and room for
-#: float32 arithmetic that differs in its last bits.
+#: HALF: relative rounding error of a float16, half of the last of its 11 bits. TINY: absolute error below its normal
+#: numbers, with room for float32 arithmetic that differs in last bits.
 HALF, TINY = 2.0**-11, 2.0**-25 + 1e-6
 
-#: Degrees by which ExtSplats may turn a rotation. An axis lies within 1 / 1023 of its code along x and y of the
-#: octahedron, so within sqrt(1 + 1 + 2 ** 2) / 1023 of it in space, at sqrt(1 / 3) from the origin in the middle of a
-#: face. The rotation is off by up to twice that angle, where it is one by 180 degrees; and half a step of the angle.
+#: Error of a rotation in ExtSplats, in degrees. The decoded axis is off by up to 1 / 1023 along x and y of the
+#: octahedron, so by up to sqrt(1 + 1 + 2 ** 2) / 1023 in space; in the middle of a face, that is at sqrt(1 / 3) from
+#: the origin. The rotation is off by up to twice that angle, if it is one by 180 degrees, and half a step of its angle.
 EXT_DEGREES = np.degrees(2 * np.sqrt(18) / 1023 + np.pi / 4095 / 2)
 
-#: Degrees by which SPZ may turn a rotation, by version; a rotation is twice the angle between its quaternions.
-#: 2: x y z lie within 1 / 255 of their codes, together within r = sqrt(3) / 255. The length of x y z is off by up to r,
-#: and where it is near 1 that makes w = sqrt(1 - length ** 2) off by up to sqrt(2 * r).
-#: 3: three components lie within sqrt(1 / 2) / 511 / 2 of their codes, together within r = sqrt(3) times that. The
-#: fourth is at least 1 / 2 and the three at most sqrt(3) / 2 long, so it is off by up to sqrt(3) * r.
+#: Error of a rotation in SPZ, in degrees, by version; a rotation differs by twice the angle between the quaternions.
+#: 2: x, y and z are off by up to 1 / 255 each, together by r = sqrt(3) / 255. So the length of x y z is off by up to r,
+#: and where it is near 1, w = sqrt(1 - length ** 2) is off by up to sqrt(2 * r).
+#: 3: three components are off by up to sqrt(1 / 2) / 511 / 2 each, together by r = sqrt(3) times that. The fourth is at
+#: least 1 / 2 and the length of the three at most sqrt(3) / 2, so it is off by up to sqrt(3) * r.
 SPZ_DEGREES = {
     2: np.degrees(2 * np.hypot(np.sqrt(2 * np.sqrt(3) / 255), np.sqrt(3) / 255)),
     3: np.degrees(2 * 2 * np.sqrt(3) * np.sqrt(0.5) / 511 / 2),
@@ -40,24 +40,24 @@ SPZ_DEGREES = {
 
 
 def degrees_between(a: Floats, b: Floats) -> Floats:
-    """(N,) angles of the rotations that lead from one to the other; q and -q are the same rotation."""
+    """Returns (N,) angles between rotations; q and -q are the same rotation."""
     a, b = a.astype(np.float64), b.astype(np.float64)
     chord = np.minimum(np.linalg.norm(a - b, axis=1), np.linalg.norm(a + b, axis=1))
     return np.degrees(4 * np.arcsin(chord / 2))
 
 
 def within(got: Floats, expected: Floats, tolerance: Floats | float) -> None:
-    """Each number lies within its tolerance."""
+    """Asserts that each number is within its tolerance of the expected one."""
     assert got.shape == expected.shape
     excess = np.abs(got.astype(np.float64) - expected) - tolerance
     assert excess.max(initial=-1) <= 0, f"{np.count_nonzero(excess > 0)} of {got.size} are off by up to {excess.max()}"
 
 
 def held_by_ext_sh(sh: Floats) -> tuple[Floats, Floats]:
-    """What ExtSplats holds of SH coefficients (N, K, 3), and by how much it may be off.
+    """Returns SH coefficients (N, K, 3) as ExtSplats can hold them, and their largest error.
 
-    The three channels share the exponent of the largest, rounded *down*, and have a byte of magnitude each that stands
-    for 0 .. 2 ** exponent. What exceeds that is cut off: Spark shows up to half of a coefficient's strength less.
+    The three channels share the exponent of the largest, rounded *down*, and each has a byte of magnitude for
+    0..2 ** exponent. Larger magnitudes are clamped: Spark shows a coefficient with as little as half of its strength.
     """
     largest = np.maximum(np.abs(sh).max(axis=2, keepdims=True), 2.0**-15)
     most = 2.0 ** np.floor(np.log2(largest))
@@ -65,23 +65,23 @@ def held_by_ext_sh(sh: Floats) -> tuple[Floats, Floats]:
 
 
 def check_tree(got: ExtSplats, tree: LodTree) -> None:
-    """Spark's tree has these links, and what its traversal reads of each node is that node's splat."""
+    """Asserts that Spark's tree has the same child columns, and that its nodes agree with their splats."""
     nodes = got.nodes
     assert nodes is not None
     assert len(nodes) == len(got.center) == len(tree)
     np.testing.assert_array_equal(nodes["child_count"], tree.child_count)
     np.testing.assert_array_equal(nodes["child_start"], tree.child_start)
     np.testing.assert_array_equal(nodes["center"], got.center.astype(np.float16))
-    # Not the 2 * max(scale) * max(1, D) of Spark's own tree builder and its design notes.
+    # Spark's own tree builder and its design notes use 2 * max(scale) * max(1, D) instead.
     size = 2 * np.exp(got.log_scale).mean(axis=1) * (1 + 0.7 * np.maximum(0, got.lod_opacity - 1))
     within(nodes["size"], size, HALF * size + TINY)
 
 
 def check_decoded(got: ExtSplats, data: bytes) -> Scene:
-    """Spark reads the same numbers from a file as `spz.decode`, as far as ExtSplats can hold them."""
+    """Asserts that Spark reads the same numbers as `spz.decode`, within the precision of ExtSplats."""
     scene = spz.decode(io.BytesIO(data))
     splats = scene.splats
-    np.testing.assert_array_equal(got.center, splats.center)  # both have float32
+    np.testing.assert_array_equal(got.center, splats.center)  # float32 in both
     within(got.rgb, splats.rgb, HALF * np.abs(splats.rgb) + TINY)
     log_scale = np.log(splats.scale.astype(np.float64))
     within(got.log_scale, log_scale, 1e-6)  # a float16 holds sixteenths up to 10 exactly
@@ -93,20 +93,20 @@ def check_decoded(got: ExtSplats, data: bytes) -> Scene:
         within(got.alpha, splats.opacity, HALF * splats.opacity + TINY)
     else:
         d = lod_opacity(splats.opacity)
-        # D above 1 is a quarter of itself in the float16.
+        # The float16 holds (D + 3) / 4 for D above 1, so errors are four times as large.
         within(got.lod_opacity, d, np.where(d > 1, 4 * 2 * HALF, HALF * d) + 4 * TINY)
         check_tree(got, scene.tree)
     return scene
 
 
 def check_close(got: ExtSplats, splats: Splats, version: int, fractional_bits: int) -> None:
-    """Spark shows what was there before encoding, to the steps of SPZ's codings and those of ExtSplats."""
+    """Asserts that Spark reads the splats that were encoded, within the precision of SPZ and of ExtSplats."""
     within(got.center, splats.center.astype(np.float64), 0.5 * 2.0**-fractional_bits)
-    # A byte a channel, of SH DC coefficients times 0.15 around one half.
+    # A byte for each channel: 0.15 times the SH DC coefficient, around one half.
     range_, step = SH_C0 / 0.15 / 2, SH_C0 / 0.15 / 255
     rgb = splats.rgb.astype(np.float64).clip(0.5 - range_, 0.5 + range_)
     within(got.rgb, rgb, step / 2 + HALF * np.abs(rgb) + TINY)
-    # A byte, sixteenths of a logarithm from -10 up.
+    # A byte: sixteenths of a natural logarithm, from -10 upwards.
     log_scale = np.log(splats.scale.astype(np.float64)).clip(-10, 255 / 16 - 10)
     within(got.log_scale, log_scale, 1 / 32 + 1e-6)
     assert degrees_between(got.quat_xyzw, splats.quat_xyzw).max() <= SPZ_DEGREES[version] + EXT_DEGREES
@@ -114,12 +114,12 @@ def check_close(got: ExtSplats, splats: Splats, version: int, fractional_bits: i
         within(got.alpha, splats.opacity, 1 / 510 + HALF)
     else:
         d = lod_opacity(splats.opacity).astype(np.float64)
-        # A byte, half of its codes for 0..1 and half for 1..5; 1 itself lies between the two.
+        # A byte: half of its codes are for 0..1, half for 1..5; 1 lies between two codes.
         within(got.lod_opacity, d, np.where(d > 1, 4 / 255 + 8 * HALF, 1 / 255 + HALF))
 
 
 def check_sh(spark: Spark, data: bytes, splats: Splats) -> None:
-    """Spark reads the SH coefficients at full strength: the older layout, PackedSplats, does not cut them off."""
+    """Asserts that Spark reads SH at full strength in its older layout, PackedSplats, which does not clamp them."""
     got = spark.load_packed_sh(data)
     degree = np.repeat([0, 1, 2], [3, 5, 7])[: splats.sh.shape[1], None]
     spz_step = 2.0 ** np.array([3, 4, 4])[degree] / 128  # 5, 4 and 4 bits of -1..1, rounded
@@ -129,7 +129,7 @@ def check_sh(spark: Spark, data: bytes, splats: Splats) -> None:
 
 
 def check(spark: Spark, scene: Scene, options: WriteOptions = DEFAULTS, *, threads: int = 1) -> ExtSplats:
-    """All of the above, for the file that `spz.encode` makes of a scene."""
+    """Writes a scene with `spz.encode` and makes all of the checks above."""
     data = b"".join(spz.encode(scene, options, threads=threads))
     raw = gzip.decompress(data)
     assert raw[4] == (options.spz_version or 3)
@@ -137,7 +137,7 @@ def check(spark: Spark, scene: Scene, options: WriteOptions = DEFAULTS, *, threa
     decoded = check_decoded(got, data)
     assert (decoded.tree is None) == (scene.tree is None)
     if scene.tree is not None:
-        check_tree(got, scene.tree)  # what went in, not only what spz.decode finds
-    check_close(got, scene.splats, options.version, raw[13])
+        check_tree(got, scene.tree)  # the tree that was written, and not only what spz.decode reads
+    check_close(got, scene.splats, raw[4], raw[13])
     check_sh(spark, data, scene.splats)
     return got

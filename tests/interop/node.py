@@ -9,16 +9,16 @@ from pathlib import Path
 from threading import Timer
 from typing import Any
 
-#: Far above what any request here takes; only there so that one that hangs fails the test and not the day.
+#: Time limit of a request, in seconds: far above what any takes, so that only a request that hangs fails.
 SECONDS = 120
 
 
 class Node:
-    """One Node process; it does one request after the other.
+    """One Node process, which answers one request after the other.
 
     Args:
         command: the program and its arguments.
-        log: the file for what it says on stderr.
+        log: the file for its standard error.
     """
 
     def __init__(self, command: Sequence[str], log: Path) -> None:
@@ -35,7 +35,7 @@ class Node:
         self._process.wait(SECONDS)
 
     def ask(self, request: Mapping[str, Any]) -> dict[str, Any]:
-        """The answer to a request; an `AssertionError` where that is an error, or the process ends."""
+        """Returns the answer to a request; raises an `AssertionError` if it is an error or the process ends."""
         assert self._process.stdin and self._process.stdout
         watchdog = Timer(SECONDS, self._process.kill)
         watchdog.start()

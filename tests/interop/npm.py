@@ -1,4 +1,4 @@
-"""Gets packages of other people's programs from npm, or skips where that cannot be."""
+"""Installs packages of other programs from npm, or skips the test if that is not possible."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ def folder_with(
     request: pytest.FixtureRequest,
     tmp_path_factory: pytest.TempPathFactory,
 ) -> Path:
-    """A folder whose node_modules has these packages: the one that an environment variable names, or one of ours.
+    """Returns a folder whose node_modules has packages: the one that an environment variable names, or a new one.
 
     Args:
-        packages: versions by name, all that is needed; no scripts of theirs run and no peers come with them.
-        variable: the environment variable; the versions in its folder are not looked at.
-        request: of the fixture that asks; its cache holds our folder.
-        tmp_path_factory: where there is no cache.
+        packages: versions by name, with all that they need; their scripts are not run, nor their peers installed.
+        variable: the environment variable; versions in its folder are not checked.
+        request: request of the calling fixture; the new folder is kept in its cache.
+        tmp_path_factory: makes the new folder if there is no cache.
     """
     if given := os.environ.get(variable):
         for name in packages:
@@ -38,7 +38,7 @@ def folder_with(
     label = variable.lower().removesuffix("_dir")
     parent = cache.mkdir(label) if cache else tmp_path_factory.mktemp(label)
     folder: Path = parent / "-".join(packages.values())
-    with _locked(parent / "lock"):  # several processes may test at once
+    with _locked(parent / "lock"):  # several processes may run tests at once
         if not _has(folder, packages):
             _install(folder, packages)
     return folder
@@ -63,14 +63,14 @@ def _has(folder: Path, packages: Mapping[str, str]) -> bool:
 
 
 def _install(folder: Path, packages: Mapping[str, str]) -> None:
-    """Installs the packages beside `folder` and moves them there, so that the folder is whole or not there."""
+    """Installs packages beside `folder` and renames the result to it, so that it is complete or missing."""
     npm = shutil.which("npm")
     if npm is None:
         pytest.skip("npm is not installed")
     names = ", ".join(packages)
     with tempfile.TemporaryDirectory(dir=folder.parent) as beside:
         work = Path(beside) / "packages"
-        # Peers are for pages, or named among the packages.
+        # Peer dependencies are for pages only, or listed among the packages.
         options = [
             "--no-audit",
             "--no-fund",

@@ -1,4 +1,4 @@
-"""The real Spark in headless Chromium, and its pictures."""
+"""Draws pictures with the real Spark in headless Chromium."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ PROGRAM = Path(__file__).with_name("spark_page.mjs")
 
 @dataclass(frozen=True)
 class Picture:
-    """What Spark drew.
+    """A picture that Spark drew.
 
     Attributes:
-        rounded: (height, width, 4) float64 RGBA, 0..1, of 8 bits, to which it was rounded after every splat.
-        exact: the same in float32, which was not rounded; may be above 1.
-        drawn: how many splats it sorted.
-        nodes: (S,) those of the tree that it drew, ascending; None if the file is no tree.
+        rounded: (height, width, 4) float64 RGBA, 0..1, of a canvas of 8 bits, which rounds after every splat.
+        exact: the same of a float32 canvas, without rounding; may be above 1.
+        drawn: number of splats that Spark sorted.
+        nodes: (S,) nodes of the tree that Spark drew, ascending; None if the file has no tree.
     """
 
     rounded: NDArray[np.float64]
@@ -33,12 +33,12 @@ class Picture:
 
 
 class Page:
-    """One browser with Spark in it; has one file at a time.
+    """One browser with Spark, which shows one file at a time.
 
     Args:
-        package_dir: has node_modules.
-        chromium: the browser's program.
-        scratch: an empty folder.
+        package_dir: the folder with node_modules.
+        chromium: path of the browser.
+        scratch: an empty folder for files.
     """
 
     def __init__(self, package_dir: Path, chromium: str, scratch: Path) -> None:
@@ -46,19 +46,19 @@ class Page:
         self._node = Node([str(PROGRAM), str(package_dir), chromium], scratch / "stderr.txt")
         self.close = self._node.close
 
-    def open(self, file: Path, camera: Camera, look: RasterSettings) -> int:
-        """Loads a file, for pictures of this size and these planes; tells how many splats or nodes it has."""
-        size = {"width": camera.width, "height": camera.height, "near": look.near, "far": look.far}
+    def open(self, file: Path, camera: Camera, settings: RasterSettings) -> int:
+        """Loads a file, for the size of `camera` and the planes of `settings`; returns its splats or nodes."""
+        size = {"width": camera.width, "height": camera.height, "near": settings.near, "far": settings.far}
         answer = self._node.ask({"do": "open", "path": str(file.resolve()), **size})
         return int(answer["lod"] or answer["numSplats"])
 
-    def draw(self, camera: Camera, look: RasterSettings, *, budget: int | None = None) -> Picture:
-        """What a camera sees; its principal point is in the middle and its pixels are square.
+    def draw(self, camera: Camera, settings: RasterSettings, *, budget: int | None = None) -> Picture:
+        """Draws the picture of a camera.
 
         Args:
-            camera: of the size that the page was opened with.
-            look: its `sort` only.
-            budget: the most nodes of a tree.
+            camera: has the size that the page was opened with, a centred principal point and square pixels.
+            settings: only its `sort` is used.
+            budget: number of nodes of a tree at most.
         """
         answer = self._node.ask(
             {
@@ -66,7 +66,7 @@ class Page:
                 "viewToWorld": camera.camera_to_world.T.ravel().tolist(),
                 "fovy": float(np.degrees(camera.fov_y)),
                 "budget": budget,
-                "radial": look.sort == "radial",
+                "radial": settings.sort == "radial",
                 "out": str(self._out),
             }
         )

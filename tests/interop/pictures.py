@@ -1,4 +1,4 @@
-"""The same views drawn by us and by Spark, and how far apart they are."""
+"""Draws the same views with sparklod and with Spark, and measures their difference."""
 
 from __future__ import annotations
 
@@ -26,24 +26,24 @@ from tests.interop.page import Page
 
 FOV_Y = math.radians(50)
 
-#: Where views are from: degrees around, up, and away, in radii of the scene.
+#: The views: azimuth and elevation in degrees, and distance in radii of the scene.
 AROUND = ((0, 15, 3.0), (60, 10, 1.6), (120, 40, 2.0), (180, -5, 1.2), (240, 70, 2.5), (300, 5, 0.7))
 
 
 @dataclass(frozen=True)
 class Difference:
-    """Our picture of one view, in 8 bits, beside Spark's.
+    """The difference of sparklod's picture of a view, in 8 bits, from Spark's.
 
     Attributes:
-        drawn: splats that Spark sorted.
-        psnr: of red, green and blue of all pixels, dB.
-        covered: the same of the pixels that splats cover to a tenth and more, which are `share` of all.
-        share: 0..1.
-        most: the largest difference, of 255.
-        unrounded: PSNR where Spark does not round to 8 bits after every splat, dB.
-        held: the same, of a picture of ours that is drawn from the numbers that Spark holds, after its coding of them.
-        held_most: the largest difference then, of 255.
-        same_cut: whether our traversal draws the very nodes of the tree; None if there is no tree.
+        drawn: number of splats that Spark sorted.
+        psnr: PSNR in dB of red, green and blue of all pixels.
+        covered: PSNR in dB of the pixels where alpha is 0.1 or more.
+        share: share of these pixels, 0..1.
+        most: largest difference, of 255.
+        unrounded: PSNR in dB from a picture that Spark does not round to 8 bits after every splat.
+        held: the same of a picture that sparklod draws from splats in Spark's coding.
+        held_most: largest difference of that picture, of 255.
+        same_cut: whether both draw the same nodes of the tree; None without a tree.
     """
 
     drawn: int
@@ -58,7 +58,7 @@ class Difference:
 
 
 def cameras_around(center: NDArray[np.floating], width: int, height: int) -> list[Camera]:
-    """Cameras around a scene whose up is -y, one for each of `AROUND`; they all look at its middle."""
+    """Returns a camera for each view of `AROUND`; they look at the centre of a scene whose up is -y."""
     middle, radius = framing(center)
     focal = height / 2 / math.tan(FOV_Y / 2)
     cameras = []
@@ -71,7 +71,7 @@ def cameras_around(center: NDArray[np.floating], width: int, height: int) -> lis
 
 
 def cut_of(held: Scene, camera: Camera, budget: int) -> NDArray[np.uint32]:
-    """The nodes of a tree that our traversal draws, ascending, all directions alike."""
+    """Returns the nodes of sparklod's cut, ascending, without foveation."""
     assert held.tree is not None
     nodes = lod_tree.unpack(lod_tree.pack(held.splats, held.tree))
     view = View(camera.camera_to_world, camera.fov_x, camera.fov_y)
@@ -80,33 +80,33 @@ def cut_of(held: Scene, camera: Camera, budget: int) -> NDArray[np.uint32]:
 
 
 def compare(
-    page: Page, file: Path, cameras: Sequence[Camera], look: RasterSettings, budget: int = 0
+    page: Page, file: Path, cameras: Sequence[Camera], settings: RasterSettings, budget: int = 0
 ) -> Iterator[Difference]:
-    """Draws a file from several places, one after the other.
+    """Draws a file with each camera, by both programs, and yields the differences.
 
     Args:
-        page: Spark.
-        file: of splats, or of a tree if there is a budget.
-        cameras: all of one size.
-        look: how.
-        budget: how many nodes of the tree are drawn at most.
+        page: the browser with Spark.
+        file: a splat file, or an LoD file if there is a budget.
+        cameras: cameras of one size.
+        settings: the raster settings.
+        budget: number of nodes of the tree at most; 0 for a plain splat file.
     """
     scene = read_scene(file)
-    count = page.open(file, cameras[0], look)
+    count = page.open(file, cameras[0], settings)
     assert count == len(scene.splats), f"Spark has {count:,} splats of {file.name}, not {len(scene.splats):,}"
     held = Scene(ext_splats.unpack(ext_splats.pack(scene.splats)), scene.tree)
     for camera in cameras:
-        yield _difference(page, scene.splats, held, camera, look, budget)
+        yield _difference(page, scene.splats, held, camera, settings, budget)
 
 
 def _difference(
-    page: Page, splats: Splats, held: Scene, camera: Camera, look: RasterSettings, budget: int
+    page: Page, splats: Splats, held: Scene, camera: Camera, settings: RasterSettings, budget: int
 ) -> Difference:
-    theirs = page.draw(camera, look, budget=budget or None)
+    theirs = page.draw(camera, settings, budget=budget or None)
     nodes = cut_of(held, camera, budget) if budget else None
     rows = slice(None) if nodes is None else nodes
     image, again = (
-        np.clip(draw(shade([(some.take(rows), np.eye(4))], camera), camera, look), 0, 1)
+        np.clip(draw(shade([(some.take(rows), np.eye(4))], camera), camera, settings), 0, 1)
         for some in (splats, held.splats)
     )
     off = (np.rint(255 * image) / 255 - theirs.rounded)[..., :3]
@@ -127,6 +127,6 @@ def _difference(
 
 
 def psnr(difference: NDArray[np.floating]) -> float:
-    """Of numbers of 0..1, dB."""
+    """Returns the PSNR, in dB, of the differences of numbers of 0..1."""
     square = float(np.mean(np.square(difference, dtype=np.float64))) if difference.size else 0.0
     return 10 * math.log10(1 / square) if square else math.inf

@@ -1,4 +1,4 @@
-"""The real Spark in a Node process, and its in-memory layouts as numpy columns."""
+"""Runs the real Spark in a Node process, and decodes its in-memory layouts to numpy columns."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ from tests.interop.node import Node
 
 PROGRAM = Path(__file__).with_name("spark_load.mjs")
 
-#: ExtSplats, one row for each of its two arrays of 16 bytes a splat.
+#: ExtSplats: its two arrays of 16 bytes a splat.
 EXT0 = np.dtype([("center", "<f4", 3), ("alpha", "<f2"), ("padding", "<u2")])
 EXT1 = np.dtype([("rgb", "<f2", 3), ("log_scale", "<f2", 3), ("quat", "<u4")])
-#: A node of the LodTree. The count has a whole word, so that one that does not fit its uint16 shows up.
+#: A node of the LodTree. child_count is read as a word, so that a count beyond its uint16 is noticed.
 NODE = np.dtype([("center", "<f2", 3), ("size", "<f2"), ("child_count", "<u4"), ("child_start", "<u4")])
 assert EXT0.itemsize == EXT1.itemsize == NODE.itemsize == 16
 
-#: Bits a coefficient of the SH arrays of PackedSplats.
+#: Bits of a coefficient in the SH arrays of PackedSplats, by degree from 1.
 PACKED_SH_BITS = (7, 8, 6)
 
 
 @dataclass(frozen=True)
 class Reply:
-    """What Spark made of one file: its arrays of uint32, as they lie in memory."""
+    """What Spark read from one file: its arrays of uint32, as they are in memory."""
 
     count: int
     lod: bool
     words: Mapping[str, NDArray[np.uint32]]
 
     def rows(self, name: str, dtype: np.dtype[Any]) -> NDArray[Any]:
-        """(count,) structs of an array; Spark allocates whole rows of a texture, more than there are splats."""
+        """Returns (count,) structs of an array, without the rest of the last row that Spark allocates."""
         return self.words[name].view(dtype)[: self.count]
 
 
@@ -43,10 +43,10 @@ class ExtSplats:
     """Decoded ExtSplats of N splats.
 
     Attributes:
-        alpha: (N,) as stored: the opacity, and in an LoD file D = 1..5 as 1..2.
-        lod_opacity: (N,) D.
+        alpha: (N,) as stored: the opacity; in an LoD file 1..2 is an LoD opacity D of 1..5.
+        lod_opacity: (N,) LoD opacity D.
         sh: (N, K, 3), K = 0, 3, 8 or 15.
-        nodes: (N,) `NODE` rows if Spark took the file for an LoD tree.
+        nodes: (N,) `NODE` rows; None if Spark found no tree in the file.
     """
 
     center: NDArray[np.float32]
@@ -64,12 +64,12 @@ class ExtSplats:
 
 @dataclass(frozen=True)
 class Traversed:
-    """What Spark's traversal found.
+    """A cut that Spark's traversal found.
 
     Attributes:
-        indices: of each instance the nodes that are drawn, in Spark's order.
-        chunks: (tree, chunk) of what was looked into, the first first.
-        pixel_limit: as Spark tells it.
+        indices: the nodes drawn of each instance, in Spark's order.
+        chunks: (tree, chunk) that were visited, in order.
+        pixel_limit: the least pixel scale from the root to the node that did not fit into the budget, as Spark says.
     """
 
     indices: list[NDArray[np.uint32]]
@@ -78,7 +78,7 @@ class Traversed:
 
 
 class Spark:
-    """One Node process with Spark's worker in it; loads files one after the other."""
+    """One Node process with Spark's worker, which loads one file after the other."""
 
     def __init__(self, package_dir: Path, scratch: Path) -> None:
         self._scratch = scratch
@@ -100,7 +100,7 @@ class Spark:
         return Reply(answer["numSplats"], answer["lod"], words)
 
     def load(self, source: bytes | Path, *, lod: bool = False) -> ExtSplats:
-        """Loads the bytes of an SPZ file, or a file, as ExtSplats; `lod` builds a tree where it has none."""
+        """Loads a file, or the bytes of an SPZ file, as ExtSplats; `lod` builds a tree if it has none."""
         reply = self._ask("loadExtSplats", source, {"lod": lod})
         ext0, ext1 = reply.rows("ext0", EXT0), reply.rows("ext1", EXT1)
         nodes = reply.words["lodTree"].view(NODE) if reply.lod else None
@@ -116,16 +116,16 @@ class Spark:
         )
 
     def load_words(self, layout: str, source: bytes | Path, **options: Any) -> dict[str, NDArray[np.uint32]]:
-        """The arrays of a layout, "Packed" or "Ext", as (N, words) rows without what Spark allocates beyond its splats.
+        """Loads a file in a layout, "Packed" or "Ext"; returns its arrays as (N, words), one row a splat.
 
-        The worker takes `options`: `lod` to build a tree, `encoding` for the ranges of PackedSplats.
+        `options` go to the worker: `lod` builds a tree, `encoding` sets the ranges of PackedSplats.
         """
         reply = self._ask(f"load{layout}Splats", source, options)
         width = {"sh1": 2 if layout == "Packed" else 4}
         return {name: words.reshape(-1, width.get(name, 4))[: reply.count] for name, words in reply.words.items()}
 
     def keep_tree(self, words: NDArray[np.uint32]) -> int:
-        """Gives Spark's worker a LodTree, four words a node; returns what Spark calls it."""
+        """Loads a LodTree, four words a node, into Spark's worker; returns its id."""
         path = self._scratch / "tree"
         words.tofile(path)
         tree: int = self._node.ask({"method": "initLodTree", "path": str(path)})["lodId"]
@@ -136,9 +136,9 @@ class Spark:
         """Finds a cut, as `SparkRenderer` does.
 
         Args:
-            budget: how many splats may be drawn.
-            smallest: the pixel scale limit.
-            instances: for each lodId, viewToObjectCols, lodScale, behindFoveate, coneFov0, coneFov and coneFoveate.
+            budget: number of splats at most.
+            smallest: the pixel-scale limit.
+            instances: lodId, viewToObjectCols, lodScale, behindFoveate, coneFov0, coneFov and coneFoveate of each.
         """
         options = {
             "maxSplats": budget,
@@ -154,7 +154,7 @@ class Spark:
         return Traversed(np.split(indices, np.cumsum(answer["counts"])[:-1]), chunks, answer["pixelLimit"])
 
     def load_packed_sh(self, source: bytes) -> NDArray[np.float64]:
-        """(N, K, 3) SH coefficients of a file as Spark's other layout, PackedSplats, holds them."""
+        """Returns the (N, K, 3) SH coefficients of a file in Spark's other layout, PackedSplats."""
         reply = self._ask("loadPackedSplats", source, {})
         parts = [np.zeros((reply.count, 0))]
         for degree, bits in enumerate(PACKED_SH_BITS, 1):
@@ -162,7 +162,7 @@ class Spark:
                 break
             size = 3 * (2 * degree + 1)
             words = reply.words[f"sh{degree}"].reshape(-1, 2 if degree == 1 else 4)[: reply.count]
-            # Numbers of two's complement lie bit after bit, across words.
+            # Two's-complement numbers follow each other without gaps, also across words.
             stream = np.unpackbits(words.view(np.uint8), axis=1, bitorder="little")[:, : size * bits]
             weight = 2.0 ** np.arange(bits)
             weight[-1] *= -1
@@ -171,10 +171,10 @@ class Spark:
 
 
 def _decode_quat(code: NDArray[np.uint32]) -> NDArray[np.float64]:
-    """The axis as 10 + 10 bits of an octahedral map, and 12 bits of the angle, 0..pi."""
+    """Decodes quaternions: the axis in 10 + 10 bits of an octahedral map, the angle of 0..pi in 12 bits."""
     xy = np.stack([code & 1023, code >> 10 & 1023], axis=1) / 1023 * 2 - 1
     z = 1 - np.abs(xy).sum(axis=1, keepdims=True)
-    xy -= np.copysign(np.maximum(-z, 0), xy)  # unfolds the lower half
+    xy -= np.copysign(np.maximum(-z, 0), xy)  # unfold the lower half
     axis = np.concatenate([xy, z], axis=1)
     axis /= np.linalg.norm(axis, axis=1, keepdims=True)
     half = ((code >> 20) / 4095 * np.pi / 2)[:, None]
@@ -182,9 +182,9 @@ def _decode_quat(code: NDArray[np.uint32]) -> NDArray[np.float64]:
 
 
 def _decode_ext_sh(reply: Reply) -> NDArray[np.float64]:
-    """A word a coefficient: a byte each of r, g and b, their signs, and the exponent that they share.
+    """Decodes SH: a word a coefficient, with a byte and a sign for each of r, g and b, and one exponent for all.
 
-    sh1 holds the three of degree 1 and the first of degree 2, sh2 the other four; sh3a and sh3b hold degree 3.
+    sh1 has the three coefficients of degree 1 and the first of degree 2, sh2 the other four; sh3a and sh3b degree 3.
     """
     arrays = [
         reply.words[name].reshape(-1, 4)[: reply.count]

@@ -1,7 +1,7 @@
-"""The in-memory encodings are word for word what Spark makes: its worker of files, its JavaScript of bare numbers.
+"""The in-memory encodings are word for word those of Spark: of its worker for files, of its JavaScript for numbers.
 
-But for ties that last bits decide, in a stated share of all codes at most, which is two to three times what was seen.
-See `ties`.
+Exceptions are ties that last bits decide (see `ties`); the tests bound their share of all codes by two to three times
+the share that was measured.
 """
 
 from __future__ import annotations
@@ -41,12 +41,12 @@ PROGRAM = Path(__file__).with_name("spark_encode.mjs")
 
 
 def spark_encoding(encoding: Encoding) -> dict[str, Any]:
-    """Spark's own names."""
+    """Returns an encoding by Spark's names."""
     return {re.sub("_(.)", lambda match: match[1].upper(), name): value for name, value in asdict(encoding).items()}
 
 
 def check_file(spark: Spark, path: Path, share: float, encoding: Encoding = packed_splats.DEFAULT) -> None:
-    """Both layouts and the tree of a file, as Spark's worker and as ours of what `read_scene` reads of it."""
+    """Compares both layouts and the tree of a file: those of Spark's worker, and ours of the same file."""
     scene = read_scene(path)
     splats, lod = scene.splats, scene.tree is not None
     encoding = Encoding(**asdict(encoding) | {"lod_opacity": lod})
@@ -72,7 +72,7 @@ def check_file(spark: Spark, path: Path, share: float, encoding: Encoding = pack
 
 
 def ext_sh(words: Words) -> NDArray[np.uint32]:
-    """The words of SH without those that hold nothing: Spark leaves in them what its buffer had before."""
+    """Returns the words of SH without unused ones, in which Spark leaves what its buffer had before."""
     names = [name for name in ("sh1", "sh2", "sh3a", "sh3b") if name in words]
     everything = np.concatenate([words["ext0"][:, :0], *(words[name] for name in names)], axis=1)
     return everything[:, : (0, 3, 8, 0, 15)[len(names)]]
@@ -110,7 +110,7 @@ def baked(path: Path, splats: Splats, version: int) -> Path:
 
 
 def edges() -> Splats:
-    """Every pair of a hard rotation and a hard rest, among them the ends of all ranges."""
+    """Combines every hard rotation with hard values of the other columns, such as the ends of all ranges."""
     half = 0.5**0.5
     quats = [[0, 0, 0, 1], [0, 0, 0, -1], [1, 0, 0, 0], [-1, 0, 0, 0], [0, 1, 0, 0], [0, -1, 0, 0], [0, 0, 1, 0]]
     quats += [[0, 0, -1, 0], [half, 0, 0, half], [0, 0, -half, -half], [0, half, -half, 0], [-half, -half, 0, 0]]
@@ -141,14 +141,14 @@ def test_words_of_random_splats_are_those_of_spark(spark: Spark, tmp_path: Path,
 
 @pytest.mark.parametrize("encoding", [packed_splats.DEFAULT, WIDE])
 def test_words_at_the_ends_of_ranges_are_those_of_spark(spark: Spark, tmp_path: Path, encoding: Encoding) -> None:
-    """Ranges of ours to PackedSplats, and all their ends; ties are many here, as the numbers are round."""
+    """Ties are frequent here, as the numbers are round."""
     check_file(spark, ply(tmp_path / "edges.ply", edges()), 0.2, encoding)
 
 
 @pytest.mark.parametrize("sh_degree", range(4))
 @pytest.mark.parametrize("version", [2, 3])
 def test_words_of_a_tree_are_those_of_spark(spark: Spark, tmp_path: Path, version: int, sh_degree: int) -> None:
-    """The few numbers that SPZ has make the same ties again and again."""
+    """SPZ has few distinct numbers, so the same ties occur again and again."""
     path = baked(tmp_path / "tree.spz", random_splats(20_000, sh_degree=sh_degree), version)
     assert lod_opacity(read_scene(path).splats.opacity).max() > 1.5
     check_file(spark, path, share=2e-3)
@@ -165,7 +165,7 @@ def test_words_of_a_baked_real_scene_are_those_of_spark(spark: Spark, tmp_path: 
 
 @pytest.mark.parametrize("layout", ["Packed", "Ext"])
 def test_the_tree_of_sparks_own_builder_comes_back(spark: Spark, tmp_path: Path, layout: str) -> None:
-    """What it keeps of each merged splat, read and measured by us, gives its nodes back."""
+    """Unpacking its merged splats and packing them again gives its nodes."""
     path = ply(tmp_path / "random.ply", random_splats(20_000))
     words = spark.load_words(layout, path, lod=True)
     held = packed_splats.unpack(words, Encoding(lod_opacity=True)) if layout == "Packed" else ext_splats.unpack(words)
@@ -177,7 +177,7 @@ def test_the_tree_of_sparks_own_builder_comes_back(spark: Spark, tmp_path: Path,
 
 
 def test_sparks_worker_codes_only_a_scale_of_0_as_zero(spark: Spark, tmp_path: Path) -> None:
-    """Its pages and its JavaScript say that scales below e ** -30 are 0, and so do we."""
+    """Spark's documentation and its JavaScript make scales below e ** -30 zero, and so does sparklod."""
     splats = random_splats(1)
     splats.scale[:] = [0, np.exp(-31), np.exp(-29)]
     path = ply(tmp_path / "tiny.ply", splats)
@@ -191,14 +191,14 @@ def test_sparks_worker_codes_only_a_scale_of_0_as_zero(spark: Spark, tmp_path: P
 
 
 def cut_off(values: Floats) -> NDArray[np.float16]:
-    """float16s toward zero."""
+    """Rounds to float16 towards zero."""
     nearest = values.astype(np.float16)
     return np.where(np.abs(nearest.astype(np.float64)) > np.abs(values), np.nextafter(nearest, np.float16(0)), nearest)
 
 
 @pytest.mark.parametrize("encoding", [packed_splats.DEFAULT, WIDE, Encoding(lod_opacity=True)])
 def test_words_are_those_of_sparks_encoders_in_javascript(spark_dir: Path, tmp_path: Path, encoding: Encoding) -> None:
-    """Its float64 against our float32; where the Node at hand has no Float16Array, it cuts float16s off."""
+    """Spark's JavaScript has float64; in a Node without Float16Array it rounds float16 towards zero."""
     if shutil.which("node") is None:
         pytest.skip("Node is not installed")
     splats = random_splats(20_000, sh_degree=3, seed=1)
@@ -224,7 +224,7 @@ def test_words_are_those_of_sparks_encoders_in_javascript(spark_dir: Path, tmp_p
     ext = {name: words(name, 4) for name in ("ext0", "ext1")}
     codes, steps = ext_codes(ext_splats.pack(splats)), ext_steps(splats)
     codes |= {"alpha": to_half(splats.opacity), "rgb": to_half(splats.rgb), "log_scale": to_half(np.log(splats.scale))}
-    if to_half is cut_off:  # then float32 logarithms have their ties at whole steps
+    if to_half is cut_off:  # then ties of float32 logarithms are at whole steps
         value, error = steps["log_scale"]
         steps["log_scale"] = value + 0.5, error
     check(codes, ext_codes(ext), steps, share=2e-4)

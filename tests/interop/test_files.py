@@ -1,4 +1,4 @@
-"""Spark reads what `spz.encode` writes of made-up scenes."""
+"""Spark reads the files that `spz.encode` writes of synthetic scenes."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_spark_reads_a_tree_as_it_was_baked(spark: Spark, method: str, version: 
     scene = baked(random_splats(2000, sh_degree=sh_degree), method)
     got = laws.check(spark, scene, WriteOptions(spz_version=version))
     assert got.sh.shape == scene.splats.sh.shape
-    assert got.lod_opacity.max() > 1  # merged splats that are more than opaque were among them
+    assert got.lod_opacity.max() > 1  # there are merged splats with a D above 1
 
 
 @pytest.mark.parametrize("sh_degree", range(4))
@@ -80,7 +80,7 @@ def test_antialiased_changes_only_the_flag(spark: Spark) -> None:
 
 
 def test_a_page_that_asks_for_lod_gets_our_tree(spark: Spark) -> None:
-    """`SplatMesh({lod: true})` decodes by another way, into what Spark would build a tree from if there were none."""
+    """`SplatMesh({lod: true})` decodes in another way, from which Spark builds a tree if the file has none."""
     scene = baked(random_splats(2000, sh_degree=3))
     got = spark.load(encoded(scene), lod=True)
     assert scene.tree is not None
@@ -88,7 +88,7 @@ def test_a_page_that_asks_for_lod_gets_our_tree(spark: Spark) -> None:
 
 
 def test_spark_refuses_a_truncated_file(spark: Spark) -> None:
-    """So that the tests above would notice if Spark could not read a file."""
+    """This shows that the tests above would notice if Spark could not read a file."""
     data = encoded(baked(random_splats(500)))
     with pytest.raises(AssertionError, match="failed: "):
         spark.load(data[: len(data) // 2])

@@ -1,4 +1,4 @@
-"""Other programs' files, and ours: sparklod, splat-transform and Spark see the same splats in them."""
+"""sparklod, splat-transform and Spark read the same splats from files of sparklod and of other programs."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tests.interop.foreign import Foreign
 from tests.interop.laws import EXT_DEGREES, HALF, TINY, Floats, degrees_between, held_by_ext_sh, within
 from tests.interop.spark import Spark
 
-#: Makes a file in a folder of what is in a PLY file, and says where.
+#: Makes a file from a PLY file: takes the programs, the PLY file and a folder, and returns the path.
 Writer = Callable[[Foreign, Path, Path], Path]
 
 
@@ -38,8 +38,8 @@ def ours(codec: ModuleType, name: str) -> Writer:
     return write
 
 
-#: Few enough for several sections of the fixtures, with full buckets and others in each. Of them mkkellogg's own reader
-#: and splat-transform's read only those that begin at multiples of four bytes; 20 splats do.
+#: Sizes that give the fixtures several sections, each with full and partly filled buckets. mkkellogg's reader and
+#: splat-transform's can read sections only if they begin at multiples of four bytes, which 20 splats ensure.
 SECTIONS = {"section": 20, "block": 1.0, "bucket": 4}
 
 WRITERS: dict[str, Writer] = {
@@ -54,7 +54,7 @@ WRITERS: dict[str, Writer] = {
     "our PLY": ours(ply, "ours.ply"),
     "our SPLAT": ours(splat, "ours.splat"),
 }
-#: Put together by fixtures/make_fixtures.py. No program that can be had writes version 1 of SOG, or the older chunks.
+#: Files that fixtures/make_fixtures.py writes. No available program writes SOG of version 1 or the older chunks.
 BY_HAND = [
     *("sh3-compressed.ply", "sh1-compressed-old.ply", "coincident-compressed.ply", "sh0.splat"),
     *("sh2-level0.ksplat", "sh2-level1.ksplat", "sh2-level2.ksplat"),
@@ -63,7 +63,7 @@ BY_HAND = [
 SOURCES = [f"sh{degree}.ply" for degree in range(4)]
 WRITTEN = [pytest.param((writer, source), id=f"{writer}-{source}") for writer in WRITERS for source in SOURCES]
 FILES = [*WRITTEN, *(pytest.param((None, f"golden/{name}"), id=name) for name in BY_HAND)]
-#: Where all bounds of a chunk are alike, and where they are far apart.
+#: Scenes whose bounds of a chunk are all equal, and far apart.
 HARD = [
     pytest.param((writer, source), id=f"{writer}-{source}")
     for writer in WRITERS
@@ -84,7 +84,7 @@ class File:
 
 @pytest.fixture(scope="session")
 def make(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Callable[..., File]:
-    """Makes files, each but once."""
+    """Makes files, and each only once."""
 
     @cache
     def make(writer: str | None, source: Path) -> File:
@@ -104,8 +104,8 @@ def file(request: pytest.FixtureRequest, make: Callable[..., File]) -> File:
 
 
 def flipped(splats: Splats) -> Splats:
-    """Turned by 180 degrees about x, from the axes of PLY files to those that SPZ files have by its specification."""
-    signs = [-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1]  # of the SH that are odd in y and z together
+    """Rotates splats by 180 degrees about x, from the axes of PLY files to those of SPZ's specification."""
+    signs = [-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1]  # -1 for SH that are odd in y and z together
     return replace(
         splats,
         center=splats.center * np.float32([1, -1, -1]),
@@ -115,19 +115,19 @@ def flipped(splats: Splats) -> Splats:
 
 
 def check_same(ours: Splats, theirs: Splats, degrees: float) -> None:
-    """The same numbers, but for float32 arithmetic."""
+    """Asserts that splats are equal up to float32 arithmetic."""
     within(ours.center, theirs.center, 2.0**-22 * np.abs(theirs.center).max())
     within(np.log(ours.scale), np.log(theirs.scale), 2e-6)
     assert degrees_between(ours.quat_xyzw, theirs.quat_xyzw).max() <= degrees
-    within(ours.opacity, theirs.opacity, 1.2e-6)  # splat-transform makes it 1e-6 .. 1 - 1e-6, for its logarithm
+    within(ours.opacity, theirs.opacity, 1.2e-6)  # splat-transform clamps it to 1e-6..1 - 1e-6, for its logarithm
     within(ours.rgb, theirs.rgb, 1e-6 * (1 + np.abs(theirs.rgb)))
     within(ours.sh, theirs.sh, 1e-6 * (1 + np.abs(theirs.sh)))
 
 
 def check_with_splat_transform(foreign: Foreign, file: File) -> None:
     theirs = foreign.read(file.path)
-    # It takes the bytes of .splat for 255 * (q / 2 + 1 / 2), where their writers mean 128 * q + 128: all four
-    # components are off by up to 1 / 128, together by 1 / 64 of the length, which is at least 1 - 1 / 64.
+    # splat-transform reads the bytes of .splat as 255 * (q / 2 + 1 / 2), but writers mean 128 * q + 128: each of the
+    # four components is off by up to 1 / 128, together by 1 / 64, at a length of at least 1 - 1 / 64.
     degrees = np.degrees(2 / 63) if file.path.suffix == ".splat" else 1e-4
     check_same(read_scene(file.path, threads=2).splats, flipped(theirs) if "SPZ" in file.writer else theirs, degrees)
 
@@ -144,7 +144,7 @@ def test_splat_transform_reads_the_same_splats_of_real_scenes(
     check_with_splat_transform(foreign, make(writer, real_scene(scene)))
 
 
-#: Changes to a header of KSPLAT: offset and type of a number, and what is added to it or, for 0, put there.
+#: Changes to headers of KSPLAT: offset and type of a number, and what to add to it; 0 sets the number to 0.
 HEADERS = {
     "fewer splats than there is room for": [(16, "<u4", -5), (4096, "<u4", -5)],
     "SH from -1.5 to 1.5 unless it says otherwise": [(36, "<f4", 0), (40, "<f4", 0)],
@@ -176,7 +176,7 @@ def spark_degrees(file: File, quat: Floats) -> Floats:
 
 
 def seen_by_spark(file: File, splats: Splats) -> Floats:
-    """(N, K, 3) SH: Spark reads a byte of compressed PLY as 0..255 for -4..4, where its writer means 256 steps."""
+    """Returns (N, K, 3) SH as Spark reads them: it maps bytes 0..255 of compressed PLY to -4..4, not 256 parts."""
     if "compressed" not in file.path.name:
         return splats.sh
     codes = np.clip((splats.sh.astype(np.float64) / 8 + 0.5) * 256 - 0.5, 0, 255)
@@ -184,7 +184,7 @@ def seen_by_spark(file: File, splats: Splats) -> Floats:
 
 
 def spark_can_read(writer: str | None, source: str) -> bool:
-    """Spark 2.2 knows no SPZ 4, and here its worker gets one file."""
+    """Whether Spark 2.2 can read it: not SPZ 4, nor several files, as its worker gets only one here."""
     return writer not in ("SPZ 4", "unpacked SOG") and not source.endswith("meta.json")
 
 
@@ -205,15 +205,15 @@ def test_spark_reads_the_same_splats(spark: Spark, file: File) -> None:
 
 @dataclass(frozen=True)
 class Loss:
-    """By how much a format may miss what was put into it.
+    """The largest errors of a format.
 
     Attributes:
         center: in world units.
         scale: relative.
-        degrees: of rotation.
-        color: of rgb, once within 0..1, and of opacity.
-        sh: (N, K, 3) of SH, from what they are.
-        sh_degree: the most that it holds.
+        degrees: of rotations, in degrees.
+        color: of rgb, clamped to 0..1, and of opacity.
+        sh: returns the error of SH (N, K, 3).
+        sh_degree: the largest degree that it holds.
     """
 
     center: float = 0
@@ -224,11 +224,11 @@ class Loss:
     sh_degree: int = 3
 
 
-#: Rounding towards zero, as three.js makes a float16: its last of 11 bits, or the last of its smallest numbers.
+#: Errors of rounding to float16 towards zero, as three.js does: the last of 11 bits, and that of subnormal numbers.
 CUT, SMALL = 2.0**-10, 2.0**-24
-#: A byte a component, rounded, and 1 is 255 / 128 - 1: off by 1 / 256, one of them by 1 / 128.
+#: Rotations have a byte a component, off by up to 1 / 256; 1 becomes 255 / 128 - 1, which is off by 1 / 128.
 SPLAT = Loss(degrees=np.degrees(2 * (np.sqrt(3) / 256 + 1 / 128)), color=1 / 510 + 1e-6, sh_degree=0)
-#: Positions are rounded to 32767 steps of half a block, colours cut to bytes.
+#: Positions are rounded to 32767 steps in half a block, colours are rounded down to bytes.
 KSPLAT = Loss(5 / 2 / 32767 / 2 + 1e-6, CUT + 1e-6, np.degrees(2 * CUT), 1 / 255 + 1e-6, sh_degree=2)
 LOSSES = {
     "our PLY": Loss(),
@@ -244,7 +244,7 @@ LOSSES = {
     "file", [row for row in WRITTEN if row.values[0][0].removesuffix(" in sections") in LOSSES], indirect=True
 )
 def test_splats_of_other_writers_are_near_their_source(file: File) -> None:
-    """What is read is what was written, to the steps of the format's codings."""
+    """Splats are read as they were written, up to the precision of the format."""
     loss = LOSSES[file.writer.removesuffix(" in sections")]
     got, source = read_scene(file.path).splats, read_scene(file.source).splats
     assert got.sh_degree == min(source.sh_degree, loss.sh_degree)

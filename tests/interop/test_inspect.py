@@ -1,6 +1,6 @@
-"""`inspect --check` judges trees of Spark's own builders as what they are.
+"""`inspect --check` reports the right facts and findings of trees from Spark's own builders.
 
-What they are is told by slow, plain Python, from the bytes of the file as docs/formats.md lays them out.
+The expected ones are computed by slow, plain Python from the bytes of the file, as docs/formats.md describes them.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from tests.conftest import FIXTURES, real_scene
 from tests.interop.laws import degrees_between
 from tests.interop.spark import Spark
 
-#: Spark's names for its two builders, the tiny one and Bhattacharyya's, by ours.
+#: Values of Spark's option `lod` for its two builders, the tiny one and Bhattacharyya's, by sparklod's methods.
 BUILDERS: dict[str, Any] = {"quick": True, "quality": "quality"}
 CHUNK = 65_536
 
 
 def spark_tree(spark: Spark, source: Path, builder: str) -> Scene:
-    """The tree that Spark builds of a file, as it holds it in memory."""
+    """Returns the tree that Spark builds from a file, as it holds it in memory."""
     words = spark.load_words("Ext", source, lod=BUILDERS[builder])
     nodes = lod_tree.unpack({"lod_tree": words.pop("lodTree")})
     return Scene(ext_splats.unpack(words), nodes.tree)
@@ -41,15 +41,15 @@ def spark_tree(spark: Spark, source: Path, builder: str) -> Scene:
 
 @dataclass
 class Tree:
-    """What an LoD SPZ file of version 3 holds of its tree.
+    """The tree in an LoD SPZ file of version 3.
 
     Attributes:
         child_count, child_start: as stored.
         size: feature size of each node, world units.
-        d: Spark's opacity.
-        parents: of each node, all of them.
-        depth: edges from the root, by the first way found; nodes that it does not lead to are not in it.
-        need: the least size on the way from the root to a node's parent, at which a viewer comes to want it.
+        d: LoD opacity D of each node.
+        parents: all parents of each node.
+        depth: edges from the root by the first path found; has no nodes that cannot be reached.
+        need: the least size on the path from the root to a node's parent, below which a viewer needs the node.
     """
 
     child_count: list[int]
@@ -101,7 +101,7 @@ class Tree:
                     frontier.append(child)
 
     def codes(self) -> set[str]:
-        """The findings that there should be of the tree, but for the order of its nodes."""
+        """Returns the codes of the findings that the tree should have, but for the order of its nodes."""
         count, nodes = len(self), range(len(self))
         leaf = [not children for children in self.child_count]
         wrong = {
@@ -121,13 +121,13 @@ class Tree:
         return {code for code, found in wrong.items() if found}
 
     def rise(self) -> float:
-        """How many times as coarse a sixteenth of the file is as one before it, in medians of `need`."""
+        """Returns the largest ratio of the median `need` of a sixteenth of the file to that of an earlier one."""
         ends = [part * len(self) // 16 for part in range(17)]
         medians = [median(self.need[node] for node in range(*ends[part : part + 2])) for part in range(16)]
         return max(later / before for part, later in enumerate(medians) for before in medians[:part])
 
     def coarse_cut(self) -> set[int]:
-        """The nodes of a cut that divides the largest first, until it would have more than a chunk's."""
+        """Returns the cut that refines the largest node first, as long as it has no more nodes than a chunk."""
         cut, heap = set(), [(-self.size[0], 0)]
         while heap:
             _, node = heapq.heappop(heap)
@@ -140,7 +140,7 @@ class Tree:
         return cut
 
     def check_facts(self, report: dict[str, Any]) -> None:
-        """A report says of it what is so."""
+        """Asserts that a report has the facts of this tree."""
         facts, levels = report["tree"], Counter(self.depth.values())
         leaves = [node for node in range(len(self)) if not self.child_count[node]]
         assert report["splats"] == len(self)
@@ -164,14 +164,14 @@ class Tree:
 
 
 def inspected(path: Path, capsys: pytest.CaptureFixture[str], *options: str) -> tuple[int, dict[str, Any]]:
-    """The exit status of `inspect --check`, and its report."""
+    """Runs `inspect --check`; returns its exit status and its report."""
     code = run(["inspect", str(path), "--json", "--check", *options])
     return code, json.loads(capsys.readouterr().out)
 
 
 @pytest.fixture(params=["sh2.ply", "demo.ply", "biker.ply"])
 def source(request: pytest.FixtureRequest) -> Path:
-    """A scene: two fixtures, of which one has SH, and a real one of more nodes than a chunk."""
+    """A scene: a fixture with SH, one without, and a real scene with more nodes than a chunk."""
     path: Path = FIXTURES / request.param
     return path if path.exists() else real_scene(request.param)
 
@@ -186,9 +186,9 @@ def test_facts_and_findings_of_sparks_trees_are_right(
     tree = Tree.read(path)
     tree.check_facts(report)
     assert report["tree"]["leaves"] == len(read_scene(source).splats)
-    assert tree.codes() == set()  # what Spark builds is a tree, and sound
+    assert tree.codes() == set()  # Spark builds valid trees
     assert code == 0
-    # Its first 65,536 nodes are coarse before fine. Those that follow are a part of the scene after the other: a note.
+    # The first 65,536 nodes are coarse before fine. The others follow part by part of the scene, which is a note.
     if len(tree) > CHUNK:
         assert tree.rise() > 1.5
         assert [found["code"] for found in report["findings"]] == ["tree.coarse-first"]
@@ -202,7 +202,7 @@ def test_facts_and_findings_of_sparks_trees_are_right(
 def test_leaves_of_sparks_trees_are_the_splats_but_for_small_rotations(
     spark: Spark, tmp_path: Path, capsys: pytest.CaptureFixture[str], builder: str
 ) -> None:
-    """But for turns below 2.5 degrees: Spark's builders hold the w of a rotation as a float16, which makes 1 of it."""
+    """Spark's builders hold the w of a rotation as float16, which rounds it to 1 below 2.5 degrees."""
     source, path = FIXTURES / "demo.ply", tmp_path / "tree.spz"
     scene = spark_tree(spark, source, builder)
     path.write_bytes(b"".join(spz.encode(scene)))
@@ -217,7 +217,7 @@ def test_leaves_of_sparks_trees_are_the_splats_but_for_small_rotations(
     (found,) = (found for found in report["findings"] if found["code"] == "expect.leaves")
     assert 0 < np.count_nonzero(turned > 1) <= found["count"] <= np.count_nonzero(turned > 0.5) < 1e-3 * len(leaves)
     assert turned.max() < 2.6
-    # Where there are no such turns, they are the splats.
+    # Without such small rotations, the leaves are the splats.
     needle = tmp_path / "needle.spz"
     needle.write_bytes(b"".join(spz.encode(spark_tree(spark, FIXTURES / "needle.ply", builder))))
     code, report = inspected(needle, capsys, "--leaves-of", str(FIXTURES / "needle.ply"))

@@ -1,4 +1,4 @@
-"""Our rasterizer draws the pictures that Spark draws, in a browser."""
+"""sparklod's rasterizer draws the same pictures as Spark in a browser."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from tests.scenes import random_splats
 
 SIZE = 320, 180
 
-#: dB. What is asked of us is 40, of pictures in 8 bits; Spark rounds to them after every splat, which we do not. Where
-#: it does not either, and we draw its numbers, there is the order of operations in float32 between us, and half floats.
+#: Least PSNR in dB: of all pixels and of covered ones in 8 bits, to which Spark rounds after every splat; and of
+#: pictures from Spark's coding of the splats without that rounding, which differ by float32 and float16 alone.
 LEAST, LEAST_COVERED, LEAST_HELD = 45, 40, 58
 
 
 def check(found: Iterable[Difference]) -> None:
     for view, difference in enumerate(found):
-        assert difference.share > 0.05, f"view {view} shows nothing"
-        assert difference.same_cut is not False, f"view {view} is of another cut"
+        assert difference.share > 0.05, f"view {view} is nearly empty"
+        assert difference.same_cut is not False, f"view {view} has another cut"
         assert difference.psnr >= LEAST and difference.covered >= LEAST_COVERED, f"view {view}: {difference}"
         assert difference.held >= LEAST_HELD, f"view {view}: {difference}"
 
@@ -54,7 +54,7 @@ def test_spark_draws_plain_splats_as_we_do(page: Page, sort: str) -> None:
 
 @pytest.mark.parametrize("budget", [300, 8_000])
 def test_spark_draws_the_cut_of_a_tree_as_we_do(page: Page, tmp_path: Path, budget: int) -> None:
-    """Most of 300 are merged splats, many of them more than opaque."""
+    """Of a cut of 300 nodes most are merged splats, many of them with a D above 1."""
     file = written(tmp_path, Scene(*quick.build(demo())))
     check(compare(page, file, cameras_around(demo().center, *SIZE)[1::2], RasterSettings(), budget))
 
@@ -67,7 +67,6 @@ def test_spark_draws_spherical_harmonics_as_we_do(page: Page, tmp_path: Path, sh
 
 @pytest.mark.parametrize("sort", SORTS)
 def test_spark_draws_coincident_splats_in_our_order(page: Page, tmp_path: Path, sort: str) -> None:
-    """Which of them is in front."""
     splats = random_splats(300).take(np.repeat(np.arange(300), 3))
     splats.rgb[:] = np.random.default_rng(1).uniform(0, 1, splats.rgb.shape)
     file = written(tmp_path, Scene(splats))
@@ -75,9 +74,9 @@ def test_spark_draws_coincident_splats_in_our_order(page: Page, tmp_path: Path, 
 
 
 def test_spark_drops_splats_outside_the_clip_planes_as_we_do(page: Page, tmp_path: Path) -> None:
-    """Splats that are nearer, farther or too far out are dropped as a whole."""
+    """Spark drops a whole splat if its centre is nearer, farther or too far out."""
     splats = random_splats(3_000)
     cameras = cameras_around(splats.center, *SIZE)
     distance = float(np.linalg.norm(cameras[0].position))
-    look = RasterSettings(near=0.8 * distance, far=1.1 * distance)
-    check(compare(page, written(tmp_path, Scene(splats)), cameras[:1], look))
+    settings = RasterSettings(near=0.8 * distance, far=1.1 * distance)
+    check(compare(page, written(tmp_path, Scene(splats)), cameras[:1], settings))

@@ -1,4 +1,4 @@
-"""Our traversal draws the very nodes that Spark's draws, from wherever the camera is."""
+"""sparklod's traversal draws exactly the nodes that Spark's traversal draws, for any camera."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ FOVEATIONS = (
     SPARKS_CONES,
     Cones(0, 120, 0.4, 0.2),  # no inner cone
     Cones(70, 70, 0.4, 0.2),  # nothing between the cones
-    Cones(120, 60, 0.5, 0.1),  # the outer one inside of the inner one
+    Cones(120, 60, 0.5, 0.1),  # the outer cone inside the inner one
     Cones(90, 120, 0.4, 0.0),  # nothing behind the camera
     Cones(60, 180, 0.3, 0.3),
     Cones(90, 200, 0.3, 0.1),
@@ -39,7 +39,7 @@ FOVEATIONS = (
     Cones(33.3, 77.7, 0.123, 0.0456),
 )
 BUDGETS = (100, 1_000, 10_000, 50_000, 100_000, 250_000, 500_000, 1_500_000)
-#: Of a field of view of 60 degrees: everything, a pixel of several pictures, a large pixel, and more than anything is.
+#: Pixel-scale limits for a field of view of 60 degrees: none, a pixel of several pictures, 20 pixels, and above all.
 FOV_Y = math.radians(60)
 LIMITS = (0.0, *(pixel_limit(FOV_Y, height) for height in (480, 1080, 2160)), pixel_limit(FOV_Y, 1080, 20.0), 1e9)
 
@@ -48,7 +48,7 @@ LOD_SCALES = (1.0, 1.0, 1.0, 0.3, 2.5)
 
 @dataclass(frozen=True)
 class Tree:
-    """A tree as we and as Spark have it."""
+    """A tree as sparklod and as Spark hold it."""
 
     words: np.ndarray
     nodes: Nodes
@@ -60,7 +60,7 @@ class Tree:
 
 @cache
 def baked(path: Path, method: str = "quick") -> Tree:
-    """Our tree of a scene, measured as Spark does: what it holds of the splats, after their coding."""
+    """Bakes a scene; sizes of nodes are those of the splats in Spark's coding, as in Spark."""
     splats, tree = BUILDERS[method].load().build(read_scene(path).splats)
     return Tree.of(lod_tree.pack(ext_splats.unpack(ext_splats.pack(splats)), tree)["lod_tree"])
 
@@ -70,7 +70,7 @@ def scene(name: str) -> Path:
 
 
 class Both:
-    """Trees that Spark's worker has, too."""
+    """Trees that are loaded in Spark's worker as well, to compare cuts of both."""
 
     def __init__(self, spark: Spark, trees: Sequence[Tree]) -> None:
         self._spark, self._trees = spark, trees
@@ -78,8 +78,9 @@ class Both:
         self._forest = Forest([tree.nodes for tree in trees])
 
     def check(self, instances: Sequence[TreeInstance], camera: np.ndarray, budget: int, smallest: float) -> TreeCut:
-        """The same nodes of each instance, the same least pixel scale, and the same chunks in the order in which they
-        are wanted; but for those of the roots, which Spark always looks into.
+        """Asserts that both find the same nodes, least pixel scale, and wanted chunks in the same order.
+
+        Chunks of the roots are left out of the order, since Spark always visits them.
         """
         view = View(camera, FOV_Y, FOV_Y)
         found = Traversal(self._forest, instances)
@@ -94,15 +95,15 @@ class Both:
         beyond = [chunk for chunk in touched if chunk not in roots]
         if len(set(cut.wanted[beyond])) == len(beyond):
             assert beyond == [chunk for chunk in cut.chunks() if chunk not in roots]
-        if cut.stop:  # Spark tells the least pixel scale on the way to the node that would have exceeded the budget
+        if cut.stop:  # Spark returns the least pixel scale from the root to the node that did not fit
             _, instance, node = cut.stop
             assert [theirs.pixel_limit] == cut.limit[(cut.instance == instance) & (cut.node == node)].tolist()
-        again = found.cut(view, budget=budget, smallest=smallest)  # which begins where the first one ended
+        again = found.cut(view, budget=budget, smallest=smallest)  # starts from the first cut
         assert [nodes.tolist() for nodes in again.indices()] == [nodes.tolist() for nodes in cut.indices()]
         return cut
 
     def pixel_scale(self, instance: TreeInstance, camera: np.ndarray) -> np.float32:
-        """Of the root."""
+        """Returns the pixel scale of the root."""
         (view,) = views_of(self._forest, [instance], View(camera, FOV_Y, FOV_Y))
         return budgeted_cuts.pixel_scale(self._forest.nodes[view["node_base"]], view)
 
@@ -122,7 +123,7 @@ class Both:
 
 
 def cameras(nodes: Nodes, count: int, seed: int) -> list[np.ndarray]:
-    """(4, 4) each: far, near, amid the splats, exactly at a node, and turned to them, away or anywhere."""
+    """Returns (4, 4) matrices of cameras far, near, inside and at a node, looking at the scene, away or anywhere."""
     rng = np.random.default_rng(seed)
     middle = np.median(nodes.center, axis=0).astype(np.float64)
     radius = float(np.percentile(np.linalg.norm(nodes.center - middle, axis=1), 90))
@@ -143,7 +144,7 @@ def cameras(nodes: Nodes, count: int, seed: int) -> list[np.ndarray]:
 
 
 def facing(backward: np.ndarray) -> np.ndarray:
-    """(3, 3) of a camera with its z axis along that vector."""
+    """Returns the (3, 3) rotation of a camera whose z axis is along a vector."""
     z = backward / np.linalg.norm(backward)
     x = np.cross([0.1, 1.0, 0.2], z)
     x /= np.linalg.norm(x)
@@ -160,7 +161,7 @@ def test_the_cut_of_one_tree_is_that_of_spark(spark: Spark, name: str, method: s
     reasons = set()
     for number, camera in enumerate(cameras(tree.nodes, views, seed=len(tree.words))):
         instance = TreeInstance(0, np.eye(4), LOD_SCALES[number % 5], FOVEATIONS[number % len(FOVEATIONS)])
-        # Three of four limits end above what the budget allows.
+        # In three of four cases the limit ends the cut before the budget does.
         smallest = LIMITS[number // 2 % len(LIMITS)] if number % 4 else 0.0
         budget = BUDGETS[number % len(BUDGETS)]
         reasons.add(both.check([instance], camera, budget, smallest).reason)
@@ -173,11 +174,13 @@ def test_the_cut_of_every_cone_is_that_of_spark(spark: Spark) -> None:
     for camera in cameras(tree.nodes, 12, seed=3):
         for foveation in FOVEATIONS:
             cut = both.check([TreeInstance(0, foveation=foveation)], camera, len(tree.words) // 7, 0.0)
-            assert cut.reason == "budget" or foveation.behind == 0  # there, everything may count nothing
+            assert (
+                cut.reason == "budget" or foveation.behind == 0
+            )  # everything may be behind the camera and have no weight
 
 
 def test_the_cut_of_every_budget_is_that_of_spark(spark: Spark) -> None:
-    """From a single node to all."""
+    """Budgets from a single node to all leaves."""
     tree = baked(scene("demo.ply"))
     both = Both(spark, [tree])
     camera = cameras(tree.nodes, 2, seed=4)[1]
@@ -189,7 +192,7 @@ def test_the_cut_of_every_budget_is_that_of_spark(spark: Spark) -> None:
 
 @pytest.mark.parametrize("names, views", [(["demo.ply"], 40), (["demo.ply", "biker.spz", "playbot.sog"], 20)])
 def test_the_cut_of_several_instances_is_that_of_spark(spark: Spark, names: list[str], views: int) -> None:
-    """Several of one tree, and of several: turned, scaled, moved, and some of them exactly where others are."""
+    """Instances of one tree and of several are rotated, scaled and moved; some coincide."""
     trees = [baked(scene(name)) for name in names]
     both = Both(spark, trees)
     rng = np.random.default_rng(len(names))
@@ -202,13 +205,13 @@ def test_the_cut_of_several_instances_is_that_of_spark(spark: Spark, names: list
             chosen = (int(rng.integers(len(trees))), rng.choice(LOD_SCALES), FOVEATIONS[rng.integers(len(FOVEATIONS))])
             instances.append(TreeInstance(chosen[0], moved, float(chosen[1]), chosen[2]))
         if number % 4 == 0:
-            instances = [instances[0]] * len(instances)  # they tie all the way down
+            instances = [instances[0]] * len(instances)  # ties at every node
         both.check(instances, camera, BUDGETS[number % 5], LIMITS[number % 3])
 
 
 @pytest.mark.parametrize("name", ["demo.ply", "biker.ply"])
 def test_the_cut_of_a_tree_that_spark_built_is_that_of_spark(spark: Spark, name: str) -> None:
-    """Its own builder's, which measures after another coding than ours; four words a node as they lie in memory."""
+    """Spark's builder takes sizes from another coding than ours; the tree is its four words a node."""
     words = spark.load_words("Packed", scene(name), lod=True)["lodTree"]
     tree = Tree.of(words)
     assert (tree.nodes.tree.child_count == words.view(NODE)["child_count"][:, 0]).all()
@@ -219,7 +222,7 @@ def test_the_cut_of_a_tree_that_spark_built_is_that_of_spark(spark: Spark, name:
 
 
 def test_pixel_scales_are_those_of_spark_bit_for_bit(spark: Spark) -> None:
-    """A root is divided where the limit is the number before its pixel scale, not where it is that."""
+    """A root is refined if the limit is the float before its pixel scale, and not if it is that scale."""
     words = np.zeros((3, 4), np.uint32)
     nodes = words.view(NODE)[:, 0]
     nodes["center"], nodes["size"] = [0.3, -0.7, 0.2], 0.9
@@ -238,7 +241,7 @@ def test_pixel_scales_are_those_of_spark_bit_for_bit(spark: Spark) -> None:
 
 @pytest.mark.parametrize("name", ["biker.spz", "playbot.sog"])
 def test_the_chunks_that_are_wanted_are_those_of_spark(spark: Spark, name: str) -> None:
-    """Those of the largest nodes are looked into first."""
+    """Chunks with the largest nodes come first."""
     tree = baked(scene(name))
     both = Both(spark, [tree])
     chunks = -(-len(tree.words) // CHUNK_NODES)

@@ -1,7 +1,7 @@
-"""What may differ between Spark's words and ours: codes of values that lie half-way between two of them.
+"""Compares sparklod's words with Spark's, which may differ only where a value is half-way between two codes.
 
-Between Spark's float32 and ours (and the float64 of its JavaScript) the last bit may differ, of a logarithm or of what
-a file's numbers become. That shows only where a value is a tie but for last bits; there a code may differ by one.
+The last bit of a logarithm, or of a number decoded from a file, may differ between Spark's float32 and sparklod's (and
+the float64 of Spark's JavaScript). That changes a code only if the value is a tie but for last bits; then by one.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from sparklod_cli.model.splats import Splats
 
 Words = dict[str, NDArray[np.uint32]]
 Floats = NDArray[np.floating[Any]]
-#: A value in steps of its code, and how far, in steps, it may be off by last bits.
+#: Values in steps of their code, and the error of their last bits in steps.
 Steps = tuple[Floats, Floats | float]
 
 LAST_BITS = 2.0**-22  # relative: a few float32 operations
@@ -30,7 +30,7 @@ def linear(values: Floats, low: float, high: float, most: int) -> Steps:
 
 
 def half(values: Floats) -> Steps:
-    """float16s in their own last places."""
+    """Returns values in units of the last place of their float16."""
     with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
         steps = values.astype(np.float64) / np.spacing(np.abs(values).astype(np.float16)).astype(np.float64)
     return steps, np.abs(steps) * LAST_BITS
@@ -46,7 +46,7 @@ def rotation(splats: Splats, steps: tuple[int, int]) -> dict[str, Steps]:
     folded = (1 - np.abs(uv[:, ::-1])) * np.where(uv >= 0, 1, -1)
     uv = np.where(axis[:, 2:] < 0, folded, uv)
     angle = 2 * np.arctan2(sine, quat[:, 3]) / np.pi * steps[1]
-    # The arc cosine of w, which is near 1 for small angles, makes much of w's last bit.
+    # For small angles w is near 1, where its arc cosine magnifies an error of its last bit.
     angle_error = steps[1] * LAST_BITS * (1 + 1 / np.maximum(sine, 1e-9))
     codes = {"u": linear(uv[:, 0], -1, 1, steps[0]), "v": linear(uv[:, 1], -1, 1, steps[0])}
     return codes | {"angle": (angle, angle_error)}
@@ -96,11 +96,11 @@ def ext_codes(words: Words) -> dict[str, NDArray[Any]]:
 def check(
     ours: dict[str, NDArray[Any]], theirs: dict[str, NDArray[Any]], steps: dict[str, Steps], share: float
 ) -> None:
-    """Every code is the same, but for ties that last bits decide."""
+    """Asserts that all codes are equal, but for a share of ties that last bits decide."""
     assert ours.keys() == theirs.keys() == steps.keys()
     for name, (value, error) in steps.items():
         one, other = ours[name], theirs[name]
-        if one.dtype == np.float16:  # in their order as bits, which is that of their magnitudes
+        if one.dtype == np.float16:  # compare as integers, which have the order of the magnitudes
             np.testing.assert_array_equal(np.signbit(one), np.signbit(other), name)
             one, other, value = one.view(np.uint16) & 0x7FFF, other.view(np.uint16) & 0x7FFF, np.abs(value)
         differ = one != other

@@ -1,4 +1,4 @@
-"""The budgeted cut, with one queue, in float32 as the kernels have it."""
+"""Finds a budgeted cut with one queue, in the float32 arithmetic of the kernels."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from sparklod_cli.lod.kernels.pixel_scale import CONE, FRUSTUM
 
 
 def pixel_scale(node: np.void, view: np.void) -> np.float32:
-    """Size over distance, times the weights of the view; float32 after every operation."""
+    """Returns size over distance, times the weights of the view; float32 after every operation."""
     with np.errstate(all="ignore"):
         x, y, z = (node[axis] - view[f"origin_{axis}"] for axis in "xyz")
         distance = np.sqrt(x * x + y * y + z * z)
@@ -45,7 +45,7 @@ def pixel_scale(node: np.void, view: np.void) -> np.float32:
 
 
 def bits_of(value: float) -> int:
-    """A number >= 0 as bits, which order as numbers do; NaN counts as infinity."""
+    """Returns the bits of a number >= 0, which have the same order as the numbers; NaN counts as infinity."""
     value = np.float32(math.inf if np.isnan(value) else value)
     return int(value.view(np.uint32)) & 0x7FFFFFFF
 
@@ -56,15 +56,17 @@ def number_of(bits: int) -> float:
 
 @dataclass
 class BudgetedCut:
-    """What the queue drew; nodes are (instance, index), pixel scales are numbers."""
+    """The cut that the queue found; nodes are (instance, index)."""
 
-    limit: dict = field(default_factory=dict)  # of each node that is drawn: the least pixel scale from the root to it
-    waiting: set = field(default_factory=set)  # nodes that are drawn because they still wait in the queue
+    limit: dict = field(default_factory=dict)  # the least pixel scale from the root to each node drawn
+    waiting: set = field(default_factory=set)  # nodes drawn because they were still in the queue
     reason: str = ""
     missing: int = 0
     least: float = math.inf
     stop: tuple | None = None
-    wanted: dict = field(default_factory=lambda: defaultdict(float))  # largest limit by chunk, of those wanted
+    wanted: dict = field(
+        default_factory=lambda: defaultdict(float)
+    )  # the largest limit of a node that wants the chunk, by chunk
 
 
 def budgeted_cut(
@@ -75,13 +77,14 @@ def budgeted_cut(
     is_resident: Callable[[int], bool],
     bits: int = 16,
 ) -> BudgetedCut:
-    """One queue of the nodes of all instances: the one of the largest pixel scale is divided, as long as there is room.
+    """Refines the node of the largest pixel scale of all instances, as long as the budget allows.
 
     Args:
-        nodes: of all trees; views: of the instances. As the kernel has them.
-        budget: how many nodes may be drawn.
-        smallest: nodes of this pixel scale or less are not divided.
-        is_resident: whether a chunk, counted through all trees, is there.
+        nodes: nodes of all trees, as the kernel takes them.
+        views: views of the instances, as the kernel takes them.
+        budget: number of nodes at most.
+        smallest: nodes of this pixel scale or less are not refined.
+        is_resident: whether a chunk, numbered across all trees, is resident.
         bits: a chunk has 2 ** bits nodes.
     """
     cut, heap, drawn = BudgetedCut(), [], {}
@@ -105,14 +108,14 @@ def budgeted_cut(
         if own <= bits_of(smallest):
             break
         chunks = {int(view["chunk_base"]) + (child >> bits) for child in range(start, start + count)}
-        there = all(is_resident(chunk) for chunk in chunks)
-        if count and there and len(drawn) + len(heap) - 1 + count > budget:
+        resident = all(is_resident(chunk) for chunk in chunks)
+        if count and resident and len(drawn) + len(heap) - 1 + count > budget:
             cut.stop = number_of(own), instance, index
             break
         heapq.heappop(heap)
         for chunk in chunks:
             cut.wanted[chunk] = max(cut.wanted[chunk], number_of(limit))
-        if count and there:
+        if count and resident:
             cut.least = min(cut.least, number_of(limit))
             for child in range(start, start + count):
                 push(instance, child, limit)

@@ -1,4 +1,4 @@
-"""A frame's row worked out anew, slowly and in float64, with nothing of sparklod: in the world, not in object space."""
+"""Computes the row of a frame without sparklod's code: slowly, in float64, and in world instead of object space."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ CHUNK = 65_536
 
 @dataclass(frozen=True)
 class Nodes:
-    """A tree: (N, 3) centres, (N,) sizes, and the links."""
+    """A tree: (N, 3) centres, (N,) sizes, and the child columns."""
 
     center: np.ndarray
     size: np.ndarray
@@ -33,7 +33,7 @@ class Nodes:
 
 @dataclass(frozen=True)
 class Eye:
-    """A camera: where it is, and unit vectors to the right, up and ahead, (3,) each; fields of view in radians."""
+    """A camera: position, unit vectors to the right, up and ahead, (3,) each, and the field of view in radians."""
 
     position: np.ndarray
     right: np.ndarray
@@ -49,7 +49,7 @@ class Eye:
 
     @property
     def tan_x(self) -> float:
-        return self.tan_y * self.width / self.height  # of square pixels
+        return self.tan_y * self.width / self.height  # pixels are square
 
     @property
     def pixel(self) -> float:
@@ -58,7 +58,7 @@ class Eye:
 
 
 def cones(fov0: float, fov: float, foveate: float, behind: float) -> Callable[[Eye, np.ndarray], np.ndarray]:
-    """The weight of each of (N, 3) directions: 1 in the inner cone, `foveate` on the outer one, `behind` from 90°."""
+    """Weighs (N, 3) directions: 1 in the inner cone, `foveate` on the outer one, `behind` from 90° on."""
     inner, outer = math.cos(math.radians(fov0 / 2)), math.cos(math.radians(fov / 2))
 
     def weight(eye: Eye, offset: np.ndarray) -> np.ndarray:
@@ -69,7 +69,7 @@ def cones(fov0: float, fov: float, foveate: float, behind: float) -> Callable[[E
 
 
 def frustum(outside: float, behind: float) -> Callable[[Eye, np.ndarray], np.ndarray]:
-    """The weight of each of (N, 3) directions: 1 in the picture, `outside` beside it."""
+    """Weighs (N, 3) directions: 1 inside the frustum, `outside` it, or `behind` the camera."""
 
     def weight(eye: Eye, offset: np.ndarray) -> np.ndarray:
         ahead = offset @ eye.ahead
@@ -80,8 +80,8 @@ def frustum(outside: float, behind: float) -> Callable[[Eye, np.ndarray], np.nda
 
 
 @dataclass(frozen=True)
-class Placed:
-    """A tree in the world."""
+class Instance:
+    """A tree, the matrix that places it in the world, and its LoD settings."""
 
     nodes: Nodes
     matrix: np.ndarray = field(default_factory=lambda: np.eye(4))
@@ -91,26 +91,26 @@ class Placed:
 
 @dataclass
 class Drawn:
-    """What a viewer draws: (instance, node) each, and the cells of its row that one frame alone tells."""
+    """The cut of a frame, (instance, node) each, and the cells of its row that need no other frame."""
 
     cut: list[tuple[int, int]]
     cells: dict[str, object]
 
 
 def frame(
-    placed: Sequence[Placed], eye: Eye, budget: int, smallest: float, resident: Collection[int] | None = None
+    instances: Sequence[Instance], eye: Eye, budget: int, smallest: float, resident: Collection[int] | None = None
 ) -> Drawn:
-    """A frame, node by node through one queue.
+    """Finds the cut of a frame with one queue, and computes its cells.
 
     Args:
-        placed: what stands in the world.
+        instances: the trees in the world.
         eye: the camera.
-        budget: how many nodes may be drawn.
-        smallest: nodes of this size over distance are not divided.
-        resident: chunks that are there, with one tree; all unless given.
+        budget: number of nodes at most.
+        smallest: nodes of this pixel scale or less are not refined.
+        resident: resident chunks, if there is one tree; None for all.
     """
     offsets, scales, sizes = [], [], []
-    for each in placed:
+    for each in instances:
         offset = each.nodes.center @ each.matrix[:3, :3].T + each.matrix[:3, 3] - eye.position
         size = each.nodes.size * np.linalg.norm(each.matrix[:3, 0])
         distance = np.maximum(np.linalg.norm(offset, axis=1), 1e-300)
@@ -118,32 +118,32 @@ def frame(
         sizes.append(size / distance)
         scales.append(size / distance * each.weight(eye, offset) * each.lod_scale)
 
-    def there(chunks: set[int]) -> bool:
+    def are_resident(chunks: set[int]) -> bool:
         return resident is None or chunks <= set(resident)
 
     queue: list[tuple[float, int, int, float]] = []
     missing = 0
-    for number in range(len(placed)):
-        if there({0}):
+    for number in range(len(instances)):
+        if are_resident({0}):
             queue.append((-scales[number][0], -number, 0, math.inf))
         else:
             missing += 1
     heapq.heapify(queue)
     drawn: list[tuple[int, int]] = []
-    least, reason, touched = math.inf, "exhausted", {(id(each.nodes), 0) for each in placed}
+    least, reason, touched = math.inf, "exhausted", {(id(each.nodes), 0) for each in instances}
     while queue:
         scale, number, node, above = -queue[0][0], -queue[0][1], -queue[0][2], queue[0][3]
         if scale <= smallest:
             break
-        nodes = placed[number].nodes
+        nodes = instances[number].nodes
         count, start = int(nodes.child_count[node]), int(nodes.child_start[node])
         chunks = {start // CHUNK, (start + count - 1) // CHUNK} if count else set()
-        if count and there(chunks) and len(drawn) + len(queue) - 1 + count > budget:
+        if count and are_resident(chunks) and len(drawn) + len(queue) - 1 + count > budget:
             reason = "budget"
             break
         heapq.heappop(queue)
         touched |= {(id(nodes), chunk) for chunk in chunks}
-        if count and there(chunks):
+        if count and are_resident(chunks):
             limit = min(above, scale)
             least = min(least, limit)
             for child in range(start, start + count):
@@ -152,13 +152,13 @@ def frame(
             missing += count > 0
             drawn.append((number, node))
     frontier = [(-number, -node) for _, number, node, _ in queue]
-    coarse = any(placed[number].nodes.child_count[node] for number, node in frontier)
+    coarse = any(instances[number].nodes.child_count[node] for number, node in frontier)
     if reason != "budget":
         reason = "pixel" if coarse else "missing" if missing else "exhausted"
     cut = drawn + frontier
     cells = {
         "selected": len(cut),
-        "leaves": sum(placed[number].nodes.child_count[node] == 0 for number, node in cut),
+        "leaves": sum(instances[number].nodes.child_count[node] == 0 for number, node in cut),
         "budget_used": len(cut) / budget,
         "stop_reason": reason,
         "pixel_scale_min": None if least == math.inf else least,
@@ -168,11 +168,11 @@ def frame(
         "chunks_touched": len(touched),
     }
     cells["interior"] = cells["selected"] - cells["leaves"]
-    return Drawn(cut, cells | _seen(placed, eye, cut, offsets, sizes))
+    return Drawn(cut, cells | _seen(instances, eye, cut, offsets, sizes))
 
 
 def _seen(
-    placed: Sequence[Placed],
+    instances: Sequence[Instance],
     eye: Eye,
     cut: list[tuple[int, int]],
     offsets: list[np.ndarray],
@@ -180,11 +180,11 @@ def _seen(
 ) -> dict[str, object]:
     offset = np.array([offsets[number][node] for number, node in cut]).reshape(-1, 3)
     pixels = np.array([sizes[number][node] for number, node in cut]) / eye.pixel
-    level = [int(placed[number].nodes.level[node]) for number, node in cut]
+    level = [int(instances[number].nodes.level[node]) for number, node in cut]
     ahead = offset @ eye.ahead
     inside = (ahead > 0) & (abs(offset @ eye.right) <= eye.tan_x * ahead) & (abs(offset @ eye.up) <= eye.tan_y * ahead)
     seen = pixels[inside]
-    # A disc out to sqrt(8) standard deviations, where the size is two of them; none covers more than the picture.
+    # A splat is a disc of sqrt(8) standard deviations; its size is two of them. None covers more than the picture.
     area = np.minimum(math.pi * (math.sqrt(8) * seen / 2) ** 2, eye.width * eye.height)
     return {
         "in_frustum": int(inside.sum()),
@@ -200,7 +200,7 @@ def _seen(
 
 
 def differing(cells: dict[str, object], row: dict[str, object]) -> list[str]:
-    """The columns in which a row is not as worked out: numbers but whole ones may be off by what rounding makes."""
+    """Returns a text for each column in which a row differs; floats may differ by rounding."""
     wrong = []
     for name, value in cells.items():
         other = row[name]

@@ -1,4 +1,4 @@
-"""Gaussians, their areas and what they merge to: the formulas, written down in float64."""
+"""The formulas of splats, their areas and their merging, in float64."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from sparklod_cli.model.splats import Splats
 
 
 def ellipsoid_area(scale: np.ndarray) -> np.ndarray:
-    """Knud Thomsen's formula over (..., 3) semi-axes, as it is written down."""
+    """Knud Thomsen's approximation of the surface of ellipsoids with (..., 3) semi-axes."""
     a, b, c = np.moveaxis(np.asarray(scale, np.float64), -1, 0)
     mean = ((a * b) ** THOMSEN_P + (a * c) ** THOMSEN_P + (b * c) ** THOMSEN_P) / 3
     return 4 * math.pi * mean ** (1 / THOMSEN_P)
 
 
 def rotation_matrix(quat_xyzw: np.ndarray) -> np.ndarray:
-    """(..., 3, 3) from (..., 4), by rotating the axes with the quaternion."""
+    """Returns (..., 3, 3) from (..., 4) quaternions, by rotating the axes."""
     quat = np.asarray(quat_xyzw, np.float64)
     vector, w = quat[..., None, :3], quat[..., None, 3:]
     axes = np.broadcast_to(np.eye(3), (*quat.shape[:-1], 3, 3))
@@ -28,14 +28,14 @@ def rotation_matrix(quat_xyzw: np.ndarray) -> np.ndarray:
 
 
 def covariance(scale: np.ndarray, quat_xyzw: np.ndarray) -> np.ndarray:
-    """(..., 3, 3) R S S^T R^T."""
+    """Returns the (..., 3, 3) covariances R S S^T R^T."""
     factor = rotation_matrix(quat_xyzw) * np.asarray(scale, np.float64)[..., None, :]
     return factor @ np.swapaxes(factor, -1, -2)
 
 
 @dataclass
 class Moments:
-    """What a merged splat must have."""
+    """The values that a merged splat must have."""
 
     center: np.ndarray
     covariance: np.ndarray
@@ -45,7 +45,7 @@ class Moments:
 
 
 def merge(splats: Splats) -> Moments:
-    """Moment matching with weights opacity * area."""
+    """Merges splats by matching moments, with weights of opacity * area."""
     weight = splats.opacity.astype(np.float64) * ellipsoid_area(splats.scale)
     share = weight / weight.sum()
     center = share @ splats.center.astype(np.float64)
@@ -61,5 +61,5 @@ def merge(splats: Splats) -> Moments:
 
 
 def opacity_of(weight: float, scale: np.ndarray) -> float:
-    """Linear opacity of a merged splat of these scales."""
+    """Returns the linear opacity of a merged splat of these scales."""
     return float(np.clip(weight / ellipsoid_area(scale), MIN_OPACITY, MAX_OPACITY))

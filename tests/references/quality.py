@@ -60,14 +60,14 @@ def random_rows(count: int, seed: int, spread: float = 2.0) -> np.ndarray:
 
 
 def joint_covariance(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """That of two, weighted by what they cover."""
+    """Returns the covariance of two rows together, weighted by what each covers."""
     share = float(a[COVERED]) / (float(a[COVERED]) + float(b[COVERED]))
     offset = (b[CENTER : CENTER + 3] - a[CENTER : CENTER + 3]).astype(np.float64)
     return share * matrix(a) + (1 - share) * matrix(b) + share * (1 - share) * np.outer(offset, offset)
 
 
 def merge_cost(a: np.ndarray, b: np.ndarray) -> float:
-    """Runnalls' bound times what both cover, and Ward's variance of colour."""
+    """Returns the cost of a pair: Runnalls' bound times what both cover, plus Ward's variance of colour."""
     wa, wb = float(a[COVERED]), float(b[COVERED])
     logs = [np.linalg.slogdet(one)[1] for one in (joint_covariance(a, b), matrix(a), matrix(b))]
     shape = ((wa + wb) * logs[0] - wa * logs[1] - wb * logs[2]) / 2
@@ -86,14 +86,14 @@ def costs(rows: np.ndarray, window: int, largest: float) -> np.ndarray:
 
 
 def gaussian_on_plane(row: np.ndarray, axes: tuple[int, int], points: np.ndarray) -> np.ndarray:
-    """What a row's Gaussian of height 1 is at (..., 2) points of a plane."""
+    """Evaluates the Gaussian of a row, of height 1, at (..., 2) points of a plane."""
     inverse = np.linalg.inv(matrix(row)[np.ix_(axes, axes)])
     offset = points - row[[CENTER + axis for axis in axes]].astype(np.float64)
     return np.exp(-0.5 * np.einsum("...i,ij,...j->...", offset, inverse, offset))
 
 
 def integrals(a: np.ndarray, b: np.ndarray, axes: tuple[int, int]) -> tuple[float, float, float]:
-    """Over a plane: of the product of two Gaussians, and of each."""
+    """Integrates over a plane the product of two Gaussians, and each of them."""
     both = (a, b)
     reach = [8 * math.sqrt(np.diag(matrix(row)).max()) for row in both]
     middle = [row[[CENTER + axis for axis in axes]].astype(np.float64) for row in both]
@@ -107,7 +107,10 @@ def integrals(a: np.ndarray, b: np.ndarray, axes: tuple[int, int]) -> tuple[floa
 
 
 def moments_of_profile(a: float) -> tuple[float, float]:
-    """Coverage over 2 pi, and variance on an axis, of 1 - (1 - exp(-t)) ** A with sigma 1; A itself up to 1."""
+    """Returns coverage / 2 pi, and variance along an axis, of the profile of opacity A with sigma 1.
+
+    The profile is 1 - (1 - exp(-t)) ** A for A above 1, and A * exp(-t) up to 1.
+    """
     t = (np.arange(400_000) + 0.5) * (60 / 400_000)
     opacity = 1 - (1 - np.exp(-t)) ** a if a > 1 else a * np.exp(-t)
     coverage = opacity.sum() * (t[1] - t[0])

@@ -1,4 +1,4 @@
-"""The Quick-LoD tree, node by node with dictionaries."""
+"""Builds the tree of the quick method node by node, with dictionaries."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 
 def natural_level(scale: np.ndarray, base: float) -> int:
-    """The smallest level whose step, base ** level, is not below 2 * max(scale)."""
+    """Returns the smallest level whose step, base ** level, is not below 2 * max(scale)."""
     size = 2 * float(np.max(scale))
     level = math.ceil(math.log(size) / math.log(base))
     while base ** float(level - 1) >= size:
@@ -22,13 +22,13 @@ Tree = tuple  # a leaf is (splat index,), a merged node the sorted tuple of its 
 
 
 def quick_tree(centers_of: dict, levels: list[int], base: float, merge_center) -> Tree:
-    """The shape of the Quick-LoD tree, node by node with dictionaries.
+    """Returns the shape of the tree of the quick method.
 
     Args:
-        centers_of: centre of each leaf (index,); merged nodes are added.
-        levels: natural level of each splat.
-        base: growth of the grid.
-        merge_center: tells the centre of a merged node from the list of its children.
+        centers_of: the centre of each leaf (index,); those of merged nodes are added.
+        levels: the natural level of each splat.
+        base: ratio of the cell sizes of two levels.
+        merge_center: returns the centre of a merged node, from the list of its children.
     """
     waiting = sorted(range(len(levels)), key=lambda i: levels[i])
     level, active = min(levels), []

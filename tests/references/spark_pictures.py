@@ -1,4 +1,4 @@
-"""Splats as Spark's shaders draw them, each over the whole picture, in float64."""
+"""Draws splats as Spark's shaders do, each over the whole picture, in float64."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.references.gaussians import covariance
 
 
 def spherical_harmonics(direction: np.ndarray, degree: int) -> list[float]:
-    """Real spherical harmonics of degree 1 and above at a direction, with the sign of Condon and Shortley."""
+    """Returns real spherical harmonics from degree 1 at a direction, with the Condon-Shortley sign."""
     x, y, z = direction / np.linalg.norm(direction)
     azimuth, sine = math.atan2(y, x), math.hypot(x, y)
     found = []
@@ -30,7 +30,7 @@ def spherical_harmonics(direction: np.ndarray, degree: int) -> list[float]:
 
 
 def seen_rgb(splats: Splats, eye: np.ndarray) -> np.ndarray:
-    """(N, 3) colours of splats that are seen from a point."""
+    """Returns (N, 3) colours of splats as seen from a point."""
     degree = math.isqrt(splats.sh.shape[1] + 1) - 1
     seen = splats.rgb.astype(np.float64)
     for color, center, sh in zip(seen, splats.center, splats.sh, strict=True):
@@ -40,29 +40,29 @@ def seen_rgb(splats: Splats, eye: np.ndarray) -> np.ndarray:
 
 @dataclass
 class Drawn:
-    """What `picture` drew.
+    """A picture that `picture` drew.
 
     Attributes:
-        rgba: (height, width, 4) float64, multiplied by alpha.
-        unsure: (height, width) whether a splat ends so near to a pixel that float32 cannot tell if it is in or out.
+        rgba: (height, width, 4) float64, premultiplied by alpha.
+        unsure: (height, width) whether a splat ends so near to the pixel that float32 may decide otherwise.
     """
 
     rgba: np.ndarray
     unsure: np.ndarray
 
 
-def picture(shown: ShadedSplats, camera: Camera, look: RasterSettings) -> Drawn:
-    """Splats as Spark's shaders draw them, from far to near, each over the whole picture."""
+def picture(splats: ShadedSplats, camera: Camera, settings: RasterSettings) -> Drawn:
+    """Draws splats from far to near, each over the whole picture."""
     to_camera = np.linalg.inv(camera.camera_to_world)
     (fx, fy), (cx, cy), width, height = camera.focal, camera.principal, camera.width, camera.height
-    centers = shown.center.astype(np.float64) @ to_camera[:3, :3].T + to_camera[:3, 3]
-    turned = to_camera[:3, :3] @ covariance(shown.scale, shown.quat_xyzw) @ to_camera[:3, :3].T
-    key = np.linalg.norm(centers, axis=1) if look.sort == "radial" else -centers[:, 2]
+    centers = splats.center.astype(np.float64) @ to_camera[:3, :3].T + to_camera[:3, 3]
+    turned = to_camera[:3, :3] @ covariance(splats.scale, splats.quat_xyzw) @ to_camera[:3, :3].T
+    key = np.linalg.norm(centers, axis=1) if settings.sort == "radial" else -centers[:, 2]
     pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1)
     rgba, unsure = np.zeros((height, width, 4)), np.zeros((height, width), bool)
     for i in np.argsort(-key, kind="stable"):
-        (x, y, z), d = centers[i], min(float(shown.lod_opacity[i]), 5)
-        if not look.near < -z < look.far or not d >= 0.5 / 255:
+        (x, y, z), d = centers[i], min(float(splats.lod_opacity[i]), 5)
+        if not settings.near < -z < settings.far or not d >= 0.5 / 255:
             continue
         middle = np.array([cx - fx * x / z, cy + fy * y / z])
         if (abs(middle / (width, height) - 0.5) > 1.4 / 2).any():
@@ -75,13 +75,13 @@ def picture(shown: ShadedSplats, camera: Camera, look: RasterSettings) -> Drawn:
         sizes, axes = np.linalg.eigh(blurred)
         reach = np.minimum(deviations * np.sqrt(sizes), 512)
         z2 = (((pixels - middle) @ axes * (deviations / reach)) ** 2).sum(axis=-1)
-        alpha = _falloff(z2, strength, look.profile)
+        alpha = _falloff(z2, strength, settings.profile)
         inside = z2 <= deviations**2
         unsure |= abs(z2 / deviations**2 - 1) < 2e-4
         unsure |= inside & (min(abs(strength * 255 - 0.5), 1) < 0.01)
         unsure |= inside & (abs(alpha * 255 - 0.5) < 0.01)
         alpha = np.where(inside & (alpha >= 0.5 / 255) & (strength >= 0.5 / 255), alpha, 0)[..., None]
-        rgba = np.minimum(alpha * [*shown.rgb[i].astype(np.float64), 1], 1) + (1 - alpha) * rgba
+        rgba = np.minimum(alpha * [*splats.rgb[i].astype(np.float64), 1], 1) + (1 - alpha) * rgba
     return Drawn(rgba, unsure)
 
 

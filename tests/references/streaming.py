@@ -1,4 +1,4 @@
-"""Streaming, exactly: a cache that is looked through, and a stream that moves every byte of every transfer."""
+"""Streaming in exact fractions: a cache that is searched linearly, and a network that shares its rate among fetches."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from fractions import Fraction
 from sparklod_cli.simulation.chunk_cache import Chunks
 from sparklod_cli.simulation.streaming import Network
 
-#: Nearer than this to each other, rounding decides which of two events comes first.
+#: Seconds; of two events nearer than this, rounding decides which comes first.
 TIE = Fraction(1, 10**9)
 
 
 class NaiveCache:
-    """Of each chunk that is here, when it was last used, in which place of the list; the smallest goes first."""
+    """For each resident chunk, when it was last used and at which place of the wanted list; the smallest is evicted."""
 
     def __init__(self, capacity: int | None) -> None:
         self.capacity = math.inf if capacity is None else capacity
@@ -44,7 +44,7 @@ class NaiveCache:
 
 
 def roots_first(chunks: Chunks, wanted: list[int]) -> list[int]:
-    """What a list of wanted chunks comes to."""
+    """Returns a list of wanted chunks without repetitions, roots first."""
     result: list[int] = []
     for chunk in [each for each in wanted if each in chunks.roots] + chunks.roots + wanted:
         if chunk not in result:
@@ -54,7 +54,7 @@ def roots_first(chunks: Chunks, wanted: list[int]) -> list[int]:
 
 @dataclass
 class Fetch:
-    """A fetch under way."""
+    """A fetch under way; `latency` in seconds and `left` in bytes are what remains."""
 
     asked: Fraction
     chunk: int
@@ -64,7 +64,7 @@ class Fetch:
 
 @dataclass
 class Twin:
-    """What `Stream` does, in fractions, one fetch at a time, with a cache that is looked through."""
+    """Does what `Stream` does, in fractions and one event at a time."""
 
     chunks: Chunks
     network: Network

@@ -1,4 +1,4 @@
-"""What the links of a tree lead to, with sets and queues."""
+"""Follows the child columns of a tree, with sets and queues."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ import numpy as np
 class Followed:
     """What the links of a tree lead to, however broken they are."""
 
-    parents: list[list[int]]  # the nodes that have each as a child
+    parents: list[list[int]]  # all nodes that have the node as a child
     depth: list[int]
     limit: list[float]
 
 
 def links_of(child_count: np.ndarray, child_start: np.ndarray) -> list[range]:
-    """The children of each node that there are."""
+    """Returns the existing children of each node."""
     starts, counts = child_start.tolist(), child_count.tolist()
     return [range(start, min(len(starts), start + count)) for start, count in zip(starts, counts, strict=True)]
 
 
 def follow(child_count: np.ndarray, child_start: np.ndarray, size: np.ndarray) -> Followed:
-    """Breadth first, with sets."""
+    """Follows the children of the root breadth first."""
     links = links_of(child_count, child_start)
     every = range(len(links))
     parents = [[node for node in every if child in links[node]] for child in every]
@@ -41,7 +41,7 @@ def follow(child_count: np.ndarray, child_start: np.ndarray, size: np.ndarray) -
 
 
 def on_cycles(parent: list[int], depth: list[int]) -> list[bool]:
-    """Whether one who goes up from a node never comes to an end, nor to a node that has a depth."""
+    """Whether following parents from a node never ends, nor reaches a node that has a depth."""
     found = []
     for node in range(len(parent)):
         seen: set[int] = set()
@@ -53,7 +53,7 @@ def on_cycles(parent: list[int], depth: list[int]) -> list[bool]:
 
 
 def coarse_cut(child_count: np.ndarray, child_start: np.ndarray, size: np.ndarray, most: int) -> set[int]:
-    """The cut of a tree that is left when the largest node is divided as long as the cut has no more than `most`."""
+    """Returns the cut that refines the largest node first, as long as it has no more than `most` nodes."""
     links = links_of(child_count, child_start)
     heap = [(-float(size[0]), 0)]
     leaves: set[int] = set()

@@ -21,7 +21,7 @@ from tests.scenes import random_splats
 from tests.simulation.worlds import SPARK, camera, path_of, rows_of
 
 
-def small_forest(seed: int) -> tuple[Scenes, list[twin.Placed]]:
+def small_forest(seed: int) -> tuple[Scenes, list[twin.Instance]]:
     """Two trees of a few hundred nodes and three instances of them, as the package and the twin have them."""
     rng = np.random.default_rng(seed)
     trees = [random_tree(rng, count, 5) for count in (300, 120)]
@@ -42,18 +42,18 @@ def small_forest(seed: int) -> tuple[Scenes, list[twin.Placed]]:
         made.append(LoadedScene(Path(f"{number}.spz"), 1000, Scene(splats, tree.tree), splats, number))
     cones = twin.cones(of_all.fov0, of_all.fov, of_all.foveate, of_all.behind)
     weighting = [cones, twin.frustum(own.outside, own.behind), cones]
-    placed = [
-        twin.Placed(as_nodes[tree], spot, weight, how)
+    instances = [
+        twin.Instance(as_nodes[tree], spot, weight, how)
         for tree, spot, weight, how in zip(of, spots, weights, weighting, strict=True)
     ]
     scenes = Scenes(placements, made, [made[tree] for tree in of])
     scenes.__dict__["forest"] = Forest(trees)  # of other sizes than those of the splats
-    return scenes, placed
+    return scenes, instances
 
 
 @pytest.mark.parametrize("seed", range(6))
 def test_rows_are_as_worked_out_without_sparklod(seed: int) -> None:
-    scenes, placed = small_forest(seed)
+    scenes, instances = small_forest(seed)
     rng = np.random.default_rng(100 + seed)
     for budget, render_scale in ((3, 1.0), (150, 1.0), (100_000, 40.0), (100_000, 0.0)):
         eye, target = rng.normal(0, 2, 3), rng.normal(0, 1, 3)
@@ -61,7 +61,7 @@ def test_rows_are_as_worked_out_without_sparklod(seed: int) -> None:
         right, up, back = at.camera_to_world[:3, :3].T
         seen = twin.Eye(eye, right, up, -back, math.radians(70), 500, 300)
         (row,) = rows_of(scenes, LodSettings(budget, SPARK, render_scale=render_scale), path_of([at]))
-        drawn = twin.frame(placed, seen, budget, seen.pixel * render_scale)
+        drawn = twin.frame(instances, seen, budget, seen.pixel * render_scale)
         assert twin.differing(drawn.cells, row) == []
         cut = CutFinder(scenes, LodSettings(budget, SPARK, render_scale=render_scale)).cut(at).nodes
         assert [set(part.tolist()) for part in cut] == [

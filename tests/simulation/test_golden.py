@@ -108,7 +108,7 @@ def test_cuts_of_the_golden_table_are_those_of_a_queue(rows: list[Row]) -> None:
         found = []
         at = eye(number)
         for chunks in itertools.combinations(range(3), int(row["chunks_resident"])):
-            drawn = twin.frame([twin.Placed(nodes, weight=weight)], at, BUDGET, at.pixel, chunks)
+            drawn = twin.frame([twin.Instance(nodes, weight=weight)], at, BUDGET, at.pixel, chunks)
             found.append((twin.differing(drawn.cells, typed), drawn))
             if not found[-1][0]:
                 break

@@ -1,4 +1,4 @@
-"""COLMAP's sparse models: images and cameras, as text or binary. Their points are not looked at."""
+"""COLMAP's sparse models: images and cameras, as text or binary. Points are ignored."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from ..frame import NO_LENS, Frame, Lens, Settings
 from .colmap_models import MODELS, Model, lens_of
 from .source import Files, Parsed, finite, posed
 
-#: An image of images.bin: its number, w x y z of its rotation, x y z, and the number of its camera; its name follows.
+#: An image of images.bin: number, rotation w x y z, translation x y z, and number of its camera; its name follows.
 IMAGE = struct.Struct("<I7dI")
 
-#: A camera of cameras.bin: its number, that of its model, its width and height; its numbers follow.
+#: A camera of cameras.bin: number, number of its model, width and height; its parameters follow.
 CAMERA = struct.Struct("<IiQQ")
 
 COUNT = struct.Struct("<Q")
 
-#: Bytes of a point that an image sees: x, y, and the number of a 3D point.
+#: Bytes of a point in an image: x, y, and the number of a 3D point.
 POINT = 24
 
-#: What images.txt has of an image, in a line; in the next one are the points that it sees.
+#: Values of an image in a line of images.txt; its points follow in the next line.
 IMAGE_WORDS = 10
 
 COMMENT = "# Image list with two lines of data per image"
@@ -33,7 +33,7 @@ Cameras = dict[int, tuple[Model, Lens]]
 
 
 def recognises(files: Files) -> bool:
-    """Whether images.txt says so, or images.bin begins with a rotation."""
+    """Whether the file begins with the comment of images.txt, or like images.bin with a rotation."""
     data = _images(files)
     if data.lstrip().startswith(COMMENT.encode()):
         return True
@@ -44,36 +44,36 @@ def recognises(files: Files) -> bool:
 
 
 def _images(files: Files) -> bytes:
-    """Of images.bin or images.txt, or else the first file, whatever its name."""
+    """The bytes of images.bin or images.txt, or else of the first file."""
     named = (files.contents[name] for name in ("images.bin", "images.txt") if name in files.contents)
     return next(named, files.data)
 
 
 def parse(files: Files, settings: Settings) -> Parsed:
-    """Its images, by name: COLMAP has them in any order."""
+    """Its images, sorted by name: COLMAP writes them in any order."""
     if "cameras.bin" in files.contents:
         cameras = dict(_binary_cameras(files.contents["cameras.bin"]))
     else:
         cameras = dict(_text_cameras(files.contents.get("cameras.txt", b"")))
     data = _images(files)
     images = _text_images(data) if _is_text(data) else _binary_images(data)
-    notes = [] if cameras else ["There is no cameras.txt or cameras.bin beside it, so nothing is known of its lenses."]
+    notes = [] if cameras else ["Without a cameras.txt or cameras.bin beside it, its lenses are unknown."]
     frames = []
     used = set()
     for image, camera, quat, position, name in images:
         if cameras and camera not in cameras:
-            raise CameraPathError(f"image {image} has camera {camera}, which there is not")
+            raise CameraPathError(f"image {image} has camera {camera}, which does not exist")
         model, lens = cameras[camera] if cameras else (None, NO_LENS)
         used.add(model)
         frames.append(Frame(posed(quat, position, f"image {image}"), lens, name=name))
     distorting = sorted(model.name for model in used if model and model.distorts)
     if distorting:
-        notes.append(f"The lens distortion of {', '.join(distorting)} was left out.")
+        notes.append(f"The lens distortion of {', '.join(distorting)} was ignored.")
     return Parsed(sorted(frames, key=lambda frame: _natural(frame.name)), tuple(notes))
 
 
 def _natural(name: str) -> list[tuple[int, str]]:
-    """A key to sort names by, in which 9 comes before 10."""
+    """A key that sorts 9 before 10 in names."""
     parts = [(part.lstrip("0") if index % 2 else part) for index, part in enumerate(re.split(r"([0-9]+)", name))]
     return [(len(part) if index % 2 else 0, part) for index, part in enumerate(parts)]
 
@@ -82,7 +82,7 @@ def _is_text(data: bytes) -> bool:
     return b"\0" not in data[: 1 << 16]
 
 
-#: Of an image: its number, that of its camera, w x y z, x y z, and its name.
+#: An image: number, number of its camera, rotation w x y z, translation x y z, and name.
 Image = tuple[int, int, list[float], list[float], str]
 
 
@@ -97,7 +97,7 @@ def _text_images(data: bytes) -> Iterator[Image]:
             raise CameraPathError(f"{way} has {len(words)} values, an image has {IMAGE_WORDS}")
         image, *numbers, camera = (finite(word, way) for word in words[:9])
         yield int(image), int(camera), numbers[:4], numbers[4:], words[9].strip()
-        next(lines, None)  # the points that it sees; the line is empty where it sees none
+        next(lines, None)  # the points of the image; the line is empty without any
 
 
 def _text_cameras(data: bytes) -> Iterator[tuple[int, tuple[Model, Lens]]]:
@@ -110,7 +110,7 @@ def _text_cameras(data: bytes) -> Iterator[tuple[int, tuple[Model, Lens]]]:
             raise CameraPathError(f"{way} has {len(words)} values, a camera has more")
         model = next((model for model in MODELS if model.name == words[1]), None)
         if model is None:
-            raise CameraPathError(f"{way} has a camera model {words[1][:30]!r}, which is not known")
+            raise CameraPathError(f"{way} has a camera model {words[1][:30]!r}, which is unknown")
         key, width, height, *numbers = (finite(word, way) for word in (words[0], *words[2:]))
         yield int(key), (model, lens_of(model, width, height, numbers, way))
 
@@ -143,29 +143,29 @@ def _binary_cameras(data: bytes) -> Iterator[tuple[int, tuple[Model, Lens]]]:
         key, number, width, height = reader.take(CAMERA)
         way = f"camera {key}"
         if not 0 <= number < len(MODELS):
-            raise CameraPathError(f"{way} is of model {number}, which is not known")
+            raise CameraPathError(f"{way} is of model {number}, which is unknown")
         model = MODELS[number]
         numbers = [finite(value, way) for value in reader.take(struct.Struct(f"<{model.count}d"))]
         yield key, (model, lens_of(model, width, height, numbers, way))
 
 
 class _Reader:
-    """Goes through the bytes of a file; `CameraPathError` where they end before they should."""
+    """Reads through the bytes of a file; `CameraPathError` if they end too early."""
 
     def __init__(self, data: bytes, name: str) -> None:
         self._data, self._name, self._at = data, name, 0
 
     def expect(self, count: int, least: int) -> None:
-        """There must be room for `count` items of `least` bytes or more."""
+        """Checks that `count` items of at least `least` bytes can follow."""
         if count > (len(self._data) - self._at) // least:
-            raise CameraPathError(f"{self._name} promises {count:,}, more than it can hold")
+            raise CameraPathError(f"{self._name} announces {count:,} items, more than it can hold")
 
     def take(self, layout: struct.Struct) -> tuple[Any, ...]:
         self.skip(layout.size)
         return layout.unpack_from(self._data, self._at - layout.size)
 
     def text(self) -> str:
-        """Up to a zero."""
+        """The text up to a zero byte."""
         end = self._data.find(b"\0", self._at)
         if end < 0:
             raise CameraPathError(f"{self._name} ends inside a name")
@@ -176,4 +176,4 @@ class _Reader:
     def skip(self, size: int) -> None:
         self._at += size
         if self._at > len(self._data):
-            raise CameraPathError(f"{self._name} ends before what it promises")
+            raise CameraPathError(f"{self._name} ends before all of its data")

@@ -1,4 +1,4 @@
-"""COLMAP's camera models: how many numbers each has, of which the focal lengths and the principal point come first."""
+"""COLMAP's camera models and their parameters: focal lengths and principal point come first."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ class Model:
     """A camera model.
 
     Attributes:
-        name: in cameras.txt; cameras.bin has its row in `MODELS` instead.
-        focals: numbers of focal length, 1 or 2; 0 where it is no pinhole camera at all.
-        others: numbers that come behind the principal point, all about distortion.
+        name: in cameras.txt; cameras.bin has the index in `MODELS` instead.
+        focals: number of focal lengths, 1 or 2; 0 for a model that a pinhole camera cannot replace.
+        others: number of parameters after the principal point, all of the distortion.
     """
 
     name: str
@@ -25,12 +25,12 @@ class Model:
 
     @property
     def count(self) -> int:
-        """Numbers of a camera."""
+        """Number of parameters of a camera."""
         return self.focals + 2 + self.others
 
     @property
     def distorts(self) -> bool:
-        """Whether its images need not be those of a pinhole camera."""
+        """Whether its images may differ from those of a pinhole camera."""
         return self.others > 0 or "FISHEYE" in self.name
 
 
@@ -60,11 +60,11 @@ def lens_of(model: Model, width: float, height: float, numbers: list[float], way
     """The lens of a camera, without its distortion.
 
     Raises:
-        CameraPathError: it has another number of numbers, no sensible size, or is no pinhole camera.
+        CameraPathError: the number of parameters or the size is wrong, or it is not a pinhole camera.
     """
     if not model.focals:
         raise CameraPathError(f"{way} is {model.name}, which is not a pinhole camera")
     if len(numbers) != model.count:
-        raise CameraPathError(f"{way} has {len(numbers)} numbers, not the {model.count} of {model.name}")
+        raise CameraPathError(f"{way} has {len(numbers)} parameters, not the {model.count} of {model.name}")
     principal = numbers[model.focals], numbers[model.focals + 1]
     return Lens((side(width, way), side(height, way)), (numbers[0], numbers[model.focals - 1]), principal)

@@ -1,4 +1,4 @@
-"""cameras.json, which Inria's trainer, and others after it, put beside the splats."""
+"""cameras.json, which Inria's trainer and others write beside the splats."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def recognises(files: Files) -> bool:
 
 
 def parse(files: Files, settings: Settings) -> Parsed:
-    """Its cameras, in the order of the file: those that were tested on come first."""
+    """Its cameras in the order of the file: test cameras come first."""
     return Parsed([_frame(item) for item in files.object().items()])
 
 

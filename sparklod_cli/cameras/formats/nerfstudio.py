@@ -1,4 +1,4 @@
-"""What nerfstudio's viewer saves in camera_paths/ and `ns-render camera-path` renders."""
+"""nerfstudio's camera paths, which its viewer saves in camera_paths/ and `ns-render camera-path` renders."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from ...support.errors import CameraPathError
 from ..frame import Frame, Lens, Settings
 from .source import Files, Json, Parsed
 
-#: The camera types that a pinhole camera can stand for.
+#: The camera types that are read as pinhole cameras.
 PINHOLES = ("perspective", "fisheye")
 
 
 def recognises(files: Files) -> bool:
-    """Whether it has a list of that name."""
+    """Whether it has a camera_path."""
     return files.json is not None and files.json.has("camera_path")
 
 
 def parse(files: Files, settings: Settings) -> Parsed:
-    """Its frames. Its keyframes are not looked at: the frames are what lies between them."""
+    """Its frames. Keyframes are ignored, since the frames are interpolated from them already."""
     root = files.object()
     kind = root.get("camera_type").text() if root.has("camera_type") else PINHOLES[0]
     if kind not in PINHOLES:
@@ -30,7 +30,7 @@ def parse(files: Files, settings: Settings) -> Parsed:
         size = root.get("render_width").side(), root.get("render_height").side()
     frames = [_frame(item, size) for item in root.get("camera_path").items()]
     fps = root.get("fps").number() if root.has("fps") else 0
-    notes = ("Its cameras are fisheye, and are taken for pinhole cameras.",) if kind == "fisheye" else ()
+    notes = ("Its fisheye cameras are read as pinhole cameras.",) if kind == "fisheye" else ()
     return Parsed(frames, notes, fps if fps > 0 else None)
 
 

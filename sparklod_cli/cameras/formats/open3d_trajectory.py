@@ -1,7 +1,7 @@
 """Open3D's PinholeCameraTrajectory, as .json and .log, which Open3D itself reads.
 
-Open3D takes a broken file for a whole one: where a number is missing it goes on with one that it had before, or with
-whatever was in memory. So the file is looked at before.
+Open3D accepts broken files: in place of a missing number it uses an earlier one, or whatever is in memory. So the file
+is checked first.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ CLASS = "PinholeCameraTrajectory"
 #: Lines of a pose in a .log file: three whole numbers, and a matrix.
 LOG_LINES = 5
 
-#: Open3D has the middle of a pixel at whole numbers, and so the principal point.
+#: Open3D's pixel coordinates are whole numbers at the centres of pixels, ours at their corners.
 HALF = 0.5
 
 
@@ -38,14 +38,14 @@ def recognises(files: Files) -> bool:
 
 
 def parse(files: Files, settings: Settings) -> Parsed:
-    """Its cameras; a .log says nothing of their lenses."""
+    """Its cameras; a .log has no lenses."""
     suffix = files.path.suffix.lower()
     if suffix == ".json":
         _check_json(files)
     elif suffix == ".log":
         _check_log(files)
     else:
-        raise CameraPathError("Open3D knows its files by their suffix; rename it to .json or .log")
+        raise CameraPathError("Open3D recognizes its files by their suffix; rename it to .json or .log")
     open3d = load_open3d()
     with _quiet(open3d):
         trajectory = open3d.io.read_pinhole_camera_trajectory(str(files.path))

@@ -1,4 +1,4 @@
-"""sparklod's own CSV: a row a camera, its columns told by their names; docs/cameras.md has them."""
+"""sparklod's own CSV: a camera per row, with named columns; docs/cameras.md lists them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ COLUMNS = {*POSITION, *QUAT, *TARGET, *UP, *SIZE, "time", "fov", "name"}
 
 
 def recognises(files: Files) -> bool:
-    """Whether its first line names what a pose takes."""
+    """Whether its first line names the columns of a pose."""
     names = set(_names((files.text or "").split("\n", 1)[0]))
     return names >= {*POSITION, *QUAT} or names >= {*POSITION, *TARGET}
 
@@ -27,16 +27,16 @@ def _names(line: str) -> list[str]:
 
 
 def resembles(files: Files) -> bool:
-    """Whether it may have been meant to be one: it is called so, or its first line names some of the columns."""
+    """Whether it looks like a failed attempt: it is named .csv, or its first line names some of the columns."""
     names = _names((files.text or "").split("\n", 1)[0])
     return files.path.suffix.lower() == ".csv" or len(COLUMNS.intersection(names)) > 1
 
 
 def lacking(names: Collection[str]) -> str:
-    """What is missing of the columns that a pose takes."""
+    """The error about missing columns."""
     missing = min(([name for name in POSITION + way if name not in names] for way in (TARGET, QUAT)), key=len)
     return (
-        f"its first line, which names the columns, lacks {', '.join(missing)}; a camera takes {', '.join(POSITION)},"
+        f"its first line, which names the columns, lacks {', '.join(missing)}; a camera needs {', '.join(POSITION)},"
         f" and {', '.join(TARGET)} or {', '.join(QUAT)}"
     )
 
@@ -57,7 +57,7 @@ def parse(files: Files, settings: Settings) -> Parsed:
     except csv.Error as error:
         raise CameraPathError(f"it is not CSV: {error}") from None
     unknown = sorted(set(names) - COLUMNS)
-    notes = (f"Columns that mean nothing were left out: {', '.join(unknown)}.",) if unknown else ()
+    notes = (f"Unknown columns were ignored: {', '.join(unknown)}.",) if unknown else ()
     return Parsed(frames, notes, turned=TARGET[0] not in names)
 
 

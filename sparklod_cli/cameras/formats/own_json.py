@@ -1,4 +1,4 @@
-"""sparklod's own JSON of cameras, or of keyframes to go between; docs/cameras.md has the layout."""
+"""sparklod's own JSON of cameras or of keyframes; docs/cameras.md describes it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ FORMAT, VERSION = "sparklod-camera-path", 1
 
 
 def recognises(files: Files) -> bool:
-    """Whether it says so."""
+    """Whether its field format says so."""
     return files.json is not None and files.json.has("format") and files.json.value["format"] == FORMAT
 
 
@@ -26,7 +26,7 @@ def parse(files: Files, settings: Settings) -> Parsed:
     """Its frames, or those between its keyframes."""
     root = files.object()
     if root.has("version") and root.get("version").value != VERSION:
-        raise CameraPathError(f"version {brief(root.value['version'])} is not known, only {VERSION} is")
+        raise CameraPathError(f"version {brief(root.value['version'])} is unknown, only {VERSION} is read")
     lens = _lens(root, NO_LENS)
     fps = root.get("fps").number() if root.has("fps") else None
     if fps is not None and not fps > 0:
@@ -46,7 +46,7 @@ def _axes(root: Json) -> Axes:
         return Axes(name)
     except ValueError:
         known = ", ".join(axes.value for axes in Axes)
-        raise CameraPathError(f"axes {name[:20]!r} are not known ({known} are)") from None
+        raise CameraPathError(f"axes {name[:20]!r} are unknown; use one of {known}") from None
 
 
 def _frame(item: Json, default: Lens, axes: Axes, settings: Settings) -> Frame:
@@ -77,7 +77,7 @@ def _key(item: Json) -> Key:
 
 
 def _lens(item: Json, default: Lens) -> Lens:
-    """What an object says of the lens, over what the whole file says."""
+    """The lens of an object, whose fields override those of the whole file."""
     size, focal, principal, fov = (item.first(key) for key in ("size", "focal", "principal", "fov"))
     if size is not None:
         width, height = (side(number, size.way) for number in size.numbers(2))

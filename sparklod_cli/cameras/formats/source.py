@@ -1,4 +1,4 @@
-"""What parsers read from and hand on: files that were read, JSON that is not believed before it is looked at."""
+"""Input and output of parsers: `Files`, `Json`, which checks values where they are used, and `Parsed`."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from ..camera import Matrix
 from ..frame import Frame
 from ..pose import pose, rotation_of
 
-#: An image has no more pixels than this along a side.
+#: Most pixels along a side of an image.
 MAX_SIDE = 1 << 16
 
 
 @dataclass(frozen=True)
 class Files:
-    """A camera path's file, with those that belong to it.
+    """The file of a camera path and those that belong to it.
 
     Attributes:
         path: of the file, or of the folder.
-        contents: bytes of each file, by name, the one that was asked for first.
+        contents: bytes of each file by name; the one that was asked for comes first.
     """
 
     path: Path
@@ -38,7 +38,7 @@ class Files:
 
     @cached_property
     def text(self) -> str | None:
-        """The first file as text; None where it is something else."""
+        """The first file as text; None if it is not text."""
         try:
             text = self.data.decode("utf-8-sig")
         except UnicodeDecodeError:
@@ -47,20 +47,20 @@ class Files:
 
     @cached_property
     def json(self) -> Json | None:
-        """The first file as JSON; None where it is something else."""
+        """The first file as JSON; None if it is not JSON."""
         try:
             return Json(parse_json(self.text or ""))
         except ValueError:
             return None
 
     def lines(self) -> list[str]:
-        """Of the first file, as text; `CameraPathError` where it is none."""
+        """The lines of the first file; `CameraPathError` if it is not text."""
         if self.text is None:
             raise CameraPathError("it is not a text file")
         return self.text.splitlines()
 
     def object(self) -> Json:
-        """The first file as a JSON object or list; `CameraPathError` where it is something else."""
+        """The first file as JSON; `CameraPathError` if it is not JSON."""
         if self.json is None:
             raise CameraPathError("it is not JSON, or cut short")
         return self.json
@@ -68,13 +68,13 @@ class Files:
 
 @dataclass(frozen=True)
 class Parsed:
-    """What a parser found.
+    """The result of a parser.
 
     Attributes:
-        frames: in order; a path that is made of keys has them made when they are asked for.
-        notes: what was left out or assumed, a sentence each, for people.
-        fps: frames a second that the file names; None where it does not.
-        turned: every camera says itself which way is up.
+        frames: in order; those between keys are computed when they are asked for.
+        notes: what was ignored or assumed, one sentence each, for people.
+        fps: frames a second in the file; None if it gives none.
+        turned: every camera has its own up axis.
     """
 
     frames: Sequence[Frame]
@@ -85,30 +85,30 @@ class Parsed:
 
 @dataclass(frozen=True)
 class Json:
-    """A value of a JSON file and the way to it; what it should be is checked where it is asked for.
+    """A value of a JSON file and the keys that lead to it, as one text.
 
-    Every method raises `CameraPathError`, which names the way, where the value is something else.
+    Every method raises `CameraPathError`, which names the keys, if the value is not of the required type.
     """
 
     value: Any
     way: str = ""
 
     def has(self, *keys: str) -> bool:
-        """Whether it is an object that has all of these keys, and none of them null."""
+        """Whether it is an object with all of these keys, none of them null."""
         return isinstance(self.value, dict) and all(self.value.get(key) is not None for key in keys)
 
     def get(self, key: str) -> Json:
-        """What an object has by this key."""
+        """The value of a key of an object."""
         if not self.has(key):
             raise CameraPathError(f"{self.way or 'it'} has no {key!r}")
         return Json(self.value[key], f"{self.way}.{key}" if self.way else key)
 
     def first(self, *keys: str) -> Json | None:
-        """What an object has by the first of these keys that it has; None where it has none."""
+        """The value of the first of these keys that an object has; None if it has none."""
         return next((self.get(key) for key in keys if self.has(key)), None)
 
     def find(self, *keys: str) -> Json | None:
-        """What is at the end of a way of keys; None where it breaks off."""
+        """The value at the end of nested keys; None if one is missing."""
         here: Json | None = self
         for key in keys:
             here = here.first(key) if here else None
@@ -125,7 +125,7 @@ class Json:
         return finite(self.value, self.way)
 
     def numbers(self, *counts: int) -> list[float]:
-        """Finite numbers, as many as one of `counts`; any number of them where that is empty."""
+        """A list of finite numbers, of one of the lengths `counts`; of any length without them."""
         if not isinstance(self.value, list) or (counts and len(self.value) not in counts):
             raise CameraPathError(f"{self.way} is not a list of {' or '.join(map(str, counts)) or 'some'} numbers")
         return [finite(item, self.way) for item in self.value]
@@ -136,11 +136,11 @@ class Json:
         return first, second
 
     def matrix(self, *rows: int, columns: int = 4) -> list[float]:
-        """Finite numbers of a matrix, row by row: a list of lists, or one of all numbers.
+        """Finite numbers of a matrix, row by row, from a list of rows or of all numbers.
 
         Args:
-            rows: how many there may be.
-            columns: how many there are.
+            rows: numbers of rows that are accepted.
+            columns: number of columns.
         """
         value = self.value
         if isinstance(value, list) and len(value) in rows and all(isinstance(row, list) for row in value):
@@ -159,7 +159,7 @@ class Json:
 
 
 def posed(quat_wxyz: Sequence[float], position: Sequence[float], way: str) -> Matrix:
-    """(4, 4) of a quaternion and a position; `CameraPathError`, naming where they are, of a quaternion of length 0."""
+    """The (4, 4) pose of a quaternion and a position; `CameraPathError`, naming their place, if the length is 0."""
     try:
         return pose(rotation_of(quat_wxyz), position)
     except ValueError as error:
@@ -167,7 +167,7 @@ def posed(quat_wxyz: Sequence[float], position: Sequence[float], way: str) -> Ma
 
 
 def finite(value: Any, way: str) -> float:
-    """A finite number, of a number or of its digits; `CameraPathError`, naming where it is, of anything else."""
+    """A finite number from a number or its digits; `CameraPathError`, naming its place, for anything else."""
     try:
         number = float(value) if not isinstance(value, bool) else math.nan
     except (TypeError, ValueError, OverflowError):
@@ -178,12 +178,12 @@ def finite(value: Any, way: str) -> float:
 
 
 def brief(value: Any) -> str:
-    """A value of a file as it may be quoted: in a line, and not for pages."""
+    """A value of a file as an error quotes it: on one line, and shortened."""
     return f"a {type(value).__name__}" if isinstance(value, (dict, list)) else repr(value)[:30]
 
 
 def side(number: float, way: str) -> int:
-    """Pixels along a side of an image; `CameraPathError`, naming where it is, of a number that cannot be that."""
+    """Pixels along a side of an image; `CameraPathError`, naming its place, for an impossible number."""
     if not 1 <= number <= MAX_SIDE or number != int(number):
         raise CameraPathError(f"{way} of {number:g} is not a number of pixels")
     return int(number)

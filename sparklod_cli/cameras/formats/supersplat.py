@@ -1,7 +1,7 @@
 """SuperSplat: the settings.json of its viewer, of both versions, and the document.json of its projects.
 
-All have keys of position, target and field of view, on a time line that is counted in frames, and a smoothness; what
-lies between them is worked out as SuperSplat does.
+All have keys of position, target and field of view on a time line counted in frames, and a smoothness; frames between
+the keys are interpolated as in SuperSplat.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from .source import Files, Json, Parsed, brief
 UP = (0.0, 1.0, 0.0)
 FRAME_RATE = 30.0
 
-#: Degrees, where a file of version 1 has none: for its animation, and for its first view.
+#: Field of view in degrees of a version 1 file without one: of its animation, and of its first view.
 FOV_TRACK, FOV_VIEW = 60.0, 75.0
 
 VERSION = 2
 
 
 def recognises(files: Files) -> bool:
-    """Whether it is the one or the other."""
+    """Whether it is one of the three."""
     root = files.json
     if root is None:
         return False
@@ -41,14 +41,14 @@ def recognises(files: Files) -> bool:
     )
 
 
-@np.errstate(all="ignore")  # numbers may be of any size; what comes of them is looked at in the end
+@np.errstate(all="ignore")  # numbers may have any size; the resulting poses are checked
 def parse(files: Files, settings: Settings) -> Parsed:
     """The frames of its first animation, or else its views."""
     root = files.object()
     if root.has("poseSets"):
         return _of_document(root, settings)
     if root.has("version") and root.get("version").value != VERSION:
-        raise CameraPathError(f"version {brief(root.value['version'])} of SuperSplat's settings is not known")
+        raise CameraPathError(f"version {brief(root.value['version'])} of SuperSplat's settings is unknown")
     tracks = list(root.get("animTracks").items()) if root.has("animTracks") else []
     if tracks:
         fov = root.find("camera", "fov")
@@ -61,7 +61,7 @@ def parse(files: Files, settings: Settings) -> Parsed:
 
 
 def _of_track(track: Json, fov: float, first_version: bool, settings: Settings) -> Parsed:
-    """An item of animTracks. Version 1 has one field of view for all keys, and counted in seconds in the beginning."""
+    """An item of animTracks. Version 1 has one field of view for all keys, and at first counted in seconds."""
     rate = _positive(track, "frameRate", FRAME_RATE)
     times = np.array(track.get("keyframes").get("times").numbers())
     if not track.has("frameRate"):
@@ -82,12 +82,12 @@ def _of_track(track: Json, fov: float, first_version: bool, settings: Settings) 
 
 
 def _of_document(root: Json, settings: Settings) -> Parsed:
-    """The poses of a project; those past the end of its time line are left out."""
+    """The frames of a project; poses beyond the end of its time line are ignored."""
     line = root.get("timeline")
     count, rate = line.get("frames").number(), _positive(line, "frameRate", FRAME_RATE)
     fov = root.find("camera", "fov")
     keys = {}
-    sets = list(root.get("poseSets").items())[:1]  # SuperSplat has one set only, or none
+    sets = list(root.get("poseSets").items())[:1]  # SuperSplat writes one set or none
     for index, pose in enumerate(pose for one in sets for pose in one.get("poses").items()):
         frame = pose.get("frame").number() if pose.has("frame") else index * rate
         if frame < count:
@@ -101,7 +101,7 @@ def _of_document(root: Json, settings: Settings) -> Parsed:
 
 
 def _whole(frames: float) -> float:
-    """Rounded; what is infinite stays so."""
+    """Rounded; infinity stays infinite."""
     return float(round(frames)) if math.isfinite(frames) else frames
 
 
@@ -121,18 +121,18 @@ def _positive(place: Json, key: str, default: float) -> float:
 def _curve(
     times: Matrix, points: Matrix, smoothness: float, length: float | None, step: bool
 ) -> Callable[[Matrix], Matrix]:
-    """What is between keys.
+    """The interpolation between keys.
 
     Args:
         times: (n,) of the keys, frames.
         points: (n, 7).
-        smoothness: 0, straight from key to key, to 1.
-        length: of the loop that the path is, frames; None where it is none.
-        step: each key is held until the next.
+        smoothness: from 0, straight lines between keys, to 1.
+        length: of a path that is a loop, frames; None for another path.
+        step: hold each key until the next.
     """
     if not len(times):
         raise CameraPathError("it has no keyframes")
-    if length is not None and len(times) > 1 and not step:  # two keys more at either end, and round it goes
+    if length is not None and len(times) > 1 and not step:  # two more keys at either end close the loop
         times = np.concatenate([times[-2:] - length, times, times[:2] + length])
         points = np.concatenate([points[-2:], points, points[:2]])
     if not (np.diff(times) > 0).all():
@@ -144,7 +144,7 @@ def _curve(
 
 
 def _sampled(curve: Callable[[Matrix], Matrix], count: float, rate: float, settings: Settings) -> Parsed:
-    """All frames of a path of `count` frames; --fps takes more of them, or fewer, over the same time."""
+    """All frames of a path of `count` frames; --fps changes their number, not the duration."""
     fps = settings.fps or rate
 
     def at(numbers: NDArray[np.int64]) -> list[Frame]:
@@ -156,6 +156,6 @@ def _sampled(curve: Callable[[Matrix], Matrix], count: float, rate: float, setti
 
 
 def _looking(sample: Matrix | list[float], time: float | None, settings: Settings) -> Frame:
-    """The field of view is that along the longer side of the image."""
+    """A frame whose field of view spans the longer side of the image."""
     lens = Lens(fov=math.radians(sample[6]), fov_along="longer")
     return frame_looking(sample[:3], sample[3:6], settings.up or UP, lens, time)

@@ -1,4 +1,4 @@
-"""The table of camera path formats: adding one is a module and a row here. Imports nothing heavy, for `--help`."""
+"""The table of formats of camera paths: adding one is a module and a row. Imports nothing heavy, for `--help`."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from typing import Any
 
 from ..axes import Axes
 
-#: PlayCanvas turns what it loads by 180 degrees about z, so that y is up.
+#: PlayCanvas rotates what it loads by 180 degrees about z, so that y points up.
 PLAYCANVAS = (
-    "SuperSplat and splat-transform turn a PLY file by 180 degrees about z when they load it;"
-    " --world-transform -1,0,0,0,0,-1,0,0,0,0,1,0,0,0,0,1 turns the cameras back."
+    "SuperSplat and splat-transform rotate a PLY file by 180 degrees about z when they load it;"
+    " --world-transform -1,0,0,0,0,-1,0,0,0,0,1,0,0,0,0,1 rotates the cameras back."
 )
 
 
@@ -20,13 +20,13 @@ class PathFormat:
     """A format of camera paths.
 
     Attributes:
-        name: what `--camera-format` calls it.
+        name: value of `--camera-format`.
         title: for people.
         module: in this package; has `recognises(files) -> bool` and `parse(files, settings) -> Parsed`.
-        axes: of its matrices; None where it has eyes and targets, about which there is nothing to know.
-        looking: its cameras look from an eye to a target, or may, so that it matters which way is up.
-        world: said where `--world-transform` is not given: the world of the cameras may not be that of the splats.
-        names: sets of files that belong together, as they are named in a folder of it; empty where any name will do.
+        axes: of its matrices; None if it has eyes and targets instead.
+        looking: its cameras have, or may have, an eye and a target, which need an up axis.
+        world: note for a path without `--world-transform`: the world of its cameras may not be that of the splats.
+        names: sets of names of files that belong together in a folder; empty if its file may have any name.
     """
 
     name: str
@@ -42,7 +42,7 @@ class PathFormat:
         return import_module(f".{self.module}", __package__)
 
 
-#: In the order in which they are tried.
+#: The formats, in the order in which they are tried.
 FORMATS = (
     PathFormat("sparklod", "sparklod's JSON", "own_json", Axes.OPENGL_C2W, looking=True),
     PathFormat("csv", "sparklod's CSV", "own_csv", Axes.OPENGL_C2W, looking=True),
@@ -69,5 +69,5 @@ FORMATS = (
     PathFormat("tum", "TUM trajectory", "tum", Axes.OPENCV_C2W),
 )
 
-#: Sets of files to look for in a folder, and beside a file that is one of them: COLMAP's first, as COLMAP does.
+#: Sets of files that are searched for in a folder, and beside a file of one of them: COLMAP's first.
 NAMES = tuple(names for form in reversed(FORMATS) for names in form.names)

@@ -10,7 +10,7 @@ from .source import Files, Json, Parsed
 
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 
-#: What the names of camera models begin with that no pinhole camera can stand for.
+#: Beginnings of the names of camera models that a pinhole camera cannot replace.
 PANORAMAS = ("EQUIRECTANGULAR", "OMNIDIRECTIONAL", "VR180")
 
 
@@ -30,7 +30,7 @@ def parse(files: Files, settings: Settings) -> Parsed:
     if model.startswith(PANORAMAS):
         raise CameraPathError(f"its camera_model {model[:24]!r} is not that of a pinhole camera")
     if any(place.has(key) and place.get(key).number() for place in (root, *items) for key in DISTORTION):
-        notes.append("Its lens distortion was left out.")
+        notes.append("Its lens distortion was ignored.")
     if root.has("applied_transform"):
         notes.append("Its applied_transform was not undone.")
     return Parsed([_frame(item, root) for item in items], tuple(notes))
@@ -43,7 +43,7 @@ def _frame(item: Json, root: Json) -> Frame:
 
 
 def _lens(item: Json, root: Json) -> Lens:
-    """Each value of the frame, or else of the whole file."""
+    """The lens of a frame: each value is that of the frame, or else of the whole file."""
 
     def number(key: str) -> float | None:
         place = item if item.has(key) else root

@@ -1,4 +1,4 @@
-"""TUM trajectories, as SLAM benchmarks and evo have them: a line a pose, `timestamp tx ty tz qx qy qz qw`."""
+"""TUM trajectories of SLAM benchmarks and evo: one pose per line, `timestamp tx ty tz qx qy qz qw`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ COLUMNS = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
 
 
 def recognises(files: Files) -> bool:
-    """Whether its first line that is no comment has eight numbers."""
+    """Whether its first line that is not a comment has eight numbers."""
     words = next(_rows((files.text or "").splitlines()), (0, []))[1]
     try:
         return len([float(word) for word in words]) == len(COLUMNS)
@@ -21,7 +21,7 @@ def recognises(files: Files) -> bool:
 
 
 def parse(files: Files, settings: Settings) -> Parsed:
-    """Its lines."""
+    """Its poses, one per line."""
     return Parsed([_frame(words, f"line {number}") for number, words in _rows(files.lines())])
 
 

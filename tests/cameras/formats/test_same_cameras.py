@@ -100,7 +100,7 @@ def test_colmap_without_its_cameras_keeps_its_poses() -> None:
     path = read(text_file((FOLDER / "colmap-text" / "images.txt").read_bytes(), "renamed.dat"))
     check_pose(path.cameras[3], KNOWN[3])
     assert path.cameras[0].width == 1280
-    assert "nothing is known of its lenses" in path.notes[0]
+    assert "its lenses are unknown" in path.notes[0]
 
 
 @pytest.mark.parametrize("file", ["images.bin", "cameras.bin"])
@@ -130,4 +130,4 @@ def test_colmap_distortion_is_dropped_with_a_note(line: str) -> None:
     path = read(Files(Path("x"), {"images.txt": images, "cameras.txt": f"9 {line}\n".encode()}), format="colmap")
     assert [camera.name for camera in path.cameras] == ["a b.jpg", "c.jpg"]
     assert path.cameras[0].focal == (fx, fy)
-    assert path.notes == ((f"The lens distortion of {said} was left out.",) if said else ())
+    assert path.notes == ((f"The lens distortion of {said} was ignored.",) if said else ())

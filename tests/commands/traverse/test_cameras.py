@@ -28,7 +28,7 @@ def test_notes_on_a_camera_file_are_printed(tmp_path: Path, capsys: Said) -> Non
     (tmp_path / "transforms.json").write_text(json.dumps(path))
     assert traverse(TREE, "--camera-path", tmp_path / "transforms.json") == 0
     out, err = capsys.readouterr()
-    assert "Its lens distortion was left out." in err.splitlines()
+    assert "Its lens distortion was ignored." in err.splitlines()
     assert len(table(out)) == len(path["frames"])
     assert traverse(TREE, "--camera-path", tmp_path / "transforms.json", "-q") == 0
     assert capsys.readouterr().err == ""

@@ -1,3 +1,3 @@
-"""In the place of a package that takes seconds to load, so that runs here are quick."""
+"""Replaces a package that takes seconds to load, so that the runs of these tests are quick."""
 
 raise ImportError("left out of these tests")
