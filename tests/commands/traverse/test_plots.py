@@ -28,10 +28,10 @@ def test_a_plot_shows_what_the_frame_had(tmp_path: Path, monkeypatch: pytest.Mon
     pytest.importorskip("matplotlib", reason="charts need the extra `render`")
     from sparklod_cli.figures import traversal_chart
 
-    shown: list[traversal_chart.Scenery] = []
+    shown: list[traversal_chart.PathScene] = []
 
-    def drawn(rows: object, marked: object, title: str, scenery: traversal_chart.Scenery) -> traversal_chart.Plot:
-        shown.append(scenery)
+    def drawn(rows: object, marked: object, title: str, scene: traversal_chart.PathScene) -> traversal_chart.Plot:
+        shown.append(scene)
         return traversal_chart.Plot(b"a plot", None)
 
     monkeypatch.setattr(traversal_chart, "plot", drawn)
@@ -40,7 +40,7 @@ def test_a_plot_shows_what_the_frame_had(tmp_path: Path, monkeypatch: pytest.Mon
         table = tmp_path / f"{number}.csv"
         assert traverse(TOWN, *ORBIT, *network, "--plot", tmp_path / f"{number}.png", "-o", table) == 0
         rows = list(csv.DictReader(io.StringIO(table.read_text())))
-        scenery = shown[-1]
-        assert scenery.frame is not None
-        assert len(scenery.splats) == len(scenery.level) == int(rows[scenery.frame]["selected"])
+        scene = shown[-1]
+        assert scene.frame is not None
+        assert len(scene.splats) == len(scene.depth) == int(rows[scene.frame]["selected"])
     assert len(shown[1].splats) < len(shown[0].splats)
