@@ -25,7 +25,7 @@ from sparklod_cli.scenes.loaded import Scenes
 from sparklod_cli.scenes.reading import read_scenes
 from sparklod_cli.support.errors import FormatError, InvalidSplatsError
 from tests.conftest import FIXTURES
-from tests.render.sceneries import camera
+from tests.render.drawables import camera
 from tests.scenes import random_splats
 
 TOWN, TREE = FIXTURES / "traverse" / "town.spz", FIXTURES / "golden" / "hand-tree-v3.spz"

@@ -77,25 +77,25 @@ def five() -> list[Instance]:
 
 
 def test_centres_are_those_of_all_leaves_in_the_world() -> None:
-    placements = five()
+    instances = five()
     parts = []
-    for place in placements:
-        scene = read_scene(place.source)
+    for instance in instances:
+        scene = read_scene(instance.source)
         assert scene.tree is not None
         leaves = scene.splats.center[scene.tree.child_count == 0].astype(np.float64)
-        parts.append(leaves @ place.object_to_world[:3, :3].T + place.object_to_world[:3, 3])
-    centers = read_scenes(placements, columns=TRAVERSED, trees_only=True).balls().center
+        parts.append(leaves @ instance.object_to_world[:3, :3].T + instance.object_to_world[:3, 3])
+    centers = read_scenes(instances, columns=TRAVERSED, trees_only=True).balls().center
     assert np.allclose(centers, np.concatenate(parts), rtol=1e-6, atol=1e-5)
 
 
 def test_splats_of_an_instance_are_placed() -> None:
-    placements = five()
-    made = read_scenes(placements)
-    for number, place in enumerate(placements):
-        splats = read_scene(place.source).splats
+    instances = five()
+    made = read_scenes(instances)
+    for number, instance in enumerate(instances):
+        splats = read_scene(instance.source).splats
         nodes = np.array([5, 0, 3], np.uint32)
-        expected = splats.take(nodes) if number == 0 else placed(splats.take(nodes), place.object_to_world)
-        part = Part(made.of_instance[number], nodes, None, place.object_to_world)
+        expected = splats.take(nodes) if number == 0 else placed(splats.take(nodes), instance.object_to_world)
+        part = Part(made.of_instance[number], nodes, None, instance.object_to_world)
         for column in dataclasses.fields(expected):
             found = getattr(Cut((part,)).splats, column.name)
             assert np.array_equal(found, getattr(expected, column.name)), column.name
@@ -170,8 +170,8 @@ def test_chunks_end_where_nodes_do(nodes: int) -> None:
 
 def test_foveation_is_that_of_all_or_its_own() -> None:
     own, of_all = Frustum(0.5, 0.1), Cones(90, 120, 0.4, 0.2)
-    placements = [Instance(TREE, "a"), Instance(TREE, "b", SHIFTED, 3.0, own), Instance(HAND, "c")]
-    made = read_scenes(placements)
+    instances = [Instance(TREE, "a"), Instance(TREE, "b", SHIFTED, 3.0, own), Instance(HAND, "c")]
+    made = read_scenes(instances)
     instances = made.tree_instances(of_all)
     assert [instance.foveation for instance in instances] == [of_all, own, of_all]
     assert [instance.lod_scale for instance in instances] == [1, 3, 1]

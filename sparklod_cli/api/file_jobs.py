@@ -29,6 +29,11 @@ if TYPE_CHECKING:
     from ..model.scene import Scene
 
 
+#: Width and height of the thumbnail on a page, pixels; the splats of the cut that it shows; and the most splats of a
+#: scene without a tree that is drawn for it: more take seconds.
+THUMBNAIL, THUMBNAIL_BUDGET, MOST_SPLATS = (512, 384), 200_000, 3_000_000
+
+
 @dataclass(frozen=True)
 class DrawSettings:
     """What is drawn of a file that is inspected.
@@ -101,7 +106,8 @@ def inspect_file(
         if drawn.html is not None:
             from ..inspection.html import section_of
 
-            section = section_of(report, scene, picture)
+            thumbnail = None if scene is None else _thumbnail(report, scene, threads)
+            section = section_of(report, scene, picture, thumbnail)
         return Inspected(report, _histograms(scene, drawn.histograms), size, section, problem)
 
 
@@ -117,6 +123,33 @@ def _picture(report: Report, scene: Scene | None, drawn: DrawSettings) -> tuple[
         return tree_plot.plot(scene, by=drawn.by, depth=drawn.depth), None
     except SparklodError as error:
         return None, str(error)
+
+
+def _thumbnail(report: Report, scene: Scene, threads: int) -> Picture | None:
+    """The scene as a viewer draws it; None where it is broken, or too large to be drawn at once."""
+    from ..figures.tree_plot import Picture
+    from ..inspection.arrays import NO_CHILDREN
+    from .cameras import orbit
+    from .files import as_tree
+    from .results import show
+    from .views import cut, render
+
+    count = len(scene.splats)
+    if not count or scene.splats.invalid() or NO_CHILDREN in report.notes:
+        return None
+    if scene.tree is None and count > MOST_SPLATS:
+        return None
+    try:
+        if scene.tree is not None:
+            scene.tree.validate()
+        viewed = as_tree(scene)
+        (camera,) = orbit(viewed, count=1, size=THUMBNAIL).cameras
+        drawn = viewed if scene.tree is None else cut(viewed, camera, budget=THUMBNAIL_BUDGET, threads=threads)
+        image = render(drawn, camera, threads=threads)
+    except SparklodError:
+        return None
+    what = "all splats" if scene.tree is None else f"a cut of at most {THUMBNAIL_BUDGET:,} splats"
+    return Picture(show(image).png, f"The scene from its front; {what}")
 
 
 def _histograms(scene: Scene | None, names: Sequence[str]) -> dict[str, str]:

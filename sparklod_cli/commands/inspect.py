@@ -55,7 +55,7 @@ def inspect(ctx: click.Context, /, files: tuple[Path, ...], **_: Any) -> None:
         from ..api.file_jobs import CheckSettings, DrawSettings
         from ..inspection.checking import read_original
 
-        console.announce_compiling("inspect")
+        console.announce_compiling(*(["inspect"] if output.html is None else ["inspect", "render"]))
         drawn = DrawSettings(
             histograms=output.histogram,
             plot=output.plot,

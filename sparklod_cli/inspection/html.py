@@ -58,21 +58,25 @@ class Section:
 
     Attributes:
         report: as for JSON (`report.Report.as_dict`); fields that are missing or None are left out.
-        picture: of the scene.
+        picture: of the structure of the scene.
         histograms: by the name of the quantity.
+        thumbnail: of the scene as a viewer draws it.
     """
 
     report: Mapping[str, Any]
     picture: Picture | None = None
     histograms: Mapping[str, Histogram] = field(default_factory=dict)
+    thumbnail: Picture | None = None
 
 
-def section_of(report: Report, scene: Scene | None, picture: Picture | None) -> Section:
-    """The section about a file: its report, its picture, and histograms of what was read of it."""
+def section_of(
+    report: Report, scene: Scene | None, picture: Picture | None, thumbnail: Picture | None = None
+) -> Section:
+    """The section about a file: its report, its pictures, and histograms of what was read of it."""
     drawn = {}
     if scene is not None and len(scene.splats):
         drawn = {name: values.histogram_of(scene.splats, name) for name in values.names_of(scene.splats)}
-    return Section(report.as_dict(), picture, drawn)
+    return Section(report.as_dict(), picture, drawn, thumbnail)
 
 
 def page(sections: Sequence[Section]) -> str:
@@ -175,6 +179,7 @@ def _section(section: Section, anchor: str) -> str:
         f'<div class="head"><h2 id="{anchor}-name">{name}</h2>{form}{_verdict(report)}</div>',
         _figures(report),
         _findings(report),
+        _picture(section.thumbnail, small=True),
         _picture(section.picture),
     ]
     if report.get("tree"):
@@ -198,10 +203,11 @@ def _figures(report: Mapping[str, Any]) -> str:
         of_ratio = f"{ratio:.1f} times smaller than as floats" if ratio else ""
         cards.append(("Size", _size(report["bytes"]), ", ".join(filter(None, (of_each, of_ratio)))))
     if tree:
-        opaque, needed = 100 * (tree.get("more_than_opaque") or 0), _number(tree.get("chunks_of_coarse_cut"))
+        share, needed = tree.get("more_than_opaque"), _number(tree.get("chunks_of_coarse_cut"))
+        opaque = "" if share is None else f"{100 * share:.1f} % of all nodes have D &gt; 1"
         cards += [
             ("Leaves", _number(tree.get("leaves")), "splats of the scene"),
-            ("Inner nodes", _number(tree.get("inner")), f"{opaque:.1f} % of all nodes have D &gt; 1"),
+            ("Inner nodes", _number(tree.get("inner")), opaque),
             ("Growth", _number(tree.get("growth")), "nodes per leaf"),
             ("Depth", _number(tree.get("depth")), "edges to the deepest node"),
             ("Chunks", _number(tree.get("chunks")), f"{needed} for a coarse cut"),
@@ -235,12 +241,13 @@ def _findings(report: Mapping[str, Any]) -> str:
     return _panel("Findings", f'<ul class="findings">{"".join(items)}</ul>{notes}')
 
 
-def _picture(picture: Picture | None) -> str:
+def _picture(picture: Picture | None, *, small: bool = False) -> str:
     if picture is None:
         return ""
     data, words = base64.b64encode(picture.png).decode("ascii"), picture.description
     image = f'<img alt="Drawing of {text_of(words.partition(";")[0])}" src="data:image/png;base64,{data}">'
-    return f"<figure>{image}<figcaption>{text_of(words)}</figcaption></figure>"
+    kind = ' class="small"' if small else ""
+    return f"<figure{kind}>{image}<figcaption>{text_of(words)}</figcaption></figure>"
 
 
 def _tree(tree: Mapping[str, Any]) -> str:

@@ -16,7 +16,7 @@ from .traversal import Forest, TreeCut, TreeInstance, View
 
 
 @dataclass(frozen=True)
-class Measured:
+class CutStatistics:
     """Statistics of a cut, or of one instance's nodes in it.
 
     Attributes:
@@ -50,7 +50,7 @@ def measure(
     *,
     size: tuple[int, int],
     by_instance: bool = False,
-) -> tuple[Measured, list[Measured]]:
+) -> tuple[CutStatistics, list[CutStatistics]]:
     """Statistics of a cut as a whole and, optionally, of each instance in it.
 
     Args:
@@ -83,11 +83,11 @@ def measure(
     return whole, [_measured(row, part, width * height) for row, part in zip(counts, parts, strict=True)]
 
 
-def _measured(row: NDArray[np.int64], sizes: NDArray[np.float32], pixels: int) -> Measured:
+def _measured(row: NDArray[np.int64], sizes: NDArray[np.float32], pixels: int) -> CutStatistics:
     count = [int(value) for value in row]
     selected = count[kernels.SELECTED]
     seen = np.sort(sizes[sizes >= 0])  # several times as fast as numpy.percentile
-    return Measured(
+    return CutStatistics(
         selected=selected,
         leaves=count[kernels.LEAVES],
         frontier=count[kernels.FRONTIER],

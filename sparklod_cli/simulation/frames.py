@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..cameras.camera import Camera
 from ..cameras.path import CameraPath
-from ..lod.cut_statistics import Changes, Measured, measure
+from ..lod.cut_statistics import Changes, CutStatistics, measure
 from ..lod.settings import LodSettings
 from ..lod.traversal import TreeCut
 from ..model.instances import TOTAL
@@ -49,8 +49,8 @@ class _Found:
     """A cut, what it is like, as a whole and by instance, and how long it took."""
 
     cut: TreeCut
-    whole: Measured
-    parts: list[Measured]
+    whole: CutStatistics
+    parts: list[CutStatistics]
     seconds: float
 
 
@@ -184,7 +184,7 @@ class Simulation:
         ]
 
 
-def _shape(measured: Measured, budget: int) -> Row:
+def _shape(measured: CutStatistics, budget: int) -> Row:
     return {
         "selected": measured.selected,
         "leaves": measured.leaves,

@@ -159,13 +159,13 @@ def _plot(simulation: Simulation, path: CameraPath, target: Path, kept: _Kept, *
 
     frame = kept.shown()
     cut = simulation.scenes.cut_of(frame.cut)
-    scenery = traversal_chart.PathScene(
+    scene = traversal_chart.PathScene(
         path.cameras,
         cut.splats,
         np.concatenate([part.depth for part in cut.parts]),
         path.numbers.index(frame.number),
     )
     marked = {moment.what: moment.frame for moment in kept.lookout.moments()}
-    drawn = traversal_chart.plot(kept.rows, marked, simulation.scenes.title, scenery)
+    drawn = traversal_chart.plot(kept.rows, marked, simulation.scenes.title, scene)
     write_whole(target, [drawn.png], overwrite=overwrite)
     return drawn.note

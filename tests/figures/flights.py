@@ -35,7 +35,7 @@ def circle(count: int = 20, radius: float = 6) -> list[Camera]:
     return [looking((radius * math.cos(angle), -2, radius * math.sin(angle))) for angle in angles]
 
 
-def scenery(frame: int | None = 3) -> PathScene:
+def path_scene(frame: int | None = 3) -> PathScene:
     splats = random_splats(500)
     return PathScene(circle(), splats, np.arange(500) // 100, frame)
 
@@ -45,9 +45,9 @@ def marked(rows: list[Row]) -> dict[str, int]:
     return {moment.what: moment.frame for moment in look_at(totals(rows))}
 
 
-def plotted(rows: list[Row], title: str = "scene.spz", scenery: PathScene | None = None) -> Plot:
+def plotted(rows: list[Row], title: str = "scene.spz", path_scene: PathScene | None = None) -> Plot:
     """The plot of `traverse --plot`."""
-    return plot(rows, marked(rows), title, scenery)
+    return plot(rows, marked(rows), title, path_scene)
 
 
 def pixels(png: bytes) -> np.ndarray:

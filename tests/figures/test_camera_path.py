@@ -8,7 +8,7 @@ import pytest
 from sparklod_cli.figures import charts
 from sparklod_cli.figures.camera_path import FRAME, _above, frustum_lines, picture_of_path
 from sparklod_cli.support.errors import SparklodError
-from tests.figures.flights import SIZE, circle, count_of, looking, pixels, plotted, scenery
+from tests.figures.flights import SIZE, circle, count_of, looking, path_scene, pixels, plotted
 from tests.scenes import random_splats
 from tests.tables.rows import flight
 
@@ -16,7 +16,7 @@ from tests.tables.rows import flight
 @pytest.mark.usefixtures("drawing")
 class TestPictureOfPath:
     def test_the_figure_shows_the_scene_and_the_path(self) -> None:
-        of = scenery()
+        of = path_scene()
         with_frame = pixels(picture_of_path(of.cameras, of.splats, of.depth, frame=3, size=SIZE))
         without = pixels(picture_of_path(of.cameras, of.splats, of.depth, size=SIZE))
         assert with_frame.shape == without.shape == (250, 400, 3)
@@ -26,7 +26,7 @@ class TestPictureOfPath:
         assert count_of(without[body], "#ff5c8a", 40) == 0
 
     def test_two_figures_have_the_same_bytes(self) -> None:
-        of = scenery()
+        of = path_scene()
         assert len({picture_of_path(of.cameras, of.splats, of.depth, size=SIZE) for _ in range(2)}) == 1
 
     def test_one_camera_and_one_splat_are_drawn(self) -> None:
@@ -44,7 +44,7 @@ class TestPictureOfPath:
         assert (np.abs(pixels(image)[middle] - pixels(plain)[middle]).max(axis=2) > 40).sum() > 50
 
     def test_splats_that_are_not_finite_are_left_out(self) -> None:
-        of = scenery()
+        of = path_scene()
         of.splats.center[0], of.splats.scale[1] = np.nan, np.inf
         assert picture_of_path(of.cameras, of.splats, of.depth, size=SIZE)
         of.splats.scale[:] = 0
@@ -53,7 +53,7 @@ class TestPictureOfPath:
 
     @pytest.mark.usefixtures("charting")
     def test_the_figure_is_below_the_charts(self) -> None:
-        whole = plotted(flight(5), scenery=scenery())
+        whole = plotted(flight(5), path_scene=path_scene())
         alone = pixels(plotted(flight(5)).png)
         both = pixels(whole.png)
         assert whole.note is None

@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from sparklod_cli.support.errors import SparklodError
-from tests.figures.flights import plotted, scenery
+from tests.figures.flights import path_scene, plotted
 from tests.tables.rows import flight
 
 
@@ -26,7 +26,7 @@ def test_a_missing_matplotlib_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("charting", "fresh")
 def test_without_pyvista_there_are_charts_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pyvista", None)
-    both = plotted(flight(5), scenery=scenery())
+    both = plotted(flight(5), path_scene=path_scene())
     assert both.note is not None
     assert "sparklod[render]" in both.note
     assert both.png == plotted(flight(5)).png

@@ -14,7 +14,7 @@ from PIL import Image
 from sparklod_cli.images import pixels
 from sparklod_cli.render.color_scales import VIRIDIS, smooth
 from sparklod_cli.render.renderer import averaged, finer
-from tests.render.sceneries import camera
+from tests.render.drawables import camera
 
 UNIT = st.floats(0, 1, width=32)
 COLORS = st.tuples(UNIT, UNIT, UNIT)

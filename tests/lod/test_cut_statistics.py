@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sparklod_cli.lod.cut_statistics import Changes, Measured, measure
+from sparklod_cli.lod.cut_statistics import Changes, CutStatistics, measure
 from sparklod_cli.lod.settings import pixel_limit
 from sparklod_cli.lod.traversal import Traversal, TreeCut, TreeInstance, View
 from sparklod_cli.model.nodes import Nodes
@@ -23,7 +23,7 @@ def levels(case: Case) -> np.ndarray:
     return np.concatenate([tree.tree.depths() for tree in case.trees])
 
 
-def told(case: Case, cut: TreeCut, *, size: tuple[int, int] = SIZE) -> tuple[Measured, list[Measured]]:
+def told(case: Case, cut: TreeCut, *, size: tuple[int, int] = SIZE) -> tuple[CutStatistics, list[CutStatistics]]:
     found = case.traversal()
     return measure(found.forest, levels(case), cut, case.view, size=size, by_instance=True)
 
@@ -115,7 +115,7 @@ def test_added_and_removed_nodes_are_those_of_sets(case: Case, data: st.DataObje
         before = now
 
 
-def at_distance(center: list[float], size: float) -> Measured:
+def at_distance(center: list[float], size: float) -> CutStatistics:
     """Of one splat, seen from the origin."""
     tree = Nodes(np.array([center], np.float32), np.array([size], np.float32), links([]))
     case = Case([tree], [TreeInstance()], View(np.eye(4), math.radians(90), math.radians(90)), 1, 0.0)
@@ -150,6 +150,6 @@ def test_an_empty_cut_has_no_figures() -> None:
     case = Case([tree], [TreeInstance()], View(np.eye(4), 1.0, 1.0), 1, 0.0)
     cut = case.find(resident=np.zeros(1, np.bool_))
     whole, parts = told(case, cut)
-    nothing = Measured(0, 0, 0, 0, 0, 0, None, None, None, None, None, 0.0)
+    nothing = CutStatistics(0, 0, 0, 0, 0, 0, None, None, None, None, None, 0.0)
     assert (whole, parts) == (nothing, [nothing])
     assert Changes(case.traversal().forest, case.instances).next(cut) == [(0, None, 0)]

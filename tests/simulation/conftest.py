@@ -10,7 +10,7 @@ from sparklod_cli.model.instances import Instance
 from sparklod_cli.scenes.loaded import Scenes
 from sparklod_cli.scenes.reading import TRAVERSED, read_scenes
 from tests.lod.forests import transform
-from tests.simulation.worlds import HAND, TOWN
+from tests.simulation.paths import HAND, TOWN
 
 
 @pytest.fixture(scope="package")

@@ -17,7 +17,7 @@ from sparklod_cli.simulation.columns import COLUMNS
 from sparklod_cli.simulation.frames import Simulation
 from sparklod_cli.simulation.streaming import StreamingSettings
 from sparklod_cli.tables.columns import Row
-from tests.simulation.worlds import OF_THE_PAST, SPARK, around, camera, path_of, resting, rows_of, viewers, without
+from tests.simulation.paths import OF_THE_PAST, SPARK, around, camera, path_of, resting, rows_of, viewers, without
 
 #: Cells that only the row of all instances has.
 OF_ALL = {

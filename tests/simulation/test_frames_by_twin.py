@@ -18,7 +18,7 @@ from sparklod_cli.scenes.loaded import LoadedScene, Scenes
 from tests.lod.forests import random_tree, transform
 from tests.references import frames as twin
 from tests.scenes import random_splats
-from tests.simulation.worlds import SPARK, camera, path_of, rows_of
+from tests.simulation.paths import SPARK, camera, path_of, rows_of
 
 
 def small_forest(seed: int) -> tuple[Scenes, list[twin.Instance]]:
@@ -28,7 +28,7 @@ def small_forest(seed: int) -> tuple[Scenes, list[twin.Instance]]:
     spots = [np.eye(4), transform(rng, scale=0.6, spread=2), transform(rng, scale=1.4, spread=4)]
     of, weights = (0, 1, 0), (1.0, 2.5, 0.7)
     own, of_all = Frustum(0.3, 0.1), SPARK
-    placements = [
+    instances = [
         Instance(Path(f"{tree}.spz"), f"{number}", spot, weight, own if number == 1 else None)
         for number, (tree, spot, weight) in enumerate(zip(of, spots, weights, strict=True))
     ]
@@ -46,7 +46,7 @@ def small_forest(seed: int) -> tuple[Scenes, list[twin.Instance]]:
         twin.Instance(as_nodes[tree], spot, weight, how)
         for tree, spot, weight, how in zip(of, spots, weights, weighting, strict=True)
     ]
-    scenes = Scenes(placements, made, [made[tree] for tree in of])
+    scenes = Scenes(instances, made, [made[tree] for tree in of])
     scenes.__dict__["forest"] = Forest(trees)  # of other sizes than those of the splats
     return scenes, instances
 

@@ -12,7 +12,7 @@ from sparklod_cli.model.instances import Instance
 from sparklod_cli.scenes.loaded import Scenes
 from sparklod_cli.scenes.reading import read_scenes
 from sparklod_cli.simulation.streaming import Network, StreamingSettings
-from tests.simulation.worlds import HAND, OF_THE_PAST, SPARK, TOWN, around, path_of, resting, rows_of, without
+from tests.simulation.paths import HAND, OF_THE_PAST, SPARK, TOWN, around, path_of, resting, rows_of, without
 
 
 @pytest.mark.parametrize("capacity", [2, 3, 4])
