@@ -53,7 +53,7 @@ def small_forest(seed: int) -> tuple[Scenes, list[twin.Instance]]:
 
 @pytest.mark.parametrize("seed", range(6))
 def test_rows_are_as_worked_out_without_sparklod(seed: int) -> None:
-    scenes, instances = small_forest(seed)
+    scenes, twins = small_forest(seed)
     rng = np.random.default_rng(100 + seed)
     for budget, render_scale in ((3, 1.0), (150, 1.0), (100_000, 40.0), (100_000, 0.0)):
         eye, target = rng.normal(0, 2, 3), rng.normal(0, 1, 3)
@@ -61,7 +61,7 @@ def test_rows_are_as_worked_out_without_sparklod(seed: int) -> None:
         right, up, back = at.camera_to_world[:3, :3].T
         seen = twin.Eye(eye, right, up, -back, math.radians(70), 500, 300)
         (row,) = rows_of(scenes, LodSettings(budget, SPARK, render_scale=render_scale), path_of([at]))
-        drawn = twin.frame(instances, seen, budget, seen.pixel * render_scale)
+        drawn = twin.frame(twins, seen, budget, seen.pixel * render_scale)
         assert twin.differing(drawn.cells, row) == []
         cut = CutFinder(scenes, LodSettings(budget, SPARK, render_scale=render_scale)).cut(at).nodes
         assert [set(part.tolist()) for part in cut] == [
