@@ -73,7 +73,7 @@ class Baked:
         splats, sh_degree: of those that were kept.
         dropped: the number of splats that were left out, by reason (`selection.REASONS`).
         method: that built the tree.
-        nodes, levels: of the tree; a tree of one node has one level.
+        nodes, levels: of the tree; levels is its depth and 1, so that a tree of one node has one.
         bytes: of the output.
         version, fractional_bits: of an SPZ output, else None.
         arrays: shapes of the arrays of another output, in its order.

@@ -233,7 +233,7 @@ def test_errors_are_those_that_are_documented(scene: sparklod.Scene, tree: spark
         sparklod.build_lod(tree)
     with pytest.raises(ValueError, match="no method 'fast'"):
         sparklod.build_lod(scene, method="fast")
-    with pytest.raises(sparklod.CameraPathError, match="looks at the point where it is"):
+    with pytest.raises(sparklod.CameraPathError, match="the camera looks at its own position"):
         sparklod.Camera.look_at(EYE, EYE)
     with pytest.raises(ValueError, match="threads is 0"):
         sparklod.read(DEMO, threads=0)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ..model.splats import FloatArray, Splats
-from ..support.parallel import chunks_of, ordered_map
+from ..support.parallel import blocks_of, ordered_map
 from . import quantize
 
 
@@ -57,7 +57,7 @@ def find(splats: Splats, threads: int = 1) -> Clamps:
             counted = (int(np.count_nonzero(mask)) for mask in (below | above, below, above))
             return *counted, float(least.min()), float(most.max())
 
-        either, below, above, least, most = zip(*ordered_map(look, chunks_of(len(splats)), threads), strict=True)
+        either, below, above, least, most = zip(*ordered_map(look, blocks_of(len(splats)), threads), strict=True)
         if sum(either):
             counts[name] = int(sum(either))
         if sum(below):

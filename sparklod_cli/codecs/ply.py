@@ -21,7 +21,7 @@ from ..model.sh import degree_of, notes_on_degree
 from ..model.splats import FloatArray, Splats
 from ..support.defaults import MAX_SH_DEGREE
 from ..support.errors import FormatError, NotSplatsError, TruncatedError
-from ..support.parallel import chunks_of, ordered_map
+from ..support.parallel import blocks_of, ordered_map
 from ..support.progress import Progress, silent
 from ..support.untrusted import quoted
 from . import quantize
@@ -127,7 +127,7 @@ def _binary_rows(file: BinaryIO, header: Header) -> Iterator[Rows]:
         data = PlyData.read(file)["vertex"].data
     except (PlyParseError, ValueError) as error:
         raise FormatError(f"bad PLY data: {quoted(error)}") from None
-    for part in chunks_of(len(data)):
+    for part in blocks_of(len(data)):
         yield part, data[part]
 
 
@@ -139,7 +139,7 @@ def _text_rows(file: BinaryIO, header: Header) -> Iterator[Rows]:
         if name == "vertex":
             break
         deque(islice(file, count), maxlen=0)
-    for part in chunks_of(vertices):
+    for part in blocks_of(vertices):
         lines = list(islice(file, part.stop - part.start))
         if part.start + len(lines) < part.stop:
             raise TruncatedError(f"cut short after {part.start + len(lines):,} of {vertices:,} vertices")
@@ -180,7 +180,7 @@ def encode(
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(splats)}"]
     lines += [f"property float {name}" for name in row_type.names or ()]
     yield "".join(f"{line}\n" for line in [*lines, "end_header"]).encode()
-    parts = chunks_of(len(splats))
+    parts = blocks_of(len(splats))
     for part, piece in zip(
         parts, ordered_map(lambda part: _encode(splats, part, row_type), parts, threads), strict=True
     ):

@@ -15,7 +15,7 @@ from ..model.scene import Scene
 from ..model.sh import COEFFICIENTS
 from ..model.splats import FloatArray, Splats
 from ..support.errors import FormatError, VersionError
-from ..support.parallel import for_chunks
+from ..support.parallel import for_blocks
 from ..support.progress import Progress, silent
 from . import quantize
 from .compression import check_promise
@@ -76,7 +76,7 @@ def decode(
         def report(done: int, before: int = before) -> None:
             progress("reading", before + done, passes * count, "texel")
 
-        for_chunks(work, count, threads, report)
+        for_blocks(work, count, threads, report)
     antialiased = version == 2 and meta.has("antialias") and meta.flag("antialias")
     header = {"version": version, "palette": len(palette) if palette is not None else 0, "bytes": files.size}
     return Scene(splats, antialiased=antialiased, format=f"SOG {version}", header=header)

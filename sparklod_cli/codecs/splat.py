@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..model.scene import Scene
 from ..model.splats import Splats
 from ..support.errors import FormatError, TruncatedError
-from ..support.parallel import chunks_of, ordered_map
+from ..support.parallel import blocks_of, ordered_map
 from ..support.progress import Progress, silent
 from . import quantize
 from .options import DEFAULTS, WriteOptions
@@ -90,7 +90,7 @@ def encode(
         out["quat_wxyz"] = quantize.encode_quat_bytes(splats.quat_xyzw[:, [3, 0, 1, 2]])
         return out.tobytes()
 
-    parts = chunks_of(len(order))
+    parts = blocks_of(len(order))
     for part, piece in zip(parts, ordered_map(rows, parts, threads), strict=True):
         yield piece
         progress("writing", part.stop, len(order), "splat")

@@ -19,7 +19,7 @@ from ..model.sh import notes_on_degree
 from ..model.splats import COLUMNS, Splats
 from ..support.defaults import MAX_SH_DEGREE
 from ..support.errors import FormatError, MembersError, NotSplatsError, TreeError, TruncatedError, VersionError
-from ..support.parallel import for_chunks, ordered_map
+from ..support.parallel import for_blocks, ordered_map
 from ..support.progress import Progress, silent
 from . import compression
 from .options import DEFAULTS, WriteOptions
@@ -129,7 +129,7 @@ def encode(
             values = np.ascontiguousarray(stream.encode(_column(splats, tree, stream)[part]))
             out[part] = values.view(np.uint8).reshape(-1, stream.size)
 
-    for_chunks(fill, layout.count, threads, lambda done: progress("encoding", done, layout.count, "splat"))
+    for_blocks(fill, layout.count, threads, lambda done: progress("encoding", done, layout.count, "splat"))
     yield from compression.gzip_member(data, options.compression_level, threads, progress)
 
 

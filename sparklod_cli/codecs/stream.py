@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..support.errors import TruncatedError
-from ..support.parallel import CHUNK, chunks_of, ordered_map
+from ..support.parallel import BLOCK_ROWS, blocks_of, ordered_map
 from ..support.progress import Progress
 
 #: Least bytes of a block: with narrow rows, such as SPZ's streams, handing a smaller one to a thread costs more than it
 #: saves.
-CHUNK_BYTES = 1 << 18
+BLOCK_BYTES = 1 << 18
 
 #: A block of rows: which rows, and their content.
 Rows = tuple[slice, NDArray[Any]]
@@ -32,12 +32,12 @@ def size_of(file: BinaryIO) -> int:
 
 
 def rows_of(read: Read, row_type: np.dtype[Any], count: int, what: str = "splats") -> Iterator[Rows]:
-    """`count` rows in blocks of at least `CHUNK` rows and `CHUNK_BYTES` bytes, read when they are asked for.
+    """`count` rows in blocks of at least `BLOCK_ROWS` rows and `BLOCK_BYTES` bytes, read when they are asked for.
 
     Raises:
         TruncatedError: the data ends before that.
     """
-    for part in chunks_of(count, max(CHUNK, CHUNK_BYTES // row_type.itemsize)):
+    for part in blocks_of(count, max(BLOCK_ROWS, BLOCK_BYTES // row_type.itemsize)):
         data = read((part.stop - part.start) * row_type.itemsize)
         whole = len(data) // row_type.itemsize
         if part.start + whole < part.stop:

@@ -36,7 +36,7 @@ def report_baked(console: Console, source: Path, target: Path, baked: Baked) -> 
 
     console.say(
         f"{name_of(source)}  {count_of(baked.splats, 'splat')}, SH {baked.sh_degree}  ->  {_name(target)} "
-        f" {count_of(baked.nodes, 'node')}, {count_of(baked.levels, 'level')},"
+        f" {count_of(baked.nodes, 'node')}, depth {baked.levels - 1},"
         f" {size_of(baked.bytes)}, {_total(baked.seconds)}"
     )
     if baked.dropped:

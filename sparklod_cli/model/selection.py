@@ -1,4 +1,4 @@
-"""Which splats go into a scene: what cannot be drawn is dropped, what is not wanted cropped, all of it counted."""
+"""`Selection`, which splats of a scene to keep: it drops what cannot be drawn, crops, and counts what it drops."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from .splats import INVALID, Splats, describe_invalid
 
 Vector = tuple[float, float, float]
 
-#: Why a splat was left out, in the order in which the reasons are tried, and how a report says it.
+#: Reasons for dropping a splat, in the order in which they are applied, and their words in a report.
 REASONS = INVALID | {
     "zero_opacity": "zero opacity",
     "zero_scale": "zero scale",
@@ -23,13 +23,13 @@ REASONS = INVALID | {
 
 @dataclass(frozen=True)
 class Selection:
-    """What to keep.
+    """The splats to keep.
 
     Attributes:
-        drop_invalid: drop splats that are invalid (`splats.INVALID`), instead of failing.
+        drop_invalid: drop invalid splats (`splats.INVALID`) instead of raising an error.
         min_opacity: keep splats of at least this opacity, 0..1.
-        min_box, max_box: keep centres inside this box, borders (as float32) included; world units.
-        within: keep centres in this ball, x y z and radius.
+        min_box, max_box: keep splats whose centre lies in this box, borders (as float32) included; world units.
+        within: keep splats whose centre lies in this ball: centre and radius, world units.
     """
 
     drop_invalid: bool = False
@@ -39,10 +39,10 @@ class Selection:
     within: tuple[Vector, float] | None = None
 
     def apply(self, splats: Splats) -> tuple[Splats, dict[str, int]]:
-        """The splats that are kept, in order, and how many were dropped for each of `REASONS` that occurred.
+        """The splats that are kept, in their order, and the number dropped for each of `REASONS` that occurred.
 
         Raises:
-            InvalidSplatsError: some are invalid and `drop_invalid` is not set, or none is left.
+            InvalidSplatsError: there are no splats, some are invalid without `drop_invalid`, or none is left.
         """
         if len(splats) == 0:
             raise InvalidSplatsError("it has no splats")

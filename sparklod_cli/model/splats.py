@@ -158,4 +158,5 @@ def describe_invalid(invalid: dict[str, NDArray[np.bool_]]) -> str:
         what = "not finite (NaN, infinite, or a rotation of length 0"
     else:
         what = "invalid (" + ", ".join(f"{count:,} {INVALID[kind]}" for kind, count in counts.items())
-    return f"{sum(counts.values()):,} of {total:,} splats are {what}; the first is splat {first:,})"
+    count = sum(counts.values())
+    return f"{count:,} of {total:,} splats {'is' if count == 1 else 'are'} {what}; the first is splat {first:,})"

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..support.defaults import UP_AXES
-from ..support.parallel import chunks_of
+from ..support.parallel import blocks_of
 from .gaussian import quat_of_rotation, rotation_matrices
 from .sh import COEFFICIENTS, SH_C1, SH_C2, SH_C3
 from .splats import FloatArray, Splats
@@ -212,7 +212,7 @@ class Transform:
         quat, of_degrees = _quat_product(self.rotation), sh_rotations(self.rotation, splats.sh_degree)
         matrix = self.scale * self.rotation
         with np.errstate(over="ignore", under="ignore", invalid="ignore"):
-            for part in chunks_of(len(splats), ROWS):
+            for part in blocks_of(len(splats), ROWS):
                 result.center[part] = _multiplied(matrix, splats.center[part]) + self.translation
                 if "scale" in columns:
                     result.scale[part] = splats.scale[part].astype(np.float64) * self.scale

@@ -1,4 +1,4 @@
-"""Signals that end a run: Ctrl-C, a polite kill, a terminal that is closed."""
+"""Signals that end a run: Ctrl-C, SIGTERM, and SIGHUP of a closed terminal."""
 
 from __future__ import annotations
 
@@ -10,39 +10,41 @@ import threading
 import time
 from types import FrameType
 
-#: What ends a run, where the system has it.
+#: The signals that end a run, as far as the system has them.
 ENDING = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 
-#: Exit status of a run that was interrupted, as shells say it of SIGINT.
+#: Exit status of an interrupted run: 128 + SIGINT, as in shells.
 INTERRUPTED = 130
 
-#: Packages that compile. LLVM calls back into Python: an exception there is lost, and what LLVM gets instead of an
-#: answer can crash the process. And one kernel can take LLVM seconds, in which Python handles no signal.
+#: Packages that compile. LLVM calls back into Python, where an exception is lost, and LLVM may crash without a result;
+#: and a kernel can take LLVM seconds, during which Python handles no signal.
 COMPILERS = ("numba", "llvmlite")
 
-#: Seconds in which another thread says that the run was interrupted.
+#: Seconds to wait while another thread writes that the run was interrupted.
 FAREWELL = 0.1
 
-#: Both the main thread and the one that watches may want to end the process; it is said once.
+#: The main thread and the watching thread may both end the process; only one of them writes the message.
 _leaving = threading.Lock()
 
 
 def handle() -> None:
-    """Lets signals end this process: as `KeyboardInterrupt`, which cleans up, or at once while kernels are compiled.
+    """Lets signals end this process: by `KeyboardInterrupt`, which cleans up, or at once while kernels are compiled.
 
-    Nothing is lost by that: the cache of kernels and outputs are whole at any moment.
+    Ending at once loses nothing: outputs and the cache of kernels are complete at any moment.
     """
-    handled = [number for number in ENDING if signal.getsignal(number) != signal.SIG_IGN]  # nohup and the like hold
+    handled = [
+        number for number in ENDING if signal.getsignal(number) != signal.SIG_IGN
+    ]  # an ignored signal stays ignored, as under nohup
 
     def interrupt(signum: int, frame: FrameType | None) -> None:
         _leave_if_compiling()
         for number in handled:
-            signal.signal(number, signal.SIG_DFL)  # a second one does not wait for the cleaning up
+            signal.signal(number, signal.SIG_DFL)  # a second signal ends the process during the clean-up
         raise KeyboardInterrupt
 
     for number in handled:
         signal.signal(number, interrupt)
-    if handled and os.name == "posix":  # elsewhere a compilation is waited for
+    if handled and os.name == "posix":  # other systems wait for the compilation
         reader, writer = os.pipe()
         os.set_blocking(writer, False)
         signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
@@ -50,27 +52,27 @@ def handle() -> None:
 
 
 def ignore() -> None:
-    """Lets the process end as it was about to: what there was to do is done."""
+    """Ignores the signals at the end of the process, when all work is done."""
     for number in ENDING:
         signal.signal(number, signal.SIG_IGN)
 
 
 def _watch(reader: int, handled: list[signal.Signals]) -> None:
-    """Ends the process for the main thread while that is inside LLVM; runs in a thread of its own."""
+    """Runs in its own thread and ends the process while the main thread is inside LLVM."""
     while True:
         if any(number in handled for number in os.read(reader, 64)):
             _leave_if_compiling()
 
 
 def _leave_if_compiling() -> None:
-    """Ends the process if any of its threads compiles."""
+    """Ends the process if one of its threads is compiling."""
     for frame in sys._current_frames().values():
         at: FrameType | None = frame
         while at is not None:
             if at.f_globals.get("__name__", "").partition(".")[0] in COMPILERS:
-                # Whoever comes second, another thread or the same one at a second signal, waits for nobody.
+                # A second thread, or a second signal in the same one, does not wait for the lock.
                 if _leaving.acquire(blocking=False):
-                    with contextlib.suppress(OSError):  # not by `sys.stderr`, which the other thread may hold
+                    with contextlib.suppress(OSError):  # not `sys.stderr`, whose lock the other thread may hold
                         os.write(2, b"\r\x1b[Kinterrupted\n" if os.isatty(2) else b"interrupted\n")
                     os._exit(INTERRUPTED)
                 time.sleep(FAREWELL)

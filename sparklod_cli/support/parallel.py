@@ -1,4 +1,4 @@
-"""Working through rows in chunks, on several threads."""
+"""Work on rows in blocks, on several threads."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ from typing import TypeVar
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-#: Rows of a chunk: temporaries stay in the cache, and the interpreter's part stays small.
-CHUNK = 1 << 14
+#: Rows of a block: few enough for temporaries to stay in the processor's cache, enough for the interpreter's share of
+#: the time to stay small.
+BLOCK_ROWS = 1 << 14
 
 
 def processors() -> int:
-    """How many processors this process may use."""
+    """Number of processors that this process may use."""
     affinity = getattr(os, "sched_getaffinity", None)
     return len(affinity(0)) if affinity else os.cpu_count() or 1
 
@@ -24,7 +25,7 @@ def processors() -> int:
 def ordered_map(work: Callable[[Item], Result], items: Iterable[Item], threads: int) -> Iterator[Result]:
     """The results of `work` in the order of `items`, computed up to `threads` at a time.
 
-    Items are taken as they are needed, a few ahead of the workers, so that what they hold need not fit into memory.
+    Items are taken when they are needed, a few ahead of the workers, so that all of them need not fit into memory.
     """
     if threads == 1:
         yield from map(work, items)
@@ -42,17 +43,17 @@ def ordered_map(work: Callable[[Item], Result], items: Iterable[Item], threads: 
         pool.shutdown(wait=True, cancel_futures=True)
 
 
-def chunks_of(rows: int, size: int = CHUNK) -> list[slice]:
+def blocks_of(rows: int, size: int = BLOCK_ROWS) -> list[slice]:
     """Slices of `size` rows that cover `rows`; the last may be shorter."""
     return [slice(start, min(start + size, rows)) for start in range(0, rows, size)]
 
 
-def for_chunks(work: Callable[[slice], None], rows: int, threads: int, done: Callable[[int], None]) -> None:
-    """Calls `work` with slices that cover `rows`, and `done` with the number of rows finished so far, in order."""
+def for_blocks(work: Callable[[slice], None], rows: int, threads: int, done: Callable[[int], None]) -> None:
+    """Calls `work` with slices that cover `rows`, and `done` with the number of rows finished so far, ascending."""
 
     def run(part: slice) -> int:
         work(part)
         return part.stop
 
-    for stop in ordered_map(run, chunks_of(rows), threads):
+    for stop in ordered_map(run, blocks_of(rows), threads):
         done(stop)

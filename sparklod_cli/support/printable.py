@@ -1,28 +1,28 @@
-"""Text from outside, such as the name of a file or of a camera, as a terminal or the log of a CI run may show it."""
+"""Text from outside, such as names of files and cameras, made safe for terminals and logs of CI runs."""
 
 from __future__ import annotations
 
-#: Characters of a message at most. A path can have 4,096, and what a file says of itself any number.
+#: Most characters of a message. A path can have 4,096, and texts of a file have no limit.
 MOST = 500
 
-#: What stands for characters that are left out.
+#: Replaces characters that are left out.
 GAP = " ... "
 
 _SHORT = {"\n": "\\n", "\r": "\\r", "\t": "\\t"}
 
-#: Bytes of a name that are no UTF-8, as Python holds them.
+#: Code points by which Python represents bytes of a name that are not UTF-8.
 _BYTES = range(0xDC80, 0xDD00)
 
 
 def printable(text: str, most: int | None = None) -> str:
-    """A text on one line that does nothing but stand there.
+    """A text on one line without any effect on a terminal or a log.
 
-    What is not printable is spelt as in Python's strings: control characters and line ends, marks that turn the
-    direction of writing, half surrogate pairs. So is the first mark of what GitHub Actions would take for a command.
+    Characters that are not printable are escaped as in Python's strings: control characters, line ends, marks of
+    writing direction, halves of surrogate pairs. So is the beginning of a command of GitHub Actions.
 
     Args:
-        text: any.
-        most: characters of a text that is shortened in its middle, as it may begin with a file and end with a reason.
+        text: any text.
+        most: most characters. A longer text is cut in its middle, as it may begin with a file and end with a reason.
     """
     text = shortened(text, most)
     if not text.isprintable():
@@ -34,7 +34,7 @@ def printable(text: str, most: int | None = None) -> str:
 
 
 def shortened(text: str, most: int | None) -> str:
-    """A text of at most so many characters: beginning and end of a longer one."""
+    """A text of at most `most` characters: the beginning and the end of a longer one."""
     if most is None or len(text) <= most:
         return text
     end = (most - len(GAP)) // 4

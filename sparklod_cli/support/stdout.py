@@ -1,4 +1,4 @@
-"""Standard output that tells by itself what is wrong with it, so that nobody guesses where an error came from."""
+"""Standard output with errors of its own, so that failures to write it cannot be taken for others."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from .errors import StdoutError
 
 
 class ReaderGoneError(StdoutError):
-    """Whoever read standard output has gone. No `OSError`, as click would take one for its own to handle."""
+    """The reader of standard output is gone. Not an `OSError`, which click would handle itself."""
 
 
 @contextlib.contextmanager
 def told() -> Iterator[None]:
-    """Meanwhile, failures to write standard output are `StdoutError` or `ReaderGoneError`, and those alone are."""
+    """In this context failures to write standard output, and only those, raise `StdoutError` or `ReaderGoneError`."""
     before = sys.stdout
     sys.stdout = _Told(before)
     try:
@@ -27,7 +27,7 @@ def told() -> Iterator[None]:
 
 
 def silence(stream: Any) -> None:
-    """Sends what a broken stream still holds nowhere: the interpreter flushes it at its end, and fails if it cannot."""
+    """Redirects a broken stream to nowhere: the interpreter flushes it at its end, which would fail."""
     with contextlib.suppress(OSError, ValueError):
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, stream.fileno())
@@ -35,13 +35,13 @@ def silence(stream: Any) -> None:
 
 
 class _Told:
-    """A stream, or its bytes; None for one that is closed."""
+    """Wraps a stream or its buffer; None for a closed one."""
 
     def __init__(self, stream: Any) -> None:
         self._stream = stream
-        #: What is asked of a stream before it is written to.
+        #: Attributes that writers ask for.
         self.encoding = getattr(stream, "encoding", None) or "utf-8"
-        self.errors = "backslashreplace"  # a name that this terminal cannot show is no reason to stop
+        self.errors = "backslashreplace"  # characters that the terminal cannot show are escaped
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)
@@ -57,7 +57,7 @@ class _Told:
         if self._stream is None:
             raise StdoutError("standard output is closed")
         if data == "":
-            return 0  # click tries streams so, and says nothing of what comes of it
+            return 0  # click probes streams so, and ignores errors
         if isinstance(data, str):
             data = data.encode(self.encoding, self.errors).decode(self.encoding)
         with self._telling():
@@ -81,9 +81,9 @@ class _Told:
 
 
 def reserve() -> None:
-    """Opens what is closed of standard input, output and error, so that no file of ours gets one of their numbers.
+    """Opens whichever of standard input, output and error are closed, so that no file of ours gets their descriptors.
 
-    It would get what libraries print, too. Python goes by what it found at its start: to it they stay closed.
+    Such a file would receive what libraries print. For Python they stay closed, as it found them at its start.
     """
     while True:
         descriptor = os.open(os.devnull, os.O_RDWR)

@@ -1,4 +1,4 @@
-"""Round numbers for the marks of an axis."""
+"""Round numbers for the ticks of an axis."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ import math
 
 
 def nice_step(least: float) -> float:
-    """The least of 1, 2 and 5 times a power of ten that is not below `least`."""
+    """The smallest number of the form 1, 2 or 5 times a power of ten that is not below `least`."""
     power = 10.0 ** math.floor(math.log10(least))
     return next(step for step in (power, 2 * power, 5 * power, 10 * power, 20 * power) if step >= least * (1 - 1e-9))
 
 
 def ticks(low: float, high: float, least: float) -> list[tuple[float, str]]:
-    """Round numbers from low to high, not closer than `least`, and as text."""
+    """Round numbers from `low` to `high`, at least `least` apart, and their texts."""
     step = nice_step(least)
     digits = max(0, -math.floor(math.log10(step) + 1e-9))
     first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)

@@ -1,4 +1,4 @@
-"""Quantities as people write them: bandwidths, times, sizes and counts with units, and counts as they read them."""
+"""Quantities as people write them, bandwidths, times, sizes and counts with units, and counts in messages."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 import re
 from fractions import Fraction
 
-#: Decimal, and of any case: nobody means a thousandth of a bit.
+#: Decimal prefixes, in either case, since nobody means a thousandth of a bit.
 PREFIXES = {"": 1, "k": 10**3, "m": 10**6, "g": 10**9}
 
 NUMBER = r"(?P<number>(?:[0-9]{1,30}(?:\.[0-9]{0,30})?|\.[0-9]{1,30})(?:[eE][+-]?[0-9]{1,2})?)"
@@ -22,12 +22,12 @@ def count_of(count: int, noun: str, plural: str | None = None) -> str:
 
 
 def parse_bandwidth(text: str) -> float:
-    """Bytes/s of a text such as 20Mbit, 20Mbit/s, 20Mbps (bits) or 2.5MB/s, 2.5MBps, 2.5Mbyte (bytes).
+    """Bytes per second of a text such as 20Mbit, 20Mbit/s, 20Mbps (bits) or 2.5MB/s, 2.5MBps, 2.5Mbyte (bytes).
 
-    Of the letters alone b is a bit and B a byte; the words may be of any case. Prefixes are decimal: k, M, G.
+    As a letter, b is a bit and B a byte; words may have either case. Prefixes are decimal: k, M, G.
 
     Raises:
-        ValueError: it is none, or not more than 0.
+        ValueError: the text is not a bandwidth above 0.
     """
     match = BANDWIDTH.fullmatch(text.strip())
     if match is None:
@@ -36,7 +36,7 @@ def parse_bandwidth(text: str) -> float:
         )
     value = float(match["number"]) * PREFIXES[match["prefix"].lower()]
     if not value > 0:
-        raise ValueError(f"{text!r} is too little bandwidth to bring anything; make it more than 0")
+        raise ValueError(f"{text!r} is not a bandwidth above 0")
     unit = match["unit"]
     return value if unit == "B" or unit.lower().startswith("byte") else value / 8
 
@@ -44,10 +44,10 @@ def parse_bandwidth(text: str) -> float:
 def parse_latency(text: str) -> float:
     """Seconds of a text such as 60ms or 0.1s.
 
-    A plain number is refused: some tools mean seconds by it, others milliseconds.
+    A number without a unit is an error: some tools mean seconds by it, others milliseconds.
 
     Raises:
-        ValueError: it is none.
+        ValueError: the text is not a latency.
     """
     match = LATENCY.fullmatch(text.strip())
     if match is None:
@@ -60,7 +60,7 @@ def parse_count(text: str) -> int:
     """A whole number of a text such as 65536, 500k or 1.5M; k, M and G are thousands, millions and billions.
 
     Raises:
-        ValueError: it is none.
+        ValueError: the text is not a count.
     """
     match = COUNT.fullmatch(text.strip())
     value = Fraction(match["number"]) * PREFIXES[match["prefix"].lower()] if match else Fraction(-1, 2)
@@ -70,10 +70,10 @@ def parse_count(text: str) -> int:
 
 
 def parse_size(text: str) -> int:
-    """Bytes of a text such as 3000000, 3M, 3MB or 3MiB: k, M and G are powers of 1000, with an i of 1024.
+    """Bytes of a text such as 3000000, 3M, 3MB or 3MiB: k, M and G are powers of 1000, or of 1024 with an i.
 
     Raises:
-        ValueError: it is none.
+        ValueError: the text is not a size.
     """
     match = SIZE.fullmatch(text.strip())
     value = Fraction(-1, 2)

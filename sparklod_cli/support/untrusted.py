@@ -1,4 +1,4 @@
-"""What files say that nobody vouches for: JSON and TOML that can be worked with, and text as it may be quoted."""
+"""Untrusted contents of files: bounded JSON and TOML, and text that is safe to quote."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from typing import Any
 
 from .printable import printable
 
-#: Files that people and tools write are nested a handful deep. Whatever walks through values may recurse so far.
+#: Deepest nesting that is accepted, so that code may recurse through values; real files are nested a few deep.
 MAX_DEPTH = 64
 
-#: Digits, with a sign, of whole numbers of 64 bits; longer ones become floats, as most readers of JSON have them.
+#: Most characters of a whole number of 64 bits; longer ones become floats, as in most readers of JSON.
 MAX_DIGITS = 19
 
-#: Stands for every whole number that is larger; no number that makes sense is as large.
+#: Replaces larger whole numbers; no sensible number is as large.
 LARGEST = sys.float_info.max
 
-#: As much is quoted of what a file says, in characters.
+#: Most characters that are quoted from a file.
 QUOTED = 100
 
 _SURROGATE = re.compile("[\ud800-\udfff]")
@@ -29,17 +29,16 @@ _ESCAPED_SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
 def parse_json(data: str | bytes, *, keep_surrogates: bool = False) -> Any:
     """The value of a JSON text.
 
-    Whole numbers that do not fit into 64 bits come as the floats next to them, at most `LARGEST`. NaN and Infinity,
-    which Python writes, and 1e999 are taken, so who uses a number looks whether it is finite. Nothing is deeper than
-    `MAX_DEPTH`.
+    Whole numbers beyond 64 bits become the nearest floats, at most `LARGEST`. NaN and Infinity, which Python writes,
+    and 1e999 are accepted, so users of a number check that it is finite. Nesting is at most `MAX_DEPTH`.
 
     Args:
         data: the text, or its bytes in UTF-8.
-        keep_surrogates: leave halves of surrogate pairs in texts, which is how Python writes names of files that are
-            not UTF-8; otherwise they become U+FFFD, and all texts can be printed and written.
+        keep_surrogates: keep halves of surrogate pairs in texts, by which Python represents names of files that are
+            not UTF-8; otherwise they become U+FFFD, so that all texts can be printed and written.
 
     Raises:
-        ValueError: it is not JSON, or is too deep; one line that says so.
+        ValueError: the text is not JSON or nested too deep; the message has one line.
     """
     try:
         text = data if isinstance(data, str) else str(data, "utf-8-sig")
@@ -51,7 +50,7 @@ def parse_json(data: str | bytes, *, keep_surrogates: bool = False) -> Any:
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """The table of a TOML text; as `parse_json`, but whole numbers are those of 64 bits, as TOML has them."""
+    """The table of a TOML text, as by `parse_json`, but whole numbers must have 64 bits, as TOML demands."""
     if sys.version_info >= (3, 11):
         import tomllib
     else:
@@ -74,8 +73,8 @@ def _too_deep() -> ValueError:
 
 
 def _checked(root: Any, *, mend: bool) -> Any:
-    """A parsed value, looked through level by level: a recursion would be what it should protect from."""
-    whole = [root]  # in a list, so that every value is an item of something
+    """Checks a parsed value level by level: recursion would fail on the nesting that it guards against."""
+    whole = [root]  # in a list, so that every value is an item of a container
     containers: list[Any] = [whole]
     for _ in range(MAX_DEPTH + 1):
         inner: list[Any] = []
@@ -103,10 +102,10 @@ def well_formed(text: str) -> str:
 
 
 def shown(value: Any) -> str:
-    """A value as it may be quoted: on one line, and not too much of it, however deep it is."""
+    """A value as an error quotes it: on one line and shortened, however deep it is."""
     return printable(reprlib.repr(value), QUOTED)
 
 
 def quoted(error: Exception) -> str:
-    """What a library says of a file, as it may be quoted: it may quote the file at length itself."""
+    """The message of a library's error, shortened: it may itself quote much of a file."""
     return printable(str(error), 2 * QUOTED)

@@ -18,10 +18,10 @@ from sparklod_cli.codecs.stream import rows_of
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.support.errors import FormatError
-from sparklod_cli.support.parallel import CHUNK, ordered_map
+from sparklod_cli.support.parallel import BLOCK_ROWS, ordered_map
 from tests.scenes import random_splats
 
-COUNT = 12 * CHUNK
+COUNT = 12 * BLOCK_ROWS
 
 
 def spz4(splats: Splats) -> bytes:
@@ -67,9 +67,9 @@ def test_decoding_takes_little_memory_beside_the_splats(kind: str) -> None:
 
 
 def test_rows_that_are_missing_are_counted() -> None:
-    file = io.BytesIO(bytes(4 * (CHUNK + 10) + 3))
-    with pytest.raises(FormatError, match=f"cut short after {CHUNK + 10:,} of {2 * CHUNK:,} splats"):
-        list(rows_of(file.read, np.dtype("<u4"), 2 * CHUNK))
+    file = io.BytesIO(bytes(4 * (BLOCK_ROWS + 10) + 3))
+    with pytest.raises(FormatError, match=f"cut short after {BLOCK_ROWS + 10:,} of {2 * BLOCK_ROWS:,} splats"):
+        list(rows_of(file.read, np.dtype("<u4"), 2 * BLOCK_ROWS))
 
 
 @pytest.mark.parametrize("threads", [1, 2, 3])

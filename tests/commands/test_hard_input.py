@@ -97,17 +97,17 @@ def test_a_value_that_is_not_finite_is_refused_dropped_or_its_limit(name: str, v
     (result,) = bake(data := with_values(**{name: value}))
     (dropped,) = bake(data, options=["--on-invalid", "drop"])
     if (name == "opacity" or name.startswith("scale")) and value == -np.inf:
-        expected = "  dropped 1 zero opacity" if name == "opacity" else "20 splats"
+        expected = "  left out: 1 zero opacity" if name == "opacity" else "20 splats"
         assert expected in result
         assert expected in dropped
     elif name == "opacity" and value == np.inf:
         assert "20 splats, SH 1" in result
         assert "dropped" not in result + dropped
     else:
-        assert result.startswith("error: : 1 of 20 splats are not finite")
+        assert result.startswith("error: : 1 of 20 splats is not finite")
         assert "--on-invalid drop" in result
         assert "19 splats, SH 1" in dropped
-        assert "  dropped 1 not finite" in dropped
+        assert "  left out: 1 not finite" in dropped
 
 
 ALL_SCALES, ALL_ROTATIONS = ("scale_0", "scale_1", "scale_2"), ("rot_0", "rot_1", "rot_2", "rot_3")
@@ -119,12 +119,12 @@ def each(names: Iterable[str], *values: Any) -> Columns:
 
 #: What is done to the splats, options, and what must be said.
 NUMBERS: dict[str, tuple[Columns, list[str], str]] = {
-    "rotation of no length": (each(ALL_ROTATIONS, 0), [], r"^error: : 1 of 20 splats are not finite .*length 0"),
-    "rotation of no length, dropped": (each(ALL_ROTATIONS, 0), ["--on-invalid", "drop"], "dropped 1 not finite"),
+    "rotation of no length": (each(ALL_ROTATIONS, 0), [], r"^error: : 1 of 20 splats is not finite .*length 0"),
+    "rotation of no length, dropped": (each(ALL_ROTATIONS, 0), ["--on-invalid", "drop"], "left out: 1 not finite"),
     "all rotations of no length": (each(ALL_ROTATIONS, (0,)), ["--on-invalid", "drop"], "error: : no splat is left"),
     "tiny rotations": (each(ALL_ROTATIONS, (1e-38,)), [], "20 splats"),
     "huge rotations": (each(ALL_ROTATIONS, (3e38,)), [], "20 splats"),
-    "no scale": (each(ALL_SCALES, -1000), [], "dropped 1 zero scale"),
+    "no scale": (each(ALL_SCALES, -1000), [], "left out: 1 zero scale"),
     "no scale at all": (each(ALL_SCALES, (-1000,)), [], "error: : no splat is left of 20 .20 zero scale"),
     "discs": ({"scale_2": (-1000,)}, [], "20 splats.*clamped"),
     "tiny scales": (each(ALL_SCALES, (-100,)), [], "20 splats.*clamped"),
@@ -136,7 +136,11 @@ NUMBERS: dict[str, tuple[Columns, list[str], str]] = {
     "scales whose squares overflow": (each(ALL_SCALES, (60,)), [], "20 splats.*clamped"),
     "scales that almost overflow": (each(ALL_SCALES, (88.5,)), [], "splats|^error"),
     "scales that overflow": (each(ALL_SCALES, (89,)), [], "^error: : 20 of 20 splats are not finite"),
-    "certain and impossible logits": ({"opacity": tuple(1000 * (-1) ** np.arange(20))}, [], "dropped 10 zero opacity"),
+    "certain and impossible logits": (
+        {"opacity": tuple(1000 * (-1) ** np.arange(20))},
+        [],
+        "left out: 10 zero opacity",
+    ),
     "opacities of nothing": ({"opacity": (-1000,)}, [], "error: : no splat is left of 20 .20 zero opacity"),
     "opacities near nothing": ({"opacity": (-85,)}, [], "20 splats"),
     "glaring colours": ({"f_dc_0": 3e38, "f_dc_1": -3e38}, [], "20 splats"),

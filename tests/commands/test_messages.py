@@ -56,9 +56,9 @@ def test_a_text_that_is_not_a_size_is_wrong_usage(size: str, capsys: Said) -> No
 @pytest.mark.parametrize(
     ("first", "said"),
     [
-        ("x,y,z,yaw,pitch", "lacks target_x, target_y, target_z; a camera takes x, y, z, and"),
-        ("x,y,z,qx,qy,qz", "lacks qw; a camera takes"),
-        ("X, Y, target_x, target_y, target_z", "lacks z; a camera takes"),
+        ("x,y,z,yaw,pitch", "lacks target_x, target_y, target_z; a camera needs x, y, z, and"),
+        ("x,y,z,qx,qy,qz", "lacks qw; a camera needs"),
+        ("X, Y, target_x, target_y, target_z", "lacks z; a camera needs"),
         ("frame,position,rotation", "lacks x, y, z, target_x, target_y, target_z"),
     ],
 )

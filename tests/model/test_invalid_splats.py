@@ -75,7 +75,7 @@ def test_a_negative_scale_is_an_error_or_dropped(
     assert line == f"error: {source}: {expected}"
     assert not output.exists()
     assert run([*command, "--on-invalid", "drop"]) == 0
-    assert "  dropped 2 negative scale" in "".join(said(capfd))
+    assert "  left out: 2 negative scale" in "".join(said(capfd))
     if not encoding:
         assert run(["inspect", "--check", "--leaves-of", str(source), str(output)]) == 0
 
@@ -124,9 +124,9 @@ def test_every_kind_is_refused_by_builders_and_dropped_by_a_selection(kind: str,
     good = random_splats(20, sh_degree=1)
     splats = spoiled(kind, 4, good)
     assert {each: mask.tolist() for each, mask in splats.invalid().items()} == {kind: [at == 4 for at in range(20)]}
-    with pytest.raises(InvalidSplatsError, match=r"1 of 20 splats are .*the first is splat 4"):
+    with pytest.raises(InvalidSplatsError, match=r"1 of 20 splats is .*the first is splat 4"):
         builder.build(splats)  # type: ignore[attr-defined]
-    with pytest.raises(InvalidSplatsError, match=r"1 of 20 splats are .*the first is splat 4"):
+    with pytest.raises(InvalidSplatsError, match=r"1 of 20 splats is .*the first is splat 4"):
         Selection().apply(splats)
     kept, dropped = Selection(drop_invalid=True).apply(splats)
     assert dropped == {kind: 1}

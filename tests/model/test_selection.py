@@ -23,7 +23,7 @@ def with_value(splats: Splats, name: str, row: int, value: float) -> Splats:
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_values_that_are_not_finite_are_an_error_or_dropped(name: str, value: float) -> None:
     splats = with_value(random_splats(9, sh_degree=1), name, 4, value)
-    with pytest.raises(InvalidSplatsError, match=r"1 of 9 splats are not finite .* splat 4\), add --on-invalid drop"):
+    with pytest.raises(InvalidSplatsError, match=r"1 of 9 splats is not finite .* splat 4\), add --on-invalid drop"):
         Selection().apply(splats)
     kept, dropped = Selection(drop_invalid=True).apply(splats)
     assert dropped == {"non_finite": 1}

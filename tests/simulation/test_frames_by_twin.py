@@ -42,18 +42,18 @@ def small_forest(seed: int) -> tuple[Scenes, list[twin.Instance]]:
         made.append(LoadedScene(Path(f"{number}.spz"), 1000, Scene(splats, tree.tree), splats, number))
     cones = twin.cones(of_all.fov0, of_all.fov, of_all.foveate, of_all.behind)
     weighting = [cones, twin.frustum(own.outside, own.behind), cones]
-    instances = [
+    twins = [
         twin.Instance(as_nodes[tree], spot, weight, how)
         for tree, spot, weight, how in zip(of, spots, weights, weighting, strict=True)
     ]
     scenes = Scenes(instances, made, [made[tree] for tree in of])
     scenes.__dict__["forest"] = Forest(trees)  # of other sizes than those of the splats
-    return scenes, instances
+    return scenes, twins
 
 
 @pytest.mark.parametrize("seed", range(6))
 def test_rows_are_as_worked_out_without_sparklod(seed: int) -> None:
-    scenes, instances = small_forest(seed)
+    scenes, twins = small_forest(seed)
     rng = np.random.default_rng(100 + seed)
     for budget, render_scale in ((3, 1.0), (150, 1.0), (100_000, 40.0), (100_000, 0.0)):
         eye, target = rng.normal(0, 2, 3), rng.normal(0, 1, 3)
@@ -61,7 +61,7 @@ def test_rows_are_as_worked_out_without_sparklod(seed: int) -> None:
         right, up, back = at.camera_to_world[:3, :3].T
         seen = twin.Eye(eye, right, up, -back, math.radians(70), 500, 300)
         (row,) = rows_of(scenes, LodSettings(budget, SPARK, render_scale=render_scale), path_of([at]))
-        drawn = twin.frame(instances, seen, budget, seen.pixel * render_scale)
+        drawn = twin.frame(twins, seen, budget, seen.pixel * render_scale)
         assert twin.differing(drawn.cells, row) == []
         cut = CutFinder(scenes, LodSettings(budget, SPARK, render_scale=render_scale)).cut(at).nodes
         assert [set(part.tolist()) for part in cut] == [

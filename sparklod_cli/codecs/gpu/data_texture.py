@@ -13,7 +13,7 @@ from ...model.gaussian import covariance
 from ...model.scene import Scene
 from ...model.splats import FloatArray, Splats
 from ...support.errors import FormatError
-from ...support.parallel import for_chunks
+from ...support.parallel import for_blocks
 from .. import quantize
 from ..octahedral import Words
 
@@ -57,7 +57,7 @@ def pack(splats: Splats, *, threads: int = 1) -> dict[str, Words]:
         rows["rgba"][:, :3] = quantize.encode_unorm8(splats.rgb[part])
         rows["rgba"][:, 3] = quantize.encode_unorm8(splats.opacity[part])
 
-    for_chunks(encode, len(splats), threads, lambda _: None)
+    for_blocks(encode, len(splats), threads, lambda _: None)
     return {"texture": texture}
 
 

@@ -14,7 +14,7 @@ from ...model.nodes import Nodes
 from ...model.scene import Scene
 from ...model.splats import FloatArray, Splats
 from ...support.errors import FormatError
-from ...support.parallel import for_chunks
+from ...support.parallel import for_blocks
 from ..octahedral import Words, checked_words
 
 NODE = np.dtype(
@@ -55,7 +55,7 @@ def pack(
         rows["child_count"] = tree.child_count[part]
         rows["child_start"] = tree.child_start[part]
 
-    for_chunks(encode, len(splats), threads, lambda _: None)
+    for_blocks(encode, len(splats), threads, lambda _: None)
     return {"lod_tree": words}
 
 

@@ -17,7 +17,7 @@ from ...model.scene import Scene
 from ...model.sh import COEFFICIENTS
 from ...model.splats import FloatArray, Splats
 from ...support.errors import FormatError
-from ...support.parallel import for_chunks
+from ...support.parallel import for_blocks
 from .. import octahedral, quantize
 from ..octahedral import STEPS_8_8_8, Words, to_code
 
@@ -113,7 +113,7 @@ def pack(splats: Splats, encoding: Encoding = DEFAULT, *, threads: int = 1) -> d
             sh = splats.sh[part, COEFFICIENTS[degree - 1] : COEFFICIENTS[degree]].reshape(len(rows), -1)
             arrays[f"sh{degree}"][part] = encode_sh(sh, SH_BITS[degree], encoding.sh_max(degree))
 
-    for_chunks(encode, len(splats), threads, lambda _: None)
+    for_blocks(encode, len(splats), threads, lambda _: None)
     return arrays
 
 
@@ -157,7 +157,7 @@ def unpack(arrays: Mapping[str, NDArray[Any]], encoding: Encoding = DEFAULT, *, 
             sh = decode_sh(found[f"sh{degree}"][part], SH_BITS[degree], encoding.sh_max(degree), 3 * (2 * degree + 1))
             splats.sh[part, COEFFICIENTS[degree - 1] : COEFFICIENTS[degree]] = sh.reshape(len(rows), -1, 3)
 
-    for_chunks(decode, len(splats), threads, lambda _: None)
+    for_blocks(decode, len(splats), threads, lambda _: None)
     return splats
 
 

@@ -16,7 +16,7 @@ from sparklod_cli.codecs.gpu import data_texture
 from sparklod_cli.model.gaussian import normalized_quat
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.support.errors import FormatError
-from sparklod_cli.support.parallel import CHUNK
+from sparklod_cli.support.parallel import BLOCK_ROWS
 from tests.references import gaussians
 from tests.scenes import random_splats
 
@@ -138,11 +138,11 @@ def test_rgba_is_clamped_and_centres_are_exact() -> None:
 
 
 def test_threads_and_chunks_do_not_change_a_texel() -> None:
-    splats = random_splats(CHUNK + 1000)
+    splats = random_splats(BLOCK_ROWS + 1000)
     one, two = (data_texture.pack(splats, threads=threads)["texture"] for threads in (1, 2))
     np.testing.assert_array_equal(one, two)
-    last = data_texture.pack(splats.take(slice(CHUNK, None)))["texture"]
-    np.testing.assert_array_equal(one[CHUNK // 1024 :], last)
+    last = data_texture.pack(splats.take(slice(BLOCK_ROWS, None)))["texture"]
+    np.testing.assert_array_equal(one[BLOCK_ROWS // 1024 :], last)
 
 
 @pytest.mark.parametrize(

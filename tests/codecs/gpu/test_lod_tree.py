@@ -18,7 +18,7 @@ from sparklod_cli.model.gaussian import linear_opacity
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.support.errors import FormatError
-from sparklod_cli.support.parallel import CHUNK
+from sparklod_cli.support.parallel import BLOCK_ROWS
 from tests.scenes import random_splats
 
 
@@ -83,7 +83,7 @@ def test_sizes_and_centres_beyond_float16_are_infinite_without_a_warning() -> No
 
 @pytest.mark.parametrize("threads", [1, 2])
 def test_a_whole_tree_comes_back(threads: int) -> None:
-    splats, tree = quick.build(random_splats(CHUNK + 1000))
+    splats, tree = quick.build(random_splats(BLOCK_ROWS + 1000))
     packed = lod_tree.pack(splats, tree, threads=threads)
     got = lod_tree.unpack(packed)
     got.tree.validate()

@@ -18,7 +18,7 @@ from sparklod_cli.model.gaussian import linear_opacity, lod_opacity
 from sparklod_cli.model.sh import COEFFICIENTS
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.support.errors import FormatError
-from sparklod_cli.support.parallel import CHUNK
+from sparklod_cli.support.parallel import BLOCK_ROWS
 from tests.codecs.test_octahedral import degrees_between, random_quats
 from tests.scenes import random_splats
 
@@ -259,12 +259,12 @@ def test_any_words_of_packed_splats_are_read_without_a_warning(
 
 
 def test_threads_and_chunks_do_not_change_a_word_of_packed_splats() -> None:
-    splats = random_splats(CHUNK + 1000, sh_degree=3)
+    splats = random_splats(BLOCK_ROWS + 1000, sh_degree=3)
     one, two = (packed_splats.pack(splats, threads=threads) for threads in (1, 2))
-    last = packed_splats.pack(splats.take(slice(CHUNK, None)))
+    last = packed_splats.pack(splats.take(slice(BLOCK_ROWS, None)))
     for name in one:
         np.testing.assert_array_equal(one[name], two[name])
-        np.testing.assert_array_equal(one[name][CHUNK:], last[name])
+        np.testing.assert_array_equal(one[name][BLOCK_ROWS:], last[name])
     back = (packed_splats.unpack(one, threads=threads) for threads in (1, 2))
     for ours, theirs in zip(*map(dataclasses.astuple, back), strict=True):
         np.testing.assert_array_equal(ours, theirs)
