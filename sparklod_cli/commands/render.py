@@ -16,6 +16,7 @@ import click
 from ..images.defaults import THUMBNAIL_SIZE, THUMBNAIL_SUPERSAMPLE
 from .command import COMMON, Command
 from .options import appearance, cameras, comparison, cut, inputs, pictures
+from .options.camera_options import camera_options
 from .options.common import General, common_options
 from .paths import claim_stdout, keep_apart
 from .usage import exclude, given, options_of
@@ -92,7 +93,7 @@ class RenderOptions:
 @click.command("render", cls=Command, headings=HEADINGS, epilog=EXAMPLES, context_settings={"show_default": True})
 @pictures.picture_options
 @inputs.input_options
-@functools.partial(cameras.camera_options, still=True)
+@functools.partial(camera_options, still=True)
 @functools.partial(cut.cut_options, pictures=True)
 @appearance.appearance_options
 @comparison.comparison_options

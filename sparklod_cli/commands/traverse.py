@@ -14,6 +14,7 @@ from .command import COMMON, Command
 from .console import Console, for_screen, is_terminal
 from .options import cameras, cut, inputs, streaming
 from .options import table as tables
+from .options.camera_options import camera_options
 from .options.common import General, common_options
 from .paths import claim_stdout, keep_apart
 from .usage import options_of
@@ -43,7 +44,7 @@ HEADINGS = (COMMON, inputs.HEADING, cameras.HEADING, cut.HEADING, streaming.HEAD
 @click.command("traverse", cls=Command, headings=HEADINGS, epilog=EXAMPLES, context_settings={"show_default": True})
 @tables.table_options
 @inputs.input_options
-@cameras.camera_options
+@camera_options
 @cut.cut_options
 @streaming.streaming_options
 @functools.partial(

@@ -16,7 +16,8 @@ from click.testing import CliRunner, Result
 from sparklod_cli.cameras import generators
 from sparklod_cli.cameras.framing import FILLED
 from sparklod_cli.cameras.path import CameraPath
-from sparklod_cli.commands.options.cameras import Cameras, camera_options
+from sparklod_cli.commands.options.camera_options import camera_options
+from sparklod_cli.commands.options.cameras import Cameras
 from sparklod_cli.commands.usage import options_of
 from sparklod_cli.model.balls import Balls
 from sparklod_cli.support.errors import CameraPathError
@@ -235,8 +236,7 @@ def test_the_help_lists_formats_and_axes() -> None:
 
 
 def test_help_needs_nothing_heavy() -> None:
-    code = (
-        "import sys, sparklod_cli.commands.options.cameras; print([m for m in ('numpy', 'numba') if m in sys.modules])"
-    )
+    module = "sparklod_cli.commands.options.camera_options"
+    code = f"import sys, {module}; print([m for m in ('numpy', 'numba') if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "[]\n"

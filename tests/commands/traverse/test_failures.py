@@ -112,7 +112,7 @@ def test_traverse_never_writes_over_its_inputs(tmp_path: Path, capsys: Said) -> 
         ([FAULTS / "tree-cycle.spz"], FAULTS / "tree-cycle.spz", "its tree is broken"),
         ([FIXTURES / "sh2.ply"], FIXTURES / "sh2.ply", "bake it first with sparklod build-lod"),
         ([TREE, "--camera-path", FAULTS / "no.json"], FAULTS / "no.json", "no such file"),
-        ([TREE, "--camera-path", TREE], TREE, "no format that is known"),
+        ([TREE, "--camera-path", TREE], TREE, "of no known format"),
         (["--scene", FAULTS / "no.json"], FAULTS / "no.json", "no such file"),
         (["--scene", CAMERAS / "inria.json"], CAMERAS / "inria.json", "has no list of instances"),
         ([TREE, "-o", TREE / "out.csv"], TREE, "is a file, not a folder"),
