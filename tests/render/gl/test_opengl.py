@@ -34,7 +34,7 @@ def child(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
 DRAW_ONE = """
 import numpy as np
 from sparklod_cli.support.errors import SparklodError
-from sparklod_cli.render import osmesa
+from sparklod_cli.render.gl import osmesa
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.render.settings import Look
 from sparklod_cli.render.shading import Shown
