@@ -33,8 +33,8 @@ class KernelCache(caching._Cache):
 
     numba's cache trusts its files: an empty one ends in an `EOFError`, a flipped bit in an error of LLVM or a crash, a
     full disk in an `OSError`; and two processes that compile two signatures of one function at the same time can each
-    take the other's file for its own. Here each signature has its own file, named by all that its code depends on except
-    the source, which names the folder (`jit.CACHE_FOLDER`). A file is written atomically and begins with a
+    take the other's file for its own. Here each signature has its own file, named by all that its code depends on,
+    except the source, which names the folder (`jit.CACHE_FOLDER`). A file is written atomically and begins with a
     checksum. If a file is damaged, the kernel is compiled again; if the folder cannot be used, the kernel is compiled
     but not stored.
 
