@@ -12,7 +12,7 @@ from ..lod.builders import BUILDERS, METHODS
 from ..model.scene import Scene, Tree
 from ..model.splats import COLUMNS
 from ..support.defaults import DEFAULT_BASE, DEFAULT_COMPRESSION, DEFAULT_GROWTH, MAX_SH_DEGREE
-from ..support.errors import FormatError, memory_told
+from ..support.errors import FormatError, memory_errors_translated
 from ..support.threads import on_threads, thread_count
 from .progress import Told, telling
 
@@ -55,7 +55,7 @@ def read(
         TreeError: its tree is broken.
         OutOfMemoryError: it does not fit into memory.
     """
-    with telling(progress) as told, memory_told():
+    with telling(progress) as told, memory_errors_translated():
         count = thread_count(threads)
         if columns is None:
             scene = read_scene(Path(path), threads=count, progress=told)
@@ -114,7 +114,7 @@ def write(
 
     path, count = Path(path), thread_count(threads)
     suffix = path.suffix.lower()
-    with telling(progress) as told, memory_told():
+    with telling(progress) as told, memory_errors_translated():
         if encoding is not None:
             arrays = pack(scene, encoding, threads=count)
             pieces = dump.encode_raw(arrays) if suffix in RAW_SUFFIXES else dump.encode_npz(arrays)
@@ -164,7 +164,7 @@ def build_lod(
     if method not in BUILDERS:
         raise ValueError(f"there is no method {method!r}; give one of {', '.join(BUILDERS)}")
     build = BakeSettings(method=method, base=base, growth=growth).builder()
-    with on_threads(threads), telling(progress) as told, memory_told():
+    with on_threads(threads), telling(progress) as told, memory_errors_translated():
         kept, _ = (selection or Selection()).apply(scene.splats.with_max_sh(max_sh))
         # A builder frees its input as it goes where nobody else holds it.
         nodes, tree = build(kept, progress=told)
@@ -254,6 +254,6 @@ def inspect(
     from ..inspection import report
 
     wanted = report.ReportSettings(values=values or all_quantities, all_quantities=all_quantities, check=check)
-    with telling(progress) as told, memory_told():
+    with telling(progress) as told, memory_errors_translated():
         found, _ = report.inspect(Path(path), wanted, threads=thread_count(threads), progress=told)
     return found

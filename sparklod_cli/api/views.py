@@ -24,7 +24,7 @@ from ..scenes.finder import CutFinder, FixedCut
 from ..scenes.loaded import UNNAMED, Cut, Scenes
 from ..scenes.reading import read_scenes
 from ..support.defaults import BLEND, PRECISIONS
-from ..support.errors import FormatError, memory_told
+from ..support.errors import FormatError, memory_errors_translated
 from ..support.threads import on_threads, thread_count
 from ..tables.comparison import COLUMNS as OF_COMPARISON
 from .progress import Told, telling
@@ -67,7 +67,7 @@ def cut(
     Raises:
         ValueError: the budget is out of its range, or less than one splat for each instance.
     """
-    with on_threads(threads) as count, memory_told():
+    with on_threads(threads) as count, memory_errors_translated():
         scenes = scenes_of(viewed, count, precision)
         return CutFinder(scenes, _lod(scenes, budget, settings, continuous)).cut(camera)
 
@@ -101,7 +101,7 @@ def render(
     settings = settings or RenderSettings()
     if backend is not None:
         settings = replace(settings, backend=backend)
-    with on_threads(threads) as count, memory_told():
+    with on_threads(threads) as count, memory_errors_translated():
         source = FixedCut(viewed) if isinstance(viewed, Cut) else FixedCut(scenes_of(viewed, count).full())
         return Renderer(source, settings, [camera]).draw(camera).image
 
@@ -138,7 +138,7 @@ def traverse(
     from ..simulation.columns import COLUMNS
     from ..simulation.frames import Simulation
 
-    with on_threads(threads) as count, telling(progress) as told, memory_told():
+    with on_threads(threads) as count, telling(progress) as told, memory_errors_translated():
         scenes = _trees(viewed, count, precision)
         simulation = Simulation(scenes, _lod(scenes, budget, settings, False), streaming, by_instance=by_instance)
         frames = simulation.run(_path(cameras), threads=count, progress=told)
@@ -176,7 +176,7 @@ def compare(
     """
     from ..compare import Comparison
 
-    with on_threads(threads) as count, telling(progress) as told, memory_told():
+    with on_threads(threads) as count, telling(progress) as told, memory_errors_translated():
         scenes = _trees(viewed, count, precision)
         full = None if scene is None else scenes_of(scene, count)
         given = [_budget(budget) for budget in budgets]
