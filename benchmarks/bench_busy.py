@@ -18,7 +18,7 @@ import time
 from pathlib import Path
 
 from sparklod_cli.lod.builders import METHODS
-from sparklod_cli.support.jit import WAITING
+from sparklod_cli.support.jit import WAIT_SETTINGS
 
 #: Environment variables and options of each way of waiting, by its name in the table: OpenMP's default, what sparklod
 #: sets, two others, and one thread for comparison.
@@ -43,7 +43,7 @@ class Bakes:
 
     def start(self, way: str) -> subprocess.Popen[bytes]:
         settings, options = WAYS[way]
-        clean = {name: value for name, value in os.environ.items() if name not in (*WAITING, "OMP_WAIT_POLICY")}
+        clean = {name: value for name, value in os.environ.items() if name not in (*WAIT_SETTINGS, "OMP_WAIT_POLICY")}
         self._started += 1
         output = str(self._folder / f"{self._started}.spz")
         return subprocess.Popen([*self._line, *options, "-o", output], env={**clean, **settings})

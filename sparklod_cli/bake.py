@@ -24,7 +24,7 @@ from .model.selection import Selection
 from .model.splats import Splats
 from .model.transforms import Transform
 from .support.defaults import DEFAULT_BASE, DEFAULT_GROWTH, MAX_SH_DEGREE
-from .support.errors import FormatError, InvalidSplatsError, memory_told
+from .support.errors import FormatError, InvalidSplatsError, memory_errors_translated
 from .support.progress import Progress, silent
 from .support.threads import on_threads
 
@@ -124,7 +124,7 @@ def bake(
         FormatError, InvalidSplatsError, OutputError: see `io.read_scene`, `Selection.apply` and `io.sink`.
         OutOfMemoryError: it does not fit into memory.
     """
-    with memory_told():
+    with memory_errors_translated():
         write = sink(target, overwrite=overwrite)
         start = time.perf_counter()
         scene = read_scene(source, threads=threads, progress=progress)

@@ -14,7 +14,7 @@ from .codecs.options import WriteOptions
 from .codecs.spz_options import like
 from .io import read_scene, sink
 from .model.scene import Scene
-from .support.errors import FormatError, memory_told
+from .support.errors import FormatError, memory_errors_translated
 from .support.progress import Progress, silent
 
 #: Of outputs whose name has none.
@@ -79,7 +79,7 @@ def extract_leaves(
         OutOfMemoryError: it does not fit into memory.
         ValueError: no format of plain splats has that suffix.
     """
-    with memory_told():
+    with memory_errors_translated():
         write = sink(target, overwrite=overwrite)
         suffix = target.suffix.lower() or SUFFIX
         if suffix not in WRITABLE:

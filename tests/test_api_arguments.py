@@ -65,6 +65,21 @@ def test_what_is_no_camera_is_named(tree: sparklod.Tree, wrong: Any) -> None:
             sparklod.traverse(tree, cameras)
 
 
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"eye": (1, 2)}, "eye is"),
+        ({"eye": "abc"}, "eye is 'abc'"),
+        ({"up": (1, 2)}, "up is"),
+        ({"size": (100.5, 5)}, "whole numbers"),
+        ({"fov_y": float("nan")}, "nan degrees"),
+    ],
+)
+def test_cameras_of_no_sense_are_refused(wrong: dict[str, Any], message: str) -> None:
+    with pytest.raises(sparklod.CameraPathError, match=message):
+        sparklod.Camera.look_at(**{"eye": (0, -1, 4), "target": (0, 0, 0), **wrong})
+
+
 @pytest.mark.parametrize("method", ["quick", "quality"])
 @pytest.mark.parametrize(
     "options", [{"base": 5}, {"growth": 9}, {"growth": float("nan")}, {"max_sh": -1}, {"max_sh": 4}]

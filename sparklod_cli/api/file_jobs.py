@@ -18,7 +18,7 @@ from ..extract_leaves import extract_leaves as extract_leaves
 from ..inspection import checking
 from ..inspection.checking import CheckSettings as CheckSettings
 from ..io import check_writable, write_whole
-from ..support.errors import SparklodError, memory_told
+from ..support.errors import SparklodError, memory_errors_translated
 from ..support.progress import Progress, silent
 from ..support.threads import on_threads
 
@@ -96,7 +96,7 @@ def inspect_file(
         OutOfMemoryError: it does not fit into memory.
         OutputError: `drawn.plot` cannot be written.
     """
-    with memory_told(), on_threads(threads):
+    with memory_errors_translated(), on_threads(threads):
         report, scene = checking.inspect(path, settings, threads=threads, progress=progress)
         picture, problem = _picture(report, scene, drawn)
         size = None

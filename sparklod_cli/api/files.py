@@ -22,7 +22,7 @@ from ..support.defaults import (
     MIN_BASE,
     MIN_GROWTH,
 )
-from ..support.errors import FormatError, InvalidSplatsError, TreeError, memory_told
+from ..support.errors import FormatError, InvalidSplatsError, TreeError, memory_errors_translated
 from ..support.threads import on_threads, thread_count
 from .arguments import scene_like, whole_within, within
 from .progress import Told, telling
@@ -67,7 +67,7 @@ def read(
         OutOfMemoryError: it does not fit into memory.
     """
     path = Path(path)
-    with telling(progress) as told, memory_told(), _naming(path):
+    with telling(progress) as told, memory_errors_translated(), _naming(path):
         count = thread_count(threads)
         if columns is None:
             scene = read_scene(path, threads=count, progress=told)
@@ -143,7 +143,7 @@ def write(
         raise ValueError(f"{path}: spz_version and fractional_bits are of SPZ; leave them out, or write a .spz")
     if not len(scene_like(scene).splats):
         raise InvalidSplatsError(f"{path}: the scene has no splats to write")
-    with telling(progress) as told, memory_told():
+    with telling(progress) as told, memory_errors_translated():
         if encoding is not None:
             arrays = pack(scene, encoding, threads=count)
             pieces = dump.encode_raw(arrays) if suffix in RAW_SUFFIXES else dump.encode_npz(arrays)
@@ -196,7 +196,7 @@ def build_lod(
     within("growth", growth, MIN_GROWTH, MAX_GROWTH)
     whole_within("max_sh", max_sh, 0, MAX_SH_DEGREE)
     build = BakeSettings(method=method, base=base, growth=growth).builder()
-    with on_threads(threads), telling(progress) as told, memory_told():
+    with on_threads(threads), telling(progress) as told, memory_errors_translated():
         kept, _ = (selection or Selection()).apply(scene.splats.with_max_sh(max_sh))
         # A builder frees its input as it goes where nobody else holds it.
         nodes, tree = build(kept, progress=told)
@@ -286,6 +286,6 @@ def inspect(
     from ..inspection import report
 
     wanted = report.ReportSettings(values=values or all_quantities, all_quantities=all_quantities, check=check)
-    with telling(progress) as told, memory_told():
+    with telling(progress) as told, memory_errors_translated():
         found, _ = report.inspect(Path(path), wanted, threads=thread_count(threads), progress=told)
     return found

@@ -25,7 +25,7 @@ from ..scenes.finder import CutFinder, FixedCut
 from ..scenes.loaded import UNNAMED, Cut, Scenes
 from ..scenes.reading import read_scenes
 from ..support.defaults import BLEND, PRECISIONS
-from ..support.errors import FormatError, memory_told
+from ..support.errors import FormatError, memory_errors_translated
 from ..support.threads import on_threads, thread_count
 from ..tables.comparison import COLUMNS as OF_COMPARISON
 from .arguments import camera_like, viewed_like
@@ -71,7 +71,7 @@ def cut(
             above 1.
     """
     camera_like(camera)
-    with on_threads(threads) as count, memory_told():
+    with on_threads(threads) as count, memory_errors_translated():
         scenes = scenes_of(viewed, count, precision)
         return CutFinder(scenes, _lod(scenes, budget, settings, continuous)).cut(camera)
 
@@ -109,7 +109,7 @@ def render(
         if backend not in BACKENDS:
             raise ValueError(f"there is no backend {backend!r}; give one of {', '.join(BACKENDS)}")
         settings = replace(settings, backend=backend)
-    with on_threads(threads) as count, memory_told():
+    with on_threads(threads) as count, memory_errors_translated():
         source = FixedCut(viewed) if isinstance(viewed, Cut) else FixedCut(scenes_of(viewed, count).full())
         return Renderer(source, settings, [camera]).draw(camera).image
 
@@ -146,7 +146,7 @@ def traverse(
     from ..simulation.columns import COLUMNS
     from ..simulation.frames import Simulation
 
-    with on_threads(threads) as count, telling(progress) as told, memory_told():
+    with on_threads(threads) as count, telling(progress) as told, memory_errors_translated():
         scenes = _trees(viewed, count, precision)
         simulation = Simulation(scenes, _lod(scenes, budget, settings, False), streaming, by_instance=by_instance)
         frames = simulation.run(_path(cameras), threads=count, progress=told)
@@ -188,7 +188,7 @@ def compare(
         raise TypeError(f"budgets is {budgets!r}; give a list of budgets")
     if not budgets:
         raise ValueError("there are no budgets; give at least one")
-    with on_threads(threads) as count, telling(progress) as told, memory_told():
+    with on_threads(threads) as count, telling(progress) as told, memory_errors_translated():
         scenes = _trees(viewed, count, precision)
         full = None if scene is None else scenes_of(scene, count)
         given = [_budget(budget) for budget in budgets]

@@ -27,7 +27,7 @@ from .options.baking import (
     check_method,
     write_options,
 )
-from .options.common import General, common_options, overwrite_option
+from .options.common import General, common_options, output_option, overwrite_option
 from .paths import InputPath, OutputPath, claim_stdout, keep_apart, stem_of
 from .reports import report_baked, report_extracted
 from .usage import options_of, refuse
@@ -99,15 +99,9 @@ class Outputs:
 
 @click.command("build-lod", cls=Command, epilog=EXAMPLES, context_settings={"show_default": True})
 @click.argument("inputs", metavar="INPUT...", nargs=-1, required=True, type=InputPath(stdin=True))
-@option(
-    "-o",
-    "--output",
-    heading=COMMON,
-    metavar="FILE",
-    type=OutputPath(),
-    help="Output of a single input; - is standard output.  [default: NAME-lod.spz beside the input;"
-    " NAME-lod.npz with --encoding, NAME-unlod.spz with --unlod]",
-    show_default=False,
+@output_option(
+    "Output of a single input; - is standard output.  [default: NAME-lod.spz beside the input;"
+    " NAME-lod.npz with --encoding, NAME-unlod.spz with --unlod]"
 )
 @option(
     "--output-dir",

@@ -48,6 +48,13 @@ def option(*names: str, heading: str, **attributes: Any) -> Callable[[Decorated]
     return click.option(*names, cls=Option, heading=heading, **attributes)
 
 
+def with_options(command: Decorated, *options: Callable[[Decorated], Decorated]) -> Decorated:
+    """The command with these options, in the order in which `--help` lists them."""
+    for add in reversed(options):
+        command = add(command)
+    return command
+
+
 class Command(click.Command):
     """A command whose `--help` lists options under headings.
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..images.text import BACKGROUND, FAINT, INK, LINE
-from ..support.errors import SparklodError
+from ..support.optional import optional_import
 from ..tables.columns import Row
 from .panels import PANELS
 from .series import PINK, Frames
@@ -31,13 +31,11 @@ def load_matplotlib() -> ModuleType:
     Raises:
         SparklodError: it is not installed.
     """
-    try:
+    with optional_import("charts are drawn by matplotlib", "sparklod[render]"):
         import matplotlib
         import matplotlib.backends.backend_agg
         import matplotlib.figure
         import matplotlib.ticker
-    except ImportError as error:
-        raise SparklodError(f"charts are drawn by matplotlib: pip install 'sparklod[render]' ({error})") from None
     return matplotlib
 
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from ..model.splats import FloatArray, Splats
 from ..support.errors import SparklodError
+from ..support.optional import optional_import
 from .ellipsoids import Points, ellipsoids, rotation, sphere
 from .viewpoint import Viewpoint
 
@@ -59,10 +60,8 @@ def load_pyvista() -> ModuleType:
     if sys.platform == "linux" and not os.environ.get("DISPLAY"):
         # Without this VTK warns, and falls back to EGL only where the libraries of X are installed.
         os.environ.setdefault("VTK_DEFAULT_OPENGL_WINDOW", "vtkEGLRenderWindow")
-    try:
+    with optional_import("pictures are drawn by pyvista", "sparklod[render]"):
         import pyvista
-    except ImportError as error:
-        raise SparklodError(f"pictures are drawn by pyvista: pip install 'sparklod[render]' ({error})") from None
     try:
         subprocess.run([sys.executable, "-c", PROBE], check=True, capture_output=True, timeout=60)
     except (OSError, subprocess.SubprocessError):

@@ -13,6 +13,7 @@ import numpy as np
 from PIL import Image
 
 from ..support.errors import SparklodError
+from ..support.optional import optional_import
 from ..support.progress import Progress, silent
 from .pixels import Pixels
 
@@ -54,13 +55,14 @@ def load_imageio(form: str) -> ModuleType:
     Raises:
         SparklodError: it is not installed.
     """
-    try:
+    with optional_import(f".{form} is written by imageio", "sparklod[video]"):
         import imageio.v2
         import imageio_ffmpeg
 
-        imageio_ffmpeg.get_ffmpeg_exe()
-    except (ImportError, RuntimeError) as error:
-        raise SparklodError(f".{form} is written by imageio: pip install 'sparklod[video]' ({error})") from None
+        try:
+            imageio_ffmpeg.get_ffmpeg_exe()
+        except RuntimeError as error:  # its wheel came without the program
+            raise ImportError(error) from None
     module: ModuleType = imageio.v2
     return module
 

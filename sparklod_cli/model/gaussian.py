@@ -1,7 +1,7 @@
 """The formulas of one splat: rotation, covariance, opacity and size.
 
-Those of scalars or arrays alike are compiled into kernels, too. They are given their constants in the type that is
-computed with, for a compiled float32 plus a literal is a float64.
+The functions that accept scalars as well as arrays are also compiled into kernels. They take their constants as
+arguments, in the type of the computation, because in compiled code a float32 plus a literal is a float64.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ MIN_LENGTH, MAX_LENGTH = 1e-15, 1e15
 #: Row and column of the six elements of a covariance: xx xy xz yy yz zz.
 _ROW, _COLUMN = np.array([0, 0, 0, 1, 1, 2]), np.array([0, 1, 2, 1, 2, 2])
 
-#: Rise of the feature size per unit of D above 1, as a share; found in Spark 2.2.0's output, see `spark_size`.
+#: Rise of the feature size per unit of D above 1, as a share; inferred from Spark 2.2.0's output, see `spark_size`.
 SIZE_PER_D = 0.7
 
 #: Exponent of Knud Thomsen's approximation (2004) of an ellipsoid's surface area, within 1.061 % of it.
@@ -122,7 +122,7 @@ def quat_of_rotation(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
 def lod_opacity(opacity: FloatArray) -> FloatArray:
     """(N,) LoD opacity D, Spark's parameter, of linear opacity A: A up to 1, sqrt(1 + e * ln A) above."""
     d = np.array(opacity, np.float32)
-    above = d > 1  # few are
+    above = d > 1  # usually few
     d[above] = lod_opacity_above_1(d[above], np.float32(1), np.float32(np.e))
     return d
 
@@ -136,7 +136,7 @@ def linear_opacity(lod_opacity: FloatArray) -> FloatArray:
 
 
 def size_factor(lod_opacity: FloatArray, out: FloatArray | None = None) -> FloatArray:
-    """(N,) 1 + 0.7 * max(0, D - 1), by which a splat's feature size exceeds 2 * mean(scale); into `out` if given."""
+    """(N,) 1 + 0.7 * max(0, D - 1), the ratio of a splat's feature size to 2 * mean(scale); into `out` if given."""
     factor: FloatArray = np.subtract(lod_opacity, np.float32(1), out=out)
     np.maximum(factor, 0, out=factor)
     factor *= np.float32(SIZE_PER_D)
@@ -147,7 +147,7 @@ def size_factor(lod_opacity: FloatArray, out: FloatArray | None = None) -> Float
 def spark_size(splats: Splats) -> FloatArray:
     """(N,) feature size, 2 * mean(scale) * (1 + 0.7 * max(0, D - 1)): what Spark 2.2.0 writes into its nodes.
 
-    Found in its output, see docs/decisions/2026-11-20-what-spark-does.md; its `encode_lod_tree` computes the same.
+    Inferred from its output, see docs/decisions/2026-11-20-what-spark-does.md; its `encode_lod_tree` computes the same.
     """
     x, y, z = splats.scale.T
     mean = x + y

@@ -15,7 +15,7 @@ MAX_CHILDREN = 65535
 
 @dataclass(frozen=True)
 class LodTree:
-    """The children of M nodes; those of a node are `child_start` to `child_start + child_count - 1`.
+    """The children of M nodes: node i has the children `child_start[i]` to `child_start[i] + child_count[i] - 1`.
 
     Attributes:
         child_count: (M,) uint16, 0 for a leaf.
@@ -48,12 +48,12 @@ class LodTree:
         return depth
 
     def validate(self) -> None:
-        """Checks that this is one tree with root 0, in linear time.
+        """Checks that this is a single tree with root 0, in linear time.
 
         Each node but the root is the child of exactly one node, which comes before it; a leaf's `child_start` is 0.
 
         Raises:
-            TreeError: an invariant does not hold; it names the first such node.
+            TreeError: an invariant is violated; names the first node that violates it.
         """
         if len(self.child_count) != len(self.child_start):
             raise TreeError(f"{len(self.child_count)} child counts but {len(self.child_start)} child starts")
@@ -65,7 +65,7 @@ class LodTree:
         self._fail_at(np.flatnonzero(self.is_leaf & (self.child_start != 0)), "is a leaf with a child_start")
         self._fail_at(node[start <= node], "comes after one of its children")
         self._fail_at(node[end > len(self)], "has children past the last node")
-        # Ranges of children, sorted by their start, cover 1..M just once if each begins where the last one ended.
+        # Ranges of children, sorted by their start, cover 1..M exactly once if each begins where the last one ended.
         by_start = np.argsort(start, kind="stable")
         expected = np.concatenate([[1], end[by_start]])
         self._fail_at(

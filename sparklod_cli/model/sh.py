@@ -1,4 +1,4 @@
-"""Spherical harmonics (SH): normalisations, and numbers of coefficients by degree."""
+"""Spherical harmonics (SH): normalisations, and the number of coefficients of each degree."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from ..support.errors import FormatError
 SH_C0 = 0.28209479177387814
 
 #: Normalisations of the real spherical harmonics of degree 1 to 3, in the order and with the signs of 3D Gaussian
-#: Splatting; `transforms.sh_basis` has the polynomials that they go with.
+#: Splatting; `transforms.sh_basis` has the polynomials that they normalise.
 SH_C1 = 0.4886025119029199
 SH_C2 = (1.0925484305920792, -1.0925484305920792, 0.31539156525252005, -1.0925484305920792, 0.5462742152960396)
 SH_C3 = (
@@ -30,15 +30,15 @@ def degree_of(coefficients: int) -> int:
     """The degree with this many coefficients per channel above the constant term.
 
     Raises:
-        FormatError: there is none.
+        FormatError: no degree has this many.
     """
     try:
         return COEFFICIENTS.index(coefficients)
     except ValueError:
         known = ", ".join(map(str, COEFFICIENTS))
-        raise FormatError(f"{coefficients} SH coefficients a channel, expected one of {known}") from None
+        raise FormatError(f"{coefficients} SH coefficients per channel, expected one of {known}") from None
 
 
 def notes_on_degree(degree: int) -> tuple[str, ...]:
-    """A reader's notes on a file of this degree: that coefficients above MAX_SH_DEGREE are left out, if any are."""
+    """A reader's notes on a file of this degree: one if coefficients above MAX_SH_DEGREE are dropped."""
     return (f"SH degree {degree} is cut to {MAX_SH_DEGREE}",) if degree > MAX_SH_DEGREE else ()

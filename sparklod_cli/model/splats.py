@@ -15,8 +15,8 @@ from .sh import COEFFICIENTS, degree_of
 
 FloatArray = NDArray[np.floating[Any]]
 
-#: Kinds of invalid splats, in the order in which they are checked, and their words in reports. No Gaussian has such
-#: numbers, so nothing can be computed with them. A splat of opacity 0 or scale 0 is valid, but invisible.
+#: Kinds of invalid splats, in the order in which they are checked, and how reports name them. Such numbers do
+#: not describe a Gaussian. A splat of opacity 0 or scale 0 is valid, but invisible.
 INVALID = {
     "non_finite": "not finite",
     "bad_rotation": "rotation not of length 1",
@@ -25,7 +25,7 @@ INVALID = {
 }
 
 #: Largest difference between a rotation's squared length and 1. Codings with a byte per component are normalized when
-#: they are read, so that only the rounding of float32 is left, some 1e-7. Chosen.
+#: they are read, so that only float32 rounding, about 1e-7, remains. Chosen.
 UNIT_TOLERANCE = 1e-3
 
 
@@ -93,10 +93,10 @@ class Splats:
         return Splats(**{name: np.ascontiguousarray(getattr(self, name)[index]) for name in COLUMNS})
 
     def invalid(self) -> dict[str, NDArray[np.bool_]]:
-        """(N,) masks of invalid splats, by the kinds of `INVALID` that occur; a splat is in one mask at most.
+        """(N,) masks of invalid splats, by the kinds of `INVALID` that occur; a splat is in at most one mask.
 
-        This is the one definition of a valid splat. Readers return what a file holds; users of splats refuse or leave
-        out invalid ones.
+        This is the only definition of a valid splat. Readers return what a file contains; their callers reject or drop
+        invalid splats.
         """
         finite = self._is_finite()
         with np.errstate(over="ignore", invalid="ignore"):
@@ -125,8 +125,8 @@ class Splats:
         finite = np.ones(len(self), np.bool_)
         for name in COLUMNS:
             column = getattr(self, name).reshape(len(self), math.prod(getattr(self, name).shape[1:]))
-            # A finite sum has finite terms only; an infinite one may be an overflow. The sum of the whole column is
-            # fast, then come the sums of rows, and only rows whose sum is not finite are checked one by one.
+            # A finite sum has finite terms only; an infinite one may be an overflow. The whole column is summed first,
+            # which is fast, then each row, and only rows whose sum is not finite are checked element by element.
             with np.errstate(over="ignore", invalid="ignore"):
                 if np.isfinite(column.sum()):
                     continue
@@ -146,10 +146,10 @@ COLUMNS = tuple(field.name for field in dataclasses.fields(Splats))
 
 
 def describe_invalid(invalid: dict[str, NDArray[np.bool_]]) -> str:
-    """ "3 of 50 splats are not finite (NaN, infinite, or a rotation of length 0; the first is splat 7)", for people.
+    """ "3 of 50 splats are not finite (NaN, infinite, or a rotation of length 0; the first is splat 7)", for messages.
 
     Args:
-        invalid: of `Splats.invalid`, not empty.
+        invalid: the masks of `Splats.invalid`, not empty.
     """
     counts = {kind: int(np.count_nonzero(mask)) for kind, mask in invalid.items()}
     total = len(next(iter(invalid.values())))

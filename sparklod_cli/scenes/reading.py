@@ -13,7 +13,7 @@ from ..model.scene import Scene
 from ..model.selection import Selection, describe
 from ..model.splats import COLUMNS, Splats
 from ..support.defaults import PRECISIONS
-from ..support.errors import FormatError, InvalidSplatsError, SparklodError, TreeError, memory_told
+from ..support.errors import FormatError, InvalidSplatsError, SparklodError, TreeError, memory_errors_translated
 from ..support.progress import Progress, silent
 from .loaded import UNNAMED, LoadedScene, Scenes
 
@@ -87,7 +87,7 @@ def _read(source: Path | Scene, columns: Collection[str], threads: int, progress
         if isinstance(source, Scene):
             scene = source
         else:
-            with memory_told():
+            with memory_errors_translated():
                 scene = examine_scene(source, columns=columns, threads=threads, progress=progress)
         if scene.tree is not None:
             scene.tree.validate()

@@ -1,7 +1,7 @@
-"""How a file appears whole or not at all: it gets its name when it is complete. `io.py` alone calls this.
+"""Atomic file writes: a file gets its name only when it is complete.
 
-Where the system has unnamed files (Linux), a writer that is killed leaves nothing behind. Elsewhere the file has a name
-of its own meanwhile, and a lock for as long as its writer lives: the next run can tell what was left, and removes it.
+On systems with unnamed files (Linux), a writer that is killed leaves nothing behind. Elsewhere the file has a temporary
+name, and is locked while its writer is alive, so that the next run can recognise and remove what was left behind.
 """
 
 from __future__ import annotations
@@ -20,35 +20,35 @@ try:
 except ImportError:  # Windows, where a file that is open cannot be removed by others
     fcntl = None  # type: ignore[assignment]
 
-#: Names of files that are not complete.
+#: Names of incomplete files.
 PARTS = ".sparklod-{}.part"
 
-#: The flag that opens a file without a name in a folder; None where the system has no such files.
+#: The flag that opens an unnamed file in a folder; None where the system has none.
 UNNAMED: int | None = getattr(os, "O_TMPFILE", None)
 
-#: Where an open file can be had by its number, to give it a name.
+#: The folder of open files by descriptor, from which an unnamed file is linked to its name.
 OPEN_FILES = Path("/proc/self/fd")
 
-#: Read and written, as bytes, and not by child processes.
+#: For reading and writing bytes; not inherited by child processes.
 _FLAGS = os.O_RDWR | getattr(os, "O_BINARY", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_NOFOLLOW", 0)
 
-_COPIED = 1 << 20  # bytes at a time
+_COPY_BYTES = 1 << 20  # per read when a file is copied
 
 
 def write(target: Path, pieces: Iterable[bytes], *, overwrite: bool) -> int:
-    """Writes a file that is not there before it is complete; its size.
+    """Writes a file that appears only when it is complete, and returns its size in bytes.
 
-    A new file gets the permissions that the umask leaves, one that takes the place of another has those of that one,
-    and never more, but for those that let a program run as somebody else.
+    A new file gets the permissions that the umask allows. A replacement gets the permissions of the file it replaces,
+    except set-user-id, set-group-id and sticky, and never has more while it is written.
 
     Args:
-        target: not a symbolic link, which would be replaced.
-        pieces: of the file.
-        overwrite: takes the place of an existing file.
+        target: path of the file; a symbolic link would be replaced, not followed.
+        pieces: content of the file, in order.
+        overwrite: replace an existing file.
 
     Raises:
-        FileExistsError: there is such a file, and `overwrite` is not set.
-        OSError: the file system refused something.
+        FileExistsError: the file exists, and `overwrite` is not set.
+        OSError: the file system reported an error.
     """
     _sweep(target.parent)
     descriptor = _open_unnamed(target, overwrite)
@@ -62,7 +62,7 @@ def write(target: Path, pieces: Iterable[bytes], *, overwrite: bool) -> int:
             raise
         except OSError:  # a file system without links
             file.seek(0)
-            _write_named(target, iter(lambda: file.read(_COPIED), b""), overwrite)
+            _write_named(target, iter(lambda: file.read(_COPY_BYTES), b""), overwrite)
     return size
 
 
@@ -74,7 +74,7 @@ def _fill(file: BinaryIO, pieces: Iterable[bytes]) -> int:
 
 
 def _replaced_mode(target: Path, overwrite: bool) -> int | None:
-    """Permissions of the file that is replaced; None where there is none."""
+    """Permissions of the file that will be replaced; None if there is none."""
     try:
         return stat.S_IMODE(target.stat().st_mode) & 0o777 if overwrite else None
     except FileNotFoundError:
@@ -82,13 +82,13 @@ def _replaced_mode(target: Path, overwrite: bool) -> int | None:
 
 
 def _first_mode(target: Path, overwrite: bool) -> int:
-    """Permissions to make a file with, of which the umask takes some: none that the complete one has not."""
+    """Permissions to create a file with, before the umask: never more than the complete file will have."""
     mode = _replaced_mode(target, overwrite)
     return 0o666 if mode is None else mode & 0o600
 
 
 def _open_unnamed(target: Path, overwrite: bool) -> int | None:
-    """Opens a file without a name where `target` will be; None where that cannot be done."""
+    """Opens an unnamed file in the folder of `target`; None if that is impossible."""
     if UNNAMED is None or not OPEN_FILES.exists():
         return None
     try:
@@ -98,7 +98,7 @@ def _open_unnamed(target: Path, overwrite: bool) -> int | None:
 
 
 def _name(file: BinaryIO, target: Path, overwrite: bool) -> None:
-    """Gives a complete file without a name its name."""
+    """Gives a complete, unnamed file its name."""
     number = file.fileno()
     mode = _replaced_mode(target, overwrite)
     if mode is None:
@@ -107,25 +107,25 @@ def _name(file: BinaryIO, target: Path, overwrite: bool) -> None:
         except FileExistsError:
             if not overwrite:
                 raise
-            mode = _replaced_mode(target, overwrite)  # somebody was quicker
+            mode = _replaced_mode(target, overwrite)  # another process created it first
     if mode is not None:
         os.fchmod(number, mode)
     _lock(number)
     temporary = _part_of(target)
     try:
-        _link(number, temporary)  # no link replaces a file, so there are two names for a moment
+        _link(number, temporary)  # link() cannot replace a file, so it has two names for a moment
         temporary.replace(target)
     finally:
         temporary.unlink(missing_ok=True)
 
 
 def _link(number: int, path: Path) -> None:
-    # The folder only makes Python follow the link that the source is.
+    # src_dir_fd has no other effect than that Python follows the symbolic link in /proc.
     os.link(OPEN_FILES / str(number), path, src_dir_fd=number, follow_symlinks=True)
 
 
 def _write_named(target: Path, pieces: Iterable[bytes], overwrite: bool) -> int:
-    """As `write`, by a file that has a name of its own until it is complete."""
+    """As `write`, with a file that has a temporary name until it is complete."""
     temporary, descriptor = _open_part(target, overwrite)
     try:
         with os.fdopen(descriptor, "w+b") as file:
@@ -134,7 +134,7 @@ def _write_named(target: Path, pieces: Iterable[bytes], overwrite: bool) -> int:
             if mode is not None:
                 temporary.chmod(mode)
             if fcntl is None:
-                file.close()  # no open file can be renamed there
+                file.close()  # Windows cannot rename an open file
             _rename(temporary, target, overwrite)
     finally:
         temporary.unlink(missing_ok=True)
@@ -142,17 +142,17 @@ def _write_named(target: Path, pieces: Iterable[bytes], overwrite: bool) -> int:
 
 
 def _part_of(target: Path) -> Path:
-    """A name beside a file that nobody else has."""
+    """A unique temporary name in the folder of a file."""
     return target.with_name(PARTS.format(secrets.token_hex(8)))
 
 
 def _open_part(target: Path, overwrite: bool) -> tuple[Path, int]:
-    """Makes a locked file beside `target`; its name, and its descriptor."""
+    """Creates a locked temporary file in the folder of `target`; returns its path and descriptor."""
     while True:
         temporary = _part_of(target)
         descriptor = os.open(temporary, _FLAGS | os.O_CREAT | os.O_EXCL, _first_mode(target, overwrite))
         _lock(descriptor)
-        with contextlib.suppress(FileNotFoundError):  # swept away before it was locked
+        with contextlib.suppress(FileNotFoundError):  # another process removed it before it was locked
             if os.path.samestat(os.fstat(descriptor), temporary.stat()):
                 return temporary, descriptor
         os.close(descriptor)
@@ -163,7 +163,7 @@ def _rename(temporary: Path, target: Path, overwrite: bool) -> None:
         temporary.replace(target)
         return
     try:
-        os.link(temporary, target)  # fails where the name is taken; a rename would replace it
+        os.link(temporary, target)  # fails if the name is taken; a rename would replace that file
     except FileExistsError:
         raise
     except OSError:  # a file system without links
@@ -173,7 +173,7 @@ def _rename(temporary: Path, target: Path, overwrite: bool) -> None:
 
 
 def _lock(descriptor: int) -> None:
-    """Locks a file until it is closed, or its process dies, where the file system has locks."""
+    """Locks a file until it is closed or its process ends; does nothing if the file system has no locks."""
     if fcntl is not None:
         with contextlib.suppress(OSError):
             fcntl.flock(descriptor, fcntl.LOCK_EX)
@@ -181,7 +181,7 @@ def _lock(descriptor: int) -> None:
 
 @functools.lru_cache(256)
 def _sweep(folder: Path) -> None:
-    """Removes what writers that were killed have left in a folder; once, since all frames may go into one."""
+    """Removes the temporary files of killed writers from a folder; once, as it may get thousands of files."""
     with contextlib.suppress(OSError):
         for path in list(folder.glob(PARTS.format("*"))):
             with contextlib.suppress(OSError):
@@ -192,11 +192,11 @@ def _sweep(folder: Path) -> None:
 
 
 def _remove_unlocked(path: Path) -> None:
-    """Removes a file of ours that no living process has locked; `OSError` where it is locked."""
+    """Removes a temporary file of this user that no process has locked; raises `OSError` if it is locked."""
     descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)  # it may be read-only
     try:
-        about = os.fstat(descriptor)
-        if stat.S_ISREG(about.st_mode) and about.st_uid == os.geteuid():
+        status = os.fstat(descriptor)
+        if stat.S_ISREG(status.st_mode) and status.st_uid == os.geteuid():
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             path.unlink()
     finally:

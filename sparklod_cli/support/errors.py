@@ -1,4 +1,4 @@
-"""The errors that sparklod raises on purpose. The command line turns each into one line and an exit code."""
+"""The exceptions that sparklod raises. The command line turns each into a one-line message and an exit code."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from typing import Any
 
 
 class SparklodError(Exception):
-    """Base of every error that tells the user something; its text is one line that says what to do."""
+    """Base class of all errors meant for the user; the message is one line that says what to do."""
 
 
 class FormatError(SparklodError):
-    """A file is not what its format says, or beyond the format's limits. Its subclasses tell a validator more."""
+    """A file violates its format or exceeds the limits of the format. Subclasses name the violation."""
 
     code = "container.corrupt"
 
@@ -26,31 +26,31 @@ class UnreadableError(FormatError):
 
 
 class UnknownFormatError(FormatError):
-    """A file is of no known format."""
+    """The format of a file is unknown."""
 
     code = "file.format"
 
 
 class NotSplatsError(FormatError):
-    """A file is of a known format, but holds something else than splats."""
+    """A file is in a known format, but does not contain splats."""
 
     code = "file.not-splats"
 
 
 class TruncatedError(FormatError):
-    """A file ends before what it promises."""
+    """A file is shorter than its header declares."""
 
     code = "container.cut-short"
 
 
 class PromiseError(FormatError):
-    """A header promises more than a file of its size can hold."""
+    """A header declares more data than a file of this size can contain."""
 
     code = "container.promise"
 
 
 class VersionError(FormatError):
-    """A version, level or degree that the format does not have."""
+    """The format has no such version, level or degree."""
 
     code = "container.version"
 
@@ -62,48 +62,48 @@ class ChecksumError(FormatError):
 
 
 class MembersError(FormatError):
-    """Compressed data go on in a second gzip member, which not every reader looks at."""
+    """Compressed data continue in a second gzip member, which some readers ignore."""
 
     code = "container.members"
 
 
 class TooLongError(FormatError):
-    """A stream is longer than the header promises."""
+    """A stream is longer than the header declares."""
 
     code = "container.too-long"
 
 
 class InvalidSplatsError(SparklodError):
-    """The splats themselves cannot be used: none is left, or some are invalid."""
+    """The splats cannot be used: some are invalid, or none remain."""
 
 
 class TreeError(SparklodError):
-    """A Level-of-Detail tree breaks one of its invariants."""
+    """A Level-of-Detail tree violates one of its invariants."""
 
 
 class OutputError(SparklodError):
-    """An output cannot be written: it exists already, or the file system refused it."""
+    """An output file already exists, or the file system refused to write it."""
 
 
 class StdoutError(OutputError):
-    """Standard output is closed, or cannot be written; not the fault of the file that is being worked on."""
+    """Standard output is closed or cannot be written, which has nothing to do with the file being processed."""
 
 
 class CameraPathError(SparklodError):
-    """A camera path cannot be read or made: its file is broken or of no known format, or a camera makes no sense."""
+    """A camera path cannot be read or created: the file is corrupt or of an unknown format, or a camera is invalid."""
 
 
 class TooManyCamerasError(CameraPathError):
-    """A path has more cameras than are made, or taken."""
+    """A camera path has more cameras than the limit."""
 
 
 class OutOfMemoryError(SparklodError):
-    """What was asked for does not fit into memory."""
+    """The operation needs more memory than there is."""
 
 
 @contextlib.contextmanager
-def memory_told() -> Iterator[None]:
-    """Makes an `OutOfMemoryError`, which says what did not fit, of every way in which memory runs out inside."""
+def memory_errors_translated() -> Iterator[None]:
+    """Translates every error of the body that means memory ran out into an `OutOfMemoryError` that names the array."""
     try:
         yield
     except Exception as error:
@@ -114,21 +114,21 @@ def memory_told() -> Iterator[None]:
 
 
 def out_of_memory(error: BaseException) -> str | None:
-    """What did not fit into memory, for people; None where the error is about something else."""
+    """The message for an error that means memory ran out; None for any other error."""
     text = str(error).lower()
-    starved = (
+    is_out_of_memory = (
         isinstance(error, MemoryError)
         or (isinstance(error, OSError) and error.errno == errno.ENOMEM)
         or (isinstance(error, ImportError) and ("cannot allocate memory" in text or "failed to map segment" in text))
-        or (isinstance(error, RuntimeError) and "can't start new thread" in text)  # there is no room for its stack
+        or (isinstance(error, RuntimeError) and "can't start new thread" in text)  # no memory for its stack
     )
-    if not starved:
+    if not is_out_of_memory:
         return None
-    return f"it does not fit into memory{_array_of(error)}; free some, or ask for less at a time"
+    return f"it does not fit into memory{_array_of(error)}; free some memory, or process less at a time"
 
 
 def _array_of(error: Any) -> str:
-    """The array that numpy had no room for, as its `MemoryError` has it; empty for others."""
+    """The shape and size of the array that numpy could not allocate, from its `MemoryError`; empty for other errors."""
     shape, dtype = getattr(error, "shape", None), getattr(error, "dtype", None)
     if not shape or dtype is None:
         return ""

@@ -1,4 +1,4 @@
-"""exp2 and log2 of float32 as branch-free polynomials, which LLVM vectorizes; it does not vectorize calls of libm."""
+"""exp2 and log2 of float32 as branch-free polynomials, which LLVM vectorizes, unlike calls of libm."""
 
 from __future__ import annotations
 

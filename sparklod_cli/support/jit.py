@@ -1,4 +1,4 @@
-"""Compiling kernels: the one place that configures numba."""
+"""Compiles kernels; the only module that configures numba."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-#: How long OpenMP's threads spin while they wait for one another at the end of a parallel loop. By default that is
-#: milliseconds, which on a busy machine takes the processor from the thread that is waited for: four bakes at once then
-#: take 1.5 times as long as one after another (docs/decisions/2026-11-21-kernels.md). The variables are read when numba
-#: starts its threads; those that are set already are left alone.
-WAITING = {
-    "GOMP_SPINCOUNT": "1000",  # GNU's: iterations, some 20 microseconds
-    "KMP_BLOCKTIME": "0",  # LLVM's and Intel's: milliseconds
+#: How long OpenMP's threads spin while they wait for one another at the end of a parallel loop. By default they
+#: spin for milliseconds, which on a busy machine takes the processor from the thread they wait for: four concurrent
+#: bakes then take 1.5 times as long as four in sequence (docs/decisions/2026-11-21-kernels.md). The variables are read
+#: when numba starts its threads; variables that are already set are left unchanged.
+WAIT_SETTINGS = {
+    "GOMP_SPINCOUNT": "1000",  # GNU: iterations, about 20 microseconds
+    "KMP_BLOCKTIME": "0",  # LLVM and Intel: milliseconds
 }
 if "OMP_WAIT_POLICY" not in os.environ:
-    for _name, _value in WAITING.items():
+    for _name, _value in WAIT_SETTINGS.items():
         os.environ.setdefault(_name, _value)
 
 import numba  # noqa: E402
@@ -27,15 +27,16 @@ from numba.core import event  # noqa: E402
 
 from .jit_cache import KernelCache, Trouble, is_whole, pattern_of, stem_of  # noqa: E402
 
-#: Called with the name of a kernel when its compilation begins, and with the seconds that it took when it ends.
+#: Called with the name of a kernel when its compilation begins, and with its duration in seconds when it ends.
 Begun = Callable[[str], None]
 Done = Callable[[float], None]
 
-#: Rows from which on work is spread over threads: one thread is through with fewer before another has woken up. Chosen;
-#: no difference was measured up to 65,536 (docs/decisions/2026-11-21-kernels.md).
+#: Least number of rows for which several threads are used: with fewer, one thread finishes before another wakes up.
+#: Chosen; no difference was measured up to 65,536 (docs/decisions/2026-11-21-kernels.md).
 PARALLEL_ROWS = 4096
 
-#: Sources of compiled code: kernels, and the modules whose constants and functions they use. They name the cache.
+#: Sources of compiled code: kernels, and the modules whose constants and functions they use. The name of the cache
+#: folder is a digest of them.
 SOURCES = (
     "model/gaussian.py",
     "model/lod_tree.py",
@@ -53,10 +54,10 @@ SOURCES = (
 
 
 def _cache_folder() -> Path | None:
-    """The folder for compiled code, or None where none can be written.
+    """The folder for compiled code, or None if none is writable.
 
-    numba's own cache compares the file of a kernel alone with the source that it compiled. A kernel also consists of
-    the kernels that it calls and the constants that it uses, so the folder is named by a digest of all SOURCES.
+    numba's own cache is invalidated by changes to the file of a kernel only. A kernel also depends on the kernels that
+    it calls and the constants that it uses, so the folder is named by a digest of all SOURCES.
     """
     package = Path(__file__).parents[1]
     sources = [path for pattern in SOURCES for path in sorted(package.glob(pattern))]
@@ -84,14 +85,14 @@ def kernel(
 ) -> Callable[[Callable[..., Any]], Any]:
     """Decorator for a compiled function.
 
-    Without fastmath, as results must not depend on the number of threads. Machine code is cached beside the source, or
-    in the user's cache directory if the package is read-only; if neither can be written, each process compiles it.
+    Without fastmath, because results must not depend on the number of threads. Machine code is cached in the
+    package, or in the user's cache directory if the package is read-only; if neither is writable, every run compiles.
 
     Args:
         parallel: the function has loops that run on the threads of `use_threads`.
-        nogil: other threads of this process may run meanwhile.
-        inline: the function becomes part of the kernels that call it, which LLVM does not always do by itself.
-        contract: a product and a sum may be rounded once instead of twice, on processors that can.
+        nogil: releases the GIL, so that other Python threads can run.
+        inline: always inlines the function into its callers, which LLVM does not always do by itself.
+        contract: allows fused multiply-add, which rounds once instead of twice, on processors that have it.
     """
 
     def decorate(function: Callable[..., Any]) -> Any:
@@ -103,7 +104,7 @@ def kernel(
             fastmath={"contract"} if contract else False,
         )(function)
         if CACHE_FOLDER is not None and hasattr(compiled, "enable_caching"):  # not with NUMBA_DISABLE_JIT
-            compiled._cache = KernelCache(function, CACHE_FOLDER, _tell_trouble)
+            compiled._cache = KernelCache(function, CACHE_FOLDER, _report_trouble)
         return compiled
 
     return decorate
@@ -119,7 +120,7 @@ def is_cached(name: str) -> bool:
 
 
 def use_threads(count: int) -> None:
-    """Runs kernels on `count` threads, or on all that numba has if those are fewer."""
+    """Runs kernels on `count` threads, or on all of numba's threads if it has fewer."""
     numba.set_num_threads(min(count, numba.config.NUMBA_NUM_THREADS))
 
 
@@ -127,8 +128,8 @@ def use_threads(count: int) -> None:
 def threads_for(rows: int) -> Iterator[int]:
     """Runs kernels inside on one thread if there are fewer than PARALLEL_ROWS rows; yields the number of threads.
 
-    Waking the other threads takes longer than a few thousand rows do, and on a busy machine, where they sleep, a
-    thousand times longer.
+    Waking the other threads takes longer than processing a few thousand rows; on a busy machine, where the threads
+    sleep, a thousand times longer.
     """
     threads = numba.get_num_threads()
     use_threads(1 if rows < PARALLEL_ROWS else threads)
@@ -138,24 +139,24 @@ def threads_for(rows: int) -> Iterator[int]:
         use_threads(threads)
 
 
-#: Called with what keeps the cache from working.
-_troubled: list[Trouble] = []
+#: Callbacks for messages about a cache that does not work.
+_trouble_listeners: list[Trouble] = []
 
 
-def _tell_trouble(text: str) -> None:
-    for tell in _troubled:
-        tell(text)
+def _report_trouble(text: str) -> None:
+    for report in _trouble_listeners:
+        report(text)
 
 
 class _OnCompile(event.Listener):
-    """Reports the compilation of kernels that Python calls, not of those that they call."""
+    """Reports the compilation of kernels called from Python, not of the kernels that those call."""
 
     def __init__(self, begun: Begun, done: Done) -> None:
         self._begun, self._done = begun, done
         self._depth, self._since = 0, 0.0
 
     def on_start(self, event: event.Event) -> None:
-        self._depth += 1  # one thread at a time compiles
+        self._depth += 1  # numba compiles on one thread at a time
         if self._depth == 1:
             self._since = time.perf_counter()
             self._begun(stem_of(event.data["dispatcher"].py_func))
@@ -170,20 +171,20 @@ def listen(begun: Begun, done: Done, trouble: Trouble) -> Callable[[], None]:
     """Reports what happens when kernels are called for the first time.
 
     Args:
-        begun: called with the name of each kernel that is compiled, as it is not in the cache; see `is_cached`.
-        done: called with the seconds that took.
-        trouble: called with a line on what keeps the cache from working.
+        begun: called with the name of each kernel that has to be compiled because it is not in the cache.
+        done: called with the duration of the compilation in seconds.
+        trouble: called with a one-line message if the cache cannot be used.
 
     Returns:
-        a function that ends the reports.
+        a function that stops the reports.
     """
     listener = _OnCompile(begun, done)
     event.register("numba:compile", listener)
-    _troubled.append(trouble)
+    _trouble_listeners.append(trouble)
 
     def stop() -> None:
         event.unregister("numba:compile", listener)
-        _troubled.remove(trouble)
+        _trouble_listeners.remove(trouble)
 
     return stop
 
@@ -198,7 +199,7 @@ def threading_layer() -> str:
     """The layer that runs parallel loops: omp, tbb or workqueue. Starts its threads.
 
     Raises:
-        ValueError: none of them can be loaded.
+        ValueError: no threading layer can be loaded.
     """
     from numba.np.ufunc.parallel import _launch_threads
 

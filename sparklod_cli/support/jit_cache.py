@@ -24,7 +24,7 @@ SUFFIX = ".kernel"
 #: Bytes of the checksum at the start of a file. 16 make an accidental match impossible in practice.
 CHECKSUM = 16
 
-#: Called with a line on what keeps the cache from working; see `jit.listen`.
+#: Called with a one-line message if the cache cannot be used; see `jit.listen`.
 Trouble = Callable[[str], None]
 
 
@@ -33,15 +33,15 @@ class KernelCache(caching._Cache):
 
     numba's cache trusts its files: an empty one ends in an `EOFError`, a flipped bit in an error of LLVM or a crash, a
     full disk in an `OSError`; and two processes that compile two signatures of one function at the same time can each
-    take the other's file for its own. Here each signature has a file of its own, named by all that its code depends on
-    except the source, which names the folder (`jit.CACHE_FOLDER`). A file appears whole or not at all and begins with a
-    checksum. If anything is wrong with a file, the kernel is compiled again; if anything is wrong with the folder, the
-    kernel is compiled and not kept.
+    take the other's file for its own. Here each signature has its own file, named by all that its code depends on,
+    except the source, which names the folder (`jit.CACHE_FOLDER`). A file is written atomically and begins with a
+    checksum. If a file is damaged, the kernel is compiled again; if the folder cannot be used, the kernel is compiled
+    but not stored.
 
     Args:
         function: the Python function.
         folder: folder of the files.
-        trouble: called with a line on what is wrong.
+        trouble: called with a one-line message if the cache cannot be used.
     """
 
     def __init__(self, function: Callable[..., Any], folder: Path, trouble: Trouble) -> None:
@@ -64,11 +64,11 @@ class KernelCache(caching._Cache):
             path.unlink(missing_ok=True)
 
     def load_overload(self, signature: Any, target_context: Any) -> Any:
-        """The compiled function, or None if it has to be compiled."""
+        """Loads the compiled function; returns None if it has to be compiled."""
         target_context.refresh()
         path = self._path(signature, target_context.codegen())
         try:
-            content = path.read_bytes() if self._enabled and path.is_file() else None  # no pipe, no device
+            content = path.read_bytes() if self._enabled and path.is_file() else None  # not a pipe or a device
         except OSError:
             return None
         if content is None:
@@ -77,10 +77,10 @@ class KernelCache(caching._Cache):
             try:
                 return compiler.CompileResult._rebuild(target_context, *pickle.loads(content[CHECKSUM:]))
             except Exception as error:
-                # A file that is whole may still be of no use, such as one with types of another numpy.
+                # An undamaged file may still be unusable, for example if it refers to types of another numpy.
                 if out_of_memory(error):
                     raise
-        self._trouble(f"compiled code in {self._folder} is damaged; what is damaged is compiled again")
+        self._trouble(f"compiled code in {self._folder} is damaged; the damaged kernels are compiled again")
         with contextlib.suppress(OSError):
             path.unlink()
         return None
@@ -95,14 +95,14 @@ class KernelCache(caching._Cache):
             atomic.write(self._path(signature, compiled.codegen), [_checksum(payload), payload], overwrite=True)
         except OSError as error:
             reason = (error.strerror or str(error)).lower()
-            self._trouble(f"compiled code cannot be kept in {self._folder} ({reason}), so it is compiled in every run")
+            self._trouble(f"cannot cache compiled code in {self._folder} ({reason}); it is compiled in every run")
 
     def _path(self, signature: Any, codegen: Any) -> Path:
         return self._folder / f"{self._stem}-{_digest(*_machine(codegen))}-{_digest(str(signature))}{SUFFIX}"
 
 
 def pattern_of(stem: str) -> str:
-    """Glob pattern of a kernel's files that this process can load: of this processor, numba and Python."""
+    """Glob pattern of the files of a kernel that this process can load: those for its processor, numba and Python."""
     return f"{stem}-{_digest(*_machine(cpu_target.target_context.codegen()))}-*{SUFFIX}"
 
 
@@ -115,7 +115,7 @@ def _digest(*depends_on: Any) -> str:
 
 
 def stem_of(function: Callable[..., Any]) -> str:
-    """What a function's files are named by, "module.function", without the package."""
+    """The start of the names of a function's files: "module.function", without the package."""
     return f"{function.__module__.rpartition('.')[2]}.{function.__name__}"
 
 

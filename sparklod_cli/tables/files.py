@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from types import ModuleType
 from typing import Any
 
-from ..support.errors import SparklodError
+from ..support.optional import optional_import
 from .columns import Cell, Column, Row
 
 #: Version of the schema: counts up when a column changes its meaning or is removed, not when one is added.
@@ -58,11 +58,9 @@ def load_pyarrow() -> ModuleType:
     Raises:
         SparklodError: it is not installed.
     """
-    try:
+    with optional_import("Parquet is written by pyarrow", "sparklod[parquet]"):
         import pyarrow
         import pyarrow.parquet
-    except ImportError as error:
-        raise SparklodError(f"Parquet is written by pyarrow: pip install 'sparklod[parquet]' ({error})") from None
     return pyarrow
 
 

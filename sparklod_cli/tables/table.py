@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from html import escape
 from typing import Any, overload
 
-from ..support.errors import SparklodError
+from ..support.optional import optional_import
 from .columns import Cell, Column, Row
 
 #: Rows that are shown of a table in a notebook, half from its beginning and half from its end.
@@ -58,10 +58,8 @@ class Table(Sequence[Row]):
         Raises:
             SparklodError: pandas is not installed.
         """
-        try:
+        with optional_import("to_pandas needs pandas", "pandas"):
             import pandas
-        except ImportError as error:
-            raise SparklodError(f"to_pandas needs pandas: pip install pandas ({error})") from None
         kinds = {int: "Int64", float: "float64", str: "string"}
         cells = {column.name: self.column(column.name) for column in self.columns}
         return pandas.DataFrame(

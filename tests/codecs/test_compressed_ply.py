@@ -168,7 +168,7 @@ REFUSED: dict[str, tuple[Callable[[], bytes], str]] = {
     "44 SH": (lambda: edited("property uchar f_rest_44\n", ""), "60 rows of 44 values"),
     "42 SH": (
         lambda: re.sub(rb"property uchar f_rest_4[234]\n", b"", GOLDEN.read_bytes()),
-        "14 SH coefficients a channel",
+        "14 SH coefficients per channel",
     ),
     "lists": (lambda: edited("property uchar f_rest_0\n", "property list uchar uchar f_rest_0\n"), "element sh has no"),
     "cut short": (lambda: GOLDEN.read_bytes()[:-1], "cut short: 1 bytes are missing"),

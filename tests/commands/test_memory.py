@@ -16,7 +16,7 @@ from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
-from sparklod_cli.support.errors import OutOfMemoryError, memory_told, out_of_memory
+from sparklod_cli.support.errors import OutOfMemoryError, memory_errors_translated, out_of_memory
 from sparklod_cli.support.parallel import ordered_map
 from tests.conftest import FIXTURES, ROOT
 
@@ -136,7 +136,7 @@ def test_memory_that_runs_out_in_a_thread_is_an_out_of_memory_error(threads: int
     def work(size: int) -> int:
         return len(np.empty(size, np.uint8))
 
-    with pytest.raises(OutOfMemoryError, match="1,000,000,000,000,000 numbers"), memory_told():
+    with pytest.raises(OutOfMemoryError, match="1,000,000,000,000,000 numbers"), memory_errors_translated():
         list(ordered_map(work, [1, 10**15, 2], threads))
 
 

@@ -100,10 +100,10 @@ def test_compilations_are_reported_but_not_nested_ones() -> None:
 @pytest.mark.parametrize("given", [{}, {"OMP_WAIT_POLICY": "ACTIVE"}, {"GOMP_SPINCOUNT": "7"}])
 def test_threads_do_not_spin_unless_the_environment_says_so(given: dict[str, str]) -> None:
     code = "import os; from sparklod_cli.support import jit; print(os.environ.get('GOMP_SPINCOUNT'))"
-    clean = {name: value for name, value in os.environ.items() if name not in (*jit.WAITING, "OMP_WAIT_POLICY")}
+    clean = {name: value for name, value in os.environ.items() if name not in (*jit.WAIT_SETTINGS, "OMP_WAIT_POLICY")}
     command = [sys.executable, "-c", code]
     done = subprocess.run(command, cwd=ROOT, env={**clean, **given}, capture_output=True, text=True, check=True)
-    expected = given.get("GOMP_SPINCOUNT", "None" if given else jit.WAITING["GOMP_SPINCOUNT"])
+    expected = given.get("GOMP_SPINCOUNT", "None" if given else jit.WAIT_SETTINGS["GOMP_SPINCOUNT"])
     assert done.stdout.strip() == expected
 
 

@@ -86,7 +86,7 @@ def test_a_damaged_file_is_told_of_and_compiled_again(tmp_path: Path, damage: Ca
     kernel = compiled(tmp_path, told)
     assert kernel(2.0) == 4
     assert not was_cached(kernel)
-    assert told == [f"compiled code in {tmp_path} is damaged; what is damaged is compiled again"]
+    assert told == [f"compiled code in {tmp_path} is damaged; the damaged kernels are compiled again"]
     kernel = compiled(tmp_path, told)
     assert kernel(2.0) == 4
     assert was_cached(kernel)

@@ -13,7 +13,7 @@ from ...codecs.rounding import ROUND_TRIPS
 from ...render.backends import BACKENDS
 from ...render.settings import COLOR_BY, OF_PIXELS, PROFILES, SORTINGS, SORTS, STYLES, RasterSettings, RenderSettings
 from ...support import defaults
-from ..command import COMMON, option
+from ..command import COMMON, option, with_options
 from ..usage import exclude, is_given, require
 from .common import Command
 from .types import Real
@@ -152,94 +152,91 @@ def appearance_options(command: Command) -> Command:
     """The options of `Appearance`."""
     add = functools.partial(option, heading=HEADING)
     raster = RasterSettings()
-    for each in reversed(
-        (
-            option(
-                "--background",
-                heading=COMMON,
-                type=Background(),
-                default="black",
-                help="Colour behind the splats: '#rrggbb', black, white or transparent.",
-            ),
-            add("--alpha", is_flag=True, help="Keep alpha, as --background transparent does."),
-            add(
-                "--supersample",
-                metavar="N",
-                type=click.IntRange(1, defaults.MAX_SUPERSAMPLE),
-                default=1,
-                help="Draw each pixel as the mean of N x N samples, up to 4 x 4.",
-            ),
-            add(
-                "--color-by",
-                type=click.Choice(COLOR_BY),
-                help="Colour splats by a quantity, unlit, with a colour bar beside the picture.  [default: their own"
-                " colours]",
-            ),
-            add("--no-bar", is_flag=True, help="Leave out the colour bar of --color-by or --diff."),
-            add(
-                "--style",
-                type=click.Choice(STYLES),
-                default=STYLES[0],
-                help="Shape of each splat: its Gaussian, one opaque pixel (points), or an opaque disc, in the order of"
-                " the file (billboards) or from far to near (sorted-billboards).",
-            ),
-            add(
-                "--near",
-                metavar="D",
-                type=Real(0, defaults.FARTHEST, min_open=True),
-                default=raster.near,
-                show_default=False,
-                help="Distance of the near plane along the optical axis, in world units; nearer splats are left out."
-                f"  [default: {raster.near:g}, or less where the camera is chosen for the scene]",
-            ),
-            add(
-                "--far",
-                metavar="D",
-                type=Real(0, defaults.FARTHEST, min_open=True),
-                default=raster.far,
-                show_default=False,
-                help="Distance of the far plane along the optical axis, in world units; farther splats are left out."
-                f"  [default: {raster.far:g}, or more where the camera is chosen for the scene]",
-            ),
-            add(
-                "--through",
-                type=click.Choice(list(ROUND_TRIPS)),
-                help="Draw splats as Spark's PackedSplats or ExtSplats, or SPZ, round them; cuts stay those of the"
-                " file.  [default: as in the file]",
-            ),
-            add(
-                "--profile",
-                type=click.Choice(PROFILES),
-                default=raster.profile,
-                help="Falloff of splats with a LoD opacity above 1: as Spark 2 draws it (spark), or as its LoD design"
-                " describes it (shifted).",
-            ),
-            add(
-                "--sort",
-                type=click.Choice(SORTS),
-                default=raster.sort,
-                help="Order of the splats: by distance from the camera (radial), or along its axis (z).",
-            ),
-            add(
-                "--backend",
-                type=click.Choice(list(BACKENDS)),
-                default=next(iter(BACKENDS)),
-                help="Renderer: numba is the reference, osmesa is OpenGL in software, open3d is a quick look.",
-            ),
-            add(
-                "--sorting",
-                type=click.Choice(SORTINGS),
-                help="With --backend osmesa: sort exactly, or by 16 bits of the depth as antimatter15's viewer does"
-                " (counting16).  [default: exact]",
-            ),
-            add(
-                "--sort-throttle",
-                metavar="X",
-                type=Real(0, 2),
-                help="With --backend osmesa: keep the order until the cosine between the view directions falls below"
-                " 1 - X, such as 0.01.  [default: 0]",
-            ),
-        )
-    ):
-        command = each(command)
-    return command
+    return with_options(
+        command,
+        option(
+            "--background",
+            heading=COMMON,
+            type=Background(),
+            default="black",
+            help="Colour behind the splats: '#rrggbb', black, white or transparent.",
+        ),
+        add("--alpha", is_flag=True, help="Keep alpha, as --background transparent does."),
+        add(
+            "--supersample",
+            metavar="N",
+            type=click.IntRange(1, defaults.MAX_SUPERSAMPLE),
+            default=1,
+            help="Draw each pixel as the mean of N x N samples, up to 4 x 4.",
+        ),
+        add(
+            "--color-by",
+            type=click.Choice(COLOR_BY),
+            help="Colour splats by a quantity, unlit, with a colour bar beside the picture.  [default: their own"
+            " colours]",
+        ),
+        add("--no-bar", is_flag=True, help="Leave out the colour bar of --color-by or --diff."),
+        add(
+            "--style",
+            type=click.Choice(STYLES),
+            default=STYLES[0],
+            help="Shape of each splat: its Gaussian, one opaque pixel (points), or an opaque disc, in the order of"
+            " the file (billboards) or from far to near (sorted-billboards).",
+        ),
+        add(
+            "--near",
+            metavar="D",
+            type=Real(0, defaults.FARTHEST, min_open=True),
+            default=raster.near,
+            show_default=False,
+            help="Distance of the near plane along the optical axis, in world units; nearer splats are left out."
+            f"  [default: {raster.near:g}, or less where the camera is chosen for the scene]",
+        ),
+        add(
+            "--far",
+            metavar="D",
+            type=Real(0, defaults.FARTHEST, min_open=True),
+            default=raster.far,
+            show_default=False,
+            help="Distance of the far plane along the optical axis, in world units; farther splats are left out."
+            f"  [default: {raster.far:g}, or more where the camera is chosen for the scene]",
+        ),
+        add(
+            "--through",
+            type=click.Choice(list(ROUND_TRIPS)),
+            help="Draw splats as Spark's PackedSplats or ExtSplats, or SPZ, round them; cuts stay those of the"
+            " file.  [default: as in the file]",
+        ),
+        add(
+            "--profile",
+            type=click.Choice(PROFILES),
+            default=raster.profile,
+            help="Falloff of splats with a LoD opacity above 1: as Spark 2 draws it (spark), or as its LoD design"
+            " describes it (shifted).",
+        ),
+        add(
+            "--sort",
+            type=click.Choice(SORTS),
+            default=raster.sort,
+            help="Order of the splats: by distance from the camera (radial), or along its axis (z).",
+        ),
+        add(
+            "--backend",
+            type=click.Choice(list(BACKENDS)),
+            default=next(iter(BACKENDS)),
+            help="Renderer: numba is the reference, osmesa is OpenGL in software, open3d is a quick look.",
+        ),
+        add(
+            "--sorting",
+            type=click.Choice(SORTINGS),
+            help="With --backend osmesa: sort exactly, or by 16 bits of the depth as antimatter15's viewer does"
+            " (counting16).  [default: exact]",
+        ),
+        add(
+            "--sort-throttle",
+            metavar="X",
+            type=Real(0, 2),
+            help="With --backend osmesa: keep the order until the cosine between the view directions falls below"
+            " 1 - X, such as 0.01.  [default: 0]",
+        ),
+    )

@@ -10,7 +10,7 @@ import click
 from ...codecs.gpu.table import ENCODINGS, NPZ, RAW_SUFFIXES
 from ...lod.builders import BUILDERS, METHODS
 from ...support import defaults
-from ..command import COMMON, option
+from ..command import COMMON, option, with_options
 from ..paths import InputPath
 from ..usage import is_given, refuse
 from .common import Command
@@ -168,9 +168,7 @@ OPTIONS: tuple[Callable[[Command], Command], ...] = (
 
 def baking_options(command: Command) -> Command:
     """Adds the options of this module; `bake_settings` and `write_options` take what they are given."""
-    for add in reversed(OPTIONS):
-        command = add(command)
-    return command
+    return with_options(command, *OPTIONS)
 
 
 def check_method(ctx: click.Context) -> None:

@@ -12,8 +12,9 @@ import click
 from ... import __version__
 from ...support.defaults import MAX_THREADS
 from ...tables.files import FORMS
-from ..command import COMMON, GENERAL, option
+from ..command import COMMON, GENERAL, option, with_options
 from ..console import Console, Verbosity
+from ..paths import OutputPath
 
 #: Suffixes, without a point, of what is no table, whatever format is asked for.
 NO_TABLES = ("gif", "html", "ksplat", "mp4", "npy", "npz", "ply", "png", "sog", "splat", "spz", "webp")
@@ -76,6 +77,21 @@ def overwrite_option(command: Command) -> Command:
     return option("-f", "--overwrite", heading=COMMON, is_flag=True, help="Replace outputs that exist.")(command)
 
 
+def output_option(text: str) -> Callable[[Command], Command]:
+    """`-o`, `--output`, with its help, which says the default."""
+    return option("-o", "--output", heading=COMMON, metavar="FILE", type=OutputPath(), help=text, show_default=False)
+
+
+def assert_option(text: str, heading: str = COMMON) -> Callable[[Command], Command]:
+    """`--assert`, which can be given several times, with its help."""
+    return option("--assert", "asserts", heading=heading, metavar="TEXT", multiple=True, help=text)
+
+
+def plot_option(text: str, heading: str = COMMON) -> Callable[[Command], Command]:
+    """`--plot`, a picture of a table or of a file, with its help."""
+    return option("--plot", heading=heading, metavar="FILE", type=OutputPath(suffixes=[".png"]), help=text)
+
+
 def processors_to_use() -> int:
     """What --threads is by default."""
     from ...support.parallel import processors
@@ -95,11 +111,8 @@ def common_options(
         command: that gets them.
         json, quiet: help texts of the options of these names.
     """
-    for add in (
-        click.version_option(__version__, package_name="sparklod"),
-        verbose_option("Print how long each stage took, and which settings were chosen."),
-        option("-q", "--quiet", heading=GENERAL, is_flag=True, help=quiet),
-        option("--json", "as_json", heading=GENERAL, is_flag=True, help=json),
+    return with_options(
+        command,
         option(
             "--threads",
             heading=GENERAL,
@@ -109,6 +122,8 @@ def common_options(
             show_default="all processors",
             help="Number of threads to work on.",
         ),
-    ):
-        command = add(command)
-    return command
+        option("--json", "as_json", heading=GENERAL, is_flag=True, help=json),
+        option("-q", "--quiet", heading=GENERAL, is_flag=True, help=quiet),
+        verbose_option("Print how long each stage took, and which settings were chosen."),
+        click.version_option(__version__, package_name="sparklod"),
+    )

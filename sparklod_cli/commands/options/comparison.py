@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING
 import click
 
 from ...support import defaults
-from ..command import option
-from ..paths import InputPath, OutputPath
+from ..command import option, with_options
+from ..paths import InputPath
 from ..usage import exclude, require
 from .appearance import Appearance
-from .common import Command
+from .common import Command, assert_option, plot_option
 from .types import Real
 
 if TYPE_CHECKING:
@@ -112,47 +112,36 @@ class Comparison:
 def comparison_options(command: Command) -> Command:
     """The options of `Comparison`."""
     add = functools.partial(option, heading=HEADING)
-    for each in reversed(
-        (
-            add(
-                "--compare",
-                is_flag=True,
-                help="Measure how far the cuts of each --budget are from full detail, as a table instead of pictures.",
-            ),
-            add(
-                "--assert",
-                "asserts",
-                metavar="TEXT",
-                multiple=True,
-                help="With --compare: a condition that must hold, such as 'psnr_min>30', or '5%:psnr>30' for one of the"
-                " budgets; the exit status is 3 if it does not.",
-            ),
-            add(
-                "--plot",
-                metavar="FILE",
-                type=OutputPath(suffixes=[".png"]),
-                help="With --compare: draw charts of the table as a .png.",
-            ),
-            add(
-                "--max-sh",
-                metavar="N",
-                type=click.IntRange(0, defaults.MAX_SH_DEGREE),
-                default=defaults.MAX_SH_DEGREE,
-                help="With --compare: highest degree of spherical harmonics to draw.",
-            ),
-            add(
-                "--diff",
-                metavar="FILE",
-                type=InputPath(),
-                help="Draw the difference from the picture of another file, and print its PSNR.",
-            ),
-            add(
-                "--gain",
-                metavar="X",
-                type=Real(0, min_open=True),
-                help="Factor by which --diff multiplies differences.  [default: chosen for the pictures]",
-            ),
-        )
-    ):
-        command = each(command)
-    return command
+    return with_options(
+        command,
+        add(
+            "--compare",
+            is_flag=True,
+            help="Measure how far the cuts of each --budget are from full detail, as a table instead of pictures.",
+        ),
+        assert_option(
+            "With --compare: a condition that must hold, such as 'psnr_min>30', or '5%:psnr>30' for one of the"
+            " budgets; the exit status is 3 if it does not.",
+            HEADING,
+        ),
+        plot_option("With --compare: draw charts of the table as a .png.", HEADING),
+        add(
+            "--max-sh",
+            metavar="N",
+            type=click.IntRange(0, defaults.MAX_SH_DEGREE),
+            default=defaults.MAX_SH_DEGREE,
+            help="With --compare: highest degree of spherical harmonics to draw.",
+        ),
+        add(
+            "--diff",
+            metavar="FILE",
+            type=InputPath(),
+            help="Draw the difference from the picture of another file, and print its PSNR.",
+        ),
+        add(
+            "--gain",
+            metavar="X",
+            type=Real(0, min_open=True),
+            help="Factor by which --diff multiplies differences.  [default: chosen for the pictures]",
+        ),
+    )

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from ...support import defaults
-from ..command import COMMON, option
+from ..command import COMMON, option, with_options
 from ..usage import exclude, flag_of, require
 from .common import Command
 from .types import Quantity, Real
@@ -192,85 +192,82 @@ def cut_options(command: Command, *, pictures: bool = False) -> Command:
             f"  [default: {defaults.BLEND:g}]",
         ),
     )
-    for each in reversed(
-        (
-            option(
-                "--budget",
-                heading=COMMON,
-                type=Quantity("N|P%,..." if pictures else "N|P%", _budgets),
-                help="Largest number of splats to draw, such as 500k, or a share of the leaves, such as 5%"
-                f"{several}.  [default: that of --preset]",
-            ),
-            *(of_pictures if pictures else ()),
-            add(
-                "--preset",
-                type=click.Choice(list(defaults.PRESETS)),
-                default="desktop",
-                help="Budget of a device: Spark 2's, or that of Spark's LoD design with preview-desktop and mobile.",
-            ),
-            add(
-                "--lod-splat-scale",
-                metavar="X",
-                type=Real(0, min_open=True),
-                default=1.0,
-                help="Factor by which the budget is multiplied.",
-            ),
-            add(
-                "--lod-render-scale",
-                metavar="X",
-                type=Real(0),
-                default=1.0,
-                help="Stop refining nodes smaller than this many pixels.",
-            ),
-            add(
-                "--pixel-scale-limit",
-                metavar="X",
-                type=Real(0),
-                help="Stop refining nodes of this size over distance, or smaller.  [default: that of a pixel, times"
-                " --lod-render-scale]",
-            ),
-            add(
-                "--cone-fov0",
-                metavar="DEGREES",
-                type=Real(0, 180),
-                default=defaults.CONE_FOV0,
-                help="Full angle of the inner foveation cone, in degrees: full priority inside it.",
-            ),
-            add(
-                "--cone-fov",
-                metavar="DEGREES",
-                type=Real(0, 180),
-                default=defaults.CONE_FOV,
-                help="Full angle of the outer cone, in degrees, where priority has fallen to --cone-foveate.",
-            ),
-            add(
-                "--cone-foveate",
-                metavar="X",
-                type=Real(0),
-                default=defaults.CONE_FOVEATE,
-                help=f"Priority of nodes at the outer cone, {priority}.",
-            ),
-            add(
-                "--outside-foveate",
-                metavar="X",
-                type=Real(0),
-                help="Priority of nodes outside the frustum, in place of the cones, as in Spark's LoD design.",
-            ),
-            add(
-                "--behind-foveate",
-                metavar="X",
-                type=Real(0),
-                help="Priority of nodes behind the camera."
-                f"  [default: {defaults.BEHIND_FOVEATE:g}; 1 with --outside-foveate]",
-            ),
-            add(
-                "--precision",
-                type=click.Choice(defaults.PRECISIONS),
-                default=defaults.PRECISIONS[0],
-                help="Precision of the centres and sizes that cuts are found with: the file's, or half floats, which is"
-                " nearly what Spark holds.",
-            ),
-        )
-    ):
-        command = each(command)
-    return command
+    return with_options(
+        command,
+        option(
+            "--budget",
+            heading=COMMON,
+            type=Quantity("N|P%,..." if pictures else "N|P%", _budgets),
+            help="Largest number of splats to draw, such as 500k, or a share of the leaves, such as 5%"
+            f"{several}.  [default: that of --preset]",
+        ),
+        *(of_pictures if pictures else ()),
+        add(
+            "--preset",
+            type=click.Choice(list(defaults.PRESETS)),
+            default="desktop",
+            help="Budget of a device: Spark 2's, or that of Spark's LoD design with preview-desktop and mobile.",
+        ),
+        add(
+            "--lod-splat-scale",
+            metavar="X",
+            type=Real(0, min_open=True),
+            default=1.0,
+            help="Factor by which the budget is multiplied.",
+        ),
+        add(
+            "--lod-render-scale",
+            metavar="X",
+            type=Real(0),
+            default=1.0,
+            help="Stop refining nodes smaller than this many pixels.",
+        ),
+        add(
+            "--pixel-scale-limit",
+            metavar="X",
+            type=Real(0),
+            help="Stop refining nodes of this size over distance, or smaller.  [default: that of a pixel, times"
+            " --lod-render-scale]",
+        ),
+        add(
+            "--cone-fov0",
+            metavar="DEGREES",
+            type=Real(0, 180),
+            default=defaults.CONE_FOV0,
+            help="Full angle of the inner foveation cone, in degrees: full priority inside it.",
+        ),
+        add(
+            "--cone-fov",
+            metavar="DEGREES",
+            type=Real(0, 180),
+            default=defaults.CONE_FOV,
+            help="Full angle of the outer cone, in degrees, where priority has fallen to --cone-foveate.",
+        ),
+        add(
+            "--cone-foveate",
+            metavar="X",
+            type=Real(0),
+            default=defaults.CONE_FOVEATE,
+            help=f"Priority of nodes at the outer cone, {priority}.",
+        ),
+        add(
+            "--outside-foveate",
+            metavar="X",
+            type=Real(0),
+            help="Priority of nodes outside the frustum, in place of the cones, as in Spark's LoD design.",
+        ),
+        add(
+            "--behind-foveate",
+            metavar="X",
+            type=Real(0),
+            help="Priority of nodes behind the camera."
+            f"  [default: {defaults.BEHIND_FOVEATE:g}; 1 with --outside-foveate]",
+        ),
+        add(
+            "--precision",
+            type=click.Choice(defaults.PRECISIONS),
+            default=defaults.PRECISIONS[0],
+            help="Precision of the centres and sizes that cuts are found with: the file's, or half floats, which is"
+            " nearly what Spark holds.",
+        ),
+    )

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ..command import option
+from ..command import option, with_options
 from ..paths import InputPath
 from .common import Command
 
@@ -56,7 +56,9 @@ class Inputs:
 
 def input_options(command: Command) -> Command:
     """The files and `--scene`."""
-    for add in (
+    return with_options(
+        command,
+        click.argument("files", metavar="[FILE]...", nargs=-1, type=InputPath()),
         option(
             "--scene",
             heading=HEADING,
@@ -64,7 +66,4 @@ def input_options(command: Command) -> Command:
             type=InputPath(),
             help="Read an instances file: JSON that lists splat files and where they stand (see docs/traverse.md).",
         ),
-        click.argument("files", metavar="[FILE]...", nargs=-1, type=InputPath()),
-    ):
-        command = add(command)
-    return command
+    )

@@ -12,10 +12,10 @@ import click
 
 from ...support.defaults import MAX_SH_DEGREE, PLOT_BY
 from ...support.units import parse_size
-from ..command import COMMON, option
+from ..command import COMMON, option, with_options
 from ..paths import InputPath, OutputPath
 from ..usage import refuse
-from .common import Command
+from .common import Command, assert_option, plot_option
 from .types import Quantity, Real
 
 if TYPE_CHECKING:
@@ -37,14 +37,9 @@ OPTIONS: tuple[Callable[[Command], Command], ...] = (
         is_flag=True,
         help="Look for everything that can be wrong, and print a line for each finding instead of a report.",
     ),
-    option(
-        "--assert",
-        "asserts",
-        heading=COMMON,
-        metavar="TEXT",
-        multiple=True,
-        help="Expect this of every file, such as 'nodes<5M', 'bytes<=40MB' or 'tree.depth<24'; can be given several"
-        " times. The exit status is 3 if it does not hold.",
+    assert_option(
+        "Expect this of every file, such as 'nodes<5M', 'bytes<=40MB' or 'tree.depth<24'; can be given several"
+        " times. The exit status is 3 if it does not hold."
     ),
     option("--require-lod", heading=COMMON, is_flag=True, help="Expect a Level-of-Detail tree."),
     option(
@@ -136,13 +131,7 @@ OPTIONS: tuple[Callable[[Command], Command], ...] = (
         callback=_print_schema,
         help="Print the JSON Schema of --json and exit.",
     ),
-    option(
-        "--plot",
-        heading=PICTURES,
-        metavar="FILE",
-        type=OutputPath(suffixes=[".png"]),
-        help="Draw the structure of a single file as a .png, with pyvista.",
-    ),
+    plot_option("Draw the structure of a single file as a .png, with pyvista.", PICTURES),
     option(
         "--plot-level",
         heading=PICTURES,
@@ -162,9 +151,7 @@ OPTIONS: tuple[Callable[[Command], Command], ...] = (
 
 def inspect_options(command: Command) -> Command:
     """Adds the options of this module, of which `Checks`, `Output` and `Pictures` have the values."""
-    for add in reversed(OPTIONS):
-        command = add(command)
-    return command
+    return with_options(command, *OPTIONS)
 
 
 @dataclass(frozen=True)

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 import click
 
 from ...images.defaults import JPEG_QUALITY, THUMBNAIL_SIZE, THUMBNAIL_SUPERSAMPLE
-from ..command import COMMON, option
-from ..paths import OutputPath, stem_of
+from ..command import COMMON, option, with_options
+from ..paths import stem_of
 from ..usage import exclude, require
-from .common import Command, overwrite_option
+from .common import Command, output_option, overwrite_option
 
 if TYPE_CHECKING:
     from ...cameras.camera import Camera
@@ -117,42 +117,34 @@ def picture_options(command: Command) -> Command:
     """The options of `Pictures`."""
     add = functools.partial(option, heading=HEADING)
     width, height = THUMBNAIL_SIZE
-    for each in reversed(
-        (
-            option(
-                "-o",
-                "--output",
-                heading=COMMON,
-                metavar="FILE",
-                type=OutputPath(),
-                help="Write a .png, .jpg, .webp or .npy (floats), or with out.%04d.png one for each camera; a .mp4,"
-                " .webm, .gif or .webp for an animation; with --compare a .csv, .json or .parquet; - is standard"
-                " output.  [default: NAME.png beside the first FILE; with --compare standard output]",
-            ),
-            overwrite_option,
-            option(
-                "--thumbnail",
-                heading=COMMON,
-                is_flag=True,
-                help=f"Draw a small picture of the whole scene: {width}x{height} pixels, each the mean of"
-                f" {THUMBNAIL_SUPERSAMPLE} x {THUMBNAIL_SUPERSAMPLE} samples, to NAME-thumbnail.png.",
-            ),
-            add("--sheet", is_flag=True, help="Put the pictures of all cameras on one contact sheet."),
-            add(
-                "--jobs",
-                metavar="N",
-                type=click.IntRange(1, 256),
-                default=2,
-                help="Number of pictures to work on at a time: while one is drawn, others are sorted and written.",
-            ),
-            add(
-                "--jpeg-quality",
-                metavar="N",
-                type=click.IntRange(1, 100),
-                default=JPEG_QUALITY,
-                help="Quality of a .jpg, from 1 to 100.",
-            ),
-        )
-    ):
-        command = each(command)
-    return command
+    return with_options(
+        command,
+        output_option(
+            "Write a .png, .jpg, .webp or .npy (floats), or with out.%04d.png one for each camera; a .mp4,"
+            " .webm, .gif or .webp for an animation; with --compare a .csv, .json or .parquet; - is standard"
+            " output.  [default: NAME.png beside the first FILE; with --compare standard output]"
+        ),
+        overwrite_option,
+        option(
+            "--thumbnail",
+            heading=COMMON,
+            is_flag=True,
+            help=f"Draw a small picture of the whole scene: {width}x{height} pixels, each the mean of"
+            f" {THUMBNAIL_SUPERSAMPLE} x {THUMBNAIL_SUPERSAMPLE} samples, to NAME-thumbnail.png.",
+        ),
+        add("--sheet", is_flag=True, help="Put the pictures of all cameras on one contact sheet."),
+        add(
+            "--jobs",
+            metavar="N",
+            type=click.IntRange(1, 256),
+            default=2,
+            help="Number of pictures to work on at a time: while one is drawn, others are sorted and written.",
+        ),
+        add(
+            "--jpeg-quality",
+            metavar="N",
+            type=click.IntRange(1, 100),
+            default=JPEG_QUALITY,
+            help="Quality of a .jpg, from 1 to 100.",
+        ),
+    )

@@ -10,7 +10,7 @@ import click
 
 from ...support import defaults
 from ...support.units import parse_bandwidth, parse_latency
-from ..command import option
+from ..command import option, with_options
 from ..usage import require
 from .common import Command
 from .types import Quantity
@@ -58,32 +58,29 @@ class Streaming:
 def streaming_options(command: Command) -> Command:
     """The options of `Streaming`."""
     add = functools.partial(option, heading=HEADING)
-    for each in reversed(
-        (
-            add(
-                "--chunk-cache",
-                metavar="N",
-                type=click.IntRange(1),
-                help="Number of chunks, of 65,536 nodes each, that fit into memory.  [default: all]",
-            ),
-            add(
-                "--bandwidth",
-                type=Quantity("RATE", parse_bandwidth),
-                help="Simulate streaming over a network of this bandwidth, such as 20Mbit."
-                "  [default: every chunk is resident]",
-            ),
-            add(
-                "--latency",
-                type=Quantity("TIME", parse_latency),
-                help="Time from a request to the first byte, such as 60ms.  [default: 0ms]",
-            ),
-            add(
-                "--fetchers",
-                metavar="N",
-                type=click.IntRange(1, 1000),
-                help=f"Number of chunks that are fetched at a time.  [default: {defaults.FETCHERS}]",
-            ),
-        )
-    ):
-        command = each(command)
-    return command
+    return with_options(
+        command,
+        add(
+            "--chunk-cache",
+            metavar="N",
+            type=click.IntRange(1),
+            help="Number of chunks, of 65,536 nodes each, that fit into memory.  [default: all]",
+        ),
+        add(
+            "--bandwidth",
+            type=Quantity("RATE", parse_bandwidth),
+            help="Simulate streaming over a network of this bandwidth, such as 20Mbit."
+            "  [default: every chunk is resident]",
+        ),
+        add(
+            "--latency",
+            type=Quantity("TIME", parse_latency),
+            help="Time from a request to the first byte, such as 60ms.  [default: 0ms]",
+        ),
+        add(
+            "--fetchers",
+            metavar="N",
+            type=click.IntRange(1, 1000),
+            help=f"Number of chunks that are fetched at a time.  [default: {defaults.FETCHERS}]",
+        ),
+    )

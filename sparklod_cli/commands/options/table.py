@@ -12,11 +12,11 @@ import click
 
 from ...support.stdin import DASH
 from ...tables.files import FORMS
-from ..command import COMMON, option
+from ..command import COMMON, option, with_options
 from ..console import is_terminal
 from ..paths import OutputPath
 from ..usage import exclude, given, require
-from .common import Command, overwrite_option, table_form
+from .common import Command, assert_option, output_option, overwrite_option, plot_option, table_form
 
 if TYPE_CHECKING:
     from ...simulation.outputs import FrameOutputs
@@ -107,59 +107,41 @@ def table_options(command: Command) -> Command:
     """The options of `Table`."""
     add = functools.partial(option, heading=HEADING)
     common = functools.partial(option, heading=COMMON)
-    for each in reversed(
-        (
-            common(
-                "-o",
-                "--output",
-                metavar="FILE",
-                type=OutputPath(),
-                help="Write the table to FILE: .csv, .json or .parquet; - is standard output.  [default: standard"
-                " output, but for a terminal, which gets the summary]",
-            ),
-            overwrite_option,
-            common(
-                "--summary/--no-summary",
-                default=None,
-                help="Print what the frames come to, on standard error.  [default: if that is a terminal]",
-            ),
-            common(
-                "--assert",
-                "asserts",
-                metavar="TEXT",
-                multiple=True,
-                help="Condition that must hold, such as 'churn_p95<0.2'; the exit status is 3 if it does not.",
-            ),
-            common(
-                "--plot",
-                metavar="FILE",
-                type=OutputPath(suffixes=[".png"]),
-                help="Draw charts of the table and the path over the scene, as a .png.",
-            ),
-            add(
-                "--format",
-                "form",
-                type=click.Choice(list(FORMS)),
-                help="Format of the table.  [default: by the suffix of --output, or csv]",
-            ),
-            add("--per-instance", is_flag=True, help="Write a row for each instance, besides that of all together."),
-            add(
-                "--no-timing",
-                is_flag=True,
-                help="Leave out traverse_ms, the time that each traversal took, so that two runs write the same bytes.",
-            ),
-            add(
-                "--indices-out",
-                metavar="DIR",
-                type=OutputPath(folder=True),
-                help="Write the nodes of every cut to DIR, as .npy of uint32.",
-            ),
-            add(
-                "--padded",
-                is_flag=True,
-                help="With --indices-out: pad each file to rows of 16,384 nodes, as Spark's index texture has them.",
-            ),
-        )
-    ):
-        command = each(command)
-    return command
+    return with_options(
+        command,
+        output_option(
+            "Write the table to FILE: .csv, .json or .parquet; - is standard output.  [default: standard"
+            " output, but for a terminal, which gets the summary]"
+        ),
+        overwrite_option,
+        common(
+            "--summary/--no-summary",
+            default=None,
+            help="Print what the frames come to, on standard error.  [default: if that is a terminal]",
+        ),
+        assert_option("Condition that must hold, such as 'churn_p95<0.2'; the exit status is 3 if it does not."),
+        plot_option("Draw charts of the table and the path over the scene, as a .png."),
+        add(
+            "--format",
+            "form",
+            type=click.Choice(list(FORMS)),
+            help="Format of the table.  [default: by the suffix of --output, or csv]",
+        ),
+        add("--per-instance", is_flag=True, help="Write a row for each instance, besides that of all together."),
+        add(
+            "--no-timing",
+            is_flag=True,
+            help="Leave out traverse_ms, the time that each traversal took, so that two runs write the same bytes.",
+        ),
+        add(
+            "--indices-out",
+            metavar="DIR",
+            type=OutputPath(folder=True),
+            help="Write the nodes of every cut to DIR, as .npy of uint32.",
+        ),
+        add(
+            "--padded",
+            is_flag=True,
+            help="With --indices-out: pad each file to rows of 16,384 nodes, as Spark's index texture has them.",
+        ),
+    )

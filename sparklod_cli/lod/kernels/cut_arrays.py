@@ -28,7 +28,7 @@ class Trees(NamedTuple):
     Attributes:
         nodes: `NODE` of all trees, one after the other.
         views: (instances,) `VIEW`.
-        resident: (chunks,) bool, of all trees: the chunk's nodes are there. A node is not refined unless its children
+        resident: (chunks,) bool, of all trees: the chunk is loaded. A node is not refined unless its children
             are.
         chunk_bits: a chunk has 2 ** chunk_bits nodes.
     """

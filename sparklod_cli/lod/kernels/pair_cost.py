@@ -1,4 +1,4 @@
-"""Which nodes the quality builder merges: costs of pairs of neighbours along a curve, and the cheapest pairs.
+"""Selects the nodes that the quality builder merges: the cheapest pairs of neighbours along a curve.
 
 The quality builder's node row is one cache line: 16 float32 for each node of the growing tree. Lengths are in a unit
 near the median scale, with the origin in the middle of the scene, so that float32 holds their squares and products.

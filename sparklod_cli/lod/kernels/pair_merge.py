@@ -1,4 +1,4 @@
-"""Merges pairs of nodes into nodes that cover what the two cover together.
+"""Merges pairs of nodes into nodes that cover the union of both.
 
 Coverage is opacity integrated over the plane of projection. The coverage of a union is the sum of the two coverages
 less that of the overlap, and the same holds for first and second moments. The overlap's coverage is the integral of a
@@ -18,7 +18,7 @@ from .geometry import ellipsoid_area
 from .pair_cost import CENTER, COLOR, COVARIANCE, COVERED, DENSITY, LOG_DET, WEIGHT, log_det
 from .profile import profile_of, size_factor
 
-#: Weight of opacity beside each channel of colour in the error of a picture, which may have any background. Chosen.
+#: Weight of opacity relative to each colour channel in the error of a picture, which may have any background. Chosen.
 ALPHA_WEIGHT = 1.0
 
 #: Row and column of the elements xx yy zz xy xz yz.

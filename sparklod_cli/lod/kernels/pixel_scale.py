@@ -1,4 +1,4 @@
-"""The pixel scale of a node, its angular size: the number that the traversal orders nodes by."""
+"""The pixel scale of a node: its angular size, by which the traversal orders nodes."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import numpy as np
 
 from ...support.jit import kernel
 
-#: A node as the traversal reads it; links are relative to its own tree. Siblings are adjacent, so that a node's
-#: children are in a few cache lines.
+#: A node as the traversal reads it; child indices are relative to its own tree. Siblings are adjacent, so that
+#: a node's children share a few cache lines.
 NODE = np.dtype(
     [
         ("x", "<f4"),  # centre, object space
@@ -40,7 +40,7 @@ VIEW = np.dtype(
 #: Kinds of foveation.
 NO_FOVEATION, CONE, FRUSTUM = 0, 1, 2
 
-#: Least distance to a node, in object space: nearer ones count as at this distance, as in Spark 2.2.0's traversal.
+#: Least distance to a node, in object space; nearer nodes are treated as this far away, as in Spark 2.2.0's traversal.
 NEAREST = np.float32(1e-6)
 ZERO, ONE, INFINITE = np.float32(0), np.float32(1), np.float32(np.inf)
 
@@ -94,7 +94,7 @@ def pixel_scale(node, view):
 
 @kernel(nogil=True)
 def pixel_scales(nodes, index, views, number, scales):
-    """Pixel scales of some nodes, without sign; NaN becomes infinite. Cuts order them so, too.
+    """Absolute pixel scales of some nodes, with NaN as infinity, as cuts order them.
 
     Args:
         nodes: `NODE` of one tree.

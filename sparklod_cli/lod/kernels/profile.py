@@ -1,4 +1,4 @@
-"""Opacity profiles of merged splats: their coverage and variance on the screen, and the profile that has given ones.
+"""Opacity profiles of merged splats: their coverage and variance on the screen, and the inverse.
 
 Spark draws a splat of linear opacity A > 1 with the alpha 1 - (1 - exp(-t)) ** A, t = z^2 / 2, which is that of A equal
 splats on top of each other. Its coverage, the integral over the plane, is 2 pi sigma^2 * H(A), where H(A) is the

@@ -1,4 +1,4 @@
-"""Facts about the links of a tree that may be broken, in linear time."""
+"""Linear-time checks and statistics of the parent-child links of a tree that may be invalid."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from ...support.jit import kernel
 from .geometry import ellipsoid_area
 
 #: Links followed per node at most. A tree has fewer than one; in a broken tree nodes may share children, so that links
-#: are up to the square of the nodes. Chosen.
+#: can number up to the square of the nodes. Chosen.
 MAX_LINKS = 4
 
 #: Least surface area of a child, so that children whose areas are not float64 numbers above 0 count equally. Chosen.
@@ -17,9 +17,9 @@ LEAST_AREA = 1e-300
 
 @kernel()
 def find_depths(child_count, child_start, size):
-    """Depths of the nodes that can be reached from the root.
+    """Depths of the nodes that are reachable from the root.
 
-    Takes linear time whatever the links are: at most MAX_LINKS per node are followed.
+    Takes linear time for any links: at most MAX_LINKS per node are followed.
 
     Args:
         child_count: (N,) of any unsigned type; N is at least 1.

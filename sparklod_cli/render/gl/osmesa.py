@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from ...cameras.camera import Camera
+from ...support.optional import optional_import
 from ..backends import BackendError
 from ..rasterizer import Image, world_to_camera
 from ..settings import RasterSettings
@@ -209,10 +210,8 @@ def open_context() -> Any:
     Raises:
         BackendError: there is none; it names the packages that bring one.
     """
-    try:
+    with optional_import("the backend osmesa draws by moderngl", "sparklod[render]", BackendError):
         import moderngl  # noqa: F401
-    except ImportError as error:
-        raise BackendError(f"the backend osmesa draws by moderngl: pip install 'sparklod[render]' ({error})") from None
     reasons = []
     for kind in contexts.PACKAGES:
         reason = contexts.probe(kind)

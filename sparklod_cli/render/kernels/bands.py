@@ -1,4 +1,4 @@
-"""Draws discs, and counts fragments, in bands of rows, each of which one thread owns."""
+"""Draws discs and counts fragments in bands of rows; each band is processed by one thread."""
 
 from __future__ import annotations
 

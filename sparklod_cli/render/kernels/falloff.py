@@ -23,7 +23,7 @@ MINUS_HALF_LOG2E = f32(-0.7213475204444817)
 #: only 0 is raised to it.
 LEAST_REST = f32(1e-30)
 
-#: Least argument of `exp2`, which is exact down to -126. 2 ** -120 is lost beside 1.
+#: Least argument of `exp2`, which is exact down to -126. 1 + 2 ** -120 is 1 in float32.
 LEAST_EXPONENT = f32(-120)
 
 

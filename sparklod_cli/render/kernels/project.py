@@ -68,7 +68,7 @@ class Lens(NamedTuple):
 
 
 class Limits(NamedTuple):
-    """What is drawn of splats; float32, see `RasterSettings` and the constants beside it.
+    """Limits on what is drawn, float32; see `RasterSettings` and the constants in its module.
 
     Attributes:
         near, far: range of depths, world units.
@@ -198,7 +198,7 @@ def project(splats, world_to_camera, lens, limits, radial, screen, keys):
 
 @kernel(parallel=True)
 def gather_drawn(screen, keys, drawn):
-    """Copies the splats that are drawn, from near to far.
+    """Copies the drawn splats, from near to far.
 
     Args:
         screen: (N, COLUMNS) of `project`.

@@ -1,4 +1,4 @@
-"""Sorts splats into tiles, and draws the tiles."""
+"""Sorts splats into tiles and draws the tiles."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ f32 = np.float32
 #: Side of a tile, pixels, and pixels of a row that are blended at once: the float32 of one AVX2 vector.
 TILE, LANES = 16, 8
 
-#: A tile is finished when no pixel has a transmittance of this or more, a fortieth of an 8-bit step. Chosen.
+#: A tile is finished when no pixel has a transmittance of this or more, 1/40 of an 8-bit step. Chosen.
 OPAQUE = f32(1e-4)
 
-#: Splats after which a tile is checked for that. Chosen.
+#: Number of splats between two checks for OPAQUE. Chosen.
 CHECK_EVERY = 16
 
 

@@ -34,14 +34,14 @@ def child(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
 DRAW_ONE = """
 import numpy as np
 from sparklod_cli.support.errors import SparklodError
-from sparklod_cli.render import osmesa
+from sparklod_cli.render.gl import osmesa
 from sparklod_cli.cameras.camera import Camera
-from sparklod_cli.render.settings import Look
-from sparklod_cli.render.shading import Shown
+from sparklod_cli.render.settings import RasterSettings
+from sparklod_cli.render.shading import ShadedSplats
 rows = [[0, 0, -5]], [[0.1] * 3], [[0, 0, 0, 1]], [0.5], [[1, 1, 1]]
-shown = Shown(*(np.array(row, np.float32) for row in rows))
+shown = ShadedSplats(*(np.array(row, np.float32) for row in rows))
 try:
-    print(osmesa.draw(shown, Camera(np.eye(4), 8, 8, (1e3, 1e3), (4.5, 4.5)), Look())[4, 4, 3])
+    print(osmesa.draw(shown, Camera(np.eye(4), 8, 8, (1e3, 1e3), (4.5, 4.5)), RasterSettings())[4, 4, 3])
 except SparklodError as error:
     print(type(error).__name__, error)
 """
