@@ -1,4 +1,4 @@
-"""Files as streams of rows, decoded block by block, so that a file is never in memory as a whole."""
+"""Files as streams of rows, decoded and encoded in blocks, so that a file is never in memory as a whole."""
 
 from __future__ import annotations
 
@@ -57,3 +57,11 @@ def decode_rows(
 
     for done in ordered_map(run, rows, threads):
         progress("reading", done, count, "splat")
+
+
+def encode_rows(encode: Callable[[slice], bytes], count: int, threads: int, progress: Progress) -> Iterator[bytes]:
+    """The bytes of `count` rows in blocks, in order: `encode` is called with each block's rows, on several threads."""
+    parts = blocks_of(count)
+    for part, piece in zip(parts, ordered_map(encode, parts, threads), strict=True):
+        yield piece
+        progress("writing", part.stop, count, "splat")
