@@ -203,7 +203,7 @@ def _upside_down(asked: RenderOptions, scenes: Scenes) -> list[str]:
     plain = (loaded for loaded in scenes.loaded if loaded.scene.format.startswith("SPZ") and not loaded.is_tree)
     return [
         f"{loaded.name}: SPZ has y up by its specification, but cameras assume y down, as in trained scenes; give"
-        " --up 0,1,0 if the scene is upside down"
+        " --up y if the scene is upside down"
         for loaded in plain
     ]
 

@@ -93,6 +93,16 @@ def test_an_orbit_follows_its_options() -> None:
     assert np.allclose([camera.position for camera in path.cameras], [[0, -10, 0], [10, 0, 0], [0, 10, 0], [-10, 0, 0]])
 
 
+@pytest.mark.parametrize(
+    ("axis", "numbers"),
+    [("y", "0,1,0"), ("-y", "0,-1,0"), ("z", "0,0,1"), ("-z", "0,0,-1"), ("x", "1,0,0"), ("-x", "-1,0,0")],
+)
+def test_an_axis_is_up_by_its_name_or_its_numbers(axis: str, numbers: str) -> None:
+    named, numbered = (cameras("--orbit", "3", "--up", up).cameras for up in (axis, numbers))
+    for one, other in zip(named, numbered, strict=True):
+        assert np.array_equal(one.camera_to_world, other.camera_to_world)
+
+
 def test_a_portrait_orbit_keeps_its_distance() -> None:
     wide, tall = (cameras("--orbit", "1", "--size", size).cameras[0] for size in ("1000x500", "500x1000"))
     assert np.linalg.norm(tall.position - (1, 2, 3)) > 1.5 * np.linalg.norm(wide.position - (1, 2, 3))

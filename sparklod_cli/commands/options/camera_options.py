@@ -13,7 +13,7 @@ from ..command import COMMON, option, with_options
 from ..paths import InputPath
 from .cameras import HEADING
 from .common import Command
-from .types import Numbers, Real
+from .types import Direction, Numbers, Real
 from .views import Size, View, Views
 
 
@@ -93,9 +93,9 @@ def camera_options(command: Command, *, still: bool = False) -> Command:
         ),
         add(
             "--up",
-            type=Numbers("x", "y", "z"),
-            help="Direction that is up, for cameras of which only eye and target are known."
-            "  [default: 0,-1,0, as training leaves scenes with y down; 0,1,0 in SuperSplat's files]",
+            type=Direction(),
+            help="Direction that is up, as an axis such as -y or as x,y,z, for cameras of which only eye and target are"
+            " known.  [default: -y, as training leaves scenes with y down; y in SuperSplat's files]",
         ),
         add(
             "--world-transform",

@@ -31,6 +31,22 @@ class Numbers(click.ParamType):
         return self.name
 
 
+class Direction(Numbers):
+    """An axis by its name (y, -y, ...), or x,y,z, as a tuple of three floats."""
+
+    def __init__(self) -> None:
+        super().__init__("x", "y", "z")
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, ...]:
+        axes = {f"{sign}{name}" for name in "xyz" for sign in ("", "-")}
+        if value not in axes:
+            return super().convert(value, param, ctx)
+        return tuple((-1.0 if value[0] == "-" else 1.0) if name == value[-1] else 0.0 for name in "xyz")
+
+    def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:
+        return "AXIS|x,y,z"
+
+
 class Ball(Numbers):
     """x, y, z and a positive radius, as ((x, y, z), radius)."""
 

@@ -82,7 +82,7 @@ def test_a_plain_spz_may_stand_on_its_head(tmp_path: Path, capsys: Said) -> None
         (((), True), (("--up", "0,1,0"), False), (("--look-at", "0,0,3:0,0,0"), True), (("-q",), False))
     ):
         assert render(file, "--size", "64x48", *arguments, "-o", tmp_path / f"{number}.png") == 0
-        assert ("--up 0,1,0 if the scene is upside down" in capsys.readouterr().err) == noted
+        assert ("--up y if the scene is upside down" in capsys.readouterr().err) == noted
     assert render(TOWN, PLAIN, "--size", "64x48", "-o", tmp_path / "tree.png") == 0
     assert "upside down" not in capsys.readouterr().err
 
