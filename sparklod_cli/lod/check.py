@@ -1,4 +1,4 @@
-"""Checks the input of a builder."""
+"""Checks the input of the builders."""
 
 from __future__ import annotations
 
