@@ -8,7 +8,8 @@ from typing import Any
 
 from ..cameras.axes import Axes
 from ..cameras.defaults import ELEVATION
-from ..cameras.frame import Settings
+from ..cameras.formats.table import FORMATS
+from ..cameras.frame import MAX_FRAMES, Settings
 from ..cameras.path import CameraPath
 from ..cameras.sources import Orbit, read_path
 from ..cameras.world_transform import similarity
@@ -53,6 +54,11 @@ def read_cameras(
         raise CameraPathError(
             f"there are no axes {axes!r}; give one of {', '.join(each.value for each in Axes)}"
         ) from None
+    names = [each.name for each in FORMATS]
+    if format != "auto" and format not in names:
+        raise CameraPathError(f"there is no format {format!r}; give auto or one of {', '.join(names)}")
+    if every < 1:
+        raise CameraPathError(f"every is {every}; give 1 or more")
     settings = Settings(
         axes=chosen,
         world=None if world_transform is None else _matrix(world_transform),
@@ -99,6 +105,8 @@ def orbit(
         CameraPathError: a number is out of its range.
         InvalidSplatsError: the scenes have no finite splats.
     """
+    if not 1 <= count <= MAX_FRAMES:
+        raise CameraPathError(f"count is {count}; give 1 to {MAX_FRAMES:,} cameras")
     settings = Settings(size=size, fov_y=math.radians(fov_y), up=up)
     source = Orbit(count, center, distance, elevation)
     return source.cameras(settings, lambda: scenes_of(viewed, None).balls())

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+import contextlib
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,9 +12,19 @@ from ..io import examine_scene, read_scene, write_whole
 from ..lod.builders import BUILDERS, METHODS
 from ..model.scene import Scene, Tree
 from ..model.splats import COLUMNS
-from ..support.defaults import DEFAULT_BASE, DEFAULT_COMPRESSION, DEFAULT_GROWTH, MAX_SH_DEGREE
-from ..support.errors import FormatError, memory_errors_translated
+from ..support.defaults import (
+    DEFAULT_BASE,
+    DEFAULT_COMPRESSION,
+    DEFAULT_GROWTH,
+    MAX_BASE,
+    MAX_GROWTH,
+    MAX_SH_DEGREE,
+    MIN_BASE,
+    MIN_GROWTH,
+)
+from ..support.errors import FormatError, InvalidSplatsError, TreeError, memory_errors_translated
 from ..support.threads import on_threads, thread_count
+from .arguments import scene_like, whole_within, within
 from .progress import Told, telling
 
 if TYPE_CHECKING:
@@ -55,18 +66,28 @@ def read(
         TreeError: its tree is broken.
         OutOfMemoryError: it does not fit into memory.
     """
-    with telling(progress) as told, memory_errors_translated():
+    path = Path(path)
+    with telling(progress) as told, memory_errors_translated(), _naming(path):
         count = thread_count(threads)
         if columns is None:
-            scene = read_scene(Path(path), threads=count, progress=told)
+            scene = read_scene(path, threads=count, progress=told)
         else:
             unknown = sorted(set(columns) - set(COLUMNS))
             if unknown:
                 raise ValueError(f"there is no column {', '.join(unknown)}; give some of {', '.join(COLUMNS)}")
-            scene = examine_scene(Path(path), columns=columns, threads=count, progress=told)
-    if scene.tree is not None:
-        scene.tree.validate()
+            scene = examine_scene(path, columns=columns, threads=count, progress=told)
+        if scene.tree is not None:
+            scene.tree.validate()
     return as_tree(scene)
+
+
+@contextlib.contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    """Puts the file before what is wrong with it: Python, unlike a command, says nothing before it."""
+    try:
+        yield
+    except (FormatError, TreeError) as error:
+        raise type(error)(f"{path}: {error}") from None
 
 
 def as_tree(scene: Scene) -> Scene:
@@ -104,8 +125,9 @@ def write(
 
     Raises:
         FormatError: the format cannot hold the scene, or there is no such format.
+        InvalidSplatsError: the scene has no splats.
         OutputError: the file exists, or cannot be written.
-        ValueError: an option is out of its range.
+        ValueError: an option is out of its range, or one of SPZ is given for another format.
     """
     from ..codecs.formats import WRITABLE
     from ..codecs.gpu import dump
@@ -114,6 +136,13 @@ def write(
 
     path, count = Path(path), thread_count(threads)
     suffix = path.suffix.lower()
+    whole_within("compression_level", compression_level, 1, 9)
+    if fractional_bits is not None:
+        whole_within("fractional_bits", fractional_bits, 0, 24)
+    if (spz_version is not None or fractional_bits is not None) and (encoding is not None or suffix != ".spz"):
+        raise ValueError(f"{path}: spz_version and fractional_bits are of SPZ; leave them out, or write a .spz")
+    if not len(scene_like(scene).splats):
+        raise InvalidSplatsError(f"{path}: the scene has no splats to write")
     with telling(progress) as told, memory_errors_translated():
         if encoding is not None:
             arrays = pack(scene, encoding, threads=count)
@@ -154,15 +183,18 @@ def build_lod(
     Raises:
         FormatError: the scene has a tree already.
         InvalidSplatsError: some splats are invalid and `selection` does not drop them, or none is left.
-        ValueError: there is no such method.
+        ValueError: there is no such method, or an option is out of its range.
     """
     from ..bake import BakeSettings
     from ..model.selection import Selection
 
-    if scene.tree is not None:
+    if scene_like(scene).tree is not None:
         raise FormatError("the scene has a Level-of-Detail tree already; extract_leaves gives its splats")
     if method not in BUILDERS:
         raise ValueError(f"there is no method {method!r}; give one of {', '.join(BUILDERS)}")
+    within("base", base, MIN_BASE, MAX_BASE)
+    within("growth", growth, MIN_GROWTH, MAX_GROWTH)
+    whole_within("max_sh", max_sh, 0, MAX_SH_DEGREE)
     build = BakeSettings(method=method, base=base, growth=growth).builder()
     with on_threads(threads), telling(progress) as told, memory_errors_translated():
         kept, _ = (selection or Selection()).apply(scene.splats.with_max_sh(max_sh))
@@ -179,7 +211,7 @@ def extract_leaves(tree: Scene) -> Scene:
     """
     from ..extract_leaves import leaves_of
 
-    return leaves_of(tree)
+    return leaves_of(scene_like(tree))
 
 
 def pack(scene: Scene, encoding: str, *, threads: int | None = None) -> dict[str, NDArray[np.uint32]]:
@@ -201,7 +233,7 @@ def pack(scene: Scene, encoding: str, *, threads: int | None = None) -> dict[str
 
     if encoding not in ENCODINGS:
         raise ValueError(f"there is no encoding {encoding!r}; give one of {', '.join(ENCODINGS)}")
-    return dump.pack(scene, encoding, thread_count(threads))
+    return dump.pack(scene_like(scene), encoding, thread_count(threads))
 
 
 def unpack(arrays: Mapping[str, NDArray[np.uint32]], *, threads: int | None = None) -> Scene:

@@ -12,23 +12,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..cameras.framing import reach
 from ..model.instances import instances_of
-from ..model.splats import COLUMNS
 from ..scenes.finder import CutFinder
-from ..scenes.reading import TRAVERSED, read_scenes
-from ..support.progress import Progress, silent
+from ..support.progress import silent
 from ..support.threads import on_threads
+from .viewed_files import ViewedFiles
 
 if TYPE_CHECKING:
-    from ..cameras.frame import Settings
     from ..cameras.path import CameraPath
-    from ..cameras.sources import CameraSource
     from ..images.output import Output
     from ..images.sequence import Pictures, PictureSettings
     from ..lod.budget import Budget
     from ..lod.settings import LodSettings
-    from ..model.instances import Instance
     from ..render.settings import RenderSettings
     from ..scenes.loaded import Scenes
     from ..simulation.outputs import FrameOutputs, WrittenFrames
@@ -41,50 +36,6 @@ if TYPE_CHECKING:
 
 class UnfitError(ValueError):
     """What is asked for does not fit the scenes: a budget, or a chunk cache, too small for their roots."""
-
-
-@dataclass(frozen=True)
-class ViewedFiles:
-    """Splat files, and the cameras that look at them.
-
-    Attributes:
-        instances: at least one.
-        cameras: the source of the cameras.
-        settings: override those of a camera file.
-        precision: one of `PRECISIONS`, of the nodes that cuts are found with.
-        threads: to work on.
-        progress: called with how much is done.
-    """
-
-    instances: Sequence[Instance]
-    cameras: CameraSource
-    settings: Settings
-    precision: str
-    threads: int
-    progress: Progress = silent
-
-    def read(self, *, trees_only: bool = False, through: str | None = None, plain: bool = True) -> Scenes:
-        """The scenes, with all columns if `plain`."""
-        return read_scenes(
-            self.instances,
-            columns=COLUMNS if plain else TRAVERSED,
-            trees_only=trees_only,
-            through=through,
-            precision=self.precision,
-            threads=self.threads,
-            progress=self.progress,
-        )
-
-    def path(self, scenes: Callable[[], Scenes]) -> CameraPath:
-        """The cameras; scenes are asked for only where cameras are chosen for them."""
-        return self.cameras.cameras(self.settings, lambda: scenes().balls())
-
-    def with_planes(self, render: RenderSettings, path: CameraPath, scenes: Callable[[], Scenes]) -> RenderSettings:
-        """Settings whose near and far planes enclose the scenes, where the cameras are chosen for them."""
-        if not self.cameras.fits_scene:
-            return render
-        near, far = reach(render.raster.near, render.raster.far, path.cameras, scenes().balls())
-        return dataclasses.replace(render, raster=dataclasses.replace(render.raster, near=near, far=far))
 
 
 @dataclass(frozen=True)

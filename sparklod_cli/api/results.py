@@ -54,6 +54,9 @@ class Picture:
     def __init__(self, png: bytes) -> None:
         self.png = png
 
+    def __repr__(self) -> str:
+        return f"Picture({len(self.png):,} bytes of PNG)"
+
     def _repr_png_(self) -> bytes:
         return self.png
 
@@ -62,8 +65,12 @@ class Picture:
 
         Raises:
             OutputError: the file exists, or cannot be written.
+            ValueError: its name does not end in .png.
         """
         from ..io import write_whole
+
+        if Path(path).suffix.lower() != ".png":
+            raise ValueError(f"{path}: a picture is saved as .png, which the name does not end in")
 
         write_whole(Path(path), [self.png], overwrite=overwrite)
 
@@ -74,7 +81,13 @@ def show(image: NDArray[np.float32], *, background: tuple[float, float, float] |
     Args:
         image: (H, W, 4) float32 with alpha multiplied in, as `render` draws it.
         background: red, green and blue, 0..1, behind it; None keeps alpha.
+
+    Raises:
+        ValueError: the image has another shape.
     """
     from ..images import pixels
+
+    if getattr(image, "ndim", 0) != 3 or image.shape[2] != 4:
+        raise ValueError(f"the image has the shape {getattr(image, 'shape', ())}; give (H, W, 4), as render draws it")
 
     return Picture(pixels.encode(pixels.eight_bits(pixels.over(image, background)), "png"))

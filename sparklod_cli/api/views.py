@@ -13,10 +13,11 @@ import numpy as np
 from ..cameras.camera import Camera
 from ..cameras.path import CameraPath
 from ..images import metrics
-from ..lod.budget import Budget, parse_budget
+from ..lod.budget import LARGEST, Budget, parse_budget
 from ..lod.settings import LodSettings
 from ..model.instances import Instance, names_of
 from ..model.scene import Scene
+from ..render.backends import BACKENDS
 from ..render.rasterizer import Image
 from ..render.renderer import Renderer
 from ..render.settings import RenderSettings
@@ -27,6 +28,7 @@ from ..support.defaults import BLEND, PRECISIONS
 from ..support.errors import FormatError, memory_errors_translated
 from ..support.threads import on_threads, thread_count
 from ..tables.comparison import COLUMNS as OF_COMPARISON
+from .arguments import camera_like, viewed_like
 from .progress import Told, telling
 from .results import ComparisonTable, Frames
 
@@ -37,7 +39,7 @@ if TYPE_CHECKING:
 Viewed = Scene | Instance | Iterable["Scene | Instance"]
 
 #: A count of splats, a share of full detail (a float, 0 to 1), or either as text: "500k", "5%".
-BudgetLike = int | float | str
+BudgetLike = int | float | str | np.integer[Any] | np.floating[Any]
 
 #: Where a scene keeps what was prepared of it for looking at it once more.
 _PREPARED = "_prepared_scenes"
@@ -65,8 +67,10 @@ def cut(
         threads: to prepare the trees on; None for all processors.
 
     Raises:
-        ValueError: the budget is out of its range, or less than one splat for each instance.
+        ValueError: the budget is out of its range, or less than one splat for each instance; `continuous` is not
+            above 1.
     """
+    camera_like(camera)
     with on_threads(threads) as count, memory_errors_translated():
         scenes = scenes_of(viewed, count, precision)
         return CutFinder(scenes, _lod(scenes, budget, settings, continuous)).cut(camera)
@@ -97,9 +101,13 @@ def render(
     Raises:
         BackendError: the backend cannot draw here.
         InvalidSplatsError: a scene has nothing to draw.
+        ValueError: there is no such backend.
     """
+    camera_like(camera)
     settings = settings or RenderSettings()
     if backend is not None:
+        if backend not in BACKENDS:
+            raise ValueError(f"there is no backend {backend!r}; give one of {', '.join(BACKENDS)}")
         settings = replace(settings, backend=backend)
     with on_threads(threads) as count, memory_errors_translated():
         source = FixedCut(viewed) if isinstance(viewed, Cut) else FixedCut(scenes_of(viewed, count).full())
@@ -176,6 +184,10 @@ def compare(
     """
     from ..compare import Comparison
 
+    if isinstance(budgets, (str, int, float, np.number)):
+        raise TypeError(f"budgets is {budgets!r}; give a list of budgets")
+    if not budgets:
+        raise ValueError("there are no budgets; give at least one")
     with on_threads(threads) as count, telling(progress) as told, memory_errors_translated():
         scenes = _trees(viewed, count, precision)
         full = None if scene is None else scenes_of(scene, count)
@@ -190,11 +202,11 @@ def psnr(a: Image, b: Image, *, background: float = 0.0) -> float:
     """Peak signal-to-noise ratio of two pictures, in dB; 100 where they are the same.
 
     Args:
-        a, b: (H, W, 3) 0..1, or (H, W, 4) with alpha multiplied in, as `render` draws them.
+        a, b: floats: (H, W, 3) 0..1, or (H, W, 4) with alpha multiplied in, as `render` draws them.
         background: gray, 0..1, behind pictures with alpha.
 
     Raises:
-        ValueError: they have different shapes, or are no pictures.
+        ValueError: they have different shapes, or are no pictures: whole numbers, NaN, or no pixels.
     """
     return metrics.psnr(*_opaque(a, b, background))
 
@@ -212,6 +224,11 @@ def _opaque(a: Image, b: Image, background: float) -> list[Image]:
     a, b = np.asarray(a), np.asarray(b)
     if a.shape != b.shape or a.ndim != 3 or a.shape[2] not in (3, 4):
         raise ValueError(f"the pictures have the shapes {a.shape} and {b.shape}; give two of (H, W, 3) or (H, W, 4)")
+    for each in (a, b):
+        if not np.issubdtype(each.dtype, np.floating):
+            raise ValueError(f"a picture holds {each.dtype}; give floats 0..1, such as bytes / 255")
+        if not each.size or not np.isfinite(each).all():
+            raise ValueError("a picture has no pixels" if not each.size else "a picture holds NaN or infinity")
     return [metrics.on_background(each, background) if each.shape[2] == 4 else each for each in (a, b)]
 
 
@@ -225,6 +242,8 @@ def scenes_of(viewed: Viewed, threads: int | None, precision: str = PRECISIONS[0
         if precision not in kept:
             kept[precision] = read_scenes([Instance(viewed, UNNAMED)], precision=precision, threads=count)
         return kept[precision]
+    if not isinstance(viewed, Instance):
+        viewed_like(viewed)
     every: list[Any] = [viewed] if isinstance(viewed, Instance) else list(viewed)
     instances = [each if isinstance(each, Instance) else Instance(each) for each in every]
     if not instances:
@@ -256,6 +275,8 @@ def _lod(
     if budget is not None:
         settings = replace(settings, budget=_budget(budget).of(scenes.leaves))
     if continuous:
+        if continuous is not True and not continuous > 1:
+            raise ValueError(f"continuous is {continuous}; give a ratio above 1, or True for {BLEND}")
         settings = replace(settings, continuous=BLEND if continuous is True else float(continuous))
     return settings
 
@@ -263,9 +284,12 @@ def _lod(
 def _budget(budget: BudgetLike) -> Budget:
     if isinstance(budget, str):
         return parse_budget(budget)
-    if not budget > 0 or (isinstance(budget, float) and budget > 1):
-        raise ValueError(f"the budget is {budget}; give a count of 1 or more, or a share of full detail up to 1.0")
-    if isinstance(budget, float):
+    if isinstance(budget, bool) or not isinstance(budget, (int, float, np.integer, np.floating)):
+        raise TypeError(f"the budget is {budget!r}; give a count, a share as a float, or a text such as '5%'")
+    share = isinstance(budget, (float, np.floating))
+    if not 0 < budget <= (1 if share else LARGEST):
+        raise ValueError(f"the budget is {budget}; give a count from 1 to 2^53, or a share of full detail up to 1.0")
+    if share:
         return Budget(f"{100 * budget:g}%", Fraction(str(budget)), None)
     return Budget.of_count(int(budget))
 
@@ -273,7 +297,9 @@ def _budget(budget: BudgetLike) -> Budget:
 def _path(cameras: CameraPath | Iterable[Camera]) -> CameraPath:
     if isinstance(cameras, CameraPath):
         return cameras
-    every = tuple([cameras] if isinstance(cameras, Camera) else cameras)
+    if isinstance(cameras, str):
+        camera_like(cameras)
+    every = tuple(map(camera_like, [cameras] if isinstance(cameras, Camera) else cameras))
     if not every:
         raise ValueError("there are no cameras; give at least one")
     if any(later.time < earlier.time for earlier, later in itertools.pairwise(every)):

@@ -62,6 +62,11 @@ class Camera:
         """
         from .pose import look_at  # which needs this module
 
+        for what, vector in (("eye", eye), ("target", target), ("up", up)):
+            if np.shape(vector) != (3,):
+                raise CameraPathError(f"{what} is {vector!r}; give x, y, z")
+        if any(int(side) != side for side in size):
+            raise CameraPathError(f"a camera of {size[0]} x {size[1]} pixels; give whole numbers")
         if not 0 < fov_y < 180 or min(size) < 1:
             raise CameraPathError(f"a camera of {fov_y:g} degrees and {size[0]} x {size[1]} pixels sees nothing")
         try:

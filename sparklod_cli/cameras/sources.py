@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -54,8 +55,37 @@ class CameraFile:
         return read_path(self.path, self.format, settings)
 
 
+class _Aimed:
+    """Cameras that look at one point from a distance; either is chosen for the scene where it is None."""
+
+    center: Point | None
+    distance: float | None
+    elevation: float
+
+    @property
+    def fits_scene(self) -> bool:
+        """Whether the distance is chosen for the scene."""
+        return self.distance is None
+
+    def _aim(
+        self, frames: Callable[[], Sequence[Frame]], settings: Settings, scene: Scene, times: float = 1
+    ) -> tuple[Any, float]:
+        """What the cameras look at, (3,), and their distance from there.
+
+        Args:
+            frames: makes cameras of their directions; called where something is chosen for the scene.
+            settings: that the cameras are made with.
+            scene: gives what the splats cover.
+            times: the distance, where it is chosen, as a multiple of where the scene just fits the image.
+        """
+        if self.center is not None and self.distance is not None:
+            return self.center, self.distance
+        center, fits = _fit(frames(), self.center, scene(), settings)
+        return center, self.distance or times * fits
+
+
 @dataclass(frozen=True)
-class Orbit:
+class Orbit(_Aimed):
     """Cameras once around a scene.
 
     Attributes:
@@ -70,24 +100,16 @@ class Orbit:
     distance: float | None = None
     elevation: float = ELEVATION
 
-    @property
-    def fits_scene(self) -> bool:
-        """Whether the distance is chosen for the scene."""
-        return self.distance is None
-
     def cameras(self, settings: Settings, scene: Scene) -> CameraPath:
         """The cameras around the scene."""
         up, tilt = settings.up or DEFAULT_UP, math.radians(self.elevation)
-        center, distance = self.center, self.distance
-        if center is None or distance is None:
-            around = generators.orbit(self.count, (0.0, 0.0, 0.0), 1, tilt, up)
-            center, fits = _fit(around, center, scene(), settings)
-            distance = distance or fits
+        around = functools.partial(generators.orbit, self.count, (0.0, 0.0, 0.0), 1, tilt, up)
+        center, distance = self._aim(around, settings, scene)
         return _generated("orbit", generators.orbit(self.count, center, distance, tilt, up), settings)
 
 
 @dataclass(frozen=True)
-class Dolly:
+class Dolly(_Aimed):
     """Cameras straight towards a scene, from far to near.
 
     Attributes:
@@ -102,20 +124,12 @@ class Dolly:
     distance: float | None = None
     elevation: float = ELEVATION
 
-    @property
-    def fits_scene(self) -> bool:
-        """Whether the distance is chosen for the scene."""
-        return self.distance is None
-
     def cameras(self, settings: Settings, scene: Scene) -> CameraPath:
         """The cameras on the way to the scene."""
         up, tilt = settings.up or DEFAULT_UP, math.radians(self.elevation)
         count = max(2, round(self.seconds * (settings.fps or DEFAULT_FPS)))
-        center, distance = self.center, self.distance
-        if center is None or distance is None:
-            ahead = generators.dolly(2, (0.0, 0.0, 0.0), 1, 1, tilt, up)
-            center, fits = _fit(ahead, center, scene(), settings)
-            distance = distance or generators.DOLLY_START * fits
+        ahead = functools.partial(generators.dolly, 2, (0.0, 0.0, 0.0), 1, 1, tilt, up)
+        center, distance = self._aim(ahead, settings, scene, generators.DOLLY_START)
         last = distance / generators.DOLLY_ZOOM
         return _generated("dolly", generators.dolly(count, center, distance, last, tilt, up), settings)
 

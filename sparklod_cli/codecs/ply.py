@@ -21,13 +21,13 @@ from ..model.sh import degree_of, notes_on_degree
 from ..model.splats import FloatArray, Splats
 from ..support.defaults import MAX_SH_DEGREE
 from ..support.errors import FormatError, NotSplatsError, TruncatedError
-from ..support.parallel import blocks_of, ordered_map
+from ..support.parallel import blocks_of
 from ..support.progress import Progress, silent
 from ..support.untrusted import quoted
 from . import quantize
 from .options import DEFAULTS, WriteOptions
 from .ply_header import Header, read_header
-from .stream import Rows, decode_rows, rows_of, size_of
+from .stream import Rows, decode_rows, encode_rows, rows_of, size_of
 
 Coding = Callable[[FloatArray], FloatArray]
 
@@ -180,12 +180,7 @@ def encode(
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(splats)}"]
     lines += [f"property float {name}" for name in row_type.names or ()]
     yield "".join(f"{line}\n" for line in [*lines, "end_header"]).encode()
-    parts = blocks_of(len(splats))
-    for part, piece in zip(
-        parts, ordered_map(lambda part: _encode(splats, part, row_type), parts, threads), strict=True
-    ):
-        yield piece
-        progress("writing", part.stop, len(splats), "splat")
+    yield from encode_rows(lambda part: _encode(splats, part, row_type), len(splats), threads, progress)
 
 
 def _inria_properties(coefficients: int) -> list[str]:

@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 from ..model.scene import Scene
 from ..model.splats import Splats
 from ..support.errors import FormatError, TruncatedError
-from ..support.parallel import blocks_of, ordered_map
 from ..support.progress import Progress, silent
 from . import quantize
 from .options import DEFAULTS, WriteOptions
-from .stream import decode_rows, rows_of, size_of
+from .stream import decode_rows, encode_rows, rows_of, size_of
 
 ROW = np.dtype(
     [
@@ -90,7 +89,4 @@ def encode(
         out["quat_wxyz"] = quantize.encode_quat_bytes(splats.quat_xyzw[:, [3, 0, 1, 2]])
         return out.tobytes()
 
-    parts = blocks_of(len(order))
-    for part, piece in zip(parts, ordered_map(rows, parts, threads), strict=True):
-        yield piece
-        progress("writing", part.stop, len(order), "splat")
+    yield from encode_rows(rows, len(order), threads, progress)

@@ -1,4 +1,4 @@
-"""Files as streams of rows, decoded block by block, so that a file is never in memory as a whole."""
+"""Files as streams of rows, decoded and encoded in blocks, so that a file is never in memory as a whole."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def rows_of(read: Read, row_type: np.dtype[Any], count: int, what: str = "splats
     """`count` rows in blocks of at least `BLOCK_ROWS` rows and `BLOCK_BYTES` bytes, read when they are asked for.
 
     Raises:
-        TruncatedError: the data ends before that.
+        TruncatedError: the data ends early.
     """
     for part in blocks_of(count, max(BLOCK_ROWS, BLOCK_BYTES // row_type.itemsize)):
         data = read((part.stop - part.start) * row_type.itemsize)
@@ -57,3 +57,11 @@ def decode_rows(
 
     for done in ordered_map(run, rows, threads):
         progress("reading", done, count, "splat")
+
+
+def encode_rows(encode: Callable[[slice], bytes], count: int, threads: int, progress: Progress) -> Iterator[bytes]:
+    """The bytes of `count` rows in blocks, in order: `encode` is called with each block's rows, on several threads."""
+    parts = blocks_of(count)
+    for part, piece in zip(parts, ordered_map(encode, parts, threads), strict=True):
+        yield piece
+        progress("writing", part.stop, count, "splat")

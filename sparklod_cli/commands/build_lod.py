@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -135,11 +136,13 @@ def build_lod(ctx: click.Context, /, inputs: tuple[Path, ...], **_: Any) -> None
     _check(ctx, inputs, outputs, general)
     failed = False
     with general.console() as console:
-        work = (_extracting if outputs.unlod else _baking)(ctx, outputs, general.threads, console)
+        make, report = _job(ctx, outputs, console)
+        shared = {"overwrite": outputs.overwrite, "threads": general.threads, "progress": console.progress}
         for source in inputs:
             target = outputs.target(source)
             try:
-                result = work(source, target)
+                result = make(source, target, **shared)
+                report(console, source, target, result)
             except SparklodError as error:
                 failed = True
                 console.error(f"{name_of(source)}: {error}")
@@ -187,46 +190,14 @@ def _check(ctx: click.Context, inputs: tuple[Path, ...], outputs: Outputs, gener
         raise click.UsageError(f"trees are written as SPZ, not as {suffix}; name the output {SPZ}")
 
 
-def _baking(ctx: click.Context, outputs: Outputs, threads: int, console: Console) -> Callable[[Path, Path], Baked]:
-    """What bakes a file and reports it; the point where numpy and numba are loaded."""
-    from ..api.file_jobs import bake
+def _job(
+    ctx: click.Context, outputs: Outputs, console: Console
+) -> tuple[Callable[..., Baked | Extracted], Callable[..., None]]:
+    """What makes an output of an input, and what reports it; the point where numpy and numba are loaded."""
+    from ..api.file_jobs import bake, extract_leaves
 
+    if outputs.unlod:
+        return functools.partial(extract_leaves, options=write_options(ctx)), report_extracted
     settings = bake_settings(ctx, raw=outputs.is_raw)
     console.announce_compiling(settings.method)
-
-    def work(source: Path, target: Path) -> Baked:
-        baked = bake(
-            source,
-            target,
-            settings,
-            overwrite=outputs.overwrite,
-            threads=threads,
-            progress=console.progress,
-        )
-        report_baked(console, source, target, baked)
-        return baked
-
-    return work
-
-
-def _extracting(
-    ctx: click.Context, outputs: Outputs, threads: int, console: Console
-) -> Callable[[Path, Path], Extracted]:
-    """What writes the leaves of a file and reports it."""
-    from ..api.file_jobs import extract_leaves
-
-    options = write_options(ctx)
-
-    def work(source: Path, target: Path) -> Extracted:
-        extracted = extract_leaves(
-            source,
-            target,
-            options,
-            overwrite=outputs.overwrite,
-            threads=threads,
-            progress=console.progress,
-        )
-        report_extracted(console, source, target, extracted)
-        return extracted
-
-    return work
+    return functools.partial(bake, settings=settings), report_baked

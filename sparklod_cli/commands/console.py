@@ -49,6 +49,9 @@ def say_error(text: str) -> None:
 def say_usage_error(error: click.ClickException) -> None:
     """Prints the usage of the command, how to get its help, and in the last line what is wrong."""
     ctx = error.ctx if isinstance(error, click.UsageError) else None
+    if isinstance(error, getattr(click.exceptions, "NoArgsIsHelpError", ())) and ctx is not None:  # since click 8.2
+        _echo(ctx.get_help())
+        return
     if ctx is not None:
         _echo(f"{ctx.get_usage()}\nTry '{ctx.command_path} --help'.\n")
     text = error.format_message()

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import base64
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
 from importlib.resources import files
@@ -16,6 +15,7 @@ from ..model.scene import Scene
 from ..tables.histograms import Histogram
 from . import values
 from .findings import CODES, ERROR, NOTE, WARNING
+from .html_parts import NONE, figure_of, number_text, panel, size_text, table_of
 from .report import Report
 
 #: Content security policy: only the style and the pictures inside the page, whatever the name of a file contains.
@@ -47,9 +47,6 @@ SEVERITIES = (ERROR, WARNING, NOTE)
 
 #: Most findings of a file that are listed; checks have some forty kinds, but a file of expectations has no limit.
 MAX_FINDINGS = 200
-
-#: Stands for a missing value.
-NONE = "\u2013"
 
 
 @dataclass(frozen=True)
@@ -108,38 +105,6 @@ def page(sections: Sequence[Section]) -> str:
 """
 
 
-def _number(value: float | None) -> str:
-    if value is None:
-        return NONE
-    return f"{value:,}" if isinstance(value, int) else f"{value:,.4g}" if abs(value) < 1e6 else f"{value:.4g}"
-
-
-def _size(size: int) -> str:
-    for unit, power in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
-        if size >= power:
-            return f"{size / power:.1f} {unit}"
-    return f"{size} bytes"
-
-
-def _panel(title: str, content: str) -> str:
-    return f'<section class="panel"><h3>{title}</h3>\n{content}\n</section>' if content else ""
-
-
-def _table(head: Sequence[str], rows: Iterable[Sequence[str]], caption: str) -> str:
-    """A table of cells of HTML; the first cell of each row is its heading."""
-    columns = "".join(f'<th scope="col">{cell}</th>' for cell in head)
-    lines = (f'<tr><th scope="row">{row[0]}</th>{"".join(_cell(cell) for cell in row[1:])}</tr>' for row in rows)
-    body = "\n".join(lines)
-    return (
-        f'<div class="scroll" tabindex="0"><table><caption>{caption}</caption>\n<thead><tr>{columns}</tr></thead>\n'
-        f"<tbody>\n{body}\n</tbody></table></div>"
-    )
-
-
-def _cell(content: str) -> str:
-    return f'<td class="wide">{content}</td>' if content.startswith('<div class="track"') else f"<td>{content}</td>"
-
-
 def _verdict(report: Mapping[str, Any]) -> str:
     """The worst severity of the findings, as a badge."""
     findings = report.get("findings")
@@ -161,13 +126,13 @@ def _contents(sections: Sequence[Section]) -> str:
             [
                 name,
                 text_of(report.get("format") or NONE),
-                _number(report.get("splats")),
-                NONE if size is None else _size(size),
+                number_text(report.get("splats")),
+                NONE if size is None else size_text(size),
                 _verdict(report),
             ]
         )
     head = ("File", "Format", "Splats", "Size", "Findings")
-    return f'<nav class="panel" aria-label="Files">{_table(head, rows, "The files")}</nav>\n'
+    return f'<nav class="panel" aria-label="Files">{table_of(head, rows, "The files")}</nav>\n'
 
 
 def _section(section: Section, anchor: str) -> str:
@@ -179,8 +144,8 @@ def _section(section: Section, anchor: str) -> str:
         f'<div class="head"><h2 id="{anchor}-name">{name}</h2>{form}{_verdict(report)}</div>',
         _figures(report),
         _findings(report),
-        _picture(section.thumbnail, small=True),
-        _picture(section.picture),
+        figure_of(section.thumbnail, small=True),
+        figure_of(section.picture),
     ]
     if report.get("tree"):
         parts.append(_tree(report["tree"]))
@@ -196,27 +161,27 @@ def _figures(report: Mapping[str, Any]) -> str:
     noun = "node" if tree else "splat"
     cards: list[tuple[str, str, str]] = []
     if report.get("splats") is not None:
-        cards.append((f"{noun.title()}s", _number(report["splats"]), ""))
+        cards.append((f"{noun.title()}s", number_text(report["splats"]), ""))
     if report.get("bytes") is not None:
         each, ratio = report.get("bytes_per_splat"), report.get("compression_ratio")
         of_each = f"{each:.1f} bytes a {noun}" if each else ""
         of_ratio = f"{ratio:.1f} times smaller than as floats" if ratio else ""
-        cards.append(("Size", _size(report["bytes"]), ", ".join(filter(None, (of_each, of_ratio)))))
+        cards.append(("Size", size_text(report["bytes"]), ", ".join(filter(None, (of_each, of_ratio)))))
     if tree:
-        share, needed = tree.get("more_than_opaque"), _number(tree.get("chunks_of_coarse_cut"))
+        share, needed = tree.get("more_than_opaque"), number_text(tree.get("chunks_of_coarse_cut"))
         opaque = "" if share is None else f"{100 * share:.1f} % of all nodes have D &gt; 1"
         cards += [
-            ("Leaves", _number(tree.get("leaves")), "splats of the scene"),
-            ("Inner nodes", _number(tree.get("inner")), opaque),
-            ("Growth", _number(tree.get("growth")), "nodes per leaf"),
-            ("Depth", _number(tree.get("depth")), "edges to the deepest node"),
-            ("Chunks", _number(tree.get("chunks")), f"{needed} for a coarse cut"),
+            ("Leaves", number_text(tree.get("leaves")), "splats of the scene"),
+            ("Inner nodes", number_text(tree.get("inner")), opaque),
+            ("Growth", number_text(tree.get("growth")), "nodes per leaf"),
+            ("Depth", number_text(tree.get("depth")), "edges to the deepest node"),
+            ("Chunks", number_text(tree.get("chunks")), f"{needed} for a coarse cut"),
         ]
     if report.get("sh_degree") is not None:
-        cards.append(("SH degree", _number(report["sh_degree"]), ""))
+        cards.append(("SH degree", number_text(report["sh_degree"]), ""))
     if report.get("antialiased") is not None:
         cards.append(("Antialiased", "yes" if report["antialiased"] else "no", ""))
-    cards += [(title, _number(header[name]), "") for name, title in HEADER.items() if name in header]
+    cards += [(title, number_text(header[name]), "") for name, title in HEADER.items() if name in header]
     items = []
     for title, value, small in cards:
         more = f"<small>{small}</small>" if small else ""
@@ -228,7 +193,7 @@ def _findings(report: Mapping[str, Any]) -> str:
     findings = report.get("findings")
     notes = "".join(f"<p>{text_of(note)}</p>" for note in report.get("notes") or ())
     if not findings:
-        return _panel("Notes", notes)
+        return panel("Notes", notes)
     items = []
     worst_first = sorted(findings, key=lambda found: SEVERITIES.index(found["severity"]))
     for found in worst_first[:MAX_FINDINGS]:
@@ -237,17 +202,8 @@ def _findings(report: Mapping[str, Any]) -> str:
         head = f'<b>{severity}</b><code>{code}</code> <span class="faint">{meaning}</span>'
         items.append(f'<li class="{severity}">{head}<p>{message}</p></li>')
     if len(findings) > MAX_FINDINGS:
-        items.append(f"<li>{_number(len(findings) - MAX_FINDINGS)} more findings are not listed.</li>")
-    return _panel("Findings", f'<ul class="findings">{"".join(items)}</ul>{notes}')
-
-
-def _picture(picture: Picture | None, *, small: bool = False) -> str:
-    if picture is None:
-        return ""
-    data, words = base64.b64encode(picture.png).decode("ascii"), picture.description
-    image = f'<img alt="Drawing of {text_of(words.partition(";")[0])}" src="data:image/png;base64,{data}">'
-    kind = ' class="small"' if small else ""
-    return f"<figure{kind}>{image}<figcaption>{text_of(words)}</figcaption></figure>"
+        items.append(f"<li>{number_text(len(findings) - MAX_FINDINGS)} more findings are not listed.</li>")
+    return panel("Findings", f'<ul class="findings">{"".join(items)}</ul>{notes}')
 
 
 def _tree(tree: Mapping[str, Any]) -> str:
@@ -256,32 +212,32 @@ def _tree(tree: Mapping[str, Any]) -> str:
     rows = []
     for number, level in enumerate(levels):
         bars = bar((level["nodes"] - level["leaves"]) / most, level["leaves"] / most)
-        rows.append([f"{number}", *(_number(level[name]) for name in ("nodes", "leaves", "size")), bars])
+        rows.append([f"{number}", *(number_text(level[name]) for name in ("nodes", "leaves", "size")), bars])
     key = '<span class="key">inner</span> <span class="key soft">leaves</span>'
     caption = "Depth: edges from the root. Size: geometric mean of the feature sizes, world units."
     if tree.get("levels_left_out"):
-        caption += f" {_number(tree['levels_left_out'])} greater depths are not listed."
-    table = _table(("Depth", "Nodes", "Leaves", "Size", key), rows, caption) if rows else ""
+        caption += f" {number_text(tree['levels_left_out'])} greater depths are not listed."
+    table = table_of(("Depth", "Nodes", "Leaves", "Size", key), rows, caption) if rows else ""
     groups = children_groups(tree.get("children") or {})
     most = max((count for _, count in groups), default=0) or 1
-    rows = [[name, _number(count), bar(count / most)] for name, count in groups]
-    children = _table(("Children", "Inner nodes", ""), rows, "Inner nodes by number of children.") if rows else ""
-    return f'<div class="two">{_panel("Nodes by depth", table)}{_panel("Children", children)}</div>'
+    rows = [[name, number_text(count), bar(count / most)] for name, count in groups]
+    children = table_of(("Children", "Inner nodes", ""), rows, "Inner nodes by number of children.") if rows else ""
+    return f'<div class="two">{panel("Nodes by depth", table)}{panel("Children", children)}</div>'
 
 
 def _values(values: Mapping[str, Any]) -> str:
     quantities = values.get("quantities") or {}
     columns = list(dict.fromkeys(name for summary in quantities.values() for name in summary))
-    rows = [[text_of(name), *(_number(row.get(column)) for column in columns)] for name, row in quantities.items()]
-    table = _table(["", *map(text_of, columns)], rows, "Without numbers that are not finite.") if rows else ""
+    rows = [[text_of(name), *(number_text(row.get(column)) for column in columns)] for name, row in quantities.items()]
+    table = table_of(["", *map(text_of, columns)], rows, "Without numbers that are not finite.") if rows else ""
     boxes = []
     for name, what in (("box", "all centres"), ("box_98", "1 % to 99 %")):
         box = values.get(name)
         if box:
             edges = [high - low for low, high in zip(box["min"], box["max"], strict=True)]
             for end, numbers in (("from", box["min"]), ("to", box["max"]), ("extent", edges)):
-                boxes.append([f"{what}, {end}", *(_number(float(number)) for number in numbers)])
-    extent = _table(("", "x", "y", "z"), boxes, "World units.") if boxes else ""
+                boxes.append([f"{what}, {end}", *(number_text(float(number)) for number in numbers)])
+    extent = table_of(("", "x", "y", "z"), boxes, "World units.") if boxes else ""
     counts = (
         ("with a number that is not finite", "non_finite"),
         ("with a negative scale", "negative_scale"),
@@ -289,10 +245,10 @@ def _values(values: Mapping[str, Any]) -> str:
         ("of scale 0", "zero_scale"),
         ("of opacity above 1", "more_than_opaque"),
     )
-    degenerate = [[what, _number(values[name])] for what, name in counts if name in values]
-    out_of_range = _table(("Splats", "Count"), degenerate, "Among all splats or nodes.") if degenerate else ""
-    side = f"{_panel('Box', extent)}{_panel('Unusual values', out_of_range)}"
-    return f'{_panel("Values", table)}\n<div class="two">{side}</div>'
+    degenerate = [[what, number_text(values[name])] for what, name in counts if name in values]
+    out_of_range = table_of(("Splats", "Count"), degenerate, "Among all splats or nodes.") if degenerate else ""
+    side = f"{panel('Box', extent)}{panel('Unusual values', out_of_range)}"
+    return f'{panel("Values", table)}\n<div class="two">{side}</div>'
 
 
 def _histograms(histograms: Mapping[str, Histogram]) -> str:
@@ -304,4 +260,4 @@ def _histograms(histograms: Mapping[str, Histogram]) -> str:
         said = "; ".join(filter(None, [QUANTITIES.get(name, ""), *remarks]))
         head = f'<h4>{text_of(name)}</h4><p class="faint">{text_of(said)}</p>'
         parts.append(f"<div>{head}{chart or '<p>no numbers</p>'}</div>")
-    return _panel("Histograms", f'<div class="charts">{"".join(parts)}</div>' if parts else "")
+    return panel("Histograms", f'<div class="charts">{"".join(parts)}</div>' if parts else "")

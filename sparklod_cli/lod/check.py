@@ -1,4 +1,4 @@
-"""Checks the input of the builders."""
+"""Checks the input and the setting of a builder."""
 
 from __future__ import annotations
 
@@ -26,6 +26,12 @@ class Bounds:
     high: NDArray[np.float64]
     smallest: float
     largest: float
+
+
+def check_setting(name: str, value: float, least: float, most: float) -> None:
+    """Raises a `ValueError` where the setting of a builder is out of its range."""
+    if not least <= value <= most:
+        raise ValueError(f"{name} {value} is not within {least} to {most}")
 
 
 def check(splats: Splats) -> Bounds:

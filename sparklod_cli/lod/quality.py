@@ -24,7 +24,7 @@ from ..model.splats import COLUMNS, FloatArray, Splats
 from ..support.defaults import DEFAULT_GROWTH, MAX_GROWTH, MIN_GROWTH
 from ..support.jit import threads_for
 from ..support.progress import Progress, silent
-from .check import Bounds, check
+from .check import Bounds, check, check_setting
 from .kernels import node_rows, pair_cost, pair_merge, prune
 from .kernels.final_order import fill_leaves, merge_colors
 from .kernels.geometry import SplatColumns
@@ -154,8 +154,7 @@ def build(splats: Splats, growth: float = DEFAULT_GROWTH, *, progress: Progress 
         InvalidSplatsError: there are no splats, or one is invalid or invisible.
         ValueError: the growth is out of range.
     """
-    if not MIN_GROWTH <= growth <= MAX_GROWTH:
-        raise ValueError(f"growth {growth} is not within {MIN_GROWTH} to {MAX_GROWTH}")
+    check_setting("growth", growth, MIN_GROWTH, MAX_GROWTH)
     bounds = check(splats)
     n = len(splats)
     if n == 1:

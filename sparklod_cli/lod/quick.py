@@ -23,7 +23,7 @@ from ..model.splats import FloatArray, Splats
 from ..support.defaults import DEFAULT_BASE, MAX_BASE, MIN_BASE
 from ..support.jit import threads_for
 from ..support.progress import Progress, silent
-from .check import check
+from .check import check, check_setting
 from .kernels.final_order import fill_geometry, fill_leaves, final_indices, merge_colors
 from .kernels.geometry import CENTER, WIDTH, SplatColumns, gather_rows
 from .kernels.group import level_keys, split_cells
@@ -115,8 +115,7 @@ def build(splats: Splats, base: float = DEFAULT_BASE, *, progress: Progress = si
         InvalidSplatsError: there are no splats, or one is invalid or invisible.
         ValueError: the base is out of range.
     """
-    if not MIN_BASE <= base <= MAX_BASE:
-        raise ValueError(f"base {base} is not within {MIN_BASE} to {MAX_BASE}")
+    check_setting("base", base, MIN_BASE, MAX_BASE)
     n = len(splats)
     bounds = check(splats)
     low, high = bounds.low, bounds.high

@@ -35,13 +35,14 @@ class InstancesFileError(SparklodError):
     """An instances file cannot be understood."""
 
 
-def read_instances(path: Path) -> list[Instance]:
+def read_instances(path: Path | str) -> list[Instance]:
     """Reads the instances of a file; paths in it are relative to its folder.
 
     Raises:
         InstancesFileError: it says something that is not an instance; names the file and the instance.
         FormatError: it cannot be read.
     """
+    path = Path(path)
     try:
         data = parse_json(read_text(path), keep_surrogates=True)  # files may be called so
     except ValueError as error:

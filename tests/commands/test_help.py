@@ -55,6 +55,13 @@ def test_the_help_of_a_command_can_be_had_by_help(name: str, capsys: pytest.Capt
     assert printed("help", name, capsys=capsys) == printed(name, "--help", capsys=capsys)
 
 
+def test_without_a_command_the_program_prints_its_help(capsys: pytest.CaptureFixture[str]) -> None:
+    help_text = printed("--help", capsys=capsys)
+    run([])
+    said = capsys.readouterr()
+    assert (said.out + said.err).strip() == help_text.strip()
+
+
 def test_help_alone_is_that_of_the_program(capsys: pytest.CaptureFixture[str]) -> None:
     text = printed("help", capsys=capsys)
     assert text == printed("--help", capsys=capsys)

@@ -1,0 +1,61 @@
+"""Arguments of the API, checked before they reach a loop or a kernel; errors say the value, and what to give."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ..cameras.camera import Camera
+from ..model.scene import Scene
+
+
+def scene_like(value: Any) -> Scene:
+    """A scene or a tree.
+
+    Raises:
+        TypeError: it is anything else.
+    """
+    if not isinstance(value, Scene):
+        raise TypeError(f"it takes a scene or a tree, not {_kind(value)}; {_SCENES}")
+    return value
+
+
+def camera_like(value: Any) -> Camera:
+    """One camera.
+
+    Raises:
+        TypeError: it is anything else.
+    """
+    if not isinstance(value, Camera):
+        raise TypeError(f"a camera is a Camera, not {_kind(value)}; Camera.look_at makes one, read_cameras reads paths")
+    return value
+
+
+def within(name: str, value: Any, least: float, most: float) -> None:
+    """Raises ValueError unless a number is from `least` to `most`, and TypeError unless it is a number."""
+    if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
+        raise TypeError(f"{name} is {value!r}; give a number from {least} to {most}")
+    if not least <= value <= most:
+        raise ValueError(f"{name} is {value}; give {least} to {most}")
+
+
+def whole_within(name: str, value: Any, least: int, most: int) -> None:
+    """`within` for whole numbers."""
+    if isinstance(value, (float, np.floating)):
+        raise TypeError(f"{name} is {value!r}; give a whole number from {least} to {most}")
+    within(name, value, least, most)
+
+
+def viewed_like(value: Any) -> None:
+    """Raises TypeError for what cannot be looked at, though Python could iterate over it or fail within it."""
+    if isinstance(value, (str, bytes)) or not hasattr(value, "__iter__"):
+        raise TypeError(f"it takes scenes, trees or instances, not {_kind(value)}; {_SCENES}")
+
+
+#: How scenes come about.
+_SCENES = "read reads a file, Scene.from_arrays takes arrays"
+
+
+def _kind(value: Any) -> str:
+    return repr(value) if isinstance(value, str) else f"a {type(value).__name__}" if value is not None else "None"

@@ -1,0 +1,65 @@
+"""Splat files and the cameras that look at them, as the whole-file jobs take them."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from ..cameras.framing import reach
+from ..model.splats import COLUMNS
+from ..scenes.reading import TRAVERSED, read_scenes
+from ..support.progress import Progress, silent
+
+if TYPE_CHECKING:
+    from ..cameras.frame import Settings
+    from ..cameras.path import CameraPath
+    from ..cameras.sources import CameraSource
+    from ..model.instances import Instance
+    from ..render.settings import RenderSettings
+    from ..scenes.loaded import Scenes
+
+
+@dataclass(frozen=True)
+class ViewedFiles:
+    """Splat files, and the cameras that look at them.
+
+    Attributes:
+        instances: at least one.
+        cameras: the source of the cameras.
+        settings: override those of a camera file.
+        precision: one of `PRECISIONS`, of the nodes that cuts are found with.
+        threads: to work on.
+        progress: called with how much is done.
+    """
+
+    instances: Sequence[Instance]
+    cameras: CameraSource
+    settings: Settings
+    precision: str
+    threads: int
+    progress: Progress = silent
+
+    def read(self, *, trees_only: bool = False, through: str | None = None, plain: bool = True) -> Scenes:
+        """The scenes, with all columns if `plain`."""
+        return read_scenes(
+            self.instances,
+            columns=COLUMNS if plain else TRAVERSED,
+            trees_only=trees_only,
+            through=through,
+            precision=self.precision,
+            threads=self.threads,
+            progress=self.progress,
+        )
+
+    def path(self, scenes: Callable[[], Scenes]) -> CameraPath:
+        """The cameras; scenes are asked for only where cameras are chosen for them."""
+        return self.cameras.cameras(self.settings, lambda: scenes().balls())
+
+    def with_planes(self, render: RenderSettings, path: CameraPath, scenes: Callable[[], Scenes]) -> RenderSettings:
+        """Settings whose near and far planes enclose the scenes, where the cameras are chosen for them."""
+        if not self.cameras.fits_scene:
+            return render
+        near, far = reach(render.raster.near, render.raster.far, path.cameras, scenes().balls())
+        return dataclasses.replace(render, raster=dataclasses.replace(render.raster, near=near, far=far))
