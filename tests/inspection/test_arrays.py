@@ -102,7 +102,7 @@ def test_words_alone_tell_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[
 @pytest.mark.parametrize(
     ("arrays", "message"),
     [
-        ({"other": np.zeros((3, 4), np.uint32)}, "its arrays (other) are of no encoding"),
+        ({"other": np.zeros((3, 4), np.uint32)}, "its arrays (other) match no encoding"),
         ({"packed": np.zeros((3, 5), np.uint32)}, "packed is uint32[3, 5], expected uint32[3, 4]"),
         ({"packed": np.zeros((3, 4))}, "packed is float64[3, 4], expected uint32[3, 4]"),
         ({"ext0": np.zeros((3, 4), np.uint32)}, "no array ext1"),
