@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import struct
 import zipfile
-import zlib
 from collections.abc import Callable
 from typing import Any, BinaryIO
 
@@ -15,7 +14,7 @@ from PIL.WebPImagePlugin import WebPImageFile
 
 from ..support.errors import ChecksumError, FormatError, NotSplatsError
 from ..support.units import count_of
-from ..support.untrusted import parse_json, quoted, quoted_value
+from ..support.untrusted import ZIP_ERRORS, parse_json, quoted, quoted_value
 from .compression import check_promise
 from .stream import size_of
 
@@ -35,8 +34,6 @@ ANIMATED = 2
 #: Texels that an image may have: a multiple of the splats, and some more, since writers make images square or round
 #: sides up to powers of two.
 SPARE_FACTOR, SPARE_TEXELS = 4, 1 << 16
-
-_ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, ValueError, struct.error)
 
 
 class Meta:
@@ -193,7 +190,7 @@ class _Archive:
         self._size = size
         try:
             self._zip = zipfile.ZipFile(file)
-        except _ZIP_ERRORS as error:
+        except ZIP_ERRORS as error:
             raise FormatError(f"not a complete zip archive: {quoted(error)}") from None
         names = [name for name in self._zip.namelist() if name == META or name.endswith("/" + META)]
         if not names:
@@ -211,7 +208,7 @@ class _Archive:
         try:
             with self._zip.open(member) as file:
                 return file.read(member.file_size)  # without a size it would unpack everything before checking the size
-        except _ZIP_ERRORS as error:
+        except ZIP_ERRORS as error:
             kind = ChecksumError if "CRC" in str(error) else FormatError
             raise kind(f"{quoted_value(name)} cannot be unpacked: {quoted(error)}") from None
 

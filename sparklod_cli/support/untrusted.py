@@ -5,7 +5,10 @@ from __future__ import annotations
 import json
 import re
 import reprlib
+import struct
 import sys
+import zipfile
+import zlib
 from typing import Any
 
 from .printable import printable
@@ -24,6 +27,9 @@ QUOTED = 100
 
 _SURROGATE = re.compile("[\ud800-\udfff]")
 _ESCAPED_SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
+
+#: What `zipfile` raises on archives that are damaged, encrypted or of a kind that it does not read.
+ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, ValueError, struct.error)
 
 
 def parse_json(data: str | bytes, *, keep_surrogates: bool = False) -> Any:

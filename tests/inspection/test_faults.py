@@ -318,6 +318,6 @@ def test_whatever_the_bytes_are_there_is_a_report(path: Path, tmp_path: Path) ->
             report, scene = inspect(broken, wanted)
             plain = json.loads(json.dumps(report.as_dict(), allow_nan=False))
             if scene is not None:
-                assert "\n".join(lines(plain))
+                assert "\n".join(lines(path.name, plain))
             else:
                 assert [found["severity"] for found in plain["findings"]] == [ERROR]

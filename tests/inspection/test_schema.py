@@ -182,7 +182,7 @@ def may_be_null(way: tuple[Any, ...]) -> bool:
         return way[0] in ("bytes", "bytes_per_splat", "compression_ratio", "tree", "values", "findings")
     finding, level = way[0] == "findings", "levels" in way
     return (
-        way in (("values", "box"), ("values", "box_98"))
+        way in (("values", "box"), ("values", "box_98"), ("tree", "more_than_opaque"))
         or (way[:2] == ("values", "quantities") and len(way) == 4)
         or (finding and way[-1] in ("index", "count"))
         or (level and way[-1] == "size")

@@ -86,7 +86,7 @@ def test_no_command_prints_a_file_name_raw(
         (["build-lod", plain, f"--{evil}"], 2),
         (["build-lod", plain, "--method", evil], 2),
         (["build-lod", plain, "-o", f"out.{evil}"], None),
-        (["build-lod", plain, "-o", f"{evil}/{evil}/{evil}.spz"], 0),
+        (["build-lod", plain, "-o", f"{plain}/{evil}.spz"], 1),  # under a file
         (["inspect", tree], 0),
         (["inspect", tree, "--json"], 0),
         (["inspect", tree, "--field", "file"], 0),

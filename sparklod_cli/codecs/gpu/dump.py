@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ...model.scene import Scene
 from ...support.errors import FormatError
-from ...support.untrusted import quoted, quoted_value
+from ...support.untrusted import ZIP_ERRORS, quoted, quoted_value
 from .. import npy
 from .table import ENCODINGS
 
@@ -52,7 +52,7 @@ def decode_npz(file: BinaryIO) -> Arrays | None:
             if not members or not all(member.filename.endswith(".npy") for member in members):
                 return None
             return {member.filename.removesuffix(".npy"): _member(archive, member) for member in members}
-    except zipfile.BadZipFile:
+    except ZIP_ERRORS:
         return None
 
 
@@ -67,7 +67,7 @@ def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[Any]:
         if layout is None:
             raise FormatError("is not a .npy file")
         return npy.read_values(data, layout)
-    except (zipfile.BadZipFile, EOFError, OSError, NotImplementedError) as error:
+    except (*ZIP_ERRORS, OSError) as error:
         raise FormatError(f"its member {quoted_value(member.filename)} is damaged: {quoted(error)}") from None
     except FormatError as error:
         raise type(error)(f"its member {quoted_value(member.filename)} {error}") from None

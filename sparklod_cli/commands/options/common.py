@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import contextlib
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -85,6 +86,17 @@ def output_option(text: str) -> Callable[[Command], Command]:
 def assert_option(text: str, heading: str = COMMON) -> Callable[[Command], Command]:
     """`--assert`, which can be given several times, with its help."""
     return option("--assert", "asserts", heading=heading, metavar="TEXT", multiple=True, help=text)
+
+
+@contextlib.contextmanager
+def assert_errors() -> Iterator[None]:
+    """Turns the error that an assertion cannot be understood into a usage error that names the option."""
+    from ...tables.conditions import BadAssertionError
+
+    try:
+        yield
+    except BadAssertionError as error:
+        raise click.UsageError(f"--assert {error}") from None
 
 
 def plot_option(text: str, heading: str = COMMON) -> Callable[[Command], Command]:

@@ -16,7 +16,7 @@ from ..command import option, with_options
 from ..paths import InputPath
 from ..usage import exclude, require
 from .appearance import Appearance
-from .common import Command, assert_option, plot_option
+from .common import Command, assert_errors, assert_option, plot_option
 from .types import Real
 
 if TYPE_CHECKING:
@@ -90,7 +90,6 @@ class Comparison:
         """
         from ...tables import assertions
         from ...tables.comparison import COLUMNS
-        from ...tables.conditions import BadAssertionError
 
         found = []
         for text in self.asserts:
@@ -102,10 +101,8 @@ class Comparison:
                         f"--assert {text!r}: {name.strip()} is not one of the budgets, {', '.join(texts)}"
                     )
                 at = texts.index(name.strip())
-            try:
+            with assert_errors():
                 found.append((at, dataclasses.replace(assertions.parse(rest, COLUMNS), text=text.strip())))
-            except BadAssertionError as error:
-                raise click.UsageError(f"--assert {error}") from None
         return found
 
 

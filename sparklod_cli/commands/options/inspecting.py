@@ -15,7 +15,7 @@ from ...support.units import parse_size
 from ..command import COMMON, option, with_options
 from ..paths import InputPath, OutputPath
 from ..usage import refuse
-from .common import Command, assert_option, plot_option
+from .common import Command, assert_errors, assert_option, plot_option
 from .types import Quantity, Real
 
 if TYPE_CHECKING:
@@ -197,15 +197,12 @@ class Checks:
             ExpectationError: the file cannot.
         """
         from ...inspection.expectations import KEYS, Expectations, parse_assertion, read
-        from ...tables.conditions import BadAssertionError
 
         if not self.has_expectations:
             return None
-        try:
+        with assert_errors():
             for text in self.asserts:
                 parse_assertion(text)
-        except BadAssertionError as error:
-            raise click.UsageError(f"--assert {error}") from None
         values = {"lod": self.require_lod or None} | {key: getattr(self, key) for key in KEYS if key != "lod"}
         expected = Expectations() if self.expect is None else read(self.expect)
         return replace(

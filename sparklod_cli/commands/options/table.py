@@ -16,7 +16,7 @@ from ..command import COMMON, option, with_options
 from ..console import is_terminal
 from ..paths import OutputPath
 from ..usage import exclude, given, require
-from .common import Command, assert_option, output_option, overwrite_option, plot_option, table_form
+from .common import Command, assert_errors, assert_option, output_option, overwrite_option, plot_option, table_form
 
 if TYPE_CHECKING:
     from ...simulation.outputs import FrameOutputs
@@ -95,12 +95,9 @@ class Table:
         """
         from ...simulation.columns import COLUMNS
         from ...tables import assertions
-        from ...tables.conditions import BadAssertionError
 
-        try:
+        with assert_errors():
             return [assertions.parse(text, COLUMNS) for text in self.asserts]
-        except BadAssertionError as error:
-            raise click.UsageError(f"--assert {error}") from None
 
 
 def table_options(command: Command) -> Command:
