@@ -68,7 +68,7 @@ class Baked:
     """What was baked.
 
     Attributes:
-        format: of the input, for people.
+        format: of the input, for display.
         read: the number of splats in the input.
         splats, sh_degree: of those that were kept.
         dropped: the number of splats that were left out, by reason (`selection.REASONS`).
@@ -79,7 +79,7 @@ class Baked:
         arrays: shapes of the arrays of another output, in its order.
         clamped: by the column of `Splats`, the number of nodes with a value that the output cannot hold.
         clamps: at which ends, and how far beyond.
-        notes: what the reader had to leave out, for people.
+        notes: what the reader had to leave out, for display.
         seconds: by stage (read, build, write).
     """
 

@@ -58,7 +58,7 @@ def cli() -> None:
 
 def run(arguments: list[str] | None = None) -> int:
     """Runs the command line and returns its exit code; arguments are those of the process unless given."""
-    with stdout.told():
+    with stdout.guarded():
         return _run(arguments)
 
 

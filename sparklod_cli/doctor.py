@@ -29,10 +29,10 @@ State = Literal["ok", "note", "problem"]
 
 DISTRIBUTION = "sparklod"
 
-#: Extras for people who work on sparklod, which nobody else need install.
+#: Extras for display who work on sparklod, which nobody else need install.
 INTERNAL_EXTRAS = ("dev", "docs", "test")
 
-#: What the other extras bring, for people.
+#: What the other extras bring, for display.
 PURPOSES = {
     "parquet": "Parquet tables",
     "render": "figures, charts, and the backends osmesa and open3d of render",

@@ -26,7 +26,7 @@ class Extracted:
     """What was written.
 
     Attributes:
-        format: of the input, for people.
+        format: of the input, for display.
         nodes, splats: of its tree, and those of them that are leaves, which were written.
         sh_degree: of the splats.
         bytes: of the output.

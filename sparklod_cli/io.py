@@ -22,8 +22,8 @@ from .support import atomic
 from .support.errors import FormatError, OutputError, StdoutError, UnknownFormatError, UnreadableError
 from .support.progress import Progress, silent
 from .support.stdin import DASH, spooled
-from .support.stdout import ReaderGoneError, told
-from .support.untrusted import shown
+from .support.stdout import ReaderGoneError, guarded
+from .support.untrusted import quoted_value
 
 #: How a .npz begins, which is a zip.
 ZIP = b"PK\x03\x04"
@@ -221,16 +221,16 @@ def _leads_away(name: str) -> bool:
 def _open_beside(first: Path, name: str) -> BinaryIO:
     """Opens a file that another one names; `FormatError` where the name could lead out of their folder."""
     if first == DASH:
-        raise FormatError(f"it names {shown(name)}, and no file is beside standard input; name the folder instead")
+        raise FormatError(f"it names {quoted_value(name)}, but standard input has no folder; give the path instead")
     if _leads_away(name):
-        raise FormatError(f"it names {shown(name)}, which is not a file beside it")
+        raise FormatError(f"it names {quoted_value(name)}, which is not a file beside it")
     path = first.parent / name
     try:
         if path.exists() and not path.is_file():
-            raise FormatError(f"{shown(name)}, which it names, is not a file")
+            raise FormatError(f"{quoted_value(name)}, which it names, is not a file")
         return path.open("rb")
     except OSError as error:
-        raise FormatError(f"{shown(name)}, which it names, cannot be read: {_reason(error)}") from None
+        raise FormatError(f"{quoted_value(name)}, which it names, cannot be read: {_reason(error)}") from None
 
 
 def is_file_name(text: str) -> bool:
@@ -317,7 +317,7 @@ def sink(path: Path, *, overwrite: bool) -> Sink:
 def write_stdout(pieces: Iterable[bytes]) -> int:
     """Writes to standard output and returns the number of bytes; raises `StdoutError` if they cannot be written."""
     size = 0
-    with told():
+    with guarded():
         try:
             for piece in pieces:
                 size += sys.stdout.buffer.write(piece)

@@ -41,7 +41,7 @@ class Written:
 
     Attributes:
         path: of the file.
-        format: for people ("SPZ", "PLY"), or the name of an encoding.
+        format: for display ("SPZ", "PLY"), or the name of an encoding.
         bytes: its size.
     """
 

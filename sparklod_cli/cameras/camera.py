@@ -24,7 +24,7 @@ class Camera:
         focal: fx, fy in pixels.
         principal: cx, cy, where the optical axis meets the image, in pixels from its upper left corner.
         time: seconds since the start of its path.
-        name: of its frame, for people; may be empty.
+        name: of its frame, for display; may be empty.
     """
 
     camera_to_world: Matrix
@@ -55,7 +55,7 @@ class Camera:
             fov_y: vertical field of view, degrees.
             size: width and height of the image, pixels.
             time: seconds since the start of its path.
-            name: of its frame, for people.
+            name: of its frame, for display.
 
         Raises:
             CameraPathError: eye and target are the same point, or a number is out of its range.

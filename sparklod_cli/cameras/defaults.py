@@ -1,6 +1,6 @@
-"""What cameras are where nobody says otherwise; imports nothing, so that `--help` stays quick."""
+"""Defaults of cameras. Imports nothing, so that `--help` stays fast."""
 
-#: Degrees by which the cameras of an orbit or a dolly, and that of the whole scene, are above what they look at.
+#: Elevation in degrees, above their target, of the cameras of an orbit, a dolly and the overview.
 ELEVATION = 15.0
 
 #: How many cameras an orbit has.

@@ -36,8 +36,8 @@ class CameraPath:
 
     Attributes:
         cameras: at least one; camera-to-world in OpenGL's axes, in the world of the splats.
-        format: their origin, for people.
-        notes: what was ignored or assumed, one sentence each, for people.
+        format: their origin, for display.
+        notes: what was ignored or assumed, one sentence each, for display.
         numbers: number of each camera in the file or on the whole path, from 0.
     """
 

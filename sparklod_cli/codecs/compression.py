@@ -1,6 +1,6 @@
-"""Compression: writes one gzip member on several threads, and inflates without holding more than was asked for.
+"""Compression: writes one gzip member on several threads, and inflates without buffering more than requested.
 
-docs/decisions says why the library's own threaded gzip is not used.
+docs/decisions explains why the library's own threaded gzip is not used.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def check_promise(total: int, file_size: int) -> None:
 
 
 class Inflate:
-    """Reads a gzip member of a file, holding little more than was asked for."""
+    """Reads a gzip member of a file, buffering little more than requested."""
 
     def __init__(self, file: BinaryIO) -> None:
         self._file = file
@@ -134,7 +134,7 @@ class _Window:
 
 
 class Unzstd:
-    """Reads a zstd frame, the next `packed` bytes of a file, holding little more than was asked for."""
+    """Reads a zstd frame, the next `packed` bytes of a file, buffering little more than requested."""
 
     def __init__(self, file: BinaryIO, packed: int, name: str) -> None:
         self._name = name

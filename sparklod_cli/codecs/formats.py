@@ -16,7 +16,7 @@ class Format:
     """A file format.
 
     Attributes:
-        name: for people.
+        name: for display.
         module: in this package; has `decode(file, *, threads, progress) -> Scene`.
         writable: its module also has `encode(scene, options, *, threads, progress) -> Iterator[bytes]`, and
             `settled(scene, options) -> WriteOptions`, the options with nothing left open, which raises `FormatError`

@@ -1,4 +1,4 @@
-"""numpy's .npy files of plain numbers. Their header is Python source, which is matched here, not evaluated."""
+"""numpy's .npy files of plain numbers. Their header is Python source; it is matched with a pattern, not evaluated."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def read_layout(file: BinaryIO) -> Layout | None:
     header = file.read(min(length, MAX_HEADER))
     found = _HEADER.fullmatch(header.decode("latin-1")) if length <= MAX_HEADER else None
     if found is None:
-        raise FormatError("is not a .npy file of plain numbers: its header has another form")
+        raise FormatError("is not a .npy file of plain numbers: its header is malformed")
     try:
         dtype = np.dtype(found[1])
         shape = tuple(int(side) for side in found[3].replace(",", " ").split())

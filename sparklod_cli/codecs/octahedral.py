@@ -1,4 +1,4 @@
-"""Shared by Spark's layouts in memory: rotations as axis and angle, rounding, alpha, and checks of arrays.
+"""Codings shared by Spark's memory layouts: rotations as axis and angle, rounding, alpha, and checks of arrays.
 
 The formulas are those of Spark 2.2.0's encoders in Rust, in float32 and in the same order of operations, because the
 last bit decides between two codes. Only functions that libraries round differently (arc cosine, sine, logarithm,
@@ -104,7 +104,7 @@ def checked_words(arrays: Mapping[str, NDArray[Any]], columns: Mapping[str, int]
     """The arrays of these names, each (N, columns) uint32 with the same N, C-contiguous.
 
     Raises:
-        FormatError: one is missing, or has another shape or type.
+        FormatError: an array is missing, or has another shape or type.
     """
     found = {}
     rows = None

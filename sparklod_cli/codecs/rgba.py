@@ -16,7 +16,7 @@ from . import npy
 def decode(file: BinaryIO, count: int) -> FloatArray:
     """Colours and opacities for the `count` splats of a scene: (count, 4) float32, 0..1.
 
-    The size of a raw file tells its type.
+    The type of a raw file follows from its size.
 
     Raises:
         FormatError: it is neither, of another length, or has values that are not 0..1; continues a sentence about the

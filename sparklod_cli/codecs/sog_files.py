@@ -14,7 +14,7 @@ from PIL.WebPImagePlugin import WebPImageFile
 
 from ..support.errors import ChecksumError, FormatError, NotSplatsError
 from ..support.units import count_of
-from ..support.untrusted import ZIP_ERRORS, parse_json, quoted, shown
+from ..support.untrusted import ZIP_ERRORS, parse_json, quoted, quoted_value
 from .compression import check_promise
 from .stream import size_of
 
@@ -149,7 +149,7 @@ class Files:
 
     def _open_beside(self, name: str) -> BinaryIO:
         if self._beside is None:
-            raise FormatError(f"{META} names {shown(name)}, but other files cannot be opened here")
+            raise FormatError(f"{META} names {quoted_value(name)}, but other files cannot be opened here")
         return self._beside(name)
 
     def _size_beside(self, name: str) -> int:
@@ -168,7 +168,7 @@ class Files:
         data = self._read(name)
         width, height = _webp_size(data, name)
         if width * height > most:
-            raise FormatError(f"{shown(name)} has {width} x {height} texels, far more than are needed")
+            raise FormatError(f"{quoted_value(name)} has {width} x {height} texels, far too many")
         check_promise(4 * width * height, self.size)
         return _decode_webp(data, name)
 
@@ -177,7 +177,9 @@ class Files:
         texels = self.image(texture, index, SPARE_FACTOR * count + SPARE_TEXELS).reshape(-1, 4)
         if len(texels) < count:
             name = self.meta.name(texture, "files", index)
-            raise FormatError(f"{shown(name)} has {count_of(len(texels), 'texel')} for {count_of(count, 'splat')}")
+            raise FormatError(
+                f"{quoted_value(name)} has {count_of(len(texels), 'texel')} for {count_of(count, 'splat')}"
+            )
         return texels[:count]
 
 
@@ -199,16 +201,16 @@ class _Archive:
         try:
             member = self._zip.getinfo(self._folder + name)
         except KeyError:
-            raise FormatError(f"{META} names {shown(name)}, which is not in the archive") from None
+            raise FormatError(f"{META} names {quoted_value(name)}, which is not in the archive") from None
         if member.compress_type not in METHODS or member.flag_bits & ENCRYPTED:
-            raise FormatError(f"{shown(name)} is compressed by a method that SOG does not use, or encrypted")
+            raise FormatError(f"{quoted_value(name)} is encrypted, or compressed by a method that SOG does not use")
         check_promise(member.file_size, self._size)
         try:
             with self._zip.open(member) as file:
                 return file.read(member.file_size)  # without a size it would unpack everything before checking the size
         except ZIP_ERRORS as error:
             kind = ChecksumError if "CRC" in str(error) else FormatError
-            raise kind(f"{shown(name)} cannot be unpacked: {quoted(error)}") from None
+            raise kind(f"{quoted_value(name)} cannot be unpacked: {quoted(error)}") from None
 
 
 def _webp_size(data: bytes, name: str) -> tuple[int, int]:
@@ -216,7 +218,7 @@ def _webp_size(data: bytes, name: str) -> tuple[int, int]:
     kind = data[12:16] if data[:4] == b"RIFF" and data[8:12] == b"WEBP" and len(data) >= 30 else b""
     if kind == b"VP8X":  # 24 bits each, minus one
         if data[20] & ANIMATED:
-            raise FormatError(f"{shown(name)} is an animation, but SOG needs a still image")
+            raise FormatError(f"{quoted_value(name)} is an animation, but SOG needs a still image")
         return 1 + int.from_bytes(data[24:27], "little"), 1 + int.from_bytes(data[27:30], "little")
     if kind == b"VP8L":  # 14 bits each, minus one, after a byte of signature
         bits = int.from_bytes(data[21:25], "little")
@@ -224,7 +226,7 @@ def _webp_size(data: bytes, name: str) -> tuple[int, int]:
     if kind == b"VP8 ":  # 14 bits each, after a frame tag and a start code
         width, height = struct.unpack_from("<HH", data, 26)
         return width & 0x3FFF, height & 0x3FFF
-    raise FormatError(f"{shown(name)} is not a WebP image")
+    raise FormatError(f"{quoted_value(name)} is not a WebP image")
 
 
 def _decode_webp(data: bytes, name: str) -> Texels:
@@ -233,4 +235,4 @@ def _decode_webp(data: bytes, name: str) -> Texels:
         with WebPImageFile(io.BytesIO(data)) as image:
             return np.asarray(image if image.mode == "RGBA" else image.convert("RGBA"))
     except (OSError, ValueError, SyntaxError, EOFError) as error:
-        raise FormatError(f"{shown(name)} is a corrupt WebP image: {error}") from None
+        raise FormatError(f"{quoted_value(name)} is a corrupt WebP image: {error}") from None

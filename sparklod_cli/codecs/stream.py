@@ -35,7 +35,7 @@ def rows_of(read: Read, row_type: np.dtype[Any], count: int, what: str = "splats
     """`count` rows in blocks of at least `BLOCK_ROWS` rows and `BLOCK_BYTES` bytes, read when they are asked for.
 
     Raises:
-        TruncatedError: the data ends before that.
+        TruncatedError: the data ends early.
     """
     for part in blocks_of(count, max(BLOCK_ROWS, BLOCK_BYTES // row_type.itemsize)):
         data = read((part.stop - part.start) * row_type.itemsize)

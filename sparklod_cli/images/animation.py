@@ -73,7 +73,7 @@ def animate(frames: Iterable[Pixels], form: str, fps: float, progress: Progress 
     Args:
         frames: at least one, all of one size; with alpha for "webp" only.
         form: one of `ANIMATIONS`.
-        fps: frames a second.
+        fps: frames per second.
         progress: called for each frame that GIF and WebP write, which they do at the end; videos write frames as they
             come, without calling it.
 
@@ -94,11 +94,11 @@ def animate(frames: Iterable[Pixels], form: str, fps: float, progress: Progress 
 
 def _times(fps: float, step: int, least: int) -> Iterator[int]:
     """Durations of the frames in ms, in whole steps whose sum does not drift from the true time."""
-    shown = 0
+    elapsed = 0
     for number in itertools.count(1):
-        end = max(round(1000 * number / (fps * step)), shown + least)
-        yield (end - shown) * step
-        shown = end
+        end = max(round(1000 * number / (fps * step)), elapsed + least)
+        yield (end - elapsed) * step
+        elapsed = end
 
 
 def _write_images(

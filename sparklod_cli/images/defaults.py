@@ -1,4 +1,4 @@
-"""What pictures are where nobody says otherwise; imports nothing, so that `--help` stays quick."""
+"""Defaults of pictures. Imports nothing, so that `--help` stays fast."""
 
 #: Quality of JPEG, 1 to 100: what is lost is hardly seen.
 JPEG_QUALITY = 92

@@ -58,7 +58,7 @@ def check_covered(reference: Image, what: str) -> None:
 
 
 def on_background(image: Image, gray: float) -> Image:
-    """(H, W, 3), 0..1: an image of which red, green and blue are multiplied by alpha, on a background 0..1."""
+    """(H, W, 3), 0..1: an image with premultiplied alpha, composited over a grey background 0..1."""
     return np.clip(image[..., :3] + np.float32(gray) * (1 - image[..., 3:]), 0, 1)
 
 

@@ -1,4 +1,4 @@
-"""Where pictures go, and as what: one file, a file a frame, an animation or a contact sheet."""
+"""The destination and format of pictures: one file, one file per frame, an animation or a contact sheet."""
 
 from __future__ import annotations
 
@@ -9,28 +9,28 @@ from pathlib import Path
 
 from ..io import check_writable
 
-#: Forms of single pictures, of several in one file, and of contact sheets.
+#: Formats of single pictures, of animations, and of contact sheets.
 STILL = ("png", "jpg", "webp", "npy")
 MOVING = ("webp", "gif", "mp4", "webm")
 SHEETS = ("png", "jpg", "webp")
 
-#: Forms that keep alpha.
+#: Formats with an alpha channel.
 WITH_ALPHA = ("png", "webp", "npy")
 
-#: Forms by suffix, where that has another name.
+#: Formats by suffix, where the two differ.
 SUFFIXES = {"jpeg": "jpg"}
 
-#: What the number of a frame stands for in a name.
+#: The placeholder for the frame number in a file name.
 NUMBER = re.compile(r"%(?:0\d{1,2})?d")
 
 
 @dataclass(frozen=True)
 class Output:
-    """Where pictures go.
+    """The destination of pictures.
 
     Attributes:
-        name: of the file; of many, with a place for the number; None for standard output.
-        form: one of `STILL` or `MOVING`.
+        name: path of the file, or of a file per frame with a placeholder for its number; None for standard output.
+        form: the format, one of `STILL` or `MOVING`.
         kind: "picture", "frames", "animation" or "sheet".
     """
 
@@ -39,35 +39,35 @@ class Output:
     kind: str
 
     def path(self, number: int = 0) -> Path:
-        """Of the file, or of that of a frame."""
+        """The path of the file, or of the file of a frame."""
         assert self.name is not None
         if self.kind != "frames":
             return self.name
         return self.name.with_name(NUMBER.sub(lambda match: match[0] % number, self.name.name))
 
     def paths(self, numbers: Sequence[int]) -> list[Path]:
-        """Of all files that will be written."""
+        """The paths of all files that will be written."""
         if self.name is None:
             return []
         return [self.path(number) for number in (numbers if self.kind == "frames" else [0])]
 
     def check(self, numbers: Sequence[int], *, overwrite: bool) -> None:
-        """Raises an `OutputError` where a file cannot be written, before work goes into it."""
+        """Raises an `OutputError` if a file cannot be written; called before any work is done."""
         for path in self.paths(numbers):
             check_writable(path, overwrite=overwrite)
 
 
 def output_for(name: Path | None, default: Path, cameras: int, *, sheet: bool) -> Output:
-    """Where the pictures of some cameras go.
+    """The destination of the pictures of a number of cameras.
 
     Args:
-        name: that was asked for; "-" for standard output; None for one made of `default`.
-        default: a file without its suffix.
-        cameras: how many there are.
-        sheet: all in one picture.
+        name: the requested path; "-" for standard output; None for a path derived from `default`.
+        default: a path without suffix.
+        cameras: number of cameras.
+        sheet: put all pictures on one contact sheet.
 
     Raises:
-        ValueError: the cameras do not fit into what was asked for.
+        ValueError: this destination cannot hold that many pictures, or its format is unknown.
     """
     several = cameras > 1 and not sheet
     if name is not None and str(name) == "-":

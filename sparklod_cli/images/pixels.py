@@ -32,7 +32,7 @@ WHOLE_HEIGHT, LEAST_UNIT, LEAST_PICTURE = 1000, 0.62, (400, 240)
 #: Width of the panel with the colour scale, in pixels at `WHOLE_HEIGHT`.
 SCALE_WIDTH = 190
 
-#: Factors of which `gain_for` chooses the amplification of differences.
+#: Factors among which `gain_for` chooses the amplification of differences.
 GAINS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0)
 
 #: Ends of the colour scale of differences.
@@ -65,8 +65,8 @@ def _codes(values: Image) -> Pixels:
 
 def difference(a: Image, b: Image, gain: float) -> Image:
     """(H, W, 4) absolute differences of two images of alpha 1, channel by channel, multiplied by `gain`."""
-    shown = np.clip(gain * apart(a, b), 0, 1)
-    return np.concatenate([shown, np.ones_like(a[..., 3:])], axis=2).astype(np.float32)
+    amplified = np.clip(gain * apart(a, b), 0, 1)
+    return np.concatenate([amplified, np.ones_like(a[..., 3:])], axis=2).astype(np.float32)
 
 
 def scale_width(width: int, height: int) -> int:

@@ -1,4 +1,4 @@
-"""From cameras to picture files: draws the frames of a camera path, compares and encodes them, and writes them."""
+"""Renders the frames of a camera path, compares and encodes them, and writes them to files."""
 
 from __future__ import annotations
 
@@ -33,8 +33,9 @@ if TYPE_CHECKING:
     from .output import Output
     from .pixels import Color, Pixels
 
-#: Pixels, of all pictures together, that are kept from finding a gain until their frames are written: 2 GB of floats.
-KEPT_PIXELS = 1 << 26
+#: Maximum total number of pixels of the pictures that are cached after finding a gain until their frames are written:
+#: 2 GB of floats.
+CACHED_PIXELS = 1 << 26
 
 
 @dataclass(frozen=True)
@@ -43,11 +44,11 @@ class PictureSettings:
 
     Attributes:
         background: red, green and blue, 0..1, behind the splats; None keeps alpha.
-        bar: stands beside a picture whose colours mean something.
-        gain: factor by which differences are multiplied; None chooses one for the pictures.
-        jpeg_quality: of .jpg, 1 to 100.
-        jobs: pictures to work on at a time.
-        threads: of the kernels.
+        bar: add a colour bar to a picture whose colours encode a quantity.
+        gain: factor by which differences are multiplied; None chooses one from the pictures.
+        jpeg_quality: quality of .jpg files, 1 to 100.
+        jobs: number of pictures to process concurrently.
+        threads: number of threads of the kernels.
     """
 
     background: Color | None = None
@@ -60,12 +61,12 @@ class PictureSettings:
 
 @dataclass(frozen=True)
 class Pictures:
-    """What was written.
+    """The pictures that were written.
 
     Attributes:
-        frames: for each camera its number, time, name, splats drawn, width and height of the picture, the file where
-            each has its own, and with a reference the PSNR in dB.
-        bytes: of all files.
+        frames: for each camera its number, time, name, splats drawn, width and height of the picture, its file if each
+            frame has one, and with a reference the PSNR in dB.
+        bytes: size of all files together.
         gain: factor by which differences were multiplied; None without a reference.
         empty: no splat is in view of any camera.
     """
@@ -78,7 +79,7 @@ class Pictures:
 
 @dataclass(frozen=True)
 class _Frame:
-    """A picture that is done: pixels, or bytes of a file where each frame has its own."""
+    """A finished picture: its pixels, or the bytes of its file if each frame has one."""
 
     facts: dict[str, Any]
     pixels: Pixels | None
@@ -97,23 +98,23 @@ def write_pictures(
     overwrite: bool = False,
     progress: Progress = silent,
 ) -> Pictures:
-    """Draws and writes the pictures of a camera path.
+    """Renders and writes the pictures of a camera path.
 
     Args:
-        source: what is drawn.
+        source: the cuts to render.
         path: the cameras; all of one size for an animation or a contact sheet.
-        output: where the pictures go.
-        render: how they are drawn.
-        settings: how they become files.
-        reference: what they are compared with: the difference is written.
-        overwrite: replace files that exist.
-        progress: is told how many frames are looked at for the colours, compared, drawn and encoded.
+        output: the destination of the pictures.
+        render: settings of the renderer.
+        settings: settings of the files.
+        reference: cuts to compare with; the pictures are then differences from it.
+        overwrite: replace existing files.
+        progress: called with the number of frames scanned for the colour scale, compared, drawn and encoded.
 
     Raises:
         BackendError: the backend cannot draw here.
         OutputError: a file cannot be written.
-        SparklodError: there is nothing to colour by, the reference covers no pixel of a frame, or an animation cannot
-            be encoded here.
+        SparklodError: the quantity to colour by is missing, the reference covers no pixel of a frame, or an animation
+            cannot be encoded here.
     """
     with on_threads(settings.threads):
         renderer = Renderer(source, render, path.cameras, progress=progress)
@@ -122,13 +123,13 @@ def write_pictures(
 
 
 def frame_rate(path: CameraPath) -> float:
-    """Frames a second, on average."""
+    """Mean number of frames per second."""
     span = path.cameras[-1].time - path.cameras[0].time
     return (len(path.cameras) - 1) / span if span > 0 else DEFAULT_FPS
 
 
 class _Writer:
-    """One run of `write_pictures`, which has the arguments."""
+    """One run of `write_pictures`; see there for the arguments."""
 
     def __init__(
         self,
@@ -142,7 +143,7 @@ class _Writer:
     ) -> None:
         self._renderer, self._path, self._output, self._settings = renderer, path, output, settings
         self._reference, self._overwrite, self._progress = reference, overwrite, progress
-        self._drawn: dict[int, tuple[Drawn, Drawn]] = {}  # by the place of a camera, what finding the gain drew
+        self._drawn: dict[int, tuple[Drawn, Drawn]] = {}  # by camera index: pictures that were drawn to find the gain
         self._gain = 1.0 if reference is None else settings.gain or self._fitting_gain(reference)
         self._bytes = 0
 
@@ -183,7 +184,7 @@ class _Writer:
 
     def _frame(self, at: int) -> _Frame:
         camera, number = self._path.cameras[at], self._path.numbers[at]
-        with on_threads(self._settings.threads):  # each thread of Python has a number of its own
+        with on_threads(self._settings.threads):  # the setting is per Python thread
             drawn, other = self._draw(at)
         facts = self._facts(number, camera, drawn)
         image = codes.over(drawn.image, self._settings.background)
@@ -205,14 +206,14 @@ class _Writer:
         return _Frame(facts, pixels, b"", empty)
 
     def _draw(self, at: int) -> tuple[Drawn, Drawn | None]:
-        """The picture of a camera, and that of the reference."""
+        """The picture of a camera, and the picture of the reference."""
         if at in self._drawn:
             return self._drawn.pop(at)
         camera = self._path.cameras[at]
         return self._renderer.draw(camera), None if self._reference is None else self._reference.draw(camera)
 
     def _bar(self) -> Coloring | None:
-        """What colours mean; None where no bar says it."""
+        """The colour bar; None if the pictures get none."""
         if not self._settings.bar:
             return None
         if self._reference is not None:
@@ -220,10 +221,10 @@ class _Writer:
         return self._renderer.scale.bar if self._renderer.scale is not None else None
 
     def _fitting_gain(self, reference: Renderer) -> float:
-        """The gain that suits the first picture, the last and the one in the middle; the same for all."""
+        """The gain for all pictures, chosen from the first, the middle and the last one."""
         cameras, background = self._path.cameras, self._settings.background
         some = sorted({0, len(cameras) // 2, len(cameras) - 1}, reverse=True)
-        keep = 2 * sum(cameras[at].width * cameras[at].height for at in some) <= KEPT_PIXELS
+        keep = 2 * sum(cameras[at].width * cameras[at].height for at in some) <= CACHED_PIXELS
         differences = []
         for done, at in enumerate(some, 1):
             both = self._renderer.draw(cameras[at]), reference.draw(cameras[at])
@@ -241,7 +242,7 @@ class _Writer:
         return facts
 
     def _floats(self, drawn: Drawn, image: NDArray[np.float32]) -> NDArray[np.float32]:
-        """What a .npy holds: the numbers behind the colours where those are of pixels, else the colours."""
+        """The content of a .npy file: the values behind the colours if they are per pixel, else the colours."""
         by = self._renderer.settings.color_by
         return drawn.values if by in OF_PIXELS and drawn.values is not None else image
 

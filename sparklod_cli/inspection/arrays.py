@@ -1,4 +1,4 @@
-"""The report on a .npz file of `build-lod --encoding`: what its arrays tell of a tree, and no more."""
+"""The report on a .npz file of `build-lod --encoding`, as far as its arrays describe a tree."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from .findings import Finding
 if TYPE_CHECKING:
     from .report import ReportSettings
 
-#: What cannot be told of a tree whose nodes lie in an array without their children.
-NO_CHILDREN = "its splats are the nodes of a tree, whose children it does not hold: which are leaves cannot be told"
+#: The note on arrays with the nodes of a tree but without their children.
+NO_CHILDREN = "its splats are the nodes of a tree, but it has no child indices, so leaves cannot be told apart"
 
 
 @dataclasses.dataclass(frozen=True)
 class Facts:
-    """What arrays tell, under the names that `report.Report` has."""
+    """The facts that arrays provide, under the names of `report.Report`."""
 
     format: str
     splats: int
@@ -37,18 +37,18 @@ class Facts:
 
 
 def examine(arrays: Arrays, settings: ReportSettings, *, threads: int = 1) -> tuple[Facts, Scene | None]:
-    """What the arrays of one of `gpu.table.ENCODINGS` tell, and the splats if they hold all of them.
+    """Examines the arrays of one of `gpu.table.ENCODINGS`; returns the facts, and the splats if they are complete.
 
     Args:
-        arrays: by their names, which tell the encoding.
-        settings: what to look at.
-        threads: to decode on.
+        arrays: by name; the names identify the encoding.
+        settings: what to examine.
+        threads: number of threads to decode on.
 
     Raises:
-        FormatError: the arrays are of no encoding, or of another shape than theirs.
+        FormatError: the arrays match no encoding, or have wrong shapes.
     """
     if "packed" in arrays:
-        # build-lod writes trees, of which Spark has LoD opacities; the file does not say so.
+        # build-lod writes trees, for which Spark stores LoD opacities; the file does not record that.
         splats = packed_splats.unpack(arrays, packed_splats.Encoding(lod_opacity=True), threads=threads)
         return _of_splats("PackedSplats", splats, settings)
     if "ext0" in arrays:
@@ -57,12 +57,12 @@ def examine(arrays: Arrays, settings: ReportSettings, *, threads: int = 1) -> tu
         return _of_tree(arrays, settings), None
     if "texture" in arrays:
         return _of_texture(arrays), None
-    raise FormatError(f"its arrays ({', '.join(arrays)}) are of no encoding that build-lod writes")
+    raise FormatError(f"its arrays ({', '.join(arrays)}) match no encoding that build-lod writes")
 
 
 def _of_splats(name: str, splats: Splats, settings: ReportSettings) -> tuple[Facts, Scene]:
     scene = Scene(splats, format=f"NPZ of {name}")
-    opaque = dataclasses.replace(splats, opacity=np.minimum(splats.opacity, np.float32(1)))  # merged splats have more
+    opaque = dataclasses.replace(splats, opacity=np.minimum(splats.opacity, np.float32(1)))  # merged splats exceed 1
     return Facts(
         format=scene.format,
         splats=len(splats),
@@ -79,7 +79,7 @@ def _of_tree(arrays: Arrays, settings: ReportSettings) -> Facts:
     facts: tree.TreeFacts | None = None
     findings: list[Finding] = []
     if count:
-        # Opaque balls that have the sizes of the nodes: their scales and opacities are not held.
+        # Opaque balls of the sizes of the nodes, whose scales and opacities are not stored.
         balls = Splats.zeros(count, 0)
         balls.scale[:] = nodes.size[:, None] / 2
         balls.opacity[:] = 1
@@ -87,15 +87,15 @@ def _of_tree(arrays: Arrays, settings: ReportSettings) -> Facts:
         facts = dataclasses.replace(facts, more_than_opaque=None)
     elif settings.check:
         findings = [Finding("values.empty", "there are no splats")]
-    note = "it holds centres, sizes and children of nodes; opacities, colours and shapes cannot be told"
+    note = "it has centres, sizes and children of nodes, but no opacities, colours and shapes"
     return Facts("NPZ of LodTree", count, 0, [note], tree=facts, findings=findings)
 
 
 def _of_texture(arrays: Arrays) -> Facts:
-    room = data_texture.SPLATS_A_ROW * len(arrays["texture"]) if arrays["texture"].ndim else 0
-    data_texture.unpack(arrays, room)  # refuses what has another shape
-    used = np.flatnonzero(np.ascontiguousarray(arrays["texture"]).reshape(room, 8).any(axis=1))
-    note = "it holds centres, covariances and colours of nodes; opacities above 1, SH and children cannot be told"
+    capacity = data_texture.SPLATS_A_ROW * len(arrays["texture"]) if arrays["texture"].ndim else 0
+    data_texture.unpack(arrays, capacity)  # raises if the shape is wrong
+    used = np.flatnonzero(np.ascontiguousarray(arrays["texture"]).reshape(capacity, 8).any(axis=1))
+    note = "it has centres, covariances and colours of nodes, but no opacities above 1, SH and children"
     return Facts("NPZ of a data texture", int(used[-1]) + 1 if len(used) else 0, 0, [note])
 
 

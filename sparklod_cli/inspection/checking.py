@@ -1,4 +1,4 @@
-"""A file, reported on and held to what is expected of it: what `sparklod inspect` does with each of its files."""
+"""Inspects a file and checks it against expectations, as `sparklod inspect` does with each of its files."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from .report import Report, ReportSettings
 
 @dataclass(frozen=True)
 class CheckSettings:
-    """What to look for in a file.
+    """What to check in a file.
 
     Attributes:
-        report: what the report has.
-        expected: what the file should be.
-        original: a scene of which the leaves should be the splats.
-        everything: findings of all severities; without it, those of a file that is held to expectations are errors.
+        report: contents of the report.
+        expected: expectations that the file must meet.
+        original: the scene whose splats the leaves must equal.
+        everything: report findings of all severities; otherwise a file with expectations has errors only.
     """
 
     report: ReportSettings
@@ -34,20 +34,20 @@ class CheckSettings:
 
     @property
     def holds(self) -> bool:
-        """Whether findings are what is asked for, rather than a report."""
+        """Whether the file is checked, rather than only reported on."""
         return self.everything or self.expected is not None or self.original is not None
 
 
 def inspect(
     path: Path, settings: CheckSettings, *, threads: int = 1, progress: Progress = silent
 ) -> tuple[Report, Scene | None]:
-    """The report on a file, with what falls short of expectations among its findings; and what was read of the scene.
+    """The report on a file, whose findings include unmet expectations, and the scene as far as it was read.
 
     Args:
-        path: of the file, see `report.inspect`.
-        settings: what to look for.
-        threads: to decode on.
-        progress: is told how much is done.
+        path: path of the file, see `report.inspect`.
+        settings: what to check.
+        threads: number of threads to decode on.
+        progress: called while the file is read.
     """
     found, scene = report.inspect(path, settings.report, threads=threads, progress=progress)
     if not settings.holds or found.format is None:
@@ -56,16 +56,16 @@ def inspect(
     if settings.expected is not None:
         findings += expectations.check(found, settings.expected)
     if settings.original is not None:
-        nothing = [Finding("expect.leaves", "the file does not hold all of its splats, so they cannot be compared")]
+        nothing = [Finding("expect.leaves", "the file does not contain all of its splats, so they cannot be compared")]
         findings += nothing if scene is None else leaves.check(scene, settings.original)
     return dataclasses.replace(found, findings=findings), scene
 
 
 def read_original(path: Path, *, threads: int = 1, progress: Progress = silent) -> Scene:
-    """The scene whose splats the leaves should be.
+    """Reads the scene whose splats the leaves must equal.
 
     Raises:
-        FormatError: it cannot be read; names the file.
+        FormatError: the file cannot be read; names it.
     """
     try:
         return read_scene(path, threads=threads, progress=progress)

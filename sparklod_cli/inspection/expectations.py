@@ -12,7 +12,7 @@ from typing import Any
 from ..io import read_text
 from ..support.errors import SparklodError
 from ..support.printable import printable
-from ..support.untrusted import QUOTED, parse_json, parse_toml, quoted, shown
+from ..support.untrusted import QUOTED, parse_json, parse_toml, quoted, quoted_value
 from ..tables.conditions import BadAssertionError, Condition, is_number, number_text, parse
 from ..tables.files import near
 from .findings import Finding
@@ -126,14 +126,14 @@ def read(path: Path) -> Expectations:
         if name not in types:
             raise ExpectationError(f"{path}: {printable(name, QUOTED)} is not one of {', '.join(types)}")
         if not isinstance(value, types[name]) or (isinstance(value, bool) and name != "lod"):
-            raise ExpectationError(f"{path}: {name} cannot be {shown(value)}")
+            raise ExpectationError(f"{path}: {name} cannot be {quoted_value(value)}")
         if isinstance(value, (int, float)) and not 0 <= value < math.inf:
-            raise ExpectationError(f"{path}: {name} cannot be {shown(value)}")
+            raise ExpectationError(f"{path}: {name} cannot be {quoted_value(value)}")
     values = dict(_flat(data.pop("values", {}), str(path)))
     asserts = data.pop("assert", [])
     for each in asserts:
         if not isinstance(each, str):
-            raise ExpectationError(f"{path}: assert cannot hold {shown(each)}, only texts such as 'nodes<=5M'")
+            raise ExpectationError(f"{path}: assert cannot hold {quoted_value(each)}, only texts such as 'nodes<=5M'")
         try:
             parse_assertion(each)
         except BadAssertionError as error:
@@ -149,16 +149,16 @@ def _flat(table: dict[str, Any], path: str, prefix: str = "") -> Iterator[tuple[
             yield from _flat(wanted, path, f"{name}.")
             continue
         if isinstance(wanted, dict) and not (wanted and wanted.keys() <= {"min", "max"}):
-            raise ExpectationError(f"{path}: {printable(name, QUOTED)} takes min and max, not {shown(wanted)}")
+            raise ExpectationError(f"{path}: {printable(name, QUOTED)} takes min and max, not {quoted_value(wanted)}")
         if isinstance(wanted, dict) and not all(map(is_number, wanted.values())):
             raise ExpectationError(
-                f"{path}: min and max of {printable(name, QUOTED)} must be numbers, not {shown(wanted)}"
+                f"{path}: min and max of {printable(name, QUOTED)} must be numbers, not {quoted_value(wanted)}"
             )
         try:
             json.dumps(wanted)
         except TypeError:
             raise ExpectationError(
-                f"{path}: {printable(name, QUOTED)} cannot be {shown(wanted)}, no report has such a value"
+                f"{path}: {printable(name, QUOTED)} cannot be {quoted_value(wanted)}, no report has such a value"
             ) from None
         yield name, wanted
 

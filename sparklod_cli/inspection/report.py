@@ -32,7 +32,7 @@ class NoFieldError(SparklodError):
 
 @dataclass(frozen=True)
 class ReportSettings:
-    """What to report beside the header and the tree.
+    """What to report besides the header and the tree.
 
     Attributes:
         values: statistics of the splats.
@@ -52,7 +52,7 @@ class Report:
     Attributes:
         file: path, as it was given.
         bytes: size on disk; of an unpacked SOG, that of all its files.
-        format: name for people; None if the file could not be read.
+        format: name for display; None if the file could not be read.
         splats: number of splats, or nodes of a tree.
         sh_degree, antialiased: of the splats.
         header: fields of the header, which depend on the format.
@@ -98,7 +98,7 @@ def value_at(plain: dict[str, Any], name: str) -> Any:
     """The value of a field of a report as JSON: keys and indices with dots between ("tree.levels.0.nodes").
 
     Raises:
-        NoFieldError: there is none.
+        NoFieldError: there is no such field.
     """
     value: Any = plain
     try:

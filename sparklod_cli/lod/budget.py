@@ -1,4 +1,4 @@
-"""Budgets as people write them: a count of splats, or a share of the leaves."""
+"""Splat budgets: a count of splats, or a share of the leaves."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from ..support.units import parse_count
 #: A share of the leaves, in percent, with at most nine digits after the point.
 SHARE = re.compile(r"([0-9]{1,3}(?:\.[0-9]{1,9})?|\.[0-9]{1,9})\s*%")
 
-#: The largest count: all up to it are whole numbers in every format of a table.
+#: The largest count: up to it, every table format stores integers exactly.
 LARGEST = 1 << 53
 
 
 @dataclass(frozen=True)
 class Budget:
-    """The most splats that a cut may have.
+    """The maximum number of splats of a cut.
 
     Attributes:
-        text: as it was written: "5%" or "500k".
-        share: of the leaves of all instances together; None for a count.
-        count: splats; None for a share.
-        scale: multiplies it, Spark's `lodSplatScale`.
+        text: as the user wrote it: "5%" or "500k".
+        share: share of the leaves of all instances together; None for a count.
+        count: number of splats; None for a share.
+        scale: factor for the budget, Spark's `lodSplatScale`.
     """
 
     text: str
@@ -33,7 +33,7 @@ class Budget:
 
     @classmethod
     def of_count(cls, count: int) -> Budget:
-        """A budget of so many splats."""
+        """A budget of this many splats."""
         return cls(f"{count}", None, count)
 
     def scaled(self, scale: float) -> Budget:
@@ -41,7 +41,7 @@ class Budget:
         return replace(self, scale=self.scale * scale)
 
     def of(self, leaves: int) -> int:
-        """Splats, where all instances together have so many leaves; at least 1."""
+        """The number of splats, at least 1, for instances with this many leaves in total."""
         splats = self.count if self.share is None else self.share * leaves
         assert splats is not None
         return max(1, int(splats if self.scale == 1 else float(splats) * self.scale))
@@ -51,7 +51,7 @@ def parse_budget(text: str) -> Budget:
     """The budget of a text such as "5%" or "500k".
 
     Raises:
-        ValueError: it is neither a share nor a count, or it is 0 or a count beyond `LARGEST`.
+        ValueError: the text is neither a share nor a count, or is out of range (0, or a count beyond `LARGEST`).
     """
     text = text.strip()
     found = SHARE.fullmatch(text)
@@ -70,7 +70,7 @@ def parse_budgets(text: str) -> tuple[Budget, ...]:
     """The budgets of a text such as "2%,5%,500k".
 
     Raises:
-        ValueError: there is none, or one of them is no budget.
+        ValueError: the text has no budget, or one that is invalid.
     """
     budgets = tuple(map(parse_budget, filter(None, map(str.strip, text.split(",")))))
     if not budgets:

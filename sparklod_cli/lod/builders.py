@@ -1,4 +1,4 @@
-"""The table of methods that build trees: adding one is a module and a row here."""
+"""The table of tree builders; a new one needs a module and a row here."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Builder:
-    """A method.
+    """A tree builder.
 
     Attributes:
-        module: in this package; has `build(splats, SETTING, *, progress) -> (nodes, tree)`.
-        setting: the one number that it takes, by its name.
-        summary: for people, a phrase.
+        module: module of this package that has `build(splats, SETTING, *, progress) -> (nodes, tree)`.
+        setting: name of its only parameter, a number.
+        summary: a phrase for help texts.
     """
 
     module: str
@@ -26,7 +26,7 @@ class Builder:
         return import_module(f".{self.module}", __package__)
 
 
-#: By the name of the method; the first one is the default.
+#: Builders by the name of the method; the first is the default.
 BUILDERS = {
     "quick": Builder("quick", "base", "a voxel grid a level, in seconds"),
     "quality": Builder("quality", "growth", "merges the pairs that cost least, for closer cuts"),

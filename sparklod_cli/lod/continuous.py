@@ -1,4 +1,4 @@
-"""Continuous cuts, which do not pop: nodes fade into their children as the camera comes nearer.
+"""Continuous cuts, which do not pop: nodes fade into their children as the camera approaches.
 
 An ordinary cut refines a node or not, by whether its *limit* L, the least pixel scale on the path from the root to it,
 is above a threshold T. Here a node is refined by a share that rises smoothly from 0 to 1,
@@ -44,7 +44,7 @@ Shares = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class BlendedCut:
-    """The nodes that are drawn; S of them, of all instances.
+    """The S nodes of a continuous cut, of all instances together.
 
     Attributes:
         node: (S,) uint32 index in its tree; ascending within an instance.
@@ -66,7 +66,7 @@ class ContinuousCuts:
     """Finds continuous cuts.
 
     Args:
-        traversal: has the trees and instances.
+        traversal: provides the trees and instances.
     """
 
     def __init__(self, traversal: Traversal) -> None:
@@ -78,9 +78,9 @@ class ContinuousCuts:
         """The continuous cut.
 
         Args:
-            view: where the camera is.
-            budget: sum of the weights, all instances together, unless `smallest` or the leaves are reached before; at
-                least the number of instances. More nodes are drawn, as those that fade are drawn, too.
+            view: the camera.
+            budget: sum of the weights, all instances together, unless `smallest` or the leaves are reached first; at
+                least the number of instances. The number of nodes is larger, because fading nodes count in part.
             smallest: nodes of this pixel scale or less are not refined; see `settings.pixel_limit`.
             width: nodes of this many times the threshold are refined completely; above 1.
         """

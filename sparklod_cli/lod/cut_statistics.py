@@ -59,7 +59,7 @@ def measure(
         cut: a cut found for `view`.
         view: the camera.
         size: width and height of the picture, pixels.
-        by_instance: whether statistics of each instance are computed.
+        by_instance: compute statistics of each instance, too.
     """
     width, height = size
     counts = np.empty((len(cut.views), kernels.COUNTS), np.int64)
@@ -86,7 +86,7 @@ def measure(
 def _measured(row: NDArray[np.int64], sizes: NDArray[np.float32], pixels: int) -> CutStatistics:
     count = [int(value) for value in row]
     selected = count[kernels.SELECTED]
-    seen = np.sort(sizes[sizes >= 0])  # several times as fast as numpy.percentile
+    inside = np.sort(sizes[sizes >= 0])  # several times as fast as numpy.percentile
     return CutStatistics(
         selected=selected,
         leaves=count[kernels.LEAVES],
@@ -97,8 +97,8 @@ def _measured(row: NDArray[np.int64], sizes: NDArray[np.float32], pixels: int) -
         level_min=count[kernels.DEPTH_MIN] if selected else None,
         level_mean=count[kernels.DEPTH_SUM] / selected if selected else None,
         level_max=count[kernels.DEPTH_MAX] if selected else None,
-        px_p50=_percentile(seen, 0.50),
-        px_p95=_percentile(seen, 0.95),
+        px_p50=_percentile(inside, 0.50),
+        px_p95=_percentile(inside, 0.95),
         overdraw=count[kernels.AREA] / kernels.AREA_PARTS / pixels,
     )
 
@@ -136,14 +136,14 @@ class Changes:
 
         The second is None for the first cut.
         """
-        kept = np.zeros(len(self._base), np.int64)
+        common = np.zeros(len(self._base), np.int64)
         old = self._last or (cut.node[:0], cut.instance[:0])
-        kernels.replace_drawn(self._drawn, self._base, cut.node, cut.instance, *old, kept)
+        kernels.replace_drawn(self._drawn, self._base, cut.node, cut.instance, *old, common)
         counts = np.bincount(cut.instance, minlength=len(self._base))
         first = self._last is None
         result = [
             (int(new), None if first else int(same), int(before))
-            for new, same, before in zip(counts, kept, self._counts, strict=True)
+            for new, same, before in zip(counts, common, self._counts, strict=True)
         ]
         self._last, self._counts = (cut.node, cut.instance), counts
         return result

@@ -1,4 +1,4 @@
-"""The foveation of a view, as kernels read it."""
+"""Converts the foveation of a view to the fields that kernels read."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from .kernels.pixel_scale import CONE, FRUSTUM, NO_FOVEATION
 
 
 def set_foveation(row: np.void, foveation: Foveation, fov_x: float, fov_y: float) -> None:
-    """Fills what a `kernels.pixel_scale.VIEW` says of foveation; fields of view are radians."""
+    """Fills the foveation fields of a `kernels.pixel_scale.VIEW`; fields of view in radians."""
     row["behind"] = foveation.behind
     if isinstance(foveation, Frustum):
         row["kind"] = FRUSTUM

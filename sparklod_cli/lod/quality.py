@@ -7,7 +7,7 @@
    has this coverage (`kernels/profile.py`).
 3. The binary tree's least useful nodes are dropped (`kernels/prune.py`).
 
-docs/decisions/2026-11-21-fidelity.md has the reasons, and what else was tried.
+docs/decisions/2026-11-21-fidelity.md has the reasons, and the alternatives that were tried.
 """
 
 from __future__ import annotations
@@ -144,14 +144,14 @@ def build(splats: Splats, growth: float = DEFAULT_GROWTH, *, progress: Progress 
 
     Args:
         splats: N splats, finite, with positive opacity and at least one positive scale each.
-        growth: most nodes of the tree per leaf, 1.05 to 2.
-        progress: is told the number of nodes done in each of the stages building, pruning and ordering.
+        growth: maximum ratio of nodes to leaves, 1.05 to 2.
+        progress: called with the number of nodes done in each of the stages building, pruning and ordering.
 
     Returns:
         M >= N splats and their tree.
 
     Raises:
-        InvalidSplatsError: there is no splat, or one is invalid or cannot be seen.
+        InvalidSplatsError: there are no splats, or one is invalid or invisible.
         ValueError: the growth is out of range.
     """
     check_setting("growth", growth, MIN_GROWTH, MAX_GROWTH)
@@ -208,9 +208,9 @@ def _merge(
     Args:
         binary: the tree.
         active: (n,) uint32 nodes without a parent.
-        curve: they are sorted along.
-        largest: of the trace of a covariance, units squared; no larger node is made.
-        rounds: at most; None for as many as it takes.
+        curve: the curve to sort them along.
+        largest: largest trace of the covariance of a merged node, units squared.
+        rounds: maximum number of rounds; None for no limit.
         progress: as for `build`.
     """
     done, leaves = 0, (len(binary.rows) + 1) // 2
@@ -220,7 +220,7 @@ def _merge(
             partner, cost = pair_cost.find_partners(binary.rows, active, WINDOW, np.float32(largest))
             before = len(active)
             pairs, rest = pair_cost.match_pairs(active, partner, cost, _largest_cost(cost), binary.used)
-            if rounds is None and not len(pairs):  # no cost is a number: the nodes are too far apart for float32
+            if rounds is None and not len(pairs):  # no finite cost: too far apart for float32
                 partner = np.arange(before, dtype=np.int32) ^ 1
                 partner[partner >= before] = -1
                 pairs, rest = pair_cost.match_pairs(active, partner, np.zeros_like(cost), np.float32(0), binary.used)
@@ -273,7 +273,7 @@ def _in_final_order(
 
 
 def _by_rank(binary: _BinaryTree, rank: NDArray[np.int32], curve: _Curve) -> tuple[Nodes, NDArray[np.int64]]:
-    """The merged nodes that are kept, by rank and then along the curve, and where each rank ends, 0 first."""
+    """The remaining merged nodes, by rank and then along the curve, and where each rank ends, 0 first."""
     inner = np.flatnonzero(rank >= 0).astype(np.uint32)
     own = rank[inner]
     keys = curve.keys(binary.rows, inner, 0) | (own.astype(np.uint64) << np.uint64(3 * node_rows.CURVE_BITS))

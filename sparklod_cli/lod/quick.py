@@ -4,7 +4,7 @@ The method is Spark's ("Quick LoD algorithm"). A splat of size s = 2 * max(scale
 whose cells have edges of base ** level. From the finest level up, the splats of a level join the survivors of the level
 below, and all that share a cell become the children of one merged node.
 
-For speed, leaves are sorted once, by level and Morton code, into rows that hold all that a merge reads, so that each
+For speed, leaves are sorted once, by level and Morton code, into rows with all data that a merge reads, so that each
 level reads neighbouring memory. A level is a radix sort of its cells and one parallel merge. As the nodes of a level
 are made in Morton order, writing the levels out backwards gives the final order, coarse before fine.
 """
@@ -53,7 +53,7 @@ class _VoxelTree:
         weight: (capacity,) float64, opacity * area.
         leaves: number of leaves.
         used: number of nodes so far.
-        batches: merges that were done at once: the first new node, the (C,) members, and (G + 1,) where the members of
+        batches: merges that were done together: the first new node, the (C,) members, and (G + 1,) where the members of
             each new node begin. Members are leaves or from earlier batches.
     """
 
@@ -86,14 +86,14 @@ class _VoxelTree:
         big = np.flatnonzero(count > MAX_CHILDREN)
         shares = [np.linspace(0, count[g], -(-count[g] // MAX_CHILDREN) + 1).astype(np.int64) for g in big]
         made = np.arange(sum(len(share) - 1 for share in shares), dtype=np.uint32) + np.uint32(self.used)
-        starts, kept, at, done = [np.zeros(1, np.int64)], [], 0, 0
+        starts, parts, at, done = [np.zeros(1, np.int64)], [], 0, 0
         for g, share in zip(big, shares, strict=True):
             starts.append(starts[-1][-1] + share[1:])
-            kept += [members[at : first[g]], made[done : done + len(share) - 1]]
+            parts += [members[at : first[g]], made[done : done + len(share) - 1]]
             at, done = first[g + 1], done + len(share) - 1
         self.merge(np.concatenate([members[first[g] : first[g + 1]] for g in big]), np.concatenate(starts))
         count[big] = [len(share) - 1 for share in shares]
-        return np.concatenate([*kept, members[at:]]), np.concatenate([[0], np.cumsum(count)])
+        return np.concatenate([*parts, members[at:]]), np.concatenate([[0], np.cumsum(count)])
 
 
 def build(splats: Splats, base: float = DEFAULT_BASE, *, progress: Progress = silent) -> tuple[Splats, LodTree]:
@@ -106,13 +106,13 @@ def build(splats: Splats, base: float = DEFAULT_BASE, *, progress: Progress = si
     Args:
         splats: N splats, finite, with positive opacity and at least one positive scale each.
         base: growth of the cells from level to level, 1.1 to 2.0.
-        progress: is told the number of splats that have joined the tree.
+        progress: called with the number of splats that have joined the tree.
 
     Returns:
         M >= N splats and their tree; merged ones have linear opacities up to 1000.
 
     Raises:
-        InvalidSplatsError: there is no splat, or one is invalid or cannot be seen.
+        InvalidSplatsError: there are no splats, or one is invalid or invisible.
         ValueError: the base is out of range.
     """
     check_setting("base", base, MIN_BASE, MAX_BASE)
@@ -128,7 +128,7 @@ def build(splats: Splats, base: float = DEFAULT_BASE, *, progress: Progress = si
         columns = SplatColumns(splats.center, splats.scale, splats.quat_xyzw, splats.opacity)
         gather_rows(index, columns, rows, weight)
         rgb, sh = splats.rgb, splats.sh
-        del splats, columns  # the rows have the rest; frees the memory where the caller has let go of it, too
+        del splats, columns  # the rows have the rest; frees the memory if the caller has no reference
         voxel_tree = _VoxelTree(rows, weight, n, n, [])
         del rows
         _grow(voxel_tree, joins, base, finest, low, high, progress)

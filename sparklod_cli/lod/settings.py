@@ -14,9 +14,8 @@ class LodSettings:
     """How a viewer finds its cuts.
 
     Attributes:
-        budget: the most splats that are drawn, all instances together; Spark 2's on a desktop by default.
-        foveation: how much nodes count by direction, where an instance has no foveation of its own;
-            Spark 2's by default.
+        budget: maximum number of splats, all instances together; by default that of Spark 2 on a desktop.
+        foveation: weight of nodes by direction, for instances without their own foveation; by default Spark 2's.
         pixel_scale_limit: nodes of this pixel scale or less are not refined; None for the pixel scale of a pixel.
         render_scale: multiplies the pixel scale of a pixel, Spark's `lodRenderScale`.
         continuous: width of continuous cuts, the ratio of the pixel scales between which a node fades into its

@@ -1,4 +1,4 @@
-"""The budgeted cut through Level-of-Detail trees: what a viewer draws from where its camera is."""
+"""Budgeted cuts through Level-of-Detail trees: the nodes that a viewer draws for a camera."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from .kernels.cut import find_cut
 
 Matrix = NDArray[np.float64]
 
-#: Nodes of a chunk, in which Spark streams trees; as a power of 2.
+#: Nodes of a chunk, the unit in which Spark streams trees; as a power of 2.
 CHUNK_BITS = 16
 CHUNK_NODES = 1 << CHUNK_BITS
 
-#: Nodes that are visited for each node of a cut, at most, where every node that is refined has two children or more; in
-#: other trees the buffers grow.
+#: Initial size of the buffers, in visited nodes per node of a cut: enough if every refined node has two or more
+#: children; for other trees the buffers grow.
 VISITS = 2
 
-#: The first threshold for a cut, as a share of the last cut's: a little lower, as visiting some nodes in vain costs
-#: less than another round. Chosen; cuts do not depend on it.
+#: The first threshold for a cut, as a share of the last cut's: slightly lower, because visiting some nodes
+#: unnecessarily costs less than another round. Chosen; cuts do not depend on it.
 GUESS = 0.97
 
-#: Why a cut has no more nodes, by the kernel's number.
+#: Why a cut is not finer, by the kernel's code.
 REASONS = {
     cut_arrays.BUDGET: "budget",
     cut_arrays.PIXEL: "pixel",
@@ -40,7 +40,7 @@ REASONS = {
 
 @dataclass(frozen=True)
 class TreeInstance:
-    """A tree of a forest and where it stands.
+    """An instance of a tree of a forest.
 
     Attributes:
         tree: index of the tree in its `Forest`.
@@ -70,7 +70,7 @@ class View:
 
 
 class Forest:
-    """Trees in the layout that the traversal reads.
+    """Trees in the memory layout of the traversal.
 
     Attributes:
         nodes: `pixel_scale.NODE` of all trees, one after the other.
@@ -102,7 +102,7 @@ class Forest:
 
 @dataclass(frozen=True)
 class TreeCut:
-    """The nodes that are drawn; S of them, of all instances.
+    """The S nodes of a cut, of all instances together.
 
     Attributes:
         views: (instances,) `pixel_scale.VIEW`.
@@ -110,7 +110,7 @@ class TreeCut:
         instance: (S,) uint16.
         limit: (S,) float32, the least pixel scale from the root to the node; negative if the queue took it out, because
             it has no children or they are not resident.
-        reason: why there are no more nodes, a value of `REASONS`.
+        reason: why the cut is not finer, a value of `REASONS`.
         missing: number of nodes that would be refined if their children were resident, and of roots that are not.
         least: the least limit of a refined node; infinite if none was refined.
         stop: (pixel scale, instance, index) of the node that would have exceeded the budget, or None.
@@ -143,7 +143,7 @@ class TreeCut:
 
 
 class Traversal:
-    """Finds cuts. Each thread has buffers of its own, which are kept from one cut to the next.
+    """Finds cuts. Each thread has its own buffers, which are reused from one cut to the next.
 
     Args:
         forest: the trees.
@@ -164,7 +164,7 @@ class Traversal:
 
         Args:
             view: the camera.
-            budget: the most splats, all instances together; at least one for each instance.
+            budget: maximum number of splats, all instances together; at least one per instance.
             smallest: nodes of this pixel scale or less are not refined; see `settings.pixel_limit`.
             resident: (chunks,) bool, of all trees; all chunks are resident unless given.
         """
@@ -183,7 +183,7 @@ class Traversal:
             if reason != cut_arrays.FULL:
                 break
             work = self._work(2 * len(work.slots.node))
-        # The next cut will be much like this one.
+        # The next cut is likely to be similar.
         work.guess = GUESS * least if reason == cut_arrays.BUDGET else smallest
         return TreeCut(
             views=views,
@@ -198,7 +198,7 @@ class Traversal:
         )
 
     def forget(self) -> None:
-        """Begins this thread's next cut without the threshold of the last one. The cut is the same either way."""
+        """Discards the threshold of this thread's last cut. The next cut is the same either way."""
         work: _Work | None = getattr(self._local, "work", None)
         if work is not None:
             work.guess = 0.0

@@ -22,8 +22,8 @@ class Scene:
         splats: N splats, in the order and the axes of the file.
         tree: (N,) nodes where the file is a Level-of-Detail tree, else None.
         antialiased: trained with the opacity compensation of Mip-Splatting.
-        format: what it was read from, for people ("PLY", "SPZ 4").
-        notes: what the reader had to leave out, for people.
+        format: what it was read from, for display ("PLY", "SPZ 4").
+        notes: what the reader had to leave out, for display.
         header: numbers of the file's header that the splats do not tell, by name ("version", "fractional_bits").
     """
 

@@ -80,5 +80,5 @@ class Selection:
 
 
 def describe(dropped: dict[str, int]) -> str:
-    """ "12 not finite, 3 cropped", for people."""
+    """ "12 not finite, 3 cropped", for display."""
     return ", ".join(f"{count:,} {REASONS[reason]}" for reason, count in dropped.items())

@@ -1,1 +1,1 @@
-"""Cameras, and where they are on their way through a scene."""
+"""Renderers, their settings and colour scales."""

@@ -30,10 +30,10 @@ class Coloring:
     """What the colours of N splats mean.
 
     Attributes:
-        title: the quantity, for people.
+        title: the quantity, for display.
         rgb: (N, 3) uint8.
         ramp: (S, 3) uint8 colours of the scale, from its low to its high end; few and distinct for whole numbers.
-        marks: places on the scale, 0..1, and what they stand for.
+        marks: positions on the scale, 0..1, and their labels.
     """
 
     title: str
@@ -61,13 +61,13 @@ def whole_numbers(title: str, values: NDArray[Any], low: int, high: int) -> Colo
     count = high - low + 1
     colors = ramp(VIRIDIS, count)
     every = math.ceil(count / 12)
-    shown = [*range(low, high - every // 2, every), high] if count > 1 else [low]
-    text = {value: f"{value}" for value in shown}
+    labelled = [*range(low, high - every // 2, every), high] if count > 1 else [low]
+    text = {value: f"{value}" for value in labelled}
     if values.min() < low:
         text[low] += " or less"
     if values.max() > high:
         text[high] += " or more"
-    marks = [((value - low + 0.5) / count, text[value]) for value in shown]
+    marks = [((value - low + 0.5) / count, text[value]) for value in labelled]
     return Coloring(title, colors[np.clip(values - low, 0, count - 1)], colors, tuple(marks))
 
 

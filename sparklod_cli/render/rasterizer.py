@@ -50,7 +50,7 @@ def seen(splats: ShadedSplats, camera: Camera, settings: RasterSettings) -> NDAr
 
 
 def _buffers(count: int) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint64]]:
-    """To put splats on the screen in; kept by each thread, as new memory is slow the first time that it is touched."""
+    """Working memory for projected splats, reused by each thread, because the first access to new memory is slow."""
     if len(getattr(_kept, "keys", ())) < count:
         _kept.screens = [np.empty((count, project.COLUMNS), np.float32) for _ in range(2)]
         _kept.keys = np.empty(count, np.uint64)

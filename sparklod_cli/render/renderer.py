@@ -31,7 +31,7 @@ class Drawn:
     Attributes:
         image: (H, W, 4) float32: red, green and blue, multiplied by alpha, and alpha.
         values: (H, W) float32, the numbers behind the colours where these are of pixels; NaN where there is none.
-        splats: how many were handed to the backend.
+        splats: number of splats passed to the backend.
     """
 
     image: Image

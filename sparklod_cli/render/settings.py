@@ -18,7 +18,7 @@ BLUR = 0.3
 #: Where a splat adds less than half a step of 8 bits, it is not drawn: Spark's `minAlpha`.
 MIN_ALPHA = 0.5 / 255
 
-#: No splat is drawn farther from its centre, in pixels of the picture that is shown: Spark's `maxPixelRadius`.
+#: No splat is drawn farther from its centre, in pixels of the final picture: Spark's `maxPixelRadius`.
 MAX_PIXEL_RADIUS = 512.0
 
 #: A splat is drawn only if its centre is within this multiple of the picture's half width and height: Spark's `clipXY`.
@@ -30,7 +30,7 @@ PROFILES = ("spark", "shifted")
 #: What is drawn: splats; opaque points of a pixel; discs of one opacity, in the order of the file or from far to near.
 STYLES = ("splats", "points", "billboards", "sorted-billboards")
 
-#: What colours can mean instead of being those of the splats; those of `OF_PIXELS` are of pixels, the others of splats.
+#: Quantities that can replace the colours of splats; those in `OF_PIXELS` are per pixel, the others per splat.
 COLOR_BY = ("level", "lod-opacity", "size", "chunk", "overdraw", "depth")
 OF_PIXELS = ("overdraw", "depth")
 

@@ -1,4 +1,4 @@
-"""Simpler ways to draw splats than as splats, and how often a pixel is drawn."""
+"""Simplified drawing styles, and overdraw."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def on_screen(splats: ShadedSplats, camera: Camera, settings: RasterSettings) ->
 
 
 def overdraw(splats: ShadedSplats, camera: Camera, settings: RasterSettings) -> NDArray[np.float32]:
-    """(height, width) how many splats are blended into each pixel, those too that others hide.
+    """(height, width) number of splats blended into each pixel, including hidden ones.
 
     Splats are those that the backend numba draws.
     """

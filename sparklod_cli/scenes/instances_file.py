@@ -16,7 +16,7 @@ from ..io import is_file_name, read_text
 from ..model.foveation import Cones, Foveation, Frustum
 from ..model.instances import TOTAL, Instance, Matrix, names_of
 from ..support.errors import SparklodError
-from ..support.untrusted import parse_json, shown, well_formed
+from ..support.untrusted import parse_json, quoted_value, well_formed
 
 #: What an instance may say, and how many numbers that is; 0 for something else.
 KEYS = {"file": 0, "name": 0, "matrix": 16, "translation": 3, "rotation": 4, "scale": 1, "lod_scale": 1, "foveation": 0}
@@ -66,17 +66,17 @@ def read_instances(path: Path | str) -> list[Instance]:
 def _instance(data: Any, folder: Path) -> Instance:
     """One instance, its name empty where it has none; `ValueError` where it is none."""
     if not isinstance(data, dict):
-        raise ValueError(f"is {shown(data)}, not an object")
+        raise ValueError(f"is {quoted_value(data)}, not an object")
     for key in data:
         if key not in KEYS:
-            raise ValueError(f"has {shown(key)}, which is not one of {', '.join(KEYS)}")
+            raise ValueError(f"has {quoted_value(key)}, which is not one of {', '.join(KEYS)}")
     file, name = data.get("file"), data.get("name", "")
     if not isinstance(file, str) or not file:
         raise ValueError("names no file")
     if not is_file_name(file):
-        raise ValueError(f"names the file {shown(file)}, which no file can be called")
+        raise ValueError(f"names the file {quoted_value(file)}, which no file can be called")
     if not isinstance(name, str) or name == TOTAL:
-        raise ValueError(f"cannot be called {shown(name)}")
+        raise ValueError(f"cannot be called {quoted_value(name)}")
     lod_scale = _numbers(data, "lod_scale", [1.0])[0]
     if lod_scale < 0:
         raise ValueError(f"has a lod_scale of {lod_scale:g}")
@@ -110,7 +110,7 @@ def _foveation(data: Any) -> Foveation | None:
     if data is None:
         return None
     if not isinstance(data, dict):
-        raise ValueError(f"has a foveation of {shown(data)}")
+        raise ValueError(f"has a foveation of {quoted_value(data)}")
     kinds: dict[type[Cones | Frustum], dict[str, str]] = {
         Frustum: {"outside_foveate": "outside", "behind_foveate": "behind"},
         Cones: {"cone_fov0": "fov0", "cone_fov": "fov", "cone_foveate": "foveate", "behind_foveate": "behind"},
@@ -118,7 +118,7 @@ def _foveation(data: Any) -> Foveation | None:
     kind = Frustum if "outside_foveate" in data else Cones
     for key in data:
         if key not in kinds[kind]:
-            raise ValueError(f"has {shown(key)} in its foveation, which is not one of {', '.join(kinds[kind])}")
+            raise ValueError(f"has {quoted_value(key)} in its foveation, which is not one of {', '.join(kinds[kind])}")
     values = {field: _numbers(data, key, [0.0])[0] for key, field in kinds[kind].items() if key in data}
     if any(value < 0 for value in values.values()):
         raise ValueError("has a negative foveation")
@@ -136,7 +136,7 @@ def _numbers(data: Mapping[str, Any], key: str, default: list[float]) -> list[fl
     count = KEYS.get(key, 1)
     plain = all(isinstance(number, (int, float)) and not isinstance(number, bool) for number in flat)
     if len(flat) != count or not plain or not all(-math.inf < number < math.inf for number in flat):
-        raise ValueError(f"has {key} {shown(value)}, which is not {count} finite number{'s' * (count > 1)}")
+        raise ValueError(f"has {key} {quoted_value(value)}, which is not {count} finite number{'s' * (count > 1)}")
     if any(abs(number) > LARGEST for number in flat):
-        raise ValueError(f"has {key} {shown(value)}, which is beyond {LARGEST:g}")
+        raise ValueError(f"has {key} {quoted_value(value)}, which is beyond {LARGEST:g}")
     return [float(number) for number in flat]

@@ -1,4 +1,4 @@
-"""Which chunks of trees are in memory: their numbers, their importance, and a cache that gives up the least used."""
+"""Chunks of trees: numbering, priority, and a cache with least-recently-used eviction."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from numpy.typing import ArrayLike, NDArray
 
 
 class Chunks:
-    """The chunks of all trees, numbered through: those of the first tree, then those of the second, and so on.
+    """The chunks of all trees, numbered consecutively, tree by tree.
 
-    These are the numbers of `lod.traversal.Forest.chunk_base`.
+    The numbers are those of `lod.traversal.Forest.chunk_base`.
 
     Args:
-        sizes: for each tree (chunks of it,) bytes in its file.
+        sizes: for each tree the sizes of its chunks in the file, bytes.
 
     Attributes:
         sizes: of each chunk, bytes.
         roots: the first chunk of each tree, which holds its root.
 
     Raises:
-        ValueError: a tree without chunks, or a negative size.
+        ValueError: a tree has no chunks, or a size is negative.
     """
 
     def __init__(self, sizes: Sequence[ArrayLike]) -> None:
@@ -32,7 +32,7 @@ class Chunks:
         for tree, of_tree in enumerate(sizes):
             column = np.asarray(of_tree, np.int64)
             if column.ndim != 1 or not len(column) or column.min() < 0:
-                raise ValueError(f"the chunks of tree {tree} are to be a list of sizes, 0 or more each")
+                raise ValueError(f"the chunks of tree {tree} must be a list of sizes, each 0 or more")
             self.roots.append(len(self.sizes))
             self.sizes += column.tolist()
 
@@ -40,19 +40,19 @@ class Chunks:
         return len(self.sizes)
 
     def bytes_of(self, chunks: Iterable[int]) -> int:
-        """The size of some chunks together."""
+        """The total size of some chunks."""
         return sum(self.sizes[chunk] for chunk in chunks)
 
 
 def by_priority(chunks: NDArray[np.integer], pixel_scales: NDArray[np.floating]) -> list[int]:
-    """Each chunk once, the most important first: that of the greatest pixel scale, of equal ones that of lower number.
+    """Each chunk once, by descending pixel scale and then by ascending number.
 
     A node is never larger than its parent where pixel scales are limits of a cut (`lod.kernels.cut`), so that coarse
     chunks come first.
 
     Args:
-        chunks: (N,) which are looked into, any number of times each.
-        pixel_scales: (N,) of the nodes whose children are in them. NaN counts as the largest, as in the traversal.
+        chunks: (N,) chunks that are read, with repetitions.
+        pixel_scales: (N,) pixel scales of the nodes whose children are in them. NaN is the largest.
     """
     if not len(chunks):
         return []
@@ -63,19 +63,19 @@ def by_priority(chunks: NDArray[np.integer], pixel_scales: NDArray[np.floating])
 
 
 class ChunkCache:
-    """Holds chunks, and gives up the least recently used ones when they are too many.
+    """Holds chunks, and evicts the least recently used ones when it is full.
 
-    A chunk is used when it arrives, and all the time that it is wanted; of those in use the more important counts as
-    the more recently used. What is wanted beyond the capacity is not worth fetching: it would push out something more
-    important, or be pushed out by it. Spark's pager does all this too.
+    A chunk is used when it arrives and as long as it is wanted; among wanted chunks the more important one counts as
+    more recently used. Wanted chunks beyond the capacity are not fetched, since they would evict more important ones or
+    be evicted by them. Spark's pager works the same way.
 
     Args:
-        chunks: of all trees. Their roots are always wanted, and more than all others.
-        capacity: how many fit; None for all.
+        chunks: the chunks of all trees. Chunks with roots are always wanted, and come first.
+        capacity: maximum number of chunks; None for all.
 
     Attributes:
-        wanted: what is wanted, each chunk once, the most important first.
-        admitted: as much of it as fits. Of this nothing is ever given up.
+        wanted: the wanted chunks, each once, the most important first.
+        admitted: the first of them, as many as fit; they are never evicted.
 
     Raises:
         ValueError: the capacity is less than the number of trees.
@@ -88,7 +88,7 @@ class ChunkCache:
             )
         self._chunks, self._capacity = chunks, capacity
         self._roots = frozenset(chunks.roots)
-        # From the first to be given up to the last: what is not wanted by last use, then what is, against its order.
+        # In order of eviction: unwanted chunks by last use, then wanted ones, the least important first.
         self._resident: OrderedDict[int, None] = OrderedDict()
         self.wanted: list[int] = []
         self.admitted: list[int] = []
@@ -101,21 +101,21 @@ class ChunkCache:
         return chunk in self._resident
 
     def resident(self) -> NDArray[np.bool_]:
-        """(chunks,) which are here, as `lod.traversal.Traversal.cut` takes it."""
+        """(chunks,) bool, the resident chunks, for `lod.traversal.Traversal.cut`."""
         present = np.zeros(len(self._chunks), np.bool_)
         present[list(self._resident)] = True
         return present
 
     def missing(self) -> list[int]:
-        """What is to be here and is not, the most important first."""
+        """The admitted chunks that are not resident, the most important first."""
         return [chunk for chunk in self.admitted if chunk not in self._resident]
 
     def want(self, wanted: Iterable[int]) -> None:
-        """Replaces what is wanted.
+        """Replaces the list of wanted chunks.
 
         Args:
-            wanted: chunks, the most important first. The roots of all trees come before them, in this order too,
-                whether named or not.
+            wanted: chunks, the most important first. The roots of all trees come before them, in this order,
+                too, whether listed or not.
 
         Raises:
             ValueError: there is no such chunk.
@@ -123,7 +123,7 @@ class ChunkCache:
         named = [int(chunk) for chunk in wanted]
         if named and not 0 <= min(named) <= max(named) < len(self._chunks):
             raise ValueError(f"chunks {min(named)} to {max(named)} are wanted, but there are {len(self._chunks)}")
-        self._arrange()  # what was wanted until now was used until now
+        self._arrange()  # chunks wanted until now count as used until now
         roots = [chunk for chunk in named if chunk in self._roots]
         self.wanted = list(dict.fromkeys([*roots, *self._chunks.roots, *named]))
         self.admitted = self.wanted[: self._capacity]
@@ -131,16 +131,15 @@ class ChunkCache:
         self._arrange()
 
     def arrive(self, chunk: int) -> int | None:
-        """A chunk has been fetched and takes its place.
+        """Adds a chunk that has been fetched.
 
         Returns:
-            the chunk that was given up for it: the least recently used one of those that are not wanted, or else the
-            least important. It may be the newcomer itself, when it was wanted once and is not any more. None if
-            there was room.
+            the chunk that was evicted: the least recently used of the unwanted chunks, or else the least important. It
+            may be the new chunk itself, if it is no longer wanted. None if nothing was evicted.
         """
         self._resident[chunk] = None
-        # The admitted fit, so when one of them makes it too many, there is a chunk here that is none of them, and that
-        # comes before them all. Any other newcomer has to get to its place for this.
+        # All admitted chunks fit, so if an admitted one exceeds the capacity, the first in the order of eviction is not
+        # admitted. Any other new chunk must first be moved to its place in that order.
         if chunk not in self._is_admitted:
             self._arrange()
         if self._capacity is None or len(self._resident) <= self._capacity:
@@ -149,13 +148,13 @@ class ChunkCache:
         return evicted
 
     def copy(self) -> ChunkCache:
-        """A cache that goes its own way from here."""
+        """An independent copy of the cache."""
         twin = copy.copy(self)  # the lists are replaced, never changed
         twin._resident = self._resident.copy()
         return twin
 
     def _arrange(self) -> None:
-        """Puts what is resident into the order in which it is to be given up."""
+        """Puts the resident chunks in order of eviction."""
         for chunk in reversed(self.wanted):
             if chunk in self._resident:
                 self._resident.move_to_end(chunk)

@@ -1,4 +1,4 @@
-"""`Simulation`: what a viewer draws along a camera path, frame by frame, and what it has to fetch for that."""
+"""`Simulation`: the cuts that a viewer draws along a camera path, frame by frame, and the chunks that it fetches."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ class Frame:
     """One frame.
 
     Attributes:
-        number: on the path.
-        camera: of it.
-        cut: what is drawn.
-        rows: that of all instances together, then those of each, if asked for.
-        in_front: the share of all that is drawn that lies in front of the camera.
+        number: number of the frame on the path.
+        camera: its camera.
+        cut: the cut that is drawn.
+        rows: the row of all instances together, then one per instance, if requested.
+        in_front: share of the drawn splats in front of the camera.
     """
 
     number: int
@@ -45,8 +45,8 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class _Found:
-    """A cut, what it is like, as a whole and by instance, and how long it took."""
+class _MeasuredCut:
+    """A cut, its statistics as a whole and by instance, and the seconds it took to find it."""
 
     cut: TreeCut
     whole: CutStatistics
@@ -55,13 +55,13 @@ class _Found:
 
 
 class Simulation:
-    """A viewer that goes along a camera path through trees.
+    """A viewer that moves along a camera path through trees.
 
     Args:
-        scenes: trees alone.
-        settings: what the viewer draws; its cuts are ordinary ones.
-        streaming: how chunks get to it; everything is there unless given.
-        by_instance: make rows of single instances, too.
+        scenes: scenes that are all trees.
+        settings: settings of the cuts; continuous cuts are not simulated.
+        streaming: network and cache; everything is resident unless given.
+        by_instance: make a row per instance, too.
 
     Raises:
         ValueError: the budget, or the cache, is too small for the roots; or there are too many instances.
@@ -82,17 +82,17 @@ class Simulation:
         self._depth = np.concatenate([depth for depth in depths if depth is not None])
         self._chunks = Chunks([tree.chunk_bytes() for tree in scenes.trees])
         self._names = [instance.name for instance in scenes.instances]
-        self._stream()  # refuses what would fail at the first frame
+        self._stream()  # raises what would fail at the first frame
 
     def _stream(self, start: float = 0.0) -> Stream:
-        """A viewer's chunks, from a time in seconds on."""
+        """A stream that starts at a time in seconds."""
         return Stream(self._chunks, self._streaming.network, capacity=self._streaming.chunk_cache, start=start)
 
     def run(self, path: CameraPath, *, threads: int = 1, progress: Progress = silent) -> Iterator[Frame]:
         """The frames of a path, in order.
 
-        Cuts are found on several threads, some frames ahead; what depends on the frame before is done in order. Where
-        chunks are missing, the cut is found once more with those that are resident.
+        Cuts are found on several threads, some frames ahead; anything that depends on the previous frame is done in
+        order. If chunks are missing, the cut is found again with the resident ones.
         """
         stream = self._stream(path.cameras[0].time)
         changes = Changes(self.scenes.forest, self._traversal.instances)
@@ -109,11 +109,11 @@ class Simulation:
             progress("traverse", at + 1, len(path.cameras), "frame")
 
     def _warm_up(self, camera: Camera) -> None:
-        """Loads or compiles the kernels, which must not count as the first frame's time."""
+        """Loads or compiles the kernels, so that the time of the first frame does not include it."""
         view = view_of(camera)
         self._traversal.cut(view, budget=len(self._traversal.instances))
 
-    def _find(self, camera: Camera, resident: NDArray[np.bool_] | None = None) -> _Found:
+    def _find(self, camera: Camera, resident: NDArray[np.bool_] | None = None) -> _MeasuredCut:
         view = view_of(camera)
         limit = self.settings.limit(camera.fov_y, camera.height)
         start = time.perf_counter()
@@ -127,10 +127,10 @@ class Simulation:
             size=(camera.width, camera.height),
             by_instance=self._by_instance,
         )
-        return _Found(cut, whole, parts, seconds)
+        return _MeasuredCut(cut, whole, parts, seconds)
 
-    def _fetched(self, camera: Camera, ideal: _Found, stream: Stream) -> tuple[_Found, Row]:
-        """The cut with the resident chunks, and the cells of the row about chunks."""
+    def _fetched(self, camera: Camera, ideal: _MeasuredCut, stream: Stream) -> tuple[_MeasuredCut, Row]:
+        """The cut with the resident chunks, and the cells of the row that describe chunks."""
         wanted = ideal.cut.chunks()
         instant = self._streaming.network.instant
         if instant:
@@ -139,7 +139,7 @@ class Simulation:
         if not all(chunk in stream.cache for chunk in wanted):
             drawn = self._find(camera, stream.cache.resident())
         if not instant:
-            stream.want(drawn.cut.chunks())  # a viewer learns from the chunks that it has which others there are
+            stream.want(drawn.cut.chunks())  # a viewer discovers chunks through those that it has
         arrived = stream.take_arrivals()
         return drawn, {
             "chunks_touched": len(stream.cache.wanted),
@@ -150,9 +150,9 @@ class Simulation:
         }
 
     def _rows(
-        self, number: int, camera: Camera, drawn: _Found, changes: Sequence[tuple[int, int | None, int]]
+        self, number: int, camera: Camera, drawn: _MeasuredCut, changes: Sequence[tuple[int, int | None, int]]
     ) -> list[Row]:
-        """The row of all instances together, without cells about chunks, and those of each, if asked for."""
+        """The row of all instances together, without the chunk cells, then one per instance, if requested."""
         cut, settings = drawn.cut, self.settings
         where: Row = {"frame": number, "time_s": camera.time, "name": camera.name}
         for name, vector in (("position", camera.position), ("forward", camera.forward)):

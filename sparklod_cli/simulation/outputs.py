@@ -1,4 +1,4 @@
-"""What is made of the frames of a simulation: a table, files of the nodes of each cut, and charts."""
+"""Outputs of a simulation: a table, index files of the cuts, and charts."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ if TYPE_CHECKING:
     from ..tables.columns import Row
     from .frames import Frame, Simulation
 
-#: Nodes of a row of Spark's index texture.
+#: Nodes per row of Spark's index texture.
 ROW = 16_384
 
 
 @dataclass(frozen=True)
 class FrameOutputs:
-    """Where the frames of a simulation go.
+    """Destinations of the frames of a simulation.
 
     Attributes:
-        table: of their rows.
-        indices: folder of the nodes of each cut; None for none.
-        padded: fill the files of nodes up to rows of `ROW`.
+        table: the table of the rows.
+        indices: folder for the node indices of each cut; None for none.
+        padded: pad the index files to whole rows of `ROW`.
         plot: file of the charts; None for none.
-        overwrite: replace files that exist.
+        overwrite: replace existing files.
     """
 
     table: TableOutput
@@ -43,7 +43,7 @@ class FrameOutputs:
     overwrite: bool = False
 
     def check(self) -> None:
-        """Raises a `SparklodError` where an output cannot be made, before work goes into it."""
+        """Raises a `SparklodError` if an output cannot be written; called before any work is done."""
         self.table.check()
         if self.plot is not None:
             check_writable(self.plot, overwrite=self.overwrite)
@@ -54,7 +54,7 @@ class FrameOutputs:
             check_writable(self.indices / "0.npy", overwrite=True)
 
     def index_files(self, numbers: Sequence[int], instances: int) -> Iterator[Path]:
-        """The files of nodes that will be written, of frames of some numbers."""
+        """The index files that will be written for frames of these numbers."""
         if self.indices is not None:
             for number in numbers:
                 yield from index_files(self.indices, number, instances)
@@ -62,12 +62,12 @@ class FrameOutputs:
 
 @dataclass(frozen=True)
 class WrittenFrames:
-    """What became of the frames.
+    """Results of `write_frames`.
 
     Attributes:
-        rows: of all instances together, one for each frame.
-        in_front: mean share of the splats drawn that are in front of the camera.
-        note: why there is no picture of the path in the charts; None where there is, or there are no charts.
+        rows: the row of all instances together for each frame.
+        in_front: mean share of the drawn splats in front of the camera.
+        note: why the charts have no picture of the path; None if they have one, or if there are no charts.
     """
 
     rows: list[Row]
@@ -76,24 +76,24 @@ class WrittenFrames:
 
 
 @dataclass
-class _Kept:
-    """What the charts need: rows, and the frames most worth a look until now."""
+class _ChartData:
+    """Data for the charts: rows, and the extreme frames so far."""
 
     rows: list[Row] = field(default_factory=list)
     in_front: list[float] = field(default_factory=list)
     lookout: Lookout = field(default_factory=Lookout)
     frames: dict[str, Frame] = field(default_factory=dict)
 
-    def look(self, frame: Frame) -> None:
-        """Keeps a frame if there is more of something in it than in all before."""
+    def add(self, frame: Frame) -> None:
+        """Stores a frame if it exceeds all earlier frames in one of the criteria."""
         for what in self.lookout.add(frame.rows[0]):
             self.frames[what] = frame
         self.frames.setdefault("first", frame)
 
-    def shown(self) -> Frame:
-        """The frame most worth a look that draws anything: before a chunk has arrived, none does."""
-        worth = [self.frames[what] for what in (*(moment.what for moment in self.lookout.moments()), "first")]
-        return next((each for each in worth if len(each.cut)), worth[0])
+    def best(self) -> Frame:
+        """The first extreme frame that draws anything; frames before the first chunk has arrived draw nothing."""
+        extremes = [self.frames[what] for what in (*(moment.what for moment in self.lookout.moments()), "first")]
+        return next((each for each in extremes if len(each.cut)), extremes[0])
 
 
 def write_frames(
@@ -105,37 +105,37 @@ def write_frames(
     progress: Progress = silent,
     passed: Filter | None = None,
 ) -> WrittenFrames:
-    """Goes along a camera path, and writes what is made of the frames, frame by frame, and the charts at last.
+    """Simulates a camera path and writes the outputs: table and index files frame by frame, then the charts.
 
     Args:
-        simulation: whose frames they are.
-        path: of the camera.
-        outputs: where they go.
-        threads: to find cuts on.
-        progress: called with the number of frames that are done.
-        passed: what the bytes of the table are passed through on their way to standard output.
+        simulation: the simulation.
+        path: the camera path.
+        outputs: destinations.
+        threads: number of threads that find cuts.
+        progress: called with the number of finished frames.
+        passed: a filter for the bytes of a table on standard output.
 
     Raises:
         OutputError: a file cannot be written.
     """
-    kept = _Kept()
+    data = _ChartData()
 
     def rows() -> Iterator[Row]:
         for frame in simulation.run(path, threads=threads, progress=progress):
-            kept.in_front.append(frame.in_front)
-            kept.rows.append(frame.rows[0])
+            data.in_front.append(frame.in_front)
+            data.rows.append(frame.rows[0])
             _write_indices(frame, outputs)
             if outputs.plot is not None:
-                kept.look(frame)
+                data.add(frame)
             yield from frame.rows
 
     outputs.table.write(rows(), passed=passed)
-    note = None if outputs.plot is None else _plot(simulation, path, outputs.plot, kept, overwrite=outputs.overwrite)
-    return WrittenFrames(kept.rows, float(np.mean(kept.in_front)), note)
+    note = None if outputs.plot is None else _plot(simulation, path, outputs.plot, data, overwrite=outputs.overwrite)
+    return WrittenFrames(data.rows, float(np.mean(data.in_front)), note)
 
 
 def index_files(folder: Path, frame: int, instances: int) -> list[Path]:
-    """Where the nodes of a frame go, a file for each instance."""
+    """The index files of a frame, one per instance."""
     if instances == 1:
         return [folder / f"{frame:06d}.npy"]
     return [folder / f"{frame:06d}.{instance}.npy" for instance in range(instances)]
@@ -153,11 +153,11 @@ def _write_indices(frame: Frame, outputs: FrameOutputs) -> None:
         write_whole(file, [out.getvalue()], overwrite=outputs.overwrite)
 
 
-def _plot(simulation: Simulation, path: CameraPath, target: Path, kept: _Kept, *, overwrite: bool) -> str | None:
-    """Draws the charts, and the path over the cut of the frame that is most worth a look; a note where it cannot."""
+def _plot(simulation: Simulation, path: CameraPath, target: Path, data: _ChartData, *, overwrite: bool) -> str | None:
+    """Writes the charts, with the path over the cut of an extreme frame; returns a note if that picture is missing."""
     from ..figures import traversal_chart
 
-    frame = kept.shown()
+    frame = data.best()
     cut = simulation.scenes.cut_of(frame.cut)
     scene = traversal_chart.PathScene(
         path.cameras,
@@ -165,7 +165,7 @@ def _plot(simulation: Simulation, path: CameraPath, target: Path, kept: _Kept, *
         np.concatenate([part.depth for part in cut.parts]),
         path.numbers.index(frame.number),
     )
-    marked = {moment.what: moment.frame for moment in kept.lookout.moments()}
-    drawn = traversal_chart.plot(kept.rows, marked, simulation.scenes.title, scene)
+    marked = {moment.what: moment.frame for moment in data.lookout.moments()}
+    drawn = traversal_chart.plot(data.rows, marked, simulation.scenes.title, scene)
     write_whole(target, [drawn.png], overwrite=overwrite)
     return drawn.note

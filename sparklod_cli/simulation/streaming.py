@@ -1,4 +1,4 @@
-"""How chunks get to a viewer over a network, in time: an exact simulation from event to event."""
+"""Streaming of chunks to a viewer over a network: an exact discrete-event simulation."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from .chunk_cache import ChunkCache, Chunks
 
 @dataclass(frozen=True)
 class Network:
-    """What stands between a viewer and the files. The default brings everything at once.
+    """The network between a viewer and the files. The default delivers everything at once.
 
     Attributes:
         bandwidth: bytes/s, shared equally by all transfers under way.
-        latency: seconds from asking for a chunk to its first byte, during which no bandwidth is used.
-        fetchers: how many chunks may be under way at a time; Spark's `numFetchers` is 3.
+        latency: seconds from the request for a chunk to its first byte, during which it uses no bandwidth.
+        fetchers: maximum number of concurrent requests; Spark's `numFetchers` is 3.
 
     Raises:
-        ValueError: one of them is out of its range.
+        ValueError: a value is out of range.
     """
 
     bandwidth: float = math.inf
@@ -40,17 +40,17 @@ class Network:
 
     @property
     def instant(self) -> bool:
-        """Whether everything comes at once."""
+        """Whether everything arrives at once."""
         return self.bandwidth == math.inf and self.latency == 0
 
 
 @dataclass(frozen=True)
 class StreamingSettings:
-    """How chunks get to a viewer and stay with it.
+    """Network and cache of a viewer.
 
     Attributes:
-        network: that brings them; by default everything comes at once.
-        chunk_cache: the most chunks of 65,536 nodes that the viewer holds; None for all.
+        network: the network; by default everything arrives at once.
+        chunk_cache: capacity of the cache in chunks of 65,536 nodes; None for all.
     """
 
     network: Network = field(default_factory=Network)
@@ -60,24 +60,24 @@ class StreamingSettings:
 class Stream:
     """Fetches the chunks that a viewer wants and keeps them in a cache.
 
-    For each frame: `advance` to its time, `want` what it looks into, `take_arrivals` to see what is new; then
-    `cache.resident()` is what can be drawn.
+    For each frame: `advance` to its time, `want` the chunks that its cut reads, and `take_arrivals` for the new ones;
+    `cache.resident()` are then the chunks that can be drawn.
 
-    A fetcher that is free takes the most important of the admitted chunks that is neither here nor under way. Nothing
-    under way is cancelled, as in Spark; a chunk that is no longer wanted when it arrives goes into the cache if there
-    is room, or in place of one that has not been used for longer. Decoding takes no time here, and nothing fails.
+    A free fetcher requests the most important admitted chunk that is neither resident nor under way. Requests are not
+    cancelled, as in Spark; a chunk that is no longer wanted when it arrives goes into the cache if there
+    is room, or in place of one that has not been used for longer. Decoding takes no time, and no request fails.
 
-    State changes at events only, so the same happens whether time advances in one step or in many.
+    The state changes at events only, so the result does not depend on the steps in which time advances.
 
     Args:
-        chunks: of all trees.
-        network: what brings them; everything comes at once unless given.
-        capacity: how many chunks the cache holds; None for all.
-        start: seconds, the time it begins at.
+        chunks: the chunks of all trees.
+        network: the network; everything arrives at once unless given.
+        capacity: maximum number of chunks in the cache; None for all.
+        start: the time at the start, seconds.
 
     Attributes:
         cache: the resident chunks.
-        now: seconds.
+        now: the current time, seconds.
 
     Raises:
         ValueError: the capacity is less than the number of trees.
@@ -90,53 +90,51 @@ class Stream:
         self._network = network or Network()
         self.cache = ChunkCache(chunks, capacity)
         self.now = start
-        self._next = 0  # all admitted chunks before this one are here or under way
+        self._next = 0  # all admitted chunks before this one are resident or under way
         self._under_way: set[int] = set()
-        # (When its first byte comes, chunk); in order, since the latency is the same for all.
-        self._asked: deque[tuple[float, int]] = deque()
-        # All transfers under way get the same. `_served` is how many bytes each would have had at the time `_since` if
-        # it had begun with the first: one ends when that has grown by its size, whatever begins and ends until then.
-        self._transfers: list[tuple[float, int, int]] = []  # heap of (what `_served` is at its end, number, chunk)
+        # (Time of its first byte, chunk), in order, since all have the same latency.
+        self._requested: deque[tuple[float, int]] = deque()
+        # Concurrent transfers share the bandwidth equally. `_served` is the number of bytes that a transfer which began
+        # with the first would have received at time `_since`; a transfer ends when that has grown by its size.
+        self._transfers: list[tuple[float, int, int]] = []  # heap of (`_served` at its end, number, chunk)
         self._served = 0.0
         self._since = start
         self._begun = 0
         self._arrived: list[int] = []
 
     def advance(self, to_time: float) -> None:
-        """Lets everything happen until a time, in seconds, itself included.
+        """Processes all events up to and including a time in seconds.
 
         Raises:
             ValueError: the time is in the past, or not finite.
         """
         if not self.now <= to_time < math.inf:
-            raise ValueError(
-                f"time went from {self.now:g} s to {to_time:g} s; it can only go forward, and not for ever"
-            )
-        while self._happens(to_time):
+            raise ValueError(f"time went from {self.now:g} s to {to_time:g} s; it must increase and be finite")
+        while self._step(to_time):
             pass
         self.now = to_time
 
     def want(self, wanted: Iterable[int]) -> None:
-        """Replaces what is wanted from now on, the most important first, as `ChunkCache.want` does.
+        """Replaces the list of wanted chunks, the most important first, see `ChunkCache.want`.
 
         Raises:
             ValueError: there is no such chunk.
         """
         self.cache.want(wanted)
         self._next = 0
-        self._ask(self.now)
-        self.advance(self.now)  # where the network brings everything at once, it is here now
+        self._request(self.now)
+        self.advance(self.now)  # with an instant network everything arrives now
 
     def take_arrivals(self) -> list[int]:
-        """The chunks that have arrived since the last call, in order; also those that the cache has given up again."""
+        """The chunks that have arrived since the last call, in order; including those that have been evicted."""
         arrived, self._arrived = self._arrived, []
         return arrived
 
     def complete_in(self, wanted: Iterable[int]) -> float | None:
-        """Seconds until all these chunks are resident if nothing else is wanted from now on.
+        """Seconds until all these chunks are resident if no others are requested.
 
         Returns:
-            0 if it is here already; None if it never will be, because it does not fit into the cache.
+            0 if they are resident; None if they do not fit into the cache.
         """
         future = self._copy()
         future.want(wanted)
@@ -146,32 +144,32 @@ class Stream:
         if not missing:
             return 0.0
         future.take_arrivals()
-        while missing and future._happens(math.inf):
+        while missing and future._step(math.inf):
             missing.difference_update(future.take_arrivals())
         return future._since - self.now
 
     def _copy(self) -> Stream:
         twin = copy.copy(self)
         twin.cache = self.cache.copy()
-        twin._under_way, twin._asked = self._under_way.copy(), self._asked.copy()
+        twin._under_way, twin._requested = self._under_way.copy(), self._requested.copy()
         twin._transfers, twin._arrived = self._transfers.copy(), self._arrived.copy()
         return twin
 
-    def _ask(self, time: float) -> None:
-        """Gives work to the fetchers that are free."""
+    def _request(self, time: float) -> None:
+        """Starts requests on the free fetchers."""
         admitted = self.cache.admitted
         while len(self._under_way) < self._network.fetchers and self._next < len(admitted):
             chunk = admitted[self._next]
             self._next += 1
             if chunk not in self.cache and chunk not in self._under_way:
                 self._under_way.add(chunk)
-                self._asked.append((time + self._network.latency, chunk))
+                self._requested.append((time + self._network.latency, chunk))
 
-    def _happens(self, until: float) -> bool:
-        """Lets the next event happen, if there is one until a time: a transfer ends, or one begins."""
+    def _step(self, until: float) -> bool:
+        """Processes the next event, the start or end of a transfer; False if there is none until a time."""
         if not self._under_way:
             return False
-        begin = self._asked[0][0] if self._asked else math.inf
+        begin = self._requested[0][0] if self._requested else math.inf
         end = math.inf
         if self._transfers:
             end = self._since + (self._transfers[0][0] - self._served) * len(self._transfers) / self._network.bandwidth
@@ -184,22 +182,22 @@ class Stream:
         return True
 
     def _begin(self, time: float) -> None:
-        """The first byte of the chunk that was asked for first arrives."""
+        """The first byte of the oldest request arrives."""
         if self._transfers:
             served = self._served + (time - self._since) * self._network.bandwidth / len(self._transfers)
-            self._served = min(served, self._transfers[0][0])  # rounding must not take it past an end
+            self._served = min(served, self._transfers[0][0])  # rounding must not exceed the next end
         self._since = time
-        _, chunk = self._asked.popleft()
+        _, chunk = self._requested.popleft()
         self._begun += 1
         heappush(self._transfers, (self._served + self._chunks.sizes[chunk], self._begun, chunk))
 
     def _end(self, time: float) -> None:
-        """The last byte of the transfer that has least to go arrives, and its fetcher takes on another chunk."""
+        """The last byte of the transfer that ends next arrives, and its fetcher starts another request."""
         self._served, _, chunk = heappop(self._transfers)
         if not self._transfers:
-            self._served = 0.0  # small numbers have more digits to spare
+            self._served = 0.0  # keeps the numbers small, for precision
         self._since = time
         self._under_way.remove(chunk)
         self._arrived.append(chunk)
         self.cache.arrive(chunk)
-        self._ask(time)
+        self._request(time)

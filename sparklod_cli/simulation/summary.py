@@ -1,4 +1,4 @@
-"""What a simulation comes to: statistics of its frames, its totals, and the frames that are worth a look."""
+"""Summary of a simulation: statistics of its frames, totals, and the most extreme frames."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ UNITS = {column.name: column.unit for column in COLUMNS}
 #: The share of the cut inside the frustum; a quotient of two columns.
 IN_FRUSTUM = "in_frustum_share"
 
-#: What statistics are made of, in this order.
+#: Quantities with statistics, in the order of the summary.
 QUANTITIES = (
     "selected", "budget_used", "pixel_scale_min", "projected_px_p95", "overdraw_estimate", IN_FRUSTUM,
     "chunks_new", "bytes_new", "missing", "complete_in_s", "churn", "traverse_ms",
 )  # fmt: skip
 
-SHOWN = ("min", "p50", "p95", "max")
+STATISTICS = ("min", "p50", "p95", "max")
 
 
 @dataclass(frozen=True)
@@ -30,10 +30,10 @@ class Quantity:
     """Statistics over the frames.
 
     Attributes:
-        name: of a column, or `IN_FRUSTUM`.
-        unit: of the four; empty for a plain number.
-        frames: those with a value.
-        min, p50, p95, max: over these.
+        name: name of a column, or `IN_FRUSTUM`.
+        unit: unit of the values; empty for a plain number.
+        frames: number of frames with a value.
+        min, p50, p95, max: statistics over these frames.
     """
 
     name: str
@@ -47,15 +47,15 @@ class Quantity:
 
 @dataclass(frozen=True)
 class Moment:
-    """A frame that is worth a look.
+    """The frame with the largest value of one of the criteria `MOMENTS`.
 
     Attributes:
-        what: the reason, as a name: one of `MOMENTS`.
+        what: name of the criterion.
         frame: its number.
         time_s: seconds on the path.
-        name: of the frame; None where it has none.
-        value: that it has the most of.
-        unit: of the value; "limit" is a multiple of the pixel scale limit.
+        name: name of the frame; None if it has none.
+        value: the largest value.
+        unit: unit of the value; "limit" is a multiple of the pixel scale limit.
     """
 
     what: str
@@ -68,16 +68,16 @@ class Moment:
 
 @dataclass(frozen=True)
 class Summary:
-    """What a simulation comes to.
+    """Summary of a simulation.
 
     Attributes:
-        frames: their number.
-        seconds: from the first to the last.
-        chunks, bytes: that were fetched in all.
-        chunks_first, bytes_first: of them, those of the first frame.
+        frames: number of frames.
+        seconds: time from the first frame to the last.
+        chunks, bytes: total number and size of the fetched chunks.
+        chunks_first, bytes_first: those fetched for the first frame.
         stop_reasons: shares of the frames, 0..1, the most frequent first.
-        quantities: statistics; those without a value on any frame are left out.
-        moments: the frames to look at; those where there is nothing to see are left out.
+        quantities: statistics; quantities without a value on any frame are omitted.
+        moments: the most extreme frames; criteria that no frame meets are omitted.
     """
 
     frames: int
@@ -99,7 +99,7 @@ class Summary:
 
 
 def summarize(rows: Iterable[Row]) -> Summary:
-    """Summary of the rows of all frames, in their order; those of single instances are left out."""
+    """Summary of the rows of all frames, in order; rows of single instances are ignored."""
     frames = totals(rows)
     times = numbers(frames, "time_s")
     reasons = Counter(str(row["stop_reason"]) for row in frames if row["stop_reason"] is not None)
@@ -123,7 +123,7 @@ def _quantity(name: str, frames: Sequence[Row]) -> Quantity | None:
         values = numbers(frames, name)
     if not values:
         return None
-    found = {each: _rounded(statistic(each, values)) for each in SHOWN}
+    found = {each: _rounded(statistic(each, values)) for each in STATISTICS}
     return Quantity(name, UNITS.get(name, "share"), len(values), **found)
 
 
@@ -133,12 +133,12 @@ def _share(row: Row) -> Number | None:
 
 
 def _rounded(value: Number) -> Number:
-    """To nine digits, so that no figure ends in what floats leave behind."""
+    """Rounded to nine significant digits, which hides rounding errors of floats."""
     return value if isinstance(value, int) else float(f"{value:.9g}")
 
 
 def coarseness(row: Row) -> Number | None:
-    """The pixel scale down to which everything is refined, as a multiple of the limit; None without either."""
+    """The smallest pixel scale of a refined node, as a multiple of the limit; None if either is missing."""
     scale, limit = row["pixel_scale_min"], row["pixel_scale_limit"]
     return scale / limit if isinstance(scale, (int, float)) and isinstance(limit, (int, float)) and limit else None
 
@@ -147,7 +147,7 @@ def _cell(name: str) -> Callable[[Row], Number | None]:
     return lambda row: next(iter(numbers([row], name)), None)
 
 
-#: What can be the reason to look at a frame: how much there is of it, above how much, and the unit.
+#: Criteria for extreme frames: the value of a row, the threshold that it must exceed, and the unit.
 MOMENTS: dict[str, tuple[Callable[[Row], Number | None], Number, str]] = {
     "churn": (_cell("churn"), 0, "share"),
     "bytes": (_cell("bytes_new"), 0, "bytes"),
@@ -159,9 +159,9 @@ MOMENTS: dict[str, tuple[Callable[[Row], Number | None], Number, str]] = {
 
 
 class Lookout:
-    """Finds the frames with the most of each reason to look at them, one frame after the other.
+    """Finds the frame with the largest value of each criterion, the first among equals.
 
-    Of those with as much it is the first. What the first frame fetches is no such reason: it has to fetch everything.
+    The bytes fetched by the first frame do not count, since it has to fetch everything.
     """
 
     def __init__(self) -> None:
@@ -169,7 +169,7 @@ class Lookout:
         self._frames = 0
 
     def add(self, row: Row) -> list[str]:
-        """Takes the row of the next frame; of which of `MOMENTS` it has more than all before."""
+        """Adds the row of the next frame; returns the criteria in which it exceeds all earlier frames."""
         found = []
         for what, (measure, above, _) in MOMENTS.items():
             value = None if what == "bytes" and not self._frames else measure(row)
@@ -180,7 +180,7 @@ class Lookout:
         return found
 
     def moments(self) -> list[Moment]:
-        """Those of the frames until now, in the order of `MOMENTS`."""
+        """The extreme frames so far, in the order of `MOMENTS`."""
         return [
             _moment(what, row, _rounded(value), unit)
             for what, (_, _, unit) in MOMENTS.items()
@@ -190,7 +190,7 @@ class Lookout:
 
 
 def look_at(frames: Sequence[Row]) -> list[Moment]:
-    """The frames with the most of each reason to look at them."""
+    """The frames with the largest values of the criteria `MOMENTS`."""
     lookout = Lookout()
     for row in frames:
         lookout.add(row)

@@ -10,17 +10,17 @@ import threading
 import time
 from types import FrameType
 
-#: The signals that end a run, as far as the system has them.
+#: The signals that end a run, if the system has them.
 ENDING = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 
 #: Exit status of an interrupted run: 128 + SIGINT, as in shells.
 INTERRUPTED = 130
 
-#: Packages that compile. LLVM calls back into Python, where an exception is lost, and LLVM may crash without a result;
-#: and a kernel can take LLVM seconds, during which Python handles no signal.
+#: Packages that compile. An exception raised while LLVM calls back into Python is lost and may crash LLVM, and LLVM can
+#: take seconds to compile a kernel, during which Python handles no signal.
 COMPILERS = ("numba", "llvmlite")
 
-#: Seconds to wait while another thread writes that the run was interrupted.
+#: Seconds to wait for another thread to write the message.
 FAREWELL = 0.1
 
 #: The main thread and the watching thread may both end the process; only one of them writes the message.
@@ -28,9 +28,9 @@ _leaving = threading.Lock()
 
 
 def handle() -> None:
-    """Lets signals end this process: by `KeyboardInterrupt`, which cleans up, or at once while kernels are compiled.
+    """Makes signals raise `KeyboardInterrupt`, or end the process at once while kernels are being compiled.
 
-    Ending at once loses nothing: outputs and the cache of kernels are complete at any moment.
+    Ending at once loses nothing: outputs and the kernel cache are consistent at all times.
     """
     handled = [
         number for number in ENDING if signal.getsignal(number) != signal.SIG_IGN
@@ -52,7 +52,7 @@ def handle() -> None:
 
 
 def ignore() -> None:
-    """Ignores the signals at the end of the process, when all work is done."""
+    """Ignores the signals; called at the end of the process, when all work is done."""
     for number in ENDING:
         signal.signal(number, signal.SIG_IGN)
 

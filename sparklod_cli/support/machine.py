@@ -1,6 +1,6 @@
-"""What this process may use of its machine: memory and processors, and the limits that a container sets on both.
+"""Memory and processors available to this process, and the limits that a container sets on both.
 
-Each function returns None where the system does not say; none of them raises.
+Each function returns None if the system does not provide the figure; none of them raises.
 """
 
 from __future__ import annotations
@@ -9,12 +9,12 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-#: Limits of version 1 that are none: the kernel writes the largest multiple of a page.
+#: Least value that means "no limit" in cgroups version 1, where the kernel writes the largest multiple of a page.
 UNLIMITED = 1 << 60
 
 
 def total_memory() -> int | None:
-    """Bytes of memory that this process could have at most: the machine's, or the limit of its container."""
+    """Bytes of memory of the machine, or the limit of the container if that is lower."""
     physical = _meminfo("MemTotal")
     if physical is None:
         try:
@@ -25,7 +25,7 @@ def total_memory() -> int | None:
 
 
 def available_memory() -> int | None:
-    """Bytes that can be allocated before the system swaps, or the container ends the process."""
+    """Bytes that can be allocated before the system swaps or the container kills the process."""
     available = _meminfo("MemAvailable")
     if available is None:
         return None
@@ -33,7 +33,7 @@ def available_memory() -> int | None:
 
 
 def processor_quota() -> float | None:
-    """How many processors' time a container grants, such as 1.5; None where there is no such limit."""
+    """Processor time that a container grants, in processors, such as 1.5; None without a limit."""
     found = []
     for folder in _groups("cpu"):
         words = (_text(folder / "cpu.max") or "").split()  # version 2
@@ -53,7 +53,7 @@ def _meminfo(name: str) -> int | None:
 
 
 def _memory_limits() -> Iterator[tuple[int, int]]:
-    """Limit and use in bytes of each group of processes that this one is in."""
+    """Memory limit and usage in bytes of each cgroup of this process."""
     for folder in _groups("memory"):
         for limit_name, used_name in (
             ("memory.max", "memory.current"),  # version 2
@@ -65,7 +65,7 @@ def _memory_limits() -> Iterator[tuple[int, int]]:
 
 
 def _groups(controller: str) -> list[Path]:
-    """The folders of cgroups, versions 1 and 2, that limit this process, with all above them."""
+    """The folders of the cgroups (versions 1 and 2) of this process, and of their ancestors."""
     root = Path("/sys/fs/cgroup")
     folders = {root, root / controller}  # in a container, its own group is the root
     for line in (_text(Path("/proc/self/cgroup")) or "").splitlines():

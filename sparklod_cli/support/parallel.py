@@ -1,4 +1,4 @@
-"""Work on rows in blocks, on several threads."""
+"""Processes rows in blocks, on several threads."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from typing import TypeVar
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-#: Rows of a block: few enough for temporaries to stay in the processor's cache, enough for the interpreter's share of
-#: the time to stay small.
+#: Rows of a block: few enough for temporaries to stay in the processor's cache, enough for the
+#: overhead of the interpreter to stay small.
 BLOCK_ROWS = 1 << 14
 
 

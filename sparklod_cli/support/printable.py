@@ -1,32 +1,32 @@
-"""Text from outside, such as names of files and cameras, made safe for terminals and logs of CI runs."""
+"""Makes untrusted text, such as names of files and cameras, safe for terminals and CI logs."""
 
 from __future__ import annotations
 
-#: Most characters of a message. A path can have 4,096, and texts of a file have no limit.
+#: Maximum length of a message, in characters. A path can have 4,096, and strings in a file have no limit.
 MOST = 500
 
-#: Replaces characters that are left out.
+#: Replaces the omitted middle of a text.
 GAP = " ... "
 
 _SHORT = {"\n": "\\n", "\r": "\\r", "\t": "\\t"}
 
-#: Code points by which Python represents bytes of a name that are not UTF-8.
+#: Code points with which Python represents bytes of a file name that are not UTF-8.
 _BYTES = range(0xDC80, 0xDD00)
 
 
 def printable(text: str, most: int | None = None) -> str:
-    """A text on one line without any effect on a terminal or a log.
+    """A text on one line that cannot control a terminal or a log.
 
-    Characters that are not printable are escaped as in Python's strings: control characters, line ends, marks of
-    writing direction, halves of surrogate pairs. So is the beginning of a command of GitHub Actions.
+    Unprintable characters are escaped as in Python strings: control characters, line ends, directional marks and lone
+    surrogates. So is the start of a GitHub Actions command.
 
     Args:
         text: any text.
-        most: most characters. A longer text is cut in its middle, as it may begin with a file and end with a reason.
+        most: maximum length. A longer text loses its middle, since it may begin with a path and end with a reason.
     """
     text = shortened(text, most)
     if not text.isprintable():
-        text = "".join(mark if mark.isprintable() else _spelt(mark) for mark in text)
+        text = "".join(mark if mark.isprintable() else _escaped(mark) for mark in text)
     text = text.replace("##[", "\\x23#[")
     if text.lstrip().startswith("::"):
         text = text.replace(":", "\\x3a", 1)
@@ -41,7 +41,7 @@ def shortened(text: str, most: int | None) -> str:
     return text[: most - len(GAP) - end] + GAP + text[len(text) - end :]
 
 
-def _spelt(mark: str) -> str:
+def _escaped(mark: str) -> str:
     code = ord(mark)
     if code in _BYTES:
         return f"\\x{code - 0xDC00:02x}"

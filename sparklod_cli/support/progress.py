@@ -1,4 +1,4 @@
-"""`Progress`, the callback by which long work reports what it has done."""
+"""`Progress`, the callback with which long operations report their progress."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Protocol
 
 
 class Progress(Protocol):
-    """Called now and then with a stage ("reading", "building", "encoding"), how much of it is done, and the unit."""
+    """Called repeatedly with a stage ("reading", "building", "encoding"), the amount done, the total and the unit."""
 
     def __call__(self, stage: str, done: int, total: int, unit: str) -> None: ...
 

@@ -1,4 +1,4 @@
-"""What an installed distribution requires, and whether that is installed: by metadata alone, nothing is imported."""
+"""The requirements of an installed distribution and whether they are met, by metadata alone: nothing is imported."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib import metadata
 
-#: A requirement as our metadata have them: name, extras, least version, marker.
+#: A requirement as in our metadata: name, extras, minimum version, marker.
 REQUIREMENT = re.compile(r"([\w.-]+)\s*(?:\[([\w, -]+)\])?\s*(?:>=\s*([\w.]+))?[^;]*(?:;\s*(.*))?")
 
-#: The two kinds of markers that are understood; a requirement with another one counts as required.
+#: The two supported kinds of markers; a requirement with any other marker counts as required.
 EXTRA, BEFORE = re.compile(r"extra\s*==\s*['\"]([\w.-]+)['\"]"), re.compile(r"python_version\s*<\s*['\"]([\d.]+)['\"]")
 
 
@@ -20,9 +20,9 @@ class Required:
     """A distribution that another one requires.
 
     Attributes:
-        name: as pip knows it.
-        least: the oldest version that will do; empty if any will.
-        version: the one that is installed; None if none is.
+        name: its name for pip.
+        least: the minimum version; empty for any.
+        version: the installed version; None if it is not installed.
     """
 
     name: str
@@ -31,7 +31,7 @@ class Required:
 
     @property
     def missing(self) -> bool:
-        """Whether it has to be installed, or a newer one."""
+        """Whether it has to be installed or upgraded."""
         return self.version is None or _numbers(self.version) < _numbers(self.least)
 
     @property
@@ -43,7 +43,7 @@ class Required:
 
 
 def required_by(distribution: str, extra: str = "") -> Iterator[Required]:
-    """What a distribution requires: by itself or, where an extra is named, for that alone.
+    """The requirements of a distribution or, if an extra is given, those of the extra alone.
 
     Raises:
         importlib.metadata.PackageNotFoundError: the distribution is not installed.

@@ -1,4 +1,4 @@
-"""Standard input as a file that can be read from any place, and more than once."""
+"""Standard input as a seekable file that can be read more than once."""
 
 from __future__ import annotations
 
@@ -11,25 +11,25 @@ from typing import Any, BinaryIO
 
 from .errors import UnreadableError
 
-#: Standard input or output, where a path can be one of them.
+#: The path that means standard input or output.
 DASH = Path("-")
 
 
 def name_of(path: Path) -> str:
-    """What people call an input."""
+    """The name of an input in messages."""
     return "standard input" if path == DASH else str(path)
 
 
 def spooled() -> BinaryIO:
-    """All of standard input, at its beginning; it is read the first time, into a temporary file. Not to be closed.
+    """All of standard input, read into a temporary file on the first call, at its beginning. Must not be closed.
 
     Raises:
-        UnreadableError: it is closed, or a terminal.
+        UnreadableError: standard input is closed, or a terminal.
     """
     if sys.stdin is None:
         raise UnreadableError("standard input is closed")
     if sys.stdin.isatty():
-        raise UnreadableError("standard input is a terminal; pipe a file into it, or name one")
+        raise UnreadableError("standard input is a terminal; pipe a file into it, or give a path")
     file = _copy_of(sys.stdin)
     file.seek(0)
     return file

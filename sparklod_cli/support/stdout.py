@@ -1,4 +1,4 @@
-"""Standard output with errors of its own, so that failures to write it cannot be taken for others."""
+"""Standard output with its own exceptions, so that a failed write is not mistaken for another error."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from .errors import StdoutError
 
 
 class ReaderGoneError(StdoutError):
-    """The reader of standard output is gone. Not an `OSError`, which click would handle itself."""
+    """The reader of standard output has closed it. Not an `OSError`, which click would handle itself."""
 
 
 @contextlib.contextmanager
-def told() -> Iterator[None]:
-    """In this context failures to write standard output, and only those, raise `StdoutError` or `ReaderGoneError`."""
+def guarded() -> Iterator[None]:
+    """A context in which a failed write to standard output raises `StdoutError` or `ReaderGoneError`."""
     before = sys.stdout
-    sys.stdout = _Told(before)
+    sys.stdout = _GuardedStream(before)
     try:
         yield
     finally:
@@ -27,19 +27,19 @@ def told() -> Iterator[None]:
 
 
 def silence(stream: Any) -> None:
-    """Redirects a broken stream to nowhere: the interpreter flushes it at its end, which would fail."""
+    """Redirects a broken stream to the null device, since the interpreter flushes it at exit, which would fail."""
     with contextlib.suppress(OSError, ValueError):
-        nowhere = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nowhere, stream.fileno())
-        os.close(nowhere)
+        null = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, stream.fileno())
+        os.close(null)
 
 
-class _Told:
-    """Wraps a stream or its buffer; None for a closed one."""
+class _GuardedStream:
+    """Wraps a stream or its buffer, or None for a closed one."""
 
     def __init__(self, stream: Any) -> None:
         self._stream = stream
-        #: Attributes that writers ask for.
+        #: Attributes that callers read.
         self.encoding = getattr(stream, "encoding", None) or "utf-8"
         self.errors = "backslashreplace"  # characters that the terminal cannot show are escaped
 
@@ -47,8 +47,8 @@ class _Told:
         return getattr(self._stream, name)
 
     @property
-    def buffer(self) -> _Told:
-        return _Told(self._stream and self._stream.buffer)
+    def buffer(self) -> _GuardedStream:
+        return _GuardedStream(self._stream and self._stream.buffer)
 
     def isatty(self) -> bool:
         return self._stream is not None and self._stream.isatty()
@@ -57,19 +57,19 @@ class _Told:
         if self._stream is None:
             raise StdoutError("standard output is closed")
         if data == "":
-            return 0  # click probes streams so, and ignores errors
+            return 0  # click probes streams this way, and ignores errors
         if isinstance(data, str):
             data = data.encode(self.encoding, self.errors).decode(self.encoding)
-        with self._telling():
+        with self._translated_errors():
             return self._stream.write(data)
 
     def flush(self) -> None:
         if self._stream is not None:
-            with self._telling():
+            with self._translated_errors():
                 self._stream.flush()
 
     @contextlib.contextmanager
-    def _telling(self) -> Iterator[None]:
+    def _translated_errors(self) -> Iterator[None]:
         try:
             yield
         except OSError as error:
@@ -81,9 +81,9 @@ class _Told:
 
 
 def reserve() -> None:
-    """Opens whichever of standard input, output and error are closed, so that no file of ours gets their descriptors.
+    """Opens those of standard input, output and error that are closed, so that no other file gets their descriptors.
 
-    Such a file would receive what libraries print. For Python they stay closed, as it found them at its start.
+    Such a file would receive what libraries print. In Python they remain closed, as they were at startup.
     """
     while True:
         descriptor = os.open(os.devnull, os.O_RDWR)

@@ -1,7 +1,7 @@
-"""How many threads work is done on: the one place that says so, to pools and to kernels.
+"""The number of threads of thread pools and kernels.
 
-A function of the API takes `threads`, None for all processors. It hands the number to what has pools of its own
-(`parallel.ordered_map`), and runs kernels inside `on_threads`, which leaves numba as it was.
+A function of the API takes `threads`, None for all processors. It passes the number to functions with their own pools
+(`parallel.ordered_map`), and runs kernels inside `on_threads`, which restores numba's setting.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from .parallel import processors
 
 
 def thread_count(threads: int | None) -> int:
-    """The number of threads; None stands for all processors.
+    """The number of threads; None means all processors.
 
     Raises:
         ValueError: it is less than 1.
@@ -27,12 +27,12 @@ def thread_count(threads: int | None) -> int:
 
 @contextlib.contextmanager
 def on_threads(threads: int | None) -> Iterator[int]:
-    """Runs kernels that this thread calls inside on so many threads, and gives the number.
+    """A context in which kernels called by this thread run on this many threads; yields the number.
 
     Raises:
         ValueError: it is less than 1.
     """
-    from . import jit  # numba takes half a second to load
+    from . import jit  # loading numba takes half a second
 
     count, before = thread_count(threads), jit.threads_in_use()
     jit.use_threads(count)

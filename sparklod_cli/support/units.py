@@ -1,4 +1,4 @@
-"""Quantities as people write them, bandwidths, times, sizes and counts with units, and counts in messages."""
+"""Parses bandwidths, times, sizes and counts with units, and formats counts for messages."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 import re
 from fractions import Fraction
 
-#: Decimal prefixes, in either case, since nobody means a thousandth of a bit.
+#: Decimal prefixes, in either case: a lower-case m cannot sensibly mean a thousandth of a bit.
 PREFIXES = {"": 1, "k": 10**3, "m": 10**6, "g": 10**9}
 
 NUMBER = r"(?P<number>(?:[0-9]{1,30}(?:\.[0-9]{0,30})?|\.[0-9]{1,30})(?:[eE][+-]?[0-9]{1,2})?)"

@@ -1,4 +1,4 @@
-"""Untrusted contents of files: bounded JSON and TOML, and text that is safe to quote."""
+"""Untrusted file contents: bounded JSON and TOML, and text that is safe to quote."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from typing import Any
 
 from .printable import printable
 
-#: Deepest nesting that is accepted, so that code may recurse through values; real files are nested a few deep.
+#: Maximum nesting depth, so that code can recurse through values; real files have a few levels.
 MAX_DEPTH = 64
 
-#: Most characters of a whole number of 64 bits; longer ones become floats, as in most readers of JSON.
+#: Maximum number of digits of a 64-bit integer; longer ones become floats, as in most JSON readers.
 MAX_DIGITS = 19
 
-#: Replaces larger whole numbers; no sensible number is as large.
+#: Replaces larger integers; no meaningful number is this large.
 LARGEST = sys.float_info.max
 
-#: Most characters that are quoted from a file.
+#: Maximum number of characters quoted from a file.
 QUOTED = 100
 
 _SURROGATE = re.compile("[\ud800-\udfff]")
@@ -35,34 +35,34 @@ ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, Run
 def parse_json(data: str | bytes, *, keep_surrogates: bool = False) -> Any:
     """The value of a JSON text.
 
-    Whole numbers beyond 64 bits become the nearest floats, at most `LARGEST`. NaN and Infinity, which Python writes,
-    and 1e999 are accepted, so users of a number check that it is finite. Nesting is at most `MAX_DEPTH`.
+    Integers beyond 64 bits become the nearest floats, at most `LARGEST`. NaN and Infinity, which Python writes, and
+    1e999 are accepted, so callers must check that numbers are finite. Nesting is at most `MAX_DEPTH`.
 
     Args:
         data: the text, or its bytes in UTF-8.
-        keep_surrogates: keep halves of surrogate pairs in texts, by which Python represents names of files that are
-            not UTF-8; otherwise they become U+FFFD, so that all texts can be printed and written.
+        keep_surrogates: keep lone surrogates, with which Python represents file names that are not UTF-8; otherwise
+            they become U+FFFD, so that all texts can be printed and written.
 
     Raises:
-        ValueError: the text is not JSON or nested too deep; the message has one line.
+        ValueError: the text is not JSON, or too deeply nested; the message is one line.
     """
     try:
         text = data if isinstance(data, str) else str(data, "utf-8-sig")
         value = json.loads(text, parse_int=_whole)
     except RecursionError:
         raise _too_deep() from None
-    mend = not keep_surrogates and (_ESCAPED_SURROGATE.search(text) or _SURROGATE.search(text))
-    return _checked(value, mend=bool(mend))
+    replace_surrogates = not keep_surrogates and (_ESCAPED_SURROGATE.search(text) or _SURROGATE.search(text))
+    return _checked(value, replace_surrogates=bool(replace_surrogates))
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """The table of a TOML text, as by `parse_json`, but whole numbers must have 64 bits, as TOML demands."""
+    """The table of a TOML text, as `parse_json`, but integers must fit 64 bits, as TOML requires."""
     if sys.version_info >= (3, 11):
         import tomllib
     else:
         import tomli as tomllib
     try:
-        table: dict[str, Any] = _checked(tomllib.loads(text), mend=False)
+        table: dict[str, Any] = _checked(tomllib.loads(text), replace_surrogates=False)
     except RecursionError:
         raise _too_deep() from None
     return table
@@ -78,14 +78,14 @@ def _too_deep() -> ValueError:
     return ValueError(f"it is nested more than {MAX_DEPTH} deep")
 
 
-def _checked(root: Any, *, mend: bool) -> Any:
-    """Checks a parsed value level by level: recursion would fail on the nesting that it guards against."""
+def _checked(root: Any, *, replace_surrogates: bool) -> Any:
+    """Checks a parsed value level by level, since recursion would fail on the nesting it guards against."""
     whole = [root]  # in a list, so that every value is an item of a container
     containers: list[Any] = [whole]
     for _ in range(MAX_DEPTH + 1):
         inner: list[Any] = []
         for container in containers:
-            if mend and isinstance(container, dict):
+            if replace_surrogates and isinstance(container, dict):
                 items = [(well_formed(key), value) for key, value in container.items()]
                 container.clear()
                 container.update(items)
@@ -94,7 +94,7 @@ def _checked(root: Any, *, mend: bool) -> Any:
                     inner.append(value)
                 elif isinstance(value, int) and value.bit_length() > 64:
                     raise ValueError("it has a whole number of more than 64 bits")
-                elif mend and isinstance(value, str):
+                elif replace_surrogates and isinstance(value, str):
                     container[key] = well_formed(value)
         if not inner:
             return whole[0]
@@ -103,12 +103,12 @@ def _checked(root: Any, *, mend: bool) -> Any:
 
 
 def well_formed(text: str) -> str:
-    """A text with U+FFFD in place of halves of surrogate pairs, which no encoding can write."""
+    """A text with U+FFFD in place of lone surrogates, which cannot be encoded."""
     return _SURROGATE.sub("\ufffd", text)
 
 
-def shown(value: Any) -> str:
-    """A value as an error quotes it: on one line and shortened, however deep it is."""
+def quoted_value(value: Any) -> str:
+    """A value as quoted in an error: on one line and shortened, at any nesting depth."""
     return printable(reprlib.repr(value), QUOTED)
 
 

@@ -167,7 +167,7 @@ def _badness(assertion: Assertion, value: Number) -> Number:
 
 
 def place_text(row: Row) -> str:
-    """The frame of a row, for people: "frame 12 at 0.400 s (door)"."""
+    """The frame of a row, for display: "frame 12 at 0.400 s (door)"."""
     at = "" if row["time_s"] is None else f" at {row['time_s']:.3f} s"
     name = "" if row["name"] is None else str(row["name"]).replace("\r", "\\r").replace("\n", "\\n")
     return f"frame {row['frame']}{at}" + (f" ({name})" if name else "")

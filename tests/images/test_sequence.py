@@ -62,9 +62,9 @@ def test_a_difference_draws_every_picture_once(count: int, tmp_path: Path, monke
 
 def test_pictures_too_large_to_keep_come_out_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folders = [tmp_path / name for name in ("kept", "drawn-again")]
-    for folder, pixels in zip(folders, (sequence.KEPT_PIXELS, 0), strict=True):
+    for folder, pixels in zip(folders, (sequence.CACHED_PIXELS, 0), strict=True):
         folder.mkdir()
-        monkeypatch.setattr(sequence, "KEPT_PIXELS", pixels)
+        monkeypatch.setattr(sequence, "CACHED_PIXELS", pixels)
         written(folder, 3)
     one, other = ({path.name: path.read_bytes() for path in folder.iterdir()} for folder in folders)
     assert one == other

@@ -34,7 +34,7 @@ def rest(stream: Stream, wanted: list[int]) -> list[tuple[float, int]]:
     arrivals = []
     for chunk in stream.cache.wanted:
         twin = stream._copy()
-        while chunk not in twin.cache and twin._happens(math.inf):
+        while chunk not in twin.cache and twin._step(math.inf):
             pass
         arrivals.append((twin._since, chunk))
     return sorted(arrivals)

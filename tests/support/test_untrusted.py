@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sparklod_cli.support.untrusted import MAX_DEPTH, parse_json, parse_toml, shown, well_formed
+from sparklod_cli.support.untrusted import MAX_DEPTH, parse_json, parse_toml, quoted_value, well_formed
 
 VALUES = st.recursive(
     st.none() | st.booleans() | st.integers(-(10**18), 10**18) | st.floats(allow_nan=False) | st.text(),
@@ -84,7 +84,7 @@ def test_quoted_values_are_short() -> None:
     for _ in range(100_000):
         deep = [deep]
     for value in (deep, "x" * 10**6, ["\x1b[2J" * 99] * 99, {"a" * 999: [1e300] * 999}):
-        assert len(shown(value)) <= 100
-        assert shown(value).isprintable()
-    assert shown("a.spz") == "'a.spz'"
+        assert len(quoted_value(value)) <= 100
+        assert quoted_value(value).isprintable()
+    assert quoted_value("a.spz") == "'a.spz'"
     assert well_formed("a\ud800b") == "a\ufffdb"

@@ -72,7 +72,7 @@ class Parsed:
 
     Attributes:
         frames: in order; those between keys are computed when they are asked for.
-        notes: what was ignored or assumed, one sentence each, for people.
+        notes: what was ignored or assumed, one sentence each, for display.
         fps: frames a second in the file; None if it gives none.
         turned: every camera has its own up axis.
     """

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ...model.scene import Scene
 from ...support.errors import FormatError
-from ...support.untrusted import ZIP_ERRORS, quoted, shown
+from ...support.untrusted import ZIP_ERRORS, quoted, quoted_value
 from .. import npy
 from .table import ENCODINGS
 
@@ -59,7 +59,7 @@ def decode_npz(file: BinaryIO) -> Arrays | None:
 def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[Any]:
     # Stored members cannot claim more than the file has; compressed ones could, and build-lod writes none.
     if member.compress_type != zipfile.ZIP_STORED or member.flag_bits & 1:
-        raise FormatError(f"its member {shown(member.filename)} is compressed, which those of --encoding are not")
+        raise FormatError(f"its member {quoted_value(member.filename)} is compressed, unlike those of --encoding")
     try:
         with archive.open(member) as file:
             data = io.BytesIO(file.read())
@@ -68,6 +68,6 @@ def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[Any]:
             raise FormatError("is not a .npy file")
         return npy.read_values(data, layout)
     except (*ZIP_ERRORS, OSError) as error:
-        raise FormatError(f"its member {shown(member.filename)} is damaged: {quoted(error)}") from None
+        raise FormatError(f"its member {quoted_value(member.filename)} is damaged: {quoted(error)}") from None
     except FormatError as error:
-        raise type(error)(f"its member {shown(member.filename)} {error}") from None
+        raise type(error)(f"its member {quoted_value(member.filename)} {error}") from None

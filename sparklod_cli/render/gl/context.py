@@ -1,7 +1,7 @@
 """OpenGL without a window: a moderngl context over libOSMesa or, where that is missing, over EGL.
 
-Run as a module, with the name of one of the two, it says whether that draws here, by doing so. That is for a process of
-its own: a broken driver does not raise, it ends the process.
+Run as a module with the name of one of the two, it tests by drawing whether that works here. This needs a separate
+process, because a broken driver does not raise but ends the process.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
-#: OpenGL that the shaders need: unpackHalf2x16 came with 4.2.
+#: OpenGL version that the shaders need: 4.2 introduced unpackHalf2x16.
 VERSION = 420
 
-#: What a context is made over, in the order of trying, and the packages of Debian and Ubuntu that have it.
+#: Libraries that can provide a context, in the order in which they are tried, and their Debian and Ubuntu packages.
 PACKAGES = {"osmesa": "libosmesa6", "egl": "libegl1 libgl1 libgl1-mesa-dri"}
 
-#: The library has had these names; Mesa's last release with it is 25.0.
+#: File names of the library in its versions; Mesa 25.0 is the last release with it.
 OSMESA_NAMES = ("libOSMesa.so.8", "libOSMesa.so.6", "libOSMesa.so")
 
-#: The process that tries a context is given so many seconds: Mesa compiles its first shaders in well under one.
+#: Time limit in seconds of the process that tests a context; Mesa compiles its first shaders in well under one.
 PATIENCE = 60
 
 # GL/osmesa.h
@@ -34,14 +34,14 @@ _RGBA, _UNSIGNED_BYTE = 0x1908, 0x1401
 
 
 class NoContextError(Exception):
-    """There is no context to be had; its text says why."""
+    """No context can be created; the message says why."""
 
 
 class OSMesa:
-    """A context of libOSMesa, as moderngl takes one: it has `load_opengl_function`.
+    """A context of libOSMesa for moderngl, which requires the method `load_opengl_function`.
 
-    It is current on the thread that made it. What it draws on by itself is 1 x 1 and never looked at; pictures are
-    drawn on framebuffer objects.
+    It is current on the thread that created it. Its default framebuffer is 1 x 1 pixels and never read; pictures are
+    drawn to framebuffer objects.
     """
 
     def __init__(self) -> None:
@@ -61,11 +61,11 @@ class OSMesa:
             raise NoContextError("libOSMesa does not make its context current")
 
     def load_opengl_function(self, name: str) -> int:
-        """The address of a function of OpenGL; 0 if there is none of that name."""
+        """The address of an OpenGL function; 0 if there is none of that name."""
         return self._library.OSMesaGetProcAddress(name.encode()) or 0
 
     def release(self) -> None:
-        """Frees it; it must be current."""
+        """Frees the context, which must be current."""
         self._library.OSMesaMakeCurrent(None, None, _UNSIGNED_BYTE, 0, 0)
         self._library.OSMesaDestroyContext(self._context)
 
@@ -83,18 +83,18 @@ def _load(names: tuple[str, ...]) -> Any:
 def _osmesa() -> Any:
     import moderngl
 
-    how: Any = {"context": OSMesa()}  # its type hints do not know of this
-    return moderngl.create_context(require=VERSION, **how)
+    options: Any = {"context": OSMesa()}  # missing in moderngl's type hints
+    return moderngl.create_context(require=VERSION, **options)
 
 
 def _egl() -> Any:
     import moderngl
 
-    # glcontext looks for names that only the packages for developers have; glvnd has the functions in either library.
+    # glcontext looks for file names that only development packages have; with glvnd either library has the functions.
     libgl = ctypes.util.find_library("GL") or ctypes.util.find_library("OpenGL") or "libGL.so.1"
     libegl = ctypes.util.find_library("EGL") or "libEGL.so.1"
-    how: Any = {"backend": "egl", "libgl": libgl, "libegl": libegl}
-    return moderngl.create_context(require=VERSION, standalone=True, **how)
+    options: Any = {"backend": "egl", "libgl": libgl, "libegl": libegl}
+    return moderngl.create_context(require=VERSION, standalone=True, **options)
 
 
 _MAKE: dict[str, Callable[[], Any]] = {"osmesa": _osmesa, "egl": _egl}
@@ -104,23 +104,23 @@ def create(kind: str) -> Any:
     """A moderngl.Context over one of `PACKAGES`, current on this thread.
 
     Raises:
-        NoContextError: there is none; but a broken driver may end the process instead, see `probe`.
+        NoContextError: it cannot be created; a broken driver may end the process instead, see `probe`.
     """
     try:
         context = _MAKE[kind]()
-        # Python drops objects on any thread, at any time; OpenGL must hear of it on this one only, when `gc` is called.
+        # Python frees objects on any thread at any time; OpenGL objects must be freed on this thread, by `gc`.
         context.gc_mode = "context_gc"
         return context
     except NoContextError:
         raise
-    except Exception as error:  # moderngl and glcontext raise plain ones
+    except Exception as error:  # moderngl and glcontext raise plain exceptions
         raise NoContextError(str(error) or type(error).__name__) from None
 
 
 @functools.cache
 def probe(kind: str) -> str:
-    """Why a context over one of `PACKAGES` does not draw here, found out in a process of its own; empty if it does."""
-    # The child finds the modules that this process has found, wherever they are.
+    """Why a context over one of `PACKAGES` does not work here, tested in a separate process; empty if it works."""
+    # The child searches the same folders for modules as this process.
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     command = [sys.executable, "-m", __name__, kind]
     try:
@@ -129,10 +129,10 @@ def probe(kind: str) -> str:
         return str(error)
     if child.returncode == 0:
         return ""
-    said = child.stderr.strip().splitlines()
+    lines = child.stderr.strip().splitlines()
     if child.returncode < 0:
-        return f"the driver ended the process that tried it, by signal {-child.returncode}"
-    return said[-1] if said else f"trying it failed, with exit code {child.returncode}"
+        return f"the driver ended the test process by signal {-child.returncode}"
+    return lines[-1] if lines else f"the test failed with exit code {child.returncode}"
 
 
 _VERTEX = """
@@ -148,7 +148,7 @@ void main() { color = vec4(0.25, 0.5, 2.0, 1.0); }
 
 
 def _try(kind: str) -> None:
-    """Draws a triangle on floats and looks at it."""
+    """Draws a triangle to a float texture and checks the result."""
     import struct
 
     import moderngl

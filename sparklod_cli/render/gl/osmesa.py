@@ -1,7 +1,7 @@
-"""The backend `osmesa`: splats drawn by OpenGL, as the viewers in browsers do it, without a window or a graphics card.
+"""The backend `osmesa`: draws splats with OpenGL, as viewers in browsers do, without a window or a graphics card.
 
 The pipeline is antimatter15's: splats in an integer texture, an instance of one quad for each, the nearest first, and
-blending from front to back. What a splat looks like is that of the other backends.
+blending from front to back. Splats look as in the other backends.
 """
 
 from __future__ import annotations
@@ -32,27 +32,27 @@ _T = TypeVar("_T")
 
 
 def draw(
-    shown: ShadedSplats,
+    splats: ShadedSplats,
     camera: Camera,
-    look: RasterSettings,
+    raster: RasterSettings,
     *,
     precision: str = "float",
     sorting: str = "exact",
     throttle: float = 0.0,
 ) -> Image:
-    """What a camera sees: (height, width, 4) float32, red, green, blue, multiplied by alpha, and alpha; 0..1.
+    """The picture of a camera: (height, width, 4) float32 red, green, blue (premultiplied) and alpha, 0..1.
 
-    What OpenGL holds is kept from frame to frame.
+    OpenGL objects are reused from frame to frame.
 
     Args:
-        shown, camera, look: what to draw, from where, and how.
+        splats, camera, raster: the splats, the camera and the settings of the rasterizer.
         precision: one of `gl.texture.PRECISIONS`.
         sorting, throttle: see `gl.order.Order`.
 
     Raises:
-        BackendError: there is no OpenGL, or the picture or the scene is larger than it takes.
+        BackendError: OpenGL is not available, or the picture or the scene exceeds its limits.
     """
-    return _renderer(precision, sorting, throttle).draw(shown, camera, look)
+    return _renderer(precision, sorting, throttle).draw(splats, camera, raster)
 
 
 @functools.lru_cache(maxsize=2)
@@ -61,18 +61,18 @@ def _renderer(precision: str, sorting: str, throttle: float) -> Renderer:
 
 
 class Renderer:
-    """Draws frame after frame; compiles once, and uploads only what has changed.
+    """Draws a sequence of frames; compiles once, and uploads only what has changed.
 
     Attributes:
-        uploads: how often the data texture went to OpenGL.
-        sorts: how often splats were sorted.
+        uploads: number of uploads of the data texture.
+        sorts: number of times that the splats were sorted.
     """
 
     def __init__(self, *, precision: str = "float", sorting: str = "exact", throttle: float = 0.0) -> None:
-        """As `draw`, without anything to draw.
+        """Prepares OpenGL; see `draw` for the arguments.
 
         Raises:
-            BackendError: there is no OpenGL.
+            BackendError: OpenGL is not available.
         """
         self._data, self._order = data_texture_of(precision), Order(sorting, throttle)
         self.uploads = self.sorts = 0
@@ -83,24 +83,24 @@ class Renderer:
         self._array: Any = None
         on_gl_thread(self._compile, precision)
 
-    def draw(self, shown: ShadedSplats, camera: Camera, look: RasterSettings) -> Image:
+    def draw(self, splats: ShadedSplats, camera: Camera, raster: RasterSettings) -> Image:
         """See the function `draw`."""
-        return on_gl_thread(self._draw, shown, camera, look)
+        return on_gl_thread(self._draw, splats, camera, raster)
 
     def _compile(self, precision: str) -> None:
         self._context = open_context()
         self._program = self._context.program(**sources(precision))
         self._corners = self._context.buffer(CORNERS.tobytes())
 
-    def _draw(self, shown: ShadedSplats, camera: Camera, look: RasterSettings) -> Image:
+    def _draw(self, splats: ShadedSplats, camera: Camera, raster: RasterSettings) -> Image:
         self._context.gc()
-        self._hold(shown)
-        self._sort(shown, camera, look)
-        self._aim_at(camera.width, camera.height)
+        self._upload(splats)
+        self._sort(splats, camera, raster)
+        self._resize(camera.width, camera.height)
         self._target.use()
         self._target.clear()
         if self._count:
-            self._tell(camera, look)
+            self._set_uniforms(camera, raster)
             self._texture.use(0)
             self._context.enable_only(self._context.BLEND)
             self._context.blend_func = self._context.ONE_MINUS_DST_ALPHA, self._context.ONE
@@ -110,107 +110,105 @@ class Renderer:
         self._check("drawing")
         return image
 
-    def _hold(self, shown: ShadedSplats) -> None:
-        changed, moved = self._data.update(shown)
+    def _upload(self, splats: ShadedSplats) -> None:
+        changed, moved = self._data.update(splats)
         if moved:
             self._order.forget()
-        if not changed and self._texture is not None:  # which it is after one that was too large
+        if not changed and self._texture is not None:  # it is None after a scene that was too large
             return
         height, width = self._data.texture.shape[:2]
         if self._texture is None or self._texture.height != height:
             self._texture = None
-            self._fits(max(height, width), f"{len(shown):,} splats")
+            self._check_edge(max(height, width), f"{len(splats):,} splats")
             self._texture = self._context.texture((width, height), 4, dtype="u4")
             self._texture.filter = self._context.NEAREST, self._context.NEAREST
-            self._check(f"a texture for {len(shown):,} splats")
+            self._check(f"a texture for {len(splats):,} splats")
         self._texture.write(self._data.texture)
         self.uploads += 1
 
-    def _sort(self, shown: ShadedSplats, camera: Camera, look: RasterSettings) -> None:
-        indices = self._order.update(shown, camera, look)
+    def _sort(self, splats: ShadedSplats, camera: Camera, raster: RasterSettings) -> None:
+        indices = self._order.update(splats, camera, raster)
         if indices is None:
             return
         self.sorts += 1
         self._count = len(indices)
-        if self._array is None or self._capacity < len(shown):
-            self._capacity = max(1, len(shown))
+        if self._array is None or self._capacity < len(splats):
+            self._capacity = max(1, len(splats))
             self._indices = self._context.buffer(reserve=4 * self._capacity, dynamic=True)
             content = [(self._corners, "2f", "corner"), (self._indices, "1u/i", "index")]
             self._array = self._context.vertex_array(self._program, content)
         self._indices.orphan()
         self._indices.write(indices)
 
-    def _aim_at(self, width: int, height: int) -> None:
+    def _resize(self, width: int, height: int) -> None:
         if self._size == (width, height):
             return
         self._target, self._size = None, (0, 0)
-        self._fits(max(width, height), f"{width} x {height} pixels")
+        self._check_edge(max(width, height), f"{width} x {height} pixels")
         self._target = self._context.framebuffer([self._context.renderbuffer((width, height), 4, dtype="f4")])
         self._check(f"a picture of {width} x {height} pixels")
         self._size = width, height
 
-    def _tell(self, camera: Camera, look: RasterSettings) -> None:
+    def _set_uniforms(self, camera: Camera, raster: RasterSettings) -> None:
         uniforms = {
             "world_to_camera": tuple(world_to_camera(camera).T.ravel()),
             "focal": camera.focal,
             "principal": camera.principal,
             "size": (camera.width, camera.height),
-            "range": (look.near, look.far),
-            "max_radius": look.max_radius,
-            "shifted": look.profile == "shifted",
+            "range": (raster.near, raster.far),
+            "max_radius": raster.max_radius,
+            "shifted": raster.profile == "shifted",
         }
         for name, value in uniforms.items():
             self._program[name] = value
 
-    def _fits(self, edge: int, what: str) -> None:
+    def _check_edge(self, edge: int, what: str) -> None:
         most = self._context.info["GL_MAX_TEXTURE_SIZE"]
         if edge > most:
-            raise BackendError(
-                f"{what} are more than this OpenGL takes, {most} along an edge; the backend numba draws them"
-            )
+            raise BackendError(f"{what} exceed the limit of this OpenGL, {most} along an edge; use the backend numba")
 
     def _check(self, what: str) -> None:
         error = self._context.error
         if error != "GL_NO_ERROR":
-            raise BackendError(f"OpenGL refuses {what}: {error}; the backend numba may draw it")
+            raise BackendError(f"OpenGL failed at {what}: {error}; try the backend numba")
 
 
 def on_gl_thread(work: Callable[..., _T], *arguments: Any) -> _T:
-    """Does what talks to OpenGL, on the one thread that does.
+    """Runs a function on the thread that makes all calls to OpenGL.
 
-    A thread has one current context. On one of its own, ours cannot get in the way of VTK's, for one, nor VTK's in
-    ours: drivers take it for granted that a context stays current, and draw nothing, or elsewhere, where it does not.
+    A thread has one current context. On its own thread, our context cannot interfere with that of VTK, for example:
+    drivers rely on a context staying current, and otherwise draw nothing, or into another context.
     """
     thread, process = _thread()
-    if process != os.getpid():  # Mesa's threads are gone as well, and it would wait for them forever
-        raise BackendError("OpenGL does not go on in a process that was forked off: start others by spawn, not by fork")
-    return thread.submit(_worded, work, *arguments).result()
+    if process != os.getpid():  # Mesa's threads do not survive a fork, and it would wait for them forever
+        raise BackendError("OpenGL cannot be used in a forked process; start processes with spawn instead of fork")
+    return thread.submit(_translated, work, *arguments).result()
 
 
 @functools.cache
 def _thread() -> tuple[ThreadPoolExecutor, int]:
-    """The thread, and the process that has it."""
+    """The thread, and the id of its process."""
     return ThreadPoolExecutor(1, "sparklod-gl"), os.getpid()
 
 
-def _worded(work: Callable[..., _T], *arguments: Any) -> _T:
+def _translated(work: Callable[..., _T], *arguments: Any) -> _T:
     try:
         return work(*arguments)
     except Exception as error:
         if type(error).__module__.lstrip("_") == "moderngl":  # which may not be installed
-            said = str(error).split("\n")[0]
-            raise BackendError(f"OpenGL refuses to draw this ({said}); the backend numba may draw it") from error
+            message = str(error).split("\n")[0]
+            raise BackendError(f"OpenGL failed to draw ({message}); try the backend numba") from error
         raise
 
 
 @functools.cache
 def open_context() -> Any:
-    """The moderngl.Context of this process, made when first asked for; to be asked for, and used, `on_gl_thread`.
+    """The moderngl.Context of this process, created on the first call; call and use it `on_gl_thread` only.
 
     Raises:
-        BackendError: there is none; it names the packages that bring one.
+        BackendError: OpenGL is not available; names the packages to install.
     """
-    with optional_import("the backend osmesa draws by moderngl", "sparklod[render]", BackendError):
+    with optional_import("the backend osmesa needs moderngl", "sparklod[render]", BackendError):
         import moderngl  # noqa: F401
     reasons = []
     for kind in contexts.PACKAGES:

@@ -1,4 +1,4 @@
-"""The data texture: all that the vertex shader knows of the splats, in texels of four 32 bit words."""
+"""The data texture: the splats as the vertex shader reads them, in texels of four 32-bit words."""
 
 from __future__ import annotations
 
@@ -14,23 +14,22 @@ from ...model.splats import FloatArray, Splats
 from ..kernels.project import MAX_COLOR
 from ..shading import ShadedSplats
 
-#: How exactly splats are held: as they are, or as antimatter15's viewer holds them.
+#: Precision of the stored splats: float32, or that of antimatter15's viewer.
 PRECISIONS = ("float", "half")
 
-#: Columns of `ShadedSplats` that stay as they are while a camera moves; colours do not, where there are spherical
-#: harmonics.
+#: Columns of `ShadedSplats` that do not change when the camera moves; colours do if there are spherical harmonics.
 GEOMETRY = ("center", "scale", "quat_xyzw", "lod_opacity")
 
 Words = NDArray[np.uint32]
 
 
 class DataTexture(ABC):
-    """The texels of the splats last given, kept so that what has not changed is not computed or uploaded again.
+    """The texels of the last splats, cached so that unchanged parts are not computed or uploaded again.
 
     Attributes:
-        texels_a_splat: how many follow each other in a row.
-        splats_a_row: a power of two.
-        texture: (height, splats_a_row * texels_a_splat, 4) uint32, row by row from splat 0 on; what is left over is 0.
+        texels_a_splat: number of consecutive texels of a splat.
+        splats_a_row: number of splats in a row, a power of two.
+        texture: (height, splats_a_row * texels_a_splat, 4) uint32, row by row from splat 0; unused texels are 0.
     """
 
     texels_a_splat: int
@@ -38,26 +37,26 @@ class DataTexture(ABC):
 
     def __init__(self) -> None:
         self.texture: Words = np.zeros((0, self.splats_a_row * self.texels_a_splat, 4), np.uint32)
-        self._shown: ShadedSplats | None = None
+        self._last: ShadedSplats | None = None
 
-    def update(self, shown: ShadedSplats) -> tuple[bool, bool]:
-        """Takes splats in.
+    def update(self, shaded: ShadedSplats) -> tuple[bool, bool]:
+        """Updates the texture to these splats.
 
-        Compares what they are, not where they lie: every frame has new arrays, mostly of the same numbers.
+        Compares values, not array identity: every frame has new arrays, mostly with the same values.
 
         Returns:
-            whether the texture has changed, and whether the splats moved, came or went.
+            whether the texture has changed, and whether anything but colours has changed.
         """
-        before, self._shown = self._shown, shown
-        moved = before is None or not _same(before, shown, GEOMETRY)
+        before, self._last = self._last, shaded
+        moved = before is None or not _same(before, shaded, GEOMETRY)
         if moved:
-            height = max(1, -(-len(shown) // self.splats_a_row))
+            height = max(1, -(-len(shaded) // self.splats_a_row))
             if len(self.texture) != height:
                 self.texture = np.zeros((height, *self.texture.shape[1:]), np.uint32)
-            self._geometry(shown)
-        recolored = moved or before is None or not _same(before, shown, ("rgb",))
+            self._geometry(shaded)
+        recolored = moved or before is None or not _same(before, shaded, ("rgb",))
         if recolored:
-            self._colors(shown)
+            self._colors(shaded)
         return recolored, moved
 
     def _rows(self, kind: np.dtype[Any], count: int) -> NDArray[Any]:
@@ -65,19 +64,19 @@ class DataTexture(ABC):
         return self.texture.reshape(-1, 4 * self.texels_a_splat).view(kind)[:count, 0]
 
     @abstractmethod
-    def _geometry(self, shown: ShadedSplats) -> None:
+    def _geometry(self, shaded: ShadedSplats) -> None:
         """Writes all but the colours."""
 
     @abstractmethod
-    def _colors(self, shown: ShadedSplats) -> None:
+    def _colors(self, shaded: ShadedSplats) -> None:
         """Writes the colours."""
 
 
 class Floats(DataTexture):
-    """Four texels a splat, in float32.
+    """Four texels per splat, in float32.
 
-    Instead of the covariance there is its root, rotation and scale: of the covariance of a thin splat, float32 would
-    lose the thin side. It takes no more room than the six elements, filled up to whole texels.
+    Stores rotation and scale instead of the covariance, in which float32 would lose the short axis of a thin splat. In
+    whole texels this takes no more space than the six elements of the covariance.
     """
 
     RECORD = np.dtype(
@@ -95,54 +94,54 @@ class Floats(DataTexture):
 
     texels_a_splat, splats_a_row = 4, 2048
 
-    def _geometry(self, shown: ShadedSplats) -> None:
-        rows = self._rows(self.RECORD, len(shown))
+    def _geometry(self, shaded: ShadedSplats) -> None:
+        rows = self._rows(self.RECORD, len(shaded))
         for name in GEOMETRY:
-            rows[name] = getattr(shown, name)
+            rows[name] = getattr(shaded, name)
 
-    def _colors(self, shown: ShadedSplats) -> None:
-        self._rows(self.RECORD, len(shown))["rgb"] = _shown_colors(shown)
+    def _colors(self, shaded: ShadedSplats) -> None:
+        self._rows(self.RECORD, len(shaded))["rgb"] = _clamped_colors(shaded)
 
 
 class Halves(DataTexture):
-    """Two texels a splat, those of antimatter15's viewer: `codecs.data_texture`.
+    """Two texels per splat, in the layout of antimatter15's viewer: `codecs.gpu.data_texture`.
 
-    A byte of opacity cannot tell a merged splat, nor a byte of colour one that is brighter than 1. So the word that the
-    viewer leaves unused has two float16: D, and what the bytes of colour are multiplied by, 1 for most.
+    A byte cannot store the opacity of a merged splat, nor a colour above 1. So the word that the viewer leaves unused
+    holds two float16: D, and a factor for the colour bytes, usually 1.
     """
 
     texels_a_splat, splats_a_row = 2, data_texture.SPLATS_A_ROW
 
-    def _geometry(self, shown: ShadedSplats) -> None:
-        colorless = np.zeros_like(shown.rgb)
-        sh = np.zeros((len(shown), COEFFICIENTS[0], 3), np.float32)
-        opacity = np.minimum(shown.lod_opacity, 1)
-        splats = Splats(shown.center, shown.scale, shown.quat_xyzw, opacity, colorless, sh)
+    def _geometry(self, shaded: ShadedSplats) -> None:
+        colorless = np.zeros_like(shaded.rgb)
+        sh = np.zeros((len(shaded), COEFFICIENTS[0], 3), np.float32)
+        opacity = np.minimum(shaded.lod_opacity, 1)
+        splats = Splats(shaded.center, shaded.scale, shaded.quat_xyzw, opacity, colorless, sh)
         self.texture = data_texture.pack(splats)["texture"]
-        self._extra(shown)[:, 0] = shown.lod_opacity
+        self._extra(shaded)[:, 0] = shaded.lod_opacity
 
-    def _colors(self, shown: ShadedSplats) -> None:
-        rgb = _shown_colors(shown)
+    def _colors(self, shaded: ShadedSplats) -> None:
+        rgb = _clamped_colors(shaded)
         gain = np.maximum(rgb.max(axis=1, initial=0), 1).astype(np.float16)
-        # float16 rounds down, too, and a byte must not wrap around.
+        # float16 may round the factor down, and a byte must not overflow.
         bright = np.minimum(rgb / gain[:, None].astype(np.float32), 1)
-        self._rows(data_texture.SPLAT, len(shown))["rgba"][:, :3] = np.rint(bright * 255)
-        self._extra(shown)[:, 1] = gain
+        self._rows(data_texture.SPLAT, len(shaded))["rgba"][:, :3] = np.rint(bright * 255)
+        self._extra(shaded)[:, 1] = gain
 
-    def _extra(self, shown: ShadedSplats) -> NDArray[np.float16]:
-        """(N, 2) of the unused word."""
-        words: NDArray[np.float16] = self.texture.reshape(-1, 8).view(np.float16)[: len(shown), 6:8]
+    def _extra(self, shaded: ShadedSplats) -> NDArray[np.float16]:
+        """(N, 2) the two halves of the word that the viewer leaves unused."""
+        words: NDArray[np.float16] = self.texture.reshape(-1, 8).view(np.float16)[: len(shaded), 6:8]
         return words
 
 
 def data_texture_of(precision: str) -> DataTexture:
-    """An empty one of `PRECISIONS`."""
+    """An empty data texture of one of `PRECISIONS`."""
     return {"float": Floats, "half": Halves}[precision]()
 
 
-def _shown_colors(shown: ShadedSplats) -> FloatArray:
-    """(N, 3) colours in the range that the rasterizer draws; 0 for what is no number."""
-    rgb: FloatArray = np.where(shown.rgb > 0, np.minimum(shown.rgb, MAX_COLOR), np.float32(0))
+def _clamped_colors(shaded: ShadedSplats) -> FloatArray:
+    """(N, 3) colours clamped to the range of the rasterizer; NaN becomes 0."""
+    rgb: FloatArray = np.where(shaded.rgb > 0, np.minimum(shaded.rgb, MAX_COLOR), np.float32(0))
     return rgb
 
 

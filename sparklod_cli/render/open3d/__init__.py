@@ -1,1 +1,1 @@
-"""The Open3D backend, which draws in a process of its own."""
+"""The Open3D backend, which draws in a separate process."""

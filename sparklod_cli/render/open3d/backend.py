@@ -1,14 +1,14 @@
-"""The backend `open3d`: a quick look, by the material `gaussianSplat` of Open3D 0.20, on any device with Vulkan 1.3.
+"""The backend `open3d`: fast previews with the material `gaussianSplat` of Open3D 0.20, on any device with Vulkan 1.3.
 
-What it does otherwise than the backend `numba`:
+Differences from the backend `numba`:
 
-- Opacity ends at 1: a merged splat of linear opacity A > 1 is drawn as an opaque one that is A ** (1 / 3) larger, which
-  has the same sum over its volume. `RasterSettings.profile` means nothing here.
-- Splats are sorted by depth; `RasterSettings.sort` means nothing here.
-- Colours end at 1 before they are blended, and have 8 bits, as has the picture. Alpha is worked out from a picture on
+- Opacity is at most 1: a merged splat of linear opacity A > 1 is drawn as an opaque one that is A ** (1 / 3) larger,
+  which has the same integral over space. `RasterSettings.profile` has no effect.
+- Splats are sorted by depth; `RasterSettings.sort` has no effect.
+- Colours are clamped to 1 before blending and have 8 bits, as does the picture. Alpha is computed from one picture on
   black and one on white.
 - Quaternions have 8 bits, and a splat's centre on the picture may be off by 1/16 of a pixel.
-- A splat is as large on the picture as it is: Spark squeezes those above 512 pixels.
+- The size of a splat on the picture is not limited; Spark limits it to 512 pixels.
 
 Without merged splats it agrees with `numba`, sorted by depth, to 50 dB and more; with many of them, to 20 to 35. It
 draws in pieces, see `PIECE`, and in software takes ten times as long or more.
@@ -35,19 +35,19 @@ from .process import Child
 #: Left, top and side of a piece of the picture, pixels.
 Square = tuple[int, int, int]
 
-#: Its sigmoid is 1 in float16.
+#: Largest logit of opacity; its sigmoid is 1 in float16.
 MOST_LOGIT = 12.0
 
-#: The largest scale that Open3D is given: those of float16 end at 65504, and are exact to 1/1024 down to 6e-5.
+#: Largest scale passed to Open3D, which stores float16: at most 65504, and exact to 1/1024 down to 6e-5.
 MOST_SCALE = 2.0**12
 
-#: Radians that the picture is turned by, which is less than it can show. Open3D divides by 0 where a splat is wider on
-#: the picture than high and not oblique at all, as happens in made-up scenes, and draws black tiles.
+#: Angle in radians by which the picture is rotated, too small to be visible. Open3D divides by 0 if a splat is wider
+#: than high and exactly axis-aligned, as happens in synthetic scenes, and draws black tiles.
 ASKEW = 1e-5
 
 
-def draw(shown: ShadedSplats, camera: Camera, look: RasterSettings) -> Image:
-    """What a camera sees: (height, width, 4) float32, red, green, blue, multiplied by alpha, and alpha; 0..1.
+def draw(shaded: ShadedSplats, camera: Camera, raster: RasterSettings) -> Image:
+    """The picture of a camera: (height, width, 4) float32 red, green, blue (premultiplied) and alpha, 0..1.
 
     Raises:
         BackendError: Open3D is not installed, cannot draw here, or has crashed.
@@ -57,7 +57,7 @@ def draw(shown: ShadedSplats, camera: Camera, look: RasterSettings) -> Image:
     with _LOCK:
         if _child is None or not _child.alive():
             _child = Child()
-        for (left, top), request, splats in pieces(shown, camera, look, _child.most_entries):
+        for (left, top), request, splats in pieces(shaded, camera, raster, _child.most_entries):
             black, white = _child.ask(request, splats).astype(np.float32) / 255
             piece = image[top : top + request["side"], left : left + request["side"]]
             height, width = piece.shape[:2]
@@ -67,37 +67,37 @@ def draw(shown: ShadedSplats, camera: Camera, look: RasterSettings) -> Image:
 
 
 def pieces(
-    shown: ShadedSplats, camera: Camera, look: RasterSettings, most_entries: int
+    shaded: ShadedSplats, camera: Camera, raster: RasterSettings, most_entries: int
 ) -> Iterator[tuple[tuple[int, int], dict[str, Any], Array]]:
-    """What Open3D is asked to draw: left and top of a piece, the request, and the splats that touch it.
+    """The pieces that Open3D draws: left and top of each, the request, and the splats that touch it.
 
-    They are those that Spark would draw, and seen from the origin.
+    The splats are those that Spark would draw, relative to the camera.
     """
     to_camera = (camera.camera_to_world[:3, :3] @ np.diag([1.0, -1.0, -1.0])).T
-    away = shown.center - camera.position  # float64, however far out the camera is
+    away = shaded.center - camera.position  # float64, however far out the camera is
     at = away @ to_camera.T
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         from_axis = at[:, :2] / at[:, 2:] * camera.focal
-        seen = (at[:, 2] > look.near) & (at[:, 2] < look.far) & (shown.lod_opacity >= MIN_ALPHA)
-        seen &= (np.abs(from_axis) <= CLIP / 2 * np.array([camera.width, camera.height])).all(axis=1)
-        seen &= np.isfinite(shown.scale).all(axis=1) & np.isfinite(shown.rgb).all(axis=1)
-    kept = np.flatnonzero(seen)
-    at, from_axis = at[kept], from_axis[kept]
+        visible = (at[:, 2] > raster.near) & (at[:, 2] < raster.far) & (shaded.lod_opacity >= MIN_ALPHA)
+        visible &= (np.abs(from_axis) <= CLIP / 2 * np.array([camera.width, camera.height])).all(axis=1)
+        visible &= np.isfinite(shaded.scale).all(axis=1) & np.isfinite(shaded.rgb).all(axis=1)
+    index = np.flatnonzero(visible)
+    at, from_axis = at[index], from_axis[index]
 
-    opacity = linear_opacity(shown.lod_opacity[kept])
-    scale = shown.scale[kept] * np.cbrt(np.maximum(opacity, 1))[:, None]
+    opacity = linear_opacity(shaded.lod_opacity[index])
+    scale = shaded.scale[index] * np.cbrt(np.maximum(opacity, 1))[:, None]
     opacity = np.clip(opacity, None, 1 - 1e-7)
     unit = MOST_SCALE / max(float(scale.max(initial=0)), 1e-30)
-    quat_wxyz = shown.quat_xyzw[kept][:, [3, 0, 1, 2]]
-    splats = np.empty((len(kept), COLUMNS), np.float32)
-    splats[:, :3] = away[kept] * unit
+    quat_wxyz = shaded.quat_xyzw[index][:, [3, 0, 1, 2]]
+    splats = np.empty((len(index), COLUMNS), np.float32)
+    splats[:, :3] = away[index] * unit
     splats[:, 3:6] = scale * unit
-    # Open3D normalizes it after it has made it bytes, and so these have a bit more.
+    # Open3D normalizes quaternions after rounding them to bytes; larger components keep one more bit.
     splats[:, 6:10] = quat_wxyz / np.abs(quat_wxyz).max(axis=1, keepdims=True)
     splats[:, 10] = np.minimum(np.log(opacity / (1 - opacity)), MOST_LOGIT)
-    splats[:, 11:] = (shown.rgb[kept] - 0.5) / SH_C0
+    splats[:, 11:] = (shaded.rgb[index] - 0.5) / SH_C0
 
-    # No less than how far out a splat is drawn, in pixels.
+    # An upper bound of the radius of each splat, in pixels.
     slope = np.einsum("ij,ij->i", at, at) / at[:, 2] ** 2
     variance = (scale.max(axis=1) * max(camera.focal) / at[:, 2]) ** 2 * slope + BLUR
     half = MAX_STD_DEV * np.sqrt(variance)[:, None] + 2
@@ -112,18 +112,18 @@ def pieces(
             "side": side,
             "intrinsic": [[fx, 0.0, cx - left], [0.0, fy, cy - top], [0.0, 0.0, 1.0]],
             "rotation": rotation,
-            "range": [look.near * unit, look.far * unit],
+            "range": [raster.near * unit, raster.far * unit],
             "entries": entries,
         }
         yield (left, top), request, splats[touching]
 
 
 def _split(camera: Camera, low: Array, high: Array, most: int) -> Iterator[tuple[Square, NDArray[np.intp], int]]:
-    """Squares that cover the picture where there are splats: which ones, and how many tiles these touch, added up.
+    """Squares that cover the splats of a picture: each with its splats, and the number of pairs of splat and tile.
 
     Args:
         low, high: (N, 2) the corners of boxes around splats, pixels.
-        most: so many at most, unless in a single tile.
+        most: maximum number of pairs in a square of more than one tile.
     """
     squares = [(x, y, PIECE) for y in range(0, camera.height, PIECE) for x in range(0, camera.width, PIECE)]
     waiting = [(square, np.arange(len(low))) for square in reversed(squares)]

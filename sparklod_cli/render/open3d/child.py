@@ -1,10 +1,11 @@
-"""Draws splats with Open3D: a program by itself, since Open3D ends its process where it fails.
+"""Draws splats with Open3D in a separate process, because Open3D ends its process when it fails.
 
-`process` runs it, and keeps it running. It answers as it starts, and to each request on its standard input; it
-ends when that is closed. A message is a line of JSON and the bytes of an array, if its "array" says so.
+`process` starts it and keeps it running. It sends a message when it has started, and one for each request on its
+standard input; it exits when that is closed. A message is a line of JSON and, if its "array" is not null, the bytes of
+an array.
 
-How Open3D 0.20 wants a splat, from its sources (`GaussianSplatDataPacking.cpp`, and the shaders `gaussian_*.comp` in
-its package): linear scales, quaternions w x y z, opacity as a logit, colour as the first spherical harmonic. It keeps
+The splats of Open3D 0.20, from its sources (`GaussianSplatDataPacking.cpp`, and the shaders `gaussian_*.comp` in
+its package): linear scales, quaternions w x y z, opacity as a logit, colour as the first spherical harmonic. It stores
 scales and colours as float16, and quaternions as bytes. Its camera is OpenCV's; the upper left corner of the upper left
 pixel is at 0, 0. Splats are blended over the background as they are, without tone mapping.
 """
@@ -24,33 +25,33 @@ from numpy.typing import NDArray
 #: Columns of the splats of a request: centre, scale, quaternion w x y z, logit of opacity, first spherical harmonics.
 COLUMNS = 14
 
-#: Pixels, the sides of a tile in which Open3D collects splats, and of the largest picture that it is asked for: so
-#: small, since it keeps positions on the picture as float16. Pictures are squares of 2 ** n tiles, since Open3D forgets
-#: a barrier where tiles are missing to one; and of no more than 256, since it leaves out splats that touch more.
+#: Sides in pixels of a tile, by which Open3D bins splats, and of the largest picture requested from it, which is small
+#: because Open3D stores screen positions as float16. Pictures are squares of 2 ** n tiles, because otherwise a barrier
+#: is missing in Open3D; and of at most 256 tiles, because it drops splats that touch more.
 TILE, PIECE = 16, 256
 
-#: Open3D makes room for so many tiles a splat, and does without those that are left. Its material has a number for it,
-#: which 0.20 does not heed off screen, and so it does not know of the 256 either.
+#: Open3D allocates this many tiles per splat, and drops further ones. Its material has a setting for this, which 0.20
+#: ignores off screen, as it ignores the limit of 256.
 TILES_A_SPLAT = 32
 
-#: A splat that is drawn nowhere, for the camera is at the same place.
+#: An invisible splat: it is at the position of the camera.
 NOWHERE = np.array([0, 0, 0, 1, 1, 1, 1, 0, 0, 0, 9, 0, 0, 0], np.float32)
 
-#: The first version that draws splats.
+#: The first version of Open3D that draws splats.
 VERSION = "0.20"
 
-#: What Open3D says, once, when it leaves out splats.
+#: Words in Open3D's warning, printed once, that it has dropped splats.
 LEFT_OUT = "dropped", "culled"
 
-#: Libraries that Open3D loads, and the packages of Debian and Ubuntu that bring them; the last one draws in software.
+#: Debian and Ubuntu packages of the libraries that Open3D loads; the last one renders in software.
 PACKAGES = "libegl1 libgl1 libusb-1.0-0 libvulkan1 mesa-vulkan-drivers"
 
 Array = NDArray[Any]
 
 
 def send(file: IO[bytes], message: dict[str, Any], array: Array | None = None) -> None:
-    """Writes a message, with an array if there is one."""
-    # Not as .npy, which numpy seeks in, and these are pipes.
+    """Writes a message and, optionally, an array."""
+    # Not as .npy, which requires a seekable file.
     about = None if array is None else {"type": array.dtype.str, "shape": array.shape}
     file.write(json.dumps({**message, "array": about}).encode() + b"\n")
     if array is not None:
@@ -59,10 +60,10 @@ def send(file: IO[bytes], message: dict[str, Any], array: Array | None = None) -
 
 
 def receive(file: IO[bytes]) -> tuple[dict[str, Any], Array | None]:
-    """A message and its array.
+    """Reads a message and its array.
 
     Raises:
-        EOFError: there is none, for the other side has ended.
+        EOFError: the other process has ended.
     """
     line = file.readline()
     if not line.endswith(b"\n"):
@@ -76,8 +77,8 @@ def receive(file: IO[bytes]) -> tuple[dict[str, Any], Array | None]:
     return message, array
 
 
-class _Heard(io.TextIOBase):
-    """Where Python prints in this process: Open3D's messages go through here."""
+class _Log(io.TextIOBase):
+    """Standard output of Python in this process, which receives Open3D's messages."""
 
     def __init__(self) -> None:
         self.text = ""
@@ -88,21 +89,21 @@ class _Heard(io.TextIOBase):
         return len(text)
 
 
-class Artist:
+class Painter:
     """Open3D's renderer, and what it renders.
 
     Raises:
-        RuntimeError: Open3D cannot draw splats here; the text is for people.
+        RuntimeError: Open3D cannot draw splats here; the message says why.
     """
 
-    def __init__(self, heard: _Heard) -> None:
-        self._heard = heard
+    def __init__(self, log: _Log) -> None:
+        self._log = log
         self._renderers: dict[int, Any] = {}
         try:
             import open3d
         except ModuleNotFoundError as error:
             raise RuntimeError(
-                f"it takes the package {error.name}, which is not installed: pip install 'open3d>={VERSION}'"
+                f"it needs the package {error.name}, which is not installed: pip install 'open3d>={VERSION}'"
             ) from None
         except (ImportError, OSError) as error:
             reason = " ".join(str(error).split())
@@ -120,10 +121,10 @@ class Artist:
         self._material.gaussian_splat_antialias = True
 
     def probe(self) -> None:
-        """Draws a splat, since without a device for Vulkan, Open3D goes on and draws nothing.
+        """Draws a splat to check that Open3D works: without a Vulkan device it draws nothing, and raises nothing.
 
         Raises:
-            RuntimeError: it is not on the picture.
+            RuntimeError: the splat is not in the picture.
         """
         splat = np.array([[0.0, 0.0, 1.0, 0.2, 0.2, 0.2, 1.0, 0.0, 0.0, 0.0, 9.0, -1.7, 1.7, -1.7]], np.float32)
         request = {
@@ -137,20 +138,20 @@ class Artist:
         red, green, blue = on_black[16, 16]
         if green < 200 or red > 50 or blue > 50 or on_white[0, 0].min() < 250:
             raise RuntimeError(
-                f"Open3D draws no splats here, for want of Vulkan 1.3 (on Debian and Ubuntu: apt install {PACKAGES})"
+                f"Open3D draws no splats here without Vulkan 1.3 (on Debian and Ubuntu: apt install {PACKAGES})"
             )
 
     def draw(self, request: dict[str, Any], splats: Array) -> Array:
-        """(2, side, side, 3) uint8: what is seen on black, and on white.
+        """(2, side, side, 3) uint8: the picture on black, and on white.
 
         Args:
             request: "side" of the picture; "intrinsic", (3, 3); "rotation", (3, 3) world to camera, with y down,
-                looking along z from the origin; "range", what is nearest and farthest; "entries", the number of pairs
-                of a splat and a tile of 16 x 16 pixels, or more.
+                looking along z from the origin; "range", near and far distance; "entries", an upper bound of the number
+                of pairs of a splat and a tile of 16 x 16 pixels.
             splats: (N, COLUMNS) float32.
 
         Raises:
-            RuntimeError: Open3D left out splats.
+            RuntimeError: Open3D dropped splats.
         """
         side = request["side"]
         renderer = self._renderer(side)
@@ -163,20 +164,20 @@ class Artist:
         intrinsic, extrinsic = np.array(request["intrinsic"]), np.eye(4)
         extrinsic[:3, :3] = request["rotation"]
         renderer.setup_camera(intrinsic, extrinsic, side, side)
-        # Again, since that has chosen a range by the boxes of what is in the scene.
+        # Again, because setup_camera chooses near and far from the bounding boxes in the scene.
         scene.camera.set_projection(intrinsic, *request["range"], side, side)
         pictures = []
         for background in (0.0, 1.0):
             scene.set_background(np.array([background, background, background, 1], np.float32))
             pictures.append(np.array(renderer.render_to_image()))
-        if any(word in self._heard.text for word in LEFT_OUT):
-            raise RuntimeError("Open3D has left out splats, since too many overlap on the picture")
+        if any(word in self._log.text for word in LEFT_OUT):
+            raise RuntimeError("Open3D has dropped splats, because too many overlap on the picture")
         return np.stack(pictures)
 
     def _renderer(self, side: int) -> Any:
         if side not in self._renderers:
             renderer = self._open3d.visualization.rendering.OffscreenRenderer(side, side)
-            # Tone mapping and dithering, which would change the background.
+            # Disables tone mapping and dithering, which would change the background.
             renderer.scene.view.set_post_processing(False)
             self._renderers[side] = renderer
         return self._renderers[side]
@@ -192,26 +193,24 @@ class Artist:
 
 
 def main() -> None:
-    """Answers requests until there are no more."""
-    signal.signal(
-        signal.SIGINT, signal.SIG_IGN
-    )  # it is for the program that runs this one, which then closes the input
+    """Answers requests until standard input is closed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # handled by the parent, which then closes the input
     answers, requests = os.fdopen(os.dup(1), "wb"), sys.stdin.buffer
-    os.dup2(2, 1)  # what libraries print themselves
-    sys.stdout = heard = _Heard()
+    os.dup2(2, 1)  # libraries print to descriptor 1
+    sys.stdout = log = _Log()
     try:
-        artist = Artist(heard)
-        artist.probe()
+        painter = Painter(log)
+        painter.probe()
     except RuntimeError as error:
         send(answers, {"error": str(error)})
     else:
         send(answers, {})
-        _answer(artist, requests, answers)
-    # Open3D takes itself apart in an order that may crash, and there is nothing left to write.
+        _answer(painter, requests, answers)
+    # Open3D's destructors may crash, and there is nothing left to write.
     os._exit(0)
 
 
-def _answer(artist: Artist, requests: IO[bytes], answers: IO[bytes]) -> None:
+def _answer(painter: Painter, requests: IO[bytes], answers: IO[bytes]) -> None:
     while True:
         try:
             request, splats = receive(requests)
@@ -219,7 +218,7 @@ def _answer(artist: Artist, requests: IO[bytes], answers: IO[bytes]) -> None:
             return
         try:
             assert splats is not None
-            pictures = artist.draw(request, splats)
+            pictures = painter.draw(request, splats)
         except Exception as error:
             send(answers, {"error": " ".join(str(error).split())})
         else:

@@ -1,4 +1,4 @@
-"""The process in which Open3D draws, as its parent has it; `child` is what runs there."""
+"""The parent's side of the process in which Open3D draws; `child` runs in that process."""
 
 from __future__ import annotations
 
@@ -18,31 +18,32 @@ from .child import PACKAGES, Array, receive, send
 
 COMMAND = [sys.executable, "-m", f"{__package__}.child"]
 
-#: Seconds that it may take to begin, and to draw a piece.
+#: Time limits in seconds for starting the process, and for drawing a piece.
 START_LIMIT, DRAW_LIMIT = 180.0, 300.0
 
-#: Pairs of splats and tiles that are drawn at once: as many as Open3D ever makes room for; and in software by an old
-#: Mesa. That of Debian 12, 22.3.6, sorts more than some 100,000 wrongly, and tiles are missing; 25.0.7 does not.
+#: Maximum number of pairs of splat and tile per request: the capacity of Open3D, and a limit for software rendering by
+#: an old Mesa. That of Debian 12, 22.3.6, sorts more than about 100,000 incorrectly, so that tiles are missing; 25.0.7
+#: does not.
 MOST_ENTRIES, MOST_ENTRIES_OF_OLD_MESA, NEW_MESA = 1 << 25, 1 << 15, 25
 
 
 class Child:
-    """A process in which Open3D draws; it ends with this one.
+    """A process in which Open3D draws; it ends with the parent process.
 
     Raises:
-        BackendError: it cannot draw here.
+        BackendError: Open3D cannot draw here.
     """
 
     def __init__(self) -> None:
-        # It finds the same modules, wherever this process has them from.
+        # The child searches the same folders for modules as this process.
         env = {**os.environ, "PYTHONPATH": os.pathsep.join(path or str(Path.cwd()) for path in sys.path)}
-        # A file, since nobody need read it while the child writes there.
+        # A file instead of a pipe, which would have to be read while the child writes.
         self._folder = tempfile.TemporaryDirectory(prefix="sparklod-", ignore_cleanup_errors=True)
-        self._said = Path(self._folder.name, "said")
+        self._log = Path(self._folder.name, "log")
         try:
-            with self._said.open("wb") as said:
+            with self._log.open("wb") as log:
                 self._process = subprocess.Popen(
-                    COMMAND, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=said, env=env
+                    COMMAND, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, env=env
                 )
         except OSError as error:
             self._folder.cleanup()
@@ -50,18 +51,18 @@ class Child:
         atexit.register(self.close)
         self._answer(START_LIMIT, hint=f" (on Debian and Ubuntu: apt install {PACKAGES})")
         mesa = re.search(r"llvmpipe Mesa (\d+)", self._words())
-        #: What may be asked at once, see `Artist.draw`.
+        #: Maximum number of pairs of splat and tile per request, see `Painter.draw`.
         self.most_entries = MOST_ENTRIES_OF_OLD_MESA if mesa and int(mesa[1]) < NEW_MESA else MOST_ENTRIES
 
     def alive(self) -> bool:
-        """Whether it can be asked."""
+        """Whether the process is running."""
         return self._process.poll() is None
 
     def ask(self, request: dict[str, Any], splats: Array) -> Array:
-        """See `Artist.draw`.
+        """Draws pictures; see `Painter.draw`.
 
         Raises:
-            BackendError: it has crashed, takes too long, or says why it cannot.
+            BackendError: Open3D has crashed, takes too long, or reports an error.
         """
         pictures = self._answer(DRAW_LIMIT, request, splats)
         assert pictures is not None
@@ -73,7 +74,7 @@ class Child:
         assert self._process.stdin is not None and self._process.stdout is not None
         too_late = threading.Event()
 
-        def stop() -> None:  # which ends what waits below, on each system
+        def stop() -> None:  # ends the wait below on every system
             too_late.set()
             self._process.kill()
 
@@ -88,7 +89,7 @@ class Child:
             if too_late.is_set():
                 raise self._error(f"Open3D has not answered for {limit:g} seconds") from None
             raise self._error(f"Open3D has crashed: {self._last_words()}{hint}") from None
-        except BaseException:  # the rest of the answer would be taken for the next one
+        except BaseException:  # the rest of this answer would be read as the next one
             self.close()
             raise
         finally:
@@ -102,7 +103,7 @@ class Child:
         return BackendError(text)
 
     def _words(self) -> str:
-        return re.sub(r"\x1b\[[0-9;]*m", "", self._said.read_text("utf-8", "replace"))
+        return re.sub(r"\x1b\[[0-9;]*m", "", self._log.read_text("utf-8", "replace"))
 
     def _last_words(self) -> str:
         with contextlib.suppress(subprocess.TimeoutExpired):
@@ -111,7 +112,7 @@ class Child:
         return lines[-1] if lines else f"exit code {self._process.returncode}"
 
     def close(self) -> None:
-        """Ends it; it does so by itself when its input is closed."""
+        """Ends the process, which exits when its input is closed."""
         atexit.unregister(self.close)
         assert self._process.stdin is not None and self._process.stdout is not None
         with contextlib.suppress(OSError):

@@ -334,7 +334,7 @@ def test_half_precision_has_the_texture_of_the_viewer() -> None:
 @needs_opengl
 def test_sizes_beyond_opengls_limits_are_refused() -> None:
     wide = dataclasses.replace(CAMERAS["front"], width=1 << 20)
-    with pytest.raises(BackendError, match="1048576 x 151 pixels are more than this OpenGL takes"):
+    with pytest.raises(BackendError, match="1048576 x 151 pixels exceed the limit of this OpenGL"):
         osmesa.draw(SPLATS["plausible"], wide, RasterSettings())
     image = osmesa.draw(SPLATS["plausible"], CAMERAS["front"], RasterSettings())
     assert psnr(image, rasterizer.draw(SPLATS["plausible"], CAMERAS["front"], RasterSettings())) >= FLOAT
