@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 #: Where each public name is. Its module is imported when the name is first used (PEP 562), so that importing the
-#: package loads neither numpy nor numba. tests/test_api.py holds this and the imports above together.
+#: package loads neither numpy nor numba. tests/api/test_package.py holds this and the imports above together.
 _MODULES = {
     "api.cameras": ("orbit", "read_cameras"),
     "api.files": ("Written", "build_lod", "extract_leaves", "inspect", "pack", "read", "unpack", "write"),
