@@ -90,12 +90,15 @@ def _opened(path: Path) -> Iterator[tuple[BinaryIO, Format, dict[str, Any]]]:
             form = sniff(head, path.suffix)
             if form is None:
                 names = ", ".join(form.name for form in FORMATS)
-                hint = "; a .splat file is told by its name alone" if path == DASH else ""
+                hint = "; a .splat file is not recognised by its content: pass it as a file" if path == DASH else ""
                 if path.suffix.lower() in RAW_SUFFIXES:
                     hint = "; words alone, as --encoding writes them by this suffix, do not tell what they are"
                 raise UnknownFormatError(f"not a splat file that sparklod reads ({names}){hint}")
             if head.startswith(ZIP) and path.suffix.lower() == NPZ:
-                raise UnknownFormatError("it holds arrays for a viewer, of which inspect can report, but no scene")
+                raise UnknownFormatError(
+                    "it holds arrays for a viewer and no scene; use the file that they were made of, or unpack them in"
+                    " Python"
+                )
             yield file, form, {"beside": functools.partial(_open_beside, path)} if form.companions else {}
     except OSError as error:
         raise UnreadableError(f"cannot be read: {_reason(error)}") from None

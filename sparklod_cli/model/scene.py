@@ -102,8 +102,8 @@ class Tree(Scene):
 
     def _facts(self) -> list[str]:
         nodes, leaves = len(self.splats), int(np.count_nonzero(self.tree.is_leaf))
-        levels = int(self.tree.depths().max(initial=-1)) + 1
-        counts = [f"{nodes:,} node{'s' * (nodes != 1)}", f"{leaves:,} leaves", f"{levels} levels"]
+        depth = int(self.tree.depths().max(initial=0))
+        counts = [f"{nodes:,} node{'s' * (nodes != 1)}", f"{leaves:,} leaves", f"depth {depth}"]
         return [*counts, *super()._facts()[1:]]
 
 

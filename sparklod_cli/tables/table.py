@@ -48,8 +48,11 @@ class Table(Sequence[Row]):
         """The cells of a column, None where one is empty.
 
         Raises:
-            KeyError: there is no such column.
+            KeyError: there is no such column; the text names those that there are.
         """
+        names = [column.name for column in self.columns]
+        if name not in names:
+            raise KeyError(f"there is no column {name!r}, only {', '.join(names)}")
         return [row[name] for row in self.rows]
 
     def to_pandas(self) -> Any:

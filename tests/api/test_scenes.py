@@ -38,7 +38,7 @@ def test_a_tree_is_read_as_a_tree(tree: sparklod.Tree, held: sparklod.Scene) -> 
     assert isinstance(held, sparklod.Tree)
     assert np.array_equal(held.tree.child_start, tree.tree.child_start)
     assert np.array_equal(held.tree.child_count, tree.tree.child_count)
-    assert "nodes" in repr(held) and "leaves" in repr(held) and "levels" in repr(held)
+    assert "nodes" in repr(held) and "leaves" in repr(held) and "depth" in repr(held)
 
 
 def test_leaves_of_a_tree_are_the_scene(scene: sparklod.Scene, tree: sparklod.Tree) -> None:

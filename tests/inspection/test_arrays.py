@@ -86,7 +86,9 @@ def test_what_arrays_do_not_hold_is_not_checked_silently(folder: Path, capsys: p
 def test_other_commands_say_that_they_are_no_scene(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for command in ("build-lod", "traverse", "render"):
         assert run([command, str(folder / "packed.npz")]) == 1
-        assert "it holds arrays for a viewer, of which inspect can report, but no scene" in capsys.readouterr().err
+        assert (
+            "it holds arrays for a viewer and no scene; use the file that they were made of" in capsys.readouterr().err
+        )
 
 
 def test_words_alone_tell_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
