@@ -17,9 +17,12 @@ from ..support.defaults import (
     DEFAULT_COMPRESSION,
     DEFAULT_GROWTH,
     MAX_BASE,
+    MAX_COMPRESSION,
+    MAX_FRACTIONAL_BITS,
     MAX_GROWTH,
     MAX_SH_DEGREE,
     MIN_BASE,
+    MIN_COMPRESSION,
     MIN_GROWTH,
 )
 from ..support.errors import FormatError, InvalidSplatsError, TreeError, memory_errors_translated
@@ -136,9 +139,9 @@ def write(
 
     path, count = Path(path), thread_count(threads)
     suffix = path.suffix.lower()
-    whole_within("compression_level", compression_level, 1, 9)
+    whole_within("compression_level", compression_level, MIN_COMPRESSION, MAX_COMPRESSION)
     if fractional_bits is not None:
-        whole_within("fractional_bits", fractional_bits, 0, 24)
+        whole_within("fractional_bits", fractional_bits, 0, MAX_FRACTIONAL_BITS)
     if (spz_version is not None or fractional_bits is not None) and (encoding is not None or suffix != ".spz"):
         raise ValueError(f"{path}: spz_version and fractional_bits are of SPZ; leave them out, or write a .spz")
     if not len(scene_like(scene).splats):

@@ -17,9 +17,6 @@ from ..support.optional import optional_import
 from ..support.progress import Progress, silent
 from .pixels import Pixels
 
-#: Suffixes of animations.
-ANIMATIONS = ("gif", "webp", "mp4", "webm")
-
 #: GIF counts time in steps of 10 ms; players slow down frames that are shorter than this many steps.
 GIF_STEP, GIF_LEAST = 10, 2
 
@@ -72,7 +69,7 @@ def animate(frames: Iterable[Pixels], form: str, fps: float, progress: Progress 
 
     Args:
         frames: at least one, all of one size; with alpha for "webp" only.
-        form: one of `ANIMATIONS`.
+        form: one of `defaults.MOVING`.
         fps: frames per second.
         progress: called for each frame that GIF and WebP write, which they do at the end; videos write frames as they
             come, without calling it.

@@ -1,4 +1,12 @@
-"""Defaults of pictures. Imports nothing, so that `--help` stays fast."""
+"""Formats and defaults of pictures. Imports nothing, so that `--help` stays fast."""
+
+#: Formats of single pictures, of animations, and of contact sheets.
+STILL = ("png", "jpg", "webp", "npy")
+MOVING = ("webp", "gif", "mp4", "webm")
+SHEETS = ("png", "jpg", "webp")
+
+#: Formats by suffix, where the two differ.
+SUFFIXES = {"jpeg": "jpg"}
 
 #: Quality of JPEG, 1 to 100: what is lost is hardly seen.
 JPEG_QUALITY = 92

@@ -8,17 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..io import check_writable
-
-#: Formats of single pictures, of animations, and of contact sheets.
-STILL = ("png", "jpg", "webp", "npy")
-MOVING = ("webp", "gif", "mp4", "webm")
-SHEETS = ("png", "jpg", "webp")
+from .defaults import MOVING, SHEETS, STILL, SUFFIXES
 
 #: Formats with an alpha channel.
 WITH_ALPHA = ("png", "webp", "npy")
-
-#: Formats by suffix, where the two differ.
-SUFFIXES = {"jpeg": "jpg"}
 
 #: The placeholder for the frame number in a file name.
 NUMBER = re.compile(r"%(?:0\d{1,2})?d")

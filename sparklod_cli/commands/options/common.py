@@ -11,14 +11,17 @@ from typing import Any, TypeVar
 import click
 
 from ... import __version__
+from ...codecs.formats import FORMATS
+from ...images.defaults import MOVING, STILL, SUFFIXES
 from ...support.defaults import MAX_THREADS
 from ...tables.files import FORMS
 from ..command import COMMON, GENERAL, option, with_options
 from ..console import Console, Verbosity
 from ..paths import OutputPath
 
-#: Suffixes, without a point, of what is no table, whatever format is asked for.
-NO_TABLES = ("gif", "html", "ksplat", "mp4", "npy", "npz", "ply", "png", "sog", "splat", "spz", "webp")
+#: Suffixes, without a point, of what is no table, whatever format is asked for: splats, pictures, pages and arrays.
+NO_TABLES = {suffix[1:] for form in FORMATS for suffix in form.suffixes} - {*FORMS}
+NO_TABLES |= {*STILL, *MOVING, *SUFFIXES, "html", "npz"}
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 

@@ -63,6 +63,8 @@ from tests.conftest import FIXTURES, ROOT
         ([TREE, "-o", "t.xlsx"], "--output t.xlsx: tables are written as .csv, .json, .parquet"),
         ([TREE, "-o", "t.png"], "--output t.png: tables are written as .csv"),
         ([TREE, "-o", "t.spz", "--format", "json"], "t.spz does not end in .json, which --format asks for"),
+        ([TREE, "-o", "t.webm", "--format", "csv"], "t.webm does not end in .csv, which --format asks for"),
+        ([TREE, "-o", "t.jpeg", "--format", "csv"], "t.jpeg does not end in .csv, which --format asks for"),
         ([TREE, "--plot", "t.jpg"], "'t.jpg' does not end in .png, which is what is written"),
         ([TREE, "--json", "-o", "-"], "--output - and --json cannot both go to standard output"),
         ([TREE, "--json", "--per-instance"], "--per-instance cannot be used with --json without --output"),
