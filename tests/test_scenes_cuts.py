@@ -11,6 +11,7 @@ from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.cameras.framing import COVERED, covered, fitted
 from sparklod_cli.codecs import ply
 from sparklod_cli.codecs.gpu import ext_splats, packed_splats
+from sparklod_cli.codecs.splat_encoding import SplatEncoding
 from sparklod_cli.images.metrics import psnr
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod.settings import LodSettings
@@ -132,7 +133,7 @@ def test_through_an_encoding_splats_are_rounded_and_the_cut_stays() -> None:
     cuts = [finder.cut(view).nodes[0] for finder in finders.values()]
     assert all(np.array_equal(cut, cuts[0]) for cut in cuts)
     original = scenes[None].loaded[0].splats
-    encoding = packed_splats.Encoding(lod_opacity=True)
+    encoding = SplatEncoding(lod_opacity=True)
     expected = packed_splats.unpack(packed_splats.pack(original, encoding), encoding)
     assert np.array_equal(scenes["packed"].loaded[0].splats.scale, expected.scale)
     assert expected.opacity.max() > 1

@@ -251,11 +251,12 @@ def unpack(arrays: Mapping[str, NDArray[np.uint32]], *, threads: int | None = No
         TreeError: the tree is broken.
     """
     from ..codecs.gpu import ext_splats, lod_tree, packed_splats
+    from ..codecs.splat_encoding import SplatEncoding
 
     count = thread_count(threads)
     tree = lod_tree.unpack(arrays).tree if "lod_tree" in arrays else None
     if "packed" in arrays:
-        encoding = packed_splats.Encoding(lod_opacity=tree is not None)
+        encoding = SplatEncoding(lod_opacity=tree is not None)
         splats = packed_splats.unpack(arrays, encoding, threads=count)
     else:
         splats = ext_splats.unpack(arrays, threads=count)

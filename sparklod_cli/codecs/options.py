@@ -8,18 +8,41 @@ from ..support.defaults import DEFAULT_COMPRESSION
 
 
 @dataclass(frozen=True)
+class RadOptions:
+    """How to write RAD. Names of encodings are keys of the tables in `rad_encodings`; "auto" suits the scene.
+
+    Attributes:
+        center, alpha, rgb, scales, orientation, sh: the encoding of each property.
+        chunked: write each chunk into a file of its own.
+        sh_codes: the most entries of a palette of spherical harmonics, which a label for each splat points into; None
+            for coefficients of each splat's own.
+    """
+
+    center: str = "auto"
+    alpha: str = "auto"
+    rgb: str = "auto"
+    scales: str = "auto"
+    orientation: str = "auto"
+    sh: str = "auto"
+    chunked: bool = False
+    sh_codes: int | None = None
+
+
+@dataclass(frozen=True)
 class WriteOptions:
     """How to write a splat file. PLY and .splat leave no such choice, and ignore all of them.
 
     Attributes:
         spz_version: 2 (rotations in 3 bytes, off by 13.4 degrees at most) or 3 (in 4 bytes, by 0.35); None for 3.
         fractional_bits: of SPZ positions, 0 to 24; None for as many as suit the scene, see `spz_options`.
-        compression_level: of SPZ, 1 (fast) to 9 (small).
+        compression_level: of SPZ and RAD, 1 (fast) to 9 (small).
+        rad: of RAD.
     """
 
     spz_version: int | None = None
     fractional_bits: int | None = None
     compression_level: int = DEFAULT_COMPRESSION
+    rad: RadOptions = RadOptions()
 
 
 #: What is written where nobody chooses.

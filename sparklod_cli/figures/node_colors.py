@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..lod.traversal import CHUNK_NODES
 from ..model.gaussian import lod_opacity, spark_size
+from ..model.nodes import CHUNK_NODES
 from ..model.splats import FloatArray, Splats
 from ..render.color_scales import (
     MAGMA,

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from ..images.text import BACKGROUND
 from ..lod.kernels.tree_links import find_depths
-from ..lod.traversal import CHUNK_NODES
 from ..model.gaussian import spark_size
+from ..model.nodes import CHUNK_NODES
 from ..model.scene import Scene
 from ..model.splats import FloatArray, Splats
 from ..render.color_scales import VIRIDIS, ramp

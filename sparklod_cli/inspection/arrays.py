@@ -10,6 +10,7 @@ import numpy as np
 
 from ..codecs.gpu import data_texture, ext_splats, lod_tree, packed_splats
 from ..codecs.gpu.dump import Arrays
+from ..codecs.splat_encoding import SplatEncoding
 from ..model.scene import Scene
 from ..model.splats import Splats
 from ..support.errors import FormatError
@@ -49,7 +50,7 @@ def examine(arrays: Arrays, settings: ReportSettings, *, threads: int = 1) -> tu
     """
     if "packed" in arrays:
         # build-lod writes trees, for which Spark stores LoD opacities; the file does not record that.
-        splats = packed_splats.unpack(arrays, packed_splats.Encoding(lod_opacity=True), threads=threads)
+        splats = packed_splats.unpack(arrays, SplatEncoding(lod_opacity=True), threads=threads)
         return _of_splats("PackedSplats", splats, settings)
     if "ext0" in arrays:
         return _of_splats("ExtSplats", ext_splats.unpack(arrays, threads=threads), settings)

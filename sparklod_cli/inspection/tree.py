@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..lod.kernels.tree_links import find_cycles, find_depths, find_parents, mean_child_sizes, sum_by_depth
-from ..lod.traversal import CHUNK_NODES
 from ..model.gaussian import spark_size
 from ..model.lod_tree import LodTree
+from ..model.nodes import CHUNK_NODES
 from ..model.splats import FloatArray, Splats
 from .findings import Finding
 

@@ -10,16 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..model.foveation import Cones, Foveation
-from ..model.nodes import Nodes
+from ..model.nodes import CHUNK_BITS, CHUNK_NODES, Nodes
 from .foveation import set_foveation
 from .kernels import cut_arrays, pixel_scale
 from .kernels.cut import find_cut
 
 Matrix = NDArray[np.float64]
-
-#: Nodes of a chunk, the unit in which Spark streams trees; as a power of 2.
-CHUNK_BITS = 16
-CHUNK_NODES = 1 << CHUNK_BITS
 
 #: Initial size of the buffers, in visited nodes per node of a cut: enough if every refined node has two or more
 #: children; for other trees the buffers grow.

@@ -8,6 +8,10 @@ from .gaussian import spark_size
 from .lod_tree import LodTree
 from .splats import FloatArray, Splats
 
+#: Nodes of a chunk, the unit in which Spark streams trees; as a power of 2.
+CHUNK_BITS = 16
+CHUNK_NODES = 1 << CHUNK_BITS
+
 
 @dataclass(frozen=True)
 class Nodes:

@@ -25,6 +25,7 @@ class Scene:
         format: what it was read from, for display ("PLY", "SPZ 4").
         notes: what the reader had to leave out, for display.
         header: numbers of the file's header that the splats do not tell, by name ("version", "fractional_bits").
+        chunk_bytes: of each of its chunks in the file, where its format has chunks; None elsewhere.
     """
 
     splats: Splats
@@ -33,6 +34,7 @@ class Scene:
     format: str = ""
     notes: tuple[str, ...] = ()
     header: Mapping[str, int] = field(default_factory=dict)
+    chunk_bytes: tuple[int, ...] | None = None
 
     @classmethod
     def from_arrays(

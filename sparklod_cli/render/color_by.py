@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cameras.camera import Camera
-from ..lod.traversal import CHUNK_NODES
 from ..model.gaussian import lod_opacity, moved, spark_size
+from ..model.nodes import CHUNK_NODES
 from ..model.splats import FloatArray
 from ..scenes.finder import CutSource
 from ..scenes.loaded import Index, LoadedScene, Part

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from ..codecs.gpu import lod_tree
 from ..lod.continuous import faded
 from ..lod.settings import LodSettings
-from ..lod.traversal import CHUNK_NODES, Forest, Traversal, TreeCut, TreeInstance
+from ..lod.traversal import Forest, Traversal, TreeCut, TreeInstance
 from ..model.balls import Balls, balls_of
 from ..model.foveation import Foveation
 from ..model.gaussian import placed
 from ..model.instances import Instance, Matrix
-from ..model.nodes import Nodes
+from ..model.nodes import CHUNK_NODES, Nodes
 from ..model.scene import Scene
 from ..model.splats import Splats
 from ..support.defaults import PRECISIONS

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from fixtures import by_hand
 from sparklod_cli.codecs import spz
 from sparklod_cli.codecs.gpu import ext_splats, lod_tree, packed_splats
-from sparklod_cli.codecs.gpu.packed_splats import Encoding
 from sparklod_cli.codecs.options import WriteOptions
+from sparklod_cli.codecs.splat_encoding import DEFAULT, SplatEncoding
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod import quick
 from sparklod_cli.model import gaussian
@@ -36,20 +36,20 @@ from tests.interop.spark import Spark
 from tests.interop.ties import Floats, Words, check, ext_codes, ext_steps, packed_codes, packed_steps
 from tests.scenes import random_splats
 
-WIDE = Encoding(rgb_min=-0.5, rgb_max=2, ln_scale_min=-8, ln_scale_max=1, sh1_max=0.5, sh2_max=2, sh3_max=0.25)
+WIDE = SplatEncoding(rgb_min=-0.5, rgb_max=2, ln_scale_min=-8, ln_scale_max=1, sh1_max=0.5, sh2_max=2, sh3_max=0.25)
 PROGRAM = Path(__file__).with_name("spark_encode.mjs")
 
 
-def spark_encoding(encoding: Encoding) -> dict[str, Any]:
+def spark_encoding(encoding: SplatEncoding) -> dict[str, Any]:
     """Returns an encoding by Spark's names."""
     return {re.sub("_(.)", lambda match: match[1].upper(), name): value for name, value in asdict(encoding).items()}
 
 
-def check_file(spark: Spark, path: Path, share: float, encoding: Encoding = packed_splats.DEFAULT) -> None:
+def check_file(spark: Spark, path: Path, share: float, encoding: SplatEncoding = DEFAULT) -> None:
     """Compares both layouts and the tree of a file: those of Spark's worker, and ours of the same file."""
     scene = read_scene(path)
     splats, lod = scene.splats, scene.tree is not None
-    encoding = Encoding(**asdict(encoding) | {"lod_opacity": lod})
+    encoding = SplatEncoding(**asdict(encoding) | {"lod_opacity": lod})
 
     ours = packed_splats.pack(splats, encoding)
     theirs = spark.load_words("Packed", path, encoding=spark_encoding(encoding))
@@ -139,8 +139,8 @@ def test_words_of_random_splats_are_those_of_spark(spark: Spark, tmp_path: Path,
     check_file(spark, path, share=2e-4)
 
 
-@pytest.mark.parametrize("encoding", [packed_splats.DEFAULT, WIDE])
-def test_words_at_the_ends_of_ranges_are_those_of_spark(spark: Spark, tmp_path: Path, encoding: Encoding) -> None:
+@pytest.mark.parametrize("encoding", [DEFAULT, WIDE])
+def test_words_at_the_ends_of_ranges_are_those_of_spark(spark: Spark, tmp_path: Path, encoding: SplatEncoding) -> None:
     """Ties are frequent here, as the numbers are round."""
     check_file(spark, ply(tmp_path / "edges.ply", edges()), 0.2, encoding)
 
@@ -168,7 +168,9 @@ def test_the_tree_of_sparks_own_builder_comes_back(spark: Spark, tmp_path: Path,
     """Unpacking its merged splats and packing them again gives its nodes."""
     path = ply(tmp_path / "random.ply", random_splats(20_000))
     words = spark.load_words(layout, path, lod=True)
-    held = packed_splats.unpack(words, Encoding(lod_opacity=True)) if layout == "Packed" else ext_splats.unpack(words)
+    held = (
+        packed_splats.unpack(words, SplatEncoding(lod_opacity=True)) if layout == "Packed" else ext_splats.unpack(words)
+    )
     nodes = lod_tree.unpack({"lod_tree": words["lodTree"]})
     nodes.tree.validate()
     check_tree(lod_tree.pack(held, nodes.tree)["lod_tree"], words["lodTree"], held, share=1e-3)
@@ -196,8 +198,10 @@ def cut_off(values: Floats) -> NDArray[np.float16]:
     return np.where(np.abs(nearest.astype(np.float64)) > np.abs(values), np.nextafter(nearest, np.float16(0)), nearest)
 
 
-@pytest.mark.parametrize("encoding", [packed_splats.DEFAULT, WIDE, Encoding(lod_opacity=True)])
-def test_words_are_those_of_sparks_encoders_in_javascript(spark_dir: Path, tmp_path: Path, encoding: Encoding) -> None:
+@pytest.mark.parametrize("encoding", [DEFAULT, WIDE, SplatEncoding(lod_opacity=True)])
+def test_words_are_those_of_sparks_encoders_in_javascript(
+    spark_dir: Path, tmp_path: Path, encoding: SplatEncoding
+) -> None:
     """Spark's JavaScript has float64; in a Node without Float16Array it rounds float16 towards zero."""
     if shutil.which("node") is None:
         pytest.skip("Node is not installed")

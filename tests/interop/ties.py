@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from sparklod_cli.codecs import octahedral
 from sparklod_cli.codecs.gpu import ext_splats, packed_splats
-from sparklod_cli.codecs.gpu.packed_splats import Encoding
+from sparklod_cli.codecs.splat_encoding import SplatEncoding
 from sparklod_cli.model.gaussian import lod_opacity
 from sparklod_cli.model.splats import Splats
 
@@ -52,7 +52,7 @@ def rotation(splats: Splats, steps: tuple[int, int]) -> dict[str, Steps]:
     return codes | {"angle": (angle, angle_error)}
 
 
-def packed_steps(splats: Splats, encoding: Encoding) -> dict[str, Steps]:
+def packed_steps(splats: Splats, encoding: SplatEncoding) -> dict[str, Steps]:
     d = lod_opacity(splats.opacity)
     alpha = np.where(d > 1, (d + 3) / 4, d) if encoding.lod_opacity else splats.opacity
     with np.errstate(divide="ignore"):

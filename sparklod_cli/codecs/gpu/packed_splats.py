@@ -7,7 +7,6 @@ e ** -30 becomes 0 here, as in Spark's documentation and its JavaScript, and e *
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,6 +19,7 @@ from ...support.errors import FormatError
 from ...support.parallel import for_blocks
 from .. import octahedral, quantize
 from ..octahedral import STEPS_8_8_8, Words, to_code
+from ..splat_encoding import DEFAULT, SplatEncoding
 
 SPLAT = np.dtype(
     [
@@ -43,51 +43,12 @@ SH_BITS = {1: 7, 2: 8, 3: 6}
 SCALE_ZERO = np.float32(np.exp(-30))
 
 
-@dataclass(frozen=True)
-class Encoding:
-    """The ranges of the codes: Spark's `splatEncoding`, with its defaults.
-
-    Attributes:
-        rgb_min, rgb_max: colours of code 0 and 255.
-        ln_scale_min, ln_scale_max: logarithms of the scales of code 1 and 255.
-        sh1_max, sh2_max, sh3_max: largest SH coefficient of each degree.
-        lod_opacity: alpha is 0..2, where 1..2 stands for D = 1..5, as Spark sets it for an LoD tree.
-    """
-
-    rgb_min: float = 0
-    rgb_max: float = 1
-    ln_scale_min: float = -12
-    ln_scale_max: float = 9
-    sh1_max: float = 1
-    sh2_max: float = 1
-    sh3_max: float = 1
-    lod_opacity: bool = False
-
-    def __post_init__(self) -> None:
-        if not (self.rgb_min < self.rgb_max and self.ln_scale_min < self.ln_scale_max):
-            raise ValueError(f"a range is empty: {self}")
-        if not min(self.sh1_max, self.sh2_max, self.sh3_max) > 0:
-            raise ValueError(f"the largest SH coefficients must be positive: {self}")
-
-    @property
-    def alpha_max(self) -> int:
-        """The alpha of code 255."""
-        return 2 if self.lod_opacity else 1
-
-    def sh_max(self, degree: int) -> np.float32:
-        """The largest coefficient of a degree."""
-        return np.float32((self.sh1_max, self.sh2_max, self.sh3_max)[degree - 1])
-
-
-DEFAULT = Encoding()
-
-
-def of_scene(scene: Scene) -> Encoding:
+def of_scene(scene: Scene) -> SplatEncoding:
     """The encoding that Spark sets up for a scene: an LoD tree has LoD opacities."""
-    return Encoding(lod_opacity=scene.tree is not None)
+    return SplatEncoding(lod_opacity=scene.tree is not None)
 
 
-def pack(splats: Splats, encoding: Encoding = DEFAULT, *, threads: int = 1) -> dict[str, Words]:
+def pack(splats: Splats, encoding: SplatEncoding = DEFAULT, *, threads: int = 1) -> dict[str, Words]:
     """Splats in Spark's layout: "packed" (N, 4) uint32, and by degree "sh1" (N, 2), "sh2" (N, 4) and "sh3" (N, 4).
 
     Values are clamped to the ranges of their codes; a coordinate of 65520 or more becomes infinite, as in Spark. The
@@ -122,7 +83,7 @@ def dump(scene: Scene, *, threads: int = 1) -> dict[str, Words]:
     return pack(scene.splats, of_scene(scene), threads=threads)
 
 
-def unpack(arrays: Mapping[str, NDArray[Any]], encoding: Encoding = DEFAULT, *, threads: int = 1) -> Splats:
+def unpack(arrays: Mapping[str, NDArray[Any]], encoding: SplatEncoding = DEFAULT, *, threads: int = 1) -> Splats:
     """Splats of the arrays of `pack`; arrays of SH may be missing from the highest degree down.
 
     Largest errors inside the ranges, apart from that of float32:
@@ -170,7 +131,7 @@ def _decode_linear(codes: NDArray[np.uint8], low: float, high: float) -> FloatAr
     return quantize.of_range(codes.astype(np.float32) / np.float32(255), np.float32(low), np.float32(high))
 
 
-def encode_log_scale(scale: FloatArray, encoding: Encoding = DEFAULT) -> Words:
+def encode_log_scale(scale: FloatArray, encoding: SplatEncoding = DEFAULT) -> Words:
     """Linear scales to codes: 0 for scales below e ** -30, 1..255 for steps of the logarithm."""
     low = np.float32(encoding.ln_scale_min)
     width = np.float32(encoding.ln_scale_max) - low
@@ -181,7 +142,7 @@ def encode_log_scale(scale: FloatArray, encoding: Encoding = DEFAULT) -> Words:
     return codes
 
 
-def decode_log_scale(codes: NDArray[np.uint8], encoding: Encoding = DEFAULT) -> FloatArray:
+def decode_log_scale(codes: NDArray[np.uint8], encoding: SplatEncoding = DEFAULT) -> FloatArray:
     """Largest error: a factor of e ** (range / 508), 4.3 % by default; exact for 0."""
     low = np.float32(encoding.ln_scale_min)
     step = (np.float32(encoding.ln_scale_max) - low) / np.float32(254)

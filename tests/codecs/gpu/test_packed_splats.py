@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from sparklod_cli.codecs.gpu import packed_splats
-from sparklod_cli.codecs.gpu.packed_splats import Encoding
+from sparklod_cli.codecs.splat_encoding import DEFAULT, SplatEncoding
 from sparklod_cli.model.gaussian import linear_opacity, lod_opacity
 from sparklod_cli.model.sh import COEFFICIENTS
 from sparklod_cli.model.splats import Splats
@@ -23,8 +23,8 @@ from tests.codecs.test_octahedral import degrees_between, random_quats
 from tests.scenes import random_splats
 
 ROUNDING = 1.001  # float32's own errors, which no docstring counts
-WIDE = Encoding(rgb_min=-0.5, rgb_max=2, ln_scale_min=-8, ln_scale_max=1, sh1_max=0.5, sh2_max=2, sh3_max=0.25)
-LOD = Encoding(lod_opacity=True)
+WIDE = SplatEncoding(rgb_min=-0.5, rgb_max=2, ln_scale_min=-8, ln_scale_max=1, sh1_max=0.5, sh2_max=2, sh3_max=0.25)
+LOD = SplatEncoding(lod_opacity=True)
 
 
 def splats_with(count: int = 1, sh_degree: int = 0, **columns: Any) -> Splats:
@@ -34,11 +34,11 @@ def splats_with(count: int = 1, sh_degree: int = 0, **columns: Any) -> Splats:
     return splats
 
 
-def round_trip(splats: Splats, encoding: Encoding = packed_splats.DEFAULT) -> Splats:
+def round_trip(splats: Splats, encoding: SplatEncoding = DEFAULT) -> Splats:
     return packed_splats.unpack(packed_splats.pack(splats, encoding), encoding)
 
 
-def largest_error(column: str, splats: Splats, encoding: Encoding = packed_splats.DEFAULT) -> float:
+def largest_error(column: str, splats: Splats, encoding: SplatEncoding = DEFAULT) -> float:
     back = getattr(round_trip(splats, encoding), column).astype(np.float64)
     return float(np.abs(back - getattr(splats, column)).max())
 
@@ -91,8 +91,8 @@ def test_there_is_an_array_for_each_sh_degree(sh_degree: int) -> None:
 # --- Largest errors ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("encoding", [packed_splats.DEFAULT, WIDE])
-def test_colours_are_within_half_a_step_of_their_range(encoding: Encoding) -> None:
+@pytest.mark.parametrize("encoding", [DEFAULT, WIDE])
+def test_colours_are_within_half_a_step_of_their_range(encoding: SplatEncoding) -> None:
     low, high = encoding.rgb_min, encoding.rgb_max
     bound = (high - low) / 510
     assert (
@@ -129,8 +129,8 @@ def test_centers_keep_the_precision_of_float16(center: np.ndarray) -> None:
     assert (np.abs(back - center) <= np.maximum(2.0**-11 * np.abs(center), 2.0**-25)).all()
 
 
-@pytest.mark.parametrize("encoding", [packed_splats.DEFAULT, WIDE])
-def test_logarithms_of_scales_are_within_half_a_step_of_their_range(encoding: Encoding) -> None:
+@pytest.mark.parametrize("encoding", [DEFAULT, WIDE])
+def test_logarithms_of_scales_are_within_half_a_step_of_their_range(encoding: SplatEncoding) -> None:
     log = ramp(encoding.ln_scale_min, encoding.ln_scale_max, 3).astype(np.float64)
     splats = splats_with(20_000, scale=np.exp(log))
     error = np.abs(np.log(round_trip(splats, encoding).scale) - log).max()
@@ -144,8 +144,8 @@ def test_rotations_are_off_by_less_than_two_degrees() -> None:
     assert 0.95 * 1.94 <= error <= 1.94
 
 
-@pytest.mark.parametrize("encoding", [packed_splats.DEFAULT, WIDE])
-def test_sh_are_within_half_a_step_of_the_range_of_their_degree(encoding: Encoding) -> None:
+@pytest.mark.parametrize("encoding", [DEFAULT, WIDE])
+def test_sh_are_within_half_a_step_of_the_range_of_their_degree(encoding: SplatEncoding) -> None:
     splats = random_splats(20_000, sh_degree=3)
     tops = {1: (encoding.sh1_max, 126), 2: (encoding.sh2_max, 254), 3: (encoding.sh3_max, 62)}
     for degree, (most, _) in tops.items():
@@ -159,8 +159,8 @@ def test_sh_are_within_half_a_step_of_the_range_of_their_degree(encoding: Encodi
         assert (some <= ROUNDING * most / steps).all()
 
 
-@given(data=st.data(), encoding=st.sampled_from([packed_splats.DEFAULT, WIDE, LOD]))
-def test_all_columns_of_any_splats_are_within_their_bounds(data: st.DataObject, encoding: Encoding) -> None:
+@given(data=st.data(), encoding=st.sampled_from([DEFAULT, WIDE, LOD]))
+def test_all_columns_of_any_splats_are_within_their_bounds(data: st.DataObject, encoding: SplatEncoding) -> None:
     def numbers(low: float, high: float, *shape: int) -> np.ndarray:
         return data.draw(arrays(np.float32, shape, elements=st.floats(np.float32(low), np.float32(high), width=32)))
 
@@ -181,7 +181,7 @@ def test_all_columns_of_any_splats_are_within_their_bounds(data: st.DataObject, 
 # --- Clamping and edges -----------------------------------------------------------------------------------------------
 
 
-def code(field: str, encoding: Encoding = packed_splats.DEFAULT, **columns: Any) -> Any:
+def code(field: str, encoding: SplatEncoding = DEFAULT, **columns: Any) -> Any:
     packed = packed_splats.pack(splats_with(**columns), encoding)["packed"]
     return packed.view(packed_splats.SPLAT)[0, 0][field].tolist()
 
@@ -240,7 +240,7 @@ def test_unpacked_words_are_packed_to_the_same_words() -> None:
     rows["center"] = rng.normal(size=(1000, 3))
     rows["axis"] = rng.integers(1, 255, (1000, 2))
     rows["angle"] = rng.integers(10, 256, 1000)
-    for encoding in (packed_splats.DEFAULT, WIDE, LOD):
+    for encoding in (DEFAULT, WIDE, LOD):
         back = packed_splats.pack(packed_splats.unpack({"packed": packed}, encoding), encoding)["packed"]
         np.testing.assert_array_equal(back, packed)
 
@@ -299,5 +299,5 @@ def test_sh_of_a_degree_that_is_missing_are_refused() -> None:
 
 @pytest.mark.parametrize("options", [{"rgb_min": 1}, {"ln_scale_max": -12}, {"sh2_max": 0}, {"rgb_max": float("nan")}])
 def test_an_encoding_with_an_empty_range_is_refused(options: dict[str, float]) -> None:
-    with pytest.raises(ValueError, match=r"Encoding\("):
-        Encoding(**options)
+    with pytest.raises(ValueError, match=r"SplatEncoding\("):
+        SplatEncoding(**options)
