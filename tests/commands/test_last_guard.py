@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from sparklod_cli import io
 from sparklod_cli.cli import run
+from sparklod_cli.io import reading
 from tests.conftest import FIXTURES
 
 SCENE = FIXTURES / "one.ply"
@@ -24,7 +24,7 @@ def broken(monkeypatch: pytest.MonkeyPatch) -> Break:
         def fail(*args: object, **kwargs: object) -> None:
             raise error
 
-        monkeypatch.setattr(io, "_opened", fail)
+        monkeypatch.setattr(reading, "_opened", fail)
 
     return end_in
 

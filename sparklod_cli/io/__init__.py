@@ -1,0 +1,25 @@
+"""The only package that opens paths: tells formats, reads scenes, and writes files whole or not at all."""
+
+from .beside import companions
+from .names import is_file_name
+from .reading import examine_scene, read_arrays, read_scene, size_of_input
+from .texts import MAX_TEXT, read_rgba, read_text, read_together
+from .writing import Sink, check_writable, sink, write_stdout, write_whole
+
+__all__ = [
+    "MAX_TEXT",
+    "Sink",
+    "check_writable",
+    "companions",
+    "examine_scene",
+    "is_file_name",
+    "read_arrays",
+    "read_rgba",
+    "read_scene",
+    "read_text",
+    "read_together",
+    "sink",
+    "size_of_input",
+    "write_stdout",
+    "write_whole",
+]

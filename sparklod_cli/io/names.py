@@ -1,0 +1,23 @@
+"""Names of files, and why one cannot be opened, in words."""
+
+from __future__ import annotations
+
+import os
+
+
+def is_file_name(text: str) -> bool:
+    """Whether a text can be a file name: no system takes the byte 0 or half of a surrogate pair."""
+    try:
+        return b"\0" not in os.fsencode(text)
+    except UnicodeEncodeError:
+        return False
+
+
+def leads_away(name: str) -> bool:
+    """Whether a name could mean something else than a file in the same folder."""
+    return name in ("", ".", "..") or any(mark in name for mark in "/\\:") or not is_file_name(name)
+
+
+def reason_of(error: OSError) -> str:
+    """What the system says of an error, to stand after a colon."""
+    return (error.strerror or str(error)).lower()

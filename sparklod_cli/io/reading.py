@@ -1,0 +1,127 @@
+"""Reads splat files of any format, which their content tells."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import os
+from collections.abc import Collection, Iterator
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from ..codecs.formats import FORMATS, HEAD, Format, sniff
+from ..codecs.gpu import dump
+from ..codecs.gpu.table import NPZ, RAW_SUFFIXES
+from ..model.scene import Scene
+from ..model.splats import COLUMNS
+from ..support.errors import UnknownFormatError, UnreadableError
+from ..support.progress import Progress, silent
+from ..support.stdin import DASH, spooled
+from .beside import in_folder, open_beside
+from .names import reason_of
+
+#: How a .npz begins, which is a zip.
+ZIP = b"PK\x03\x04"
+
+
+def read_scene(path: Path, *, threads: int = 1, progress: Progress = silent) -> Scene:
+    """Reads a splat file of any known format, told by its content, or else by its suffix.
+
+    Args:
+        path: of a file, or of a folder that holds an unpacked SOG; - is standard input.
+        threads: to decode with.
+        progress: is told how much is done.
+
+    Raises:
+        FormatError: it is not a file, empty, of no known format, or broken.
+    """
+    with _opened(path) as (file, form, more):
+        scene: Scene = form.codec().decode(file, threads=threads, progress=progress, **more)
+    return scene
+
+
+def examine_scene(
+    path: Path, *, columns: Collection[str] = COLUMNS, threads: int = 1, progress: Progress = silent
+) -> Scene:
+    """Reads a splat file for a report on it: its tree may be broken, and columns that are not asked for may be 0.
+
+    Args:
+        path: as for `read_scene`.
+        columns: of `Splats`.
+        threads: to decode with.
+        progress: is told how much is done.
+
+    Raises:
+        FormatError: as `read_scene`, but for the tree.
+    """
+    with _opened(path) as (file, form, more):
+        codec = form.codec()
+        if form.selective:
+            scene: Scene = codec.examine(file, columns=columns, threads=threads, progress=progress, **more)
+        else:
+            scene = codec.decode(file, threads=threads, progress=progress, **more)
+    return scene
+
+
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator[tuple[BinaryIO, Format, dict[str, Any]]]:
+    """A splat file, its format, and what else its codec takes."""
+    try:
+        if path.is_dir():
+            path = in_folder(path)
+        if path != DASH and path.exists() and not path.is_file():
+            raise UnreadableError("it is a pipe or a device; save it to a file first")
+        with _file_of(path) as file:
+            head = file.read(HEAD)
+            file.seek(0)
+            if not head:
+                raise UnreadableError("the file is empty")
+            form = sniff(head, path.suffix)
+            if form is None:
+                names = ", ".join(form.name for form in FORMATS)
+                hint = "; a .splat file is not recognised by its content: pass it as a file" if path == DASH else ""
+                if path.suffix.lower() in RAW_SUFFIXES:
+                    hint = "; words alone, as --encoding writes them by this suffix, do not tell what they are"
+                raise UnknownFormatError(f"not a splat file that sparklod reads ({names}){hint}")
+            if head.startswith(ZIP) and path.suffix.lower() == NPZ:
+                raise UnknownFormatError(
+                    "it holds arrays for a viewer and no scene; use the file that they were made of, or unpack them in"
+                    " Python"
+                )
+            yield file, form, {"beside": functools.partial(open_beside, path)} if form.companions else {}
+    except OSError as error:
+        raise UnreadableError(f"cannot be read: {reason_of(error)}") from None
+
+
+def read_arrays(path: Path) -> dump.Arrays | None:
+    """The arrays of a .npz file; None where a file is something else, or cannot be opened.
+
+    Raises:
+        FormatError: an array is damaged, or of no plain numbers.
+    """
+    try:
+        if path != DASH and not path.is_file():
+            return None
+        with _file_of(path) as file:
+            if file.read(len(ZIP)) != ZIP:
+                return None
+            return dump.decode_npz(file)
+    except (OSError, UnreadableError):
+        return None
+
+
+def _file_of(path: Path) -> contextlib.AbstractContextManager[BinaryIO]:
+    """A file that is closed at the end, or standard input, which is not."""
+    return contextlib.nullcontext(spooled()) if path == DASH else path.open("rb")
+
+
+def size_of_input(path: Path) -> int | None:
+    """Bytes of a file, or of standard input; None where that cannot be told."""
+    try:
+        if path == DASH:
+            return spooled().seek(0, os.SEEK_END)
+        return path.stat().st_size if path.is_file() else None
+    except UnreadableError:
+        return None
+    except OSError:
+        return None
