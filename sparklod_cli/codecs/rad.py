@@ -30,6 +30,7 @@ from .options import DEFAULTS, WriteOptions
 from .rad_decode import Packed, fill
 from .rad_encode import Writing
 from .rad_header import CHUNK_MAGIC, ChunkEntry, ChunkHeader, Header, pack_header, read_header
+from .rad_names import SUFFIX, chunk_name
 from .rad_options import settled as settled
 from .stream import size_of
 
@@ -152,9 +153,10 @@ def encode_chunked(
     writing = _writing(scene, options, threads)
     entries = []
     for number, chunk in enumerate(_encoded(writing, threads, progress)):
-        entries.append(ChunkEntry(0, len(chunk), f"{stem}-{number}.radc"))
-        yield f"{stem}-{number}.radc", [chunk]
-    yield f"{stem}.rad", [pack_header(_header(writing, tuple(entries)))]
+        name = chunk_name(stem, number)
+        entries.append(ChunkEntry(0, len(chunk), name))
+        yield name, [chunk]
+    yield stem + SUFFIX, [pack_header(_header(writing, tuple(entries)))]
 
 
 def _writing(scene: Scene, options: WriteOptions, threads: int) -> Writing:
