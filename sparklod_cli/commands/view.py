@@ -7,21 +7,18 @@ import json
 import os
 import sys
 import threading
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from ..support.printable import printable
-from ..support.units import parse_count
-from .command import COMMON, Command, option, with_options
+from .command import COMMON, Command
 from .console import Console, count_of, size_of
-from .options.common import General, common_options, overwrite_option
-from .options.types import Direction, Quantity, Real
-from .options.views import View
-from .paths import InputPath, OutputPath, keep_apart
-from .usage import exclude, options_of, require
+from .options.common import General, common_options
+from .options.viewing import PAGE, SERVER, Page, Place, view_options
+from .paths import InputPath, keep_apart
+from .usage import options_of
 
 if TYPE_CHECKING:
     from ..api.viewing import Prepared, Server
@@ -38,87 +35,17 @@ Examples:
   sparklod view scene-lod.rad --export site               # for any web server
 """
 
-SERVED, SHOWN = "Server", "Page"
 
-#: Options that have no effect where a site is written.
-OF_SERVER = ("host", "port", "cors", "no_open")
-
-
-@dataclass(frozen=True)
-class Page:
-    """What the page shows at first; None for what is not given."""
-
-    look_at: Any
-    fov: float | None
-    up: tuple[float, float, float] | None
-    budget: int | None
-    camera_path: Path | None
-    spark_dir: Path | None
-
-
-@dataclass(frozen=True)
-class Place:
-    """Where the page is served, or written.
-
-    Attributes:
-        host, port: to listen on; 0 for any port that is free.
-        cors: pages of other origins may read the files.
-        no_open: open no browser.
-        export: folder that gets the site in place of a server; None for none.
-        overwrite: replace a site that is there.
-    """
-
-    host: str
-    port: int
-    cors: bool
-    no_open: bool
-    export: Path | None
-    overwrite: bool
-
-
-def _budget(text: str) -> int:
-    count = parse_count(text)
-    if count < 1:
-        raise ValueError(f"a budget of {text} leaves nothing to draw; give 1 or more")
-    return count
-
-
-def _options(command: Any) -> Any:
-    served, shown = functools.partial(option, heading=SERVED), functools.partial(option, heading=SHOWN)
-    return with_options(
-        command,
-        option("--look-at", heading=COMMON, type=View(), help="Place the camera at EYE, looking at TARGET, each x,y,z."
-               "  [default: the whole scene]"),
-        option("--camera-path", heading=COMMON, metavar="FILE", type=InputPath(),
-               help="Play the cameras of a file, or of a folder written by COLMAP."),
-        option("--spark-dir", heading=COMMON, metavar="DIR", type=InputPath(),
-               help="Take Spark and three.js from the node_modules of a folder.  [default: from a CDN, by the network]"),
-        option("--export", heading=COMMON, metavar="DIR", type=OutputPath(folder=True),
-               help="Write the page and the files into a folder that any web server can serve, in place of serving them."),
-        overwrite_option,
-        shown("--budget", type=Quantity("N", _budget), help="Most splats of trees that are drawn."
-              "  [default: as many as Spark draws on the device]"),
-        shown("--up", type=Direction(), help="Direction that is up, as an axis such as -y or as x,y,z."
-              "  [default: -y, as training leaves scenes]"),
-        shown("--fov", metavar="DEGREES", type=Real(0, 180, min_open=True, max_open=True),
-              help="Vertical field of view, in degrees.  [default: 60]"),
-        served("--port", metavar="N", type=click.IntRange(0, 65_535), default=0, show_default="any that is free",
-               help="Port to listen on."),
-        served("--host", metavar="NAME", default="127.0.0.1", show_default="127.0.0.1, for this machine alone",
-               help="Address to listen on; 0.0.0.0 lets everybody on the network see the files."),
-        served("--cors", is_flag=True, help="Let pages of other origins read the files."),
-        served("--no-open", is_flag=True, help="Open no browser."),
-    )  # fmt: skip
-
-
-@click.command("view", cls=Command, headings=(COMMON, SHOWN, SERVED), epilog=EXAMPLES,
-               context_settings={"show_default": True})  # fmt: skip
+@click.command(
+    "view", cls=Command, headings=(COMMON, PAGE, SERVER), epilog=EXAMPLES, context_settings={"show_default": True}
+)
 @click.argument("files", metavar="FILE...", nargs=-1, required=True, type=InputPath())
-@_options
+@view_options
 @functools.partial(
     common_options,
     json="Print the address and the files as one JSON object on standard output.",
     quiet="Print nothing but the address, and errors.",
+    verbose="Print each request.",
 )
 @click.pass_context
 def view(ctx: click.Context, /, files: tuple[Path, ...], **_: Any) -> None:
@@ -131,22 +58,17 @@ def view(ctx: click.Context, /, files: tuple[Path, ...], **_: Any) -> None:
     Trees in RAD files are streamed, chunk by chunk, as a viewer on the web streams them. Spark and three.js come from a
     CDN unless --spark-dir names a folder that has them.
     """
-    general, page, place = (options_of(ctx, kind) for kind in (General, Page, Place))
+    general, page, place = options_of(ctx, General), options_of(ctx, Page), options_of(ctx, Place)
     keep_apart(ctx)
-    if place.export is not None:
-        exclude(ctx, OF_SERVER, "--export")
-    else:
-        require(ctx, ["overwrite"], "--export")
+    place.check(ctx)
     with general.console() as console:
         from ..api import viewing
 
+        served = place.export is None
         if place.export is not None:
             viewing.check_folder(place.export, overwrite=place.overwrite)
-        settings = viewing.ViewSettings(**vars(page))
-        served = place.export is None
-        prepared = viewing.prepare(
-            files, settings, served=served, threads=general.threads, progress=console.progress
-        )
+        settings = viewing.ViewSettings(page.look_at, page.fov, page.up, page.budget, page.camera_path, page.spark_dir)
+        prepared = viewing.prepare(files, settings, served=served, threads=general.threads, progress=console.progress)
         console.clear()
         for note in prepared.notes:
             console.say(note)
@@ -197,6 +119,5 @@ def _report_export(console: Console, folder: Path, prepared: Prepared, size: int
 
 def _files(prepared: Prepared) -> list[dict[str, Any]]:
     return [
-        {"file": str(file.path), "url": file.url, "format": file.format, "bytes": file.bytes}
-        for file in prepared.shown
+        {"file": str(file.path), "url": file.url, "format": file.format, "bytes": file.bytes} for file in prepared.shown
     ]

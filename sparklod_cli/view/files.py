@@ -85,15 +85,16 @@ def shown_files(paths: Sequence[Path]) -> list[ShownFile]:
         FormatError: a file cannot be read, is of no known format, or refers to one that is missing or elsewhere; the
             text names it.
     """
-    shown = []
-    for number, path in enumerate(paths):
-        try:
-            shown.append(_shown(path, f"data/{number}"))
-        except FormatError as error:
-            raise type(error)(f"{path}: {error}") from None
-        except OSError as error:
-            raise UnreadableError(f"{path}: cannot be read: {reason_of(error)}") from None
-    return shown
+    return [_named(path, f"data/{number}") for number, path in enumerate(paths)]
+
+
+def _named(path: Path, folder: str) -> ShownFile:
+    try:
+        return _shown(path, folder)
+    except FormatError as error:
+        raise type(error)(f"{path}: {error}") from None
+    except OSError as error:
+        raise UnreadableError(f"{path}: cannot be read: {reason_of(error)}") from None
 
 
 def _shown(path: Path, folder: str) -> ShownFile:
@@ -111,10 +112,9 @@ def _shown(path: Path, folder: str) -> ShownFile:
     if not head:
         raise UnreadableError("the file is empty")
     found = sniff(head, path.suffix)
-    form = "RAD" if header is not None else found.name if found is not None else None
-    if form is None:
-        names = ", ".join(dict.fromkeys(form.name for form in FORMATS))
-        raise UnknownFormatError(f"not a splat file that sparklod reads ({names})")
+    if found is None:
+        raise UnknownFormatError(f"not a splat file that sparklod reads ({', '.join(form.name for form in FORMATS)})")
+    form = found.name
     files = {f"{folder}/{path.name}": path.resolve()}
     if header is not None:
         files |= {f"{folder}/{name}": beside for name, beside in _chunk_files(path, header)}

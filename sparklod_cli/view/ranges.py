@@ -41,7 +41,7 @@ def span_of(text: str | None, size: int) -> Span | None:
     first, last = found.groups()
     if first:
         begin = _number(first)
-        end = _number(last) if last else size
+        end = _number(last) if last else max(begin, size)
         if end < begin:
             return None
         return Span(begin, max(0, min(end, size - 1) - begin + 1))

@@ -23,7 +23,7 @@ from ..io.plain import open_plain
 from ..support.errors import SparklodError
 from .drops import MAX_BYTES, parse_drop
 from .files import media_type
-from .ranges import span_of
+from .ranges import DIGITS, span_of
 from .site import CAMERAS, INDEX, Site
 
 #: Where a server listens unless told otherwise: only programs of this machine can connect.
@@ -112,7 +112,7 @@ def _cannot_listen(host: str, port: int, error: OSError | UnicodeError) -> str:
         return f"port {port} cannot be used without more rights; give a --port above 1023"
     if isinstance(error, (socket.gaierror, UnicodeError)) or code == errno.EADDRNOTAVAIL:
         return f"{host!r} is no address of this machine; give --host {LOOPBACK}, or 0.0.0.0 for all of its addresses"
-    return f"cannot listen on {host}, port {port}: {(error.strerror or str(error)).lower()}"  # type: ignore[union-attr]
+    return f"cannot listen on {host}, port {port}: {(error.strerror or str(error)).lower()}"
 
 
 class Handler(BaseHTTPRequestHandler):
@@ -124,22 +124,22 @@ class Handler(BaseHTTPRequestHandler):
     sys_version = ""
     timeout = IDLE
 
-    def do_GET(self) -> None:  # noqa: N802
+    def do_GET(self) -> None:
         """Sends a resource, or a range of it."""
         if self._is_ours():
             self._send_resource(body=True)
 
-    def do_HEAD(self) -> None:  # noqa: N802
+    def do_HEAD(self) -> None:
         """Sends the headers of a resource."""
         if self._is_ours():
             self._send_resource(body=False)
 
-    def do_OPTIONS(self) -> None:  # noqa: N802
+    def do_OPTIONS(self) -> None:
         """Says what a page of another origin may send."""
         if self._is_ours():
             self._answer(HTTPStatus.NO_CONTENT, {"Allow": "GET, HEAD", **(PREFLIGHT if self.server.cors else {})})
 
-    def do_POST(self) -> None:  # noqa: N802
+    def do_POST(self) -> None:
         """Parses a camera path that was dropped onto our page."""
         if not self._is_ours():
             return
@@ -165,11 +165,15 @@ class Handler(BaseHTTPRequestHandler):
         """The body of a request; None where it was refused."""
         length = self.headers.get("Content-Length", "")
         if not (length.isascii() and length.isdigit()) or "Transfer-Encoding" in self.headers:
-            return self._refuse(HTTPStatus.LENGTH_REQUIRED, "the request has no Content-Length")
-        if len(length) > 12 or int(length) > MAX_BYTES:
-            return self._refuse(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"at most {MAX_BYTES >> 20} MiB are read")
-        body = self.rfile.read(int(length))
-        return body if len(body) == int(length) else self._refuse(HTTPStatus.BAD_REQUEST, "the request was cut short")
+            self._refuse(HTTPStatus.LENGTH_REQUIRED, "the request has no Content-Length")
+        elif len(length) > DIGITS or int(length) > MAX_BYTES:
+            self._refuse(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"at most {MAX_BYTES >> 20} MiB are read")
+        else:
+            body = self.rfile.read(int(length))
+            if len(body) == int(length):
+                return body
+            self._refuse(HTTPStatus.BAD_REQUEST, "the request was cut short")
+        return None
 
     def _is_ours(self) -> bool:
         """Whether the request names this server: a page elsewhere whose name leads here must not read our files."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import dataclasses
 import hashlib
 import json
 import re
@@ -96,7 +97,7 @@ def site_of(
         "version": __version__,
         "title": title,
         "files": [_file(file, extent) for file, extent in zip(shown, extents, strict=True)],
-        "start": _start(look.start),
+        "start": dataclasses.asdict(look.start),
         "up": look.up,
         "budget": look.budget,
         "path": None if look.path is None else frames_of(look.path),
@@ -126,17 +127,6 @@ def _file(shown: ShownFile, extent: Extent) -> dict[str, Any]:
         "leaves": extent.leaves,
         "chunks": None if shown.header is None else len(shown.header.chunks),
         "chunked": shown.header is not None and shown.header.chunked,
-    }
-
-
-def _start(start: Start) -> dict[str, Any]:
-    return {
-        "eye": start.eye,
-        "target": start.target,
-        "fov": start.fov,
-        "center": start.center,
-        "radius": start.radius,
-        "chosen": start.chosen,
     }
 
 

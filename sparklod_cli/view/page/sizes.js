@@ -1,30 +1,28 @@
-// Colours splats by their feature size: Spark's nodes do not know their depth, but each is larger than its children.
+// Colours splats by their feature size: Spark's nodes do not know their depth, but splats get smaller from level to level.
 import { dyno } from '@sparkjsdev/spark';
 import { short } from './text.js';
 
 /** Of viridis, from coarse to fine, as `sparklod render --color-by level` has it. */
 const STOPS = ['414487', '355f8d', '2a788e', '21918c', '22a884', '44bf70', '7ad151', 'bddf26', 'fde725'];
-const OCTAVES = 12; // from the radius of the scene down: 1/4096 of it
-const BANDS = OCTAVES + 1;
+const [FEWEST, MOST] = [2, 20]; // bands, a factor of two each
 
 const channels = (hex) => [0, 2, 4].map((at) => parseInt(hex.slice(at, at + 2), 16));
 
-/** The colour of a band, 0 the coarsest, as 0..255. */
-function bandColor(band) {
-  const at = (band / (BANDS - 1)) * (STOPS.length - 1);
+/** The colour of a band of several, 0 the coarsest, as 0..255. */
+function bandColor(band, count) {
+  const at = (band / (count - 1)) * (STOPS.length - 1);
   const low = Math.min(Math.floor(at), STOPS.length - 2);
   const [from, to] = [channels(STOPS[low]), channels(STOPS[low + 1])];
   return from.map((value, index) => Math.round(value + (to[index] - value) * (at - low)));
 }
 
-const COLORS = Array.from({ length: BANDS }, (_, band) => bandColor(band));
-
 export class SizeColors {
-  /** @param radius of the scene, world units: the coarsest band. */
-  constructor(radius) {
-    this.radius = radius;
+  /** @param sizes the smallest and the largest that are told apart, world units. */
+  constructor([smallest, largest]) {
+    const count = Math.max(FEWEST, Math.min(MOST, Math.round(Math.log2(largest / smallest)) + 1));
+    this.colors = Array.from({ length: count }, (_, band) => bandColor(band, count));
     this.amount = new dyno.DynoFloat({ value: 0 });
-    this.largest = new dyno.DynoFloat({ value: radius });
+    this.largest = new dyno.DynoFloat({ value: largest });
     this.modifier = this.makeModifier();
   }
 
@@ -37,7 +35,8 @@ export class SizeColors {
   }
 
   makeModifier() {
-    const table = COLORS.map((color) => `vec3(${color.map((value) => (value / 255).toFixed(5)).join(', ')})`);
+    const count = this.colors.length;
+    const table = this.colors.map((color) => `vec3(${color.map((value) => (value / 255).toFixed(5)).join(', ')})`);
     const types = { gsplat: dyno.Gsplat };
     return dyno.dynoBlock(types, types, ({ gsplat }) => {
       const recolor = new dyno.Dyno({
@@ -45,9 +44,9 @@ export class SizeColors {
         outTypes: types,
         globals: () => [
           `vec3 sizeColor(vec3 scales, float largest) {
-            vec3 table[${BANDS}] = vec3[${BANDS}](${table.join(', ')});
+            vec3 table[${count}] = vec3[${count}](${table.join(', ')});
             float size = 2.0 / 3.0 * (scales.x + scales.y + scales.z);
-            return table[clamp(int(floor(log2(largest / max(size, 1e-30)) + 0.5)), 0, ${BANDS - 1})];
+            return table[clamp(int(floor(log2(largest / max(size, 1e-30)) + 0.5)), 0, ${count - 1})];
           }`,
         ],
         statements: ({ inputs, outputs }) => [
@@ -62,16 +61,17 @@ export class SizeColors {
   /** Fills the legend: a field for each band, coarse to fine, and some sizes. */
   drawLegend(bar, marks) {
     bar.replaceChildren(
-      ...COLORS.map((color) => {
+      ...this.colors.map((color) => {
         const field = document.createElement('i');
         field.style.background = `rgb(${color.join(' ')})`;
         return field;
       }),
     );
+    const last = this.colors.length - 1;
     marks.replaceChildren(
-      ...[0, OCTAVES / 2, OCTAVES].map((octave) => {
+      ...[0, Math.round(last / 2), last].map((band) => {
         const mark = document.createElement('span');
-        mark.textContent = short(this.radius / 2 ** octave);
+        mark.textContent = short(this.largest.value / 2 ** band);
         return mark;
       }),
     );

@@ -33,7 +33,7 @@ class View {
     this.scene = new Scene();
     this.scene.add(this.spark, this.group);
     this.radius = settings.start.radius;
-    this.colors = new SizeColors(this.radius);
+    this.colors = new SizeColors(settings.start.sizes);
     this.player = new Player(this.camera, this.group.quaternion);
     this.controls = new Controls(this.canvas, this.camera, () => this.leavePath());
     this.controls.radius = this.radius;
