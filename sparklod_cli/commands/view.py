@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import contextlib
 import json
 import os
 import sys
@@ -85,7 +86,7 @@ def view(ctx: click.Context, /, files: tuple[Path, ...], **_: Any) -> None:
 
 def _serve(console: Console, server: Server, prepared: Prepared, *, opens: bool, as_json: bool) -> None:
     """Serves until an interrupt, which is how a server ends."""
-    with server:
+    with server, contextlib.suppress(KeyboardInterrupt):
         click.echo(json.dumps({"url": server.url, "files": _files(prepared)}) if as_json else server.url)
         sys.stdout.flush()
         names = ", ".join(printable(file.name) for file in prepared.shown)
@@ -93,10 +94,8 @@ def _serve(console: Console, server: Server, prepared: Prepared, *, opens: bool,
         console.say(f"serving {names}{everybody}; Ctrl-C ends it")
         if opens:
             threading.Thread(target=_open, args=(console, server.url), daemon=True).start()
-        try:
-            server.serve_forever()
-        except KeyboardInterrupt:
-            console.say("stopped")
+        server.serve_forever()
+    console.say("stopped")
 
 
 def _open(console: Console, url: str) -> None:
