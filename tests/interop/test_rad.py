@@ -18,7 +18,7 @@ from sparklod_cli.codecs import rad
 from sparklod_cli.codecs.gpu import packed_splats
 from sparklod_cli.codecs.octahedral import encode_lod_alpha
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
-from sparklod_cli.codecs.rad_header import Header, read_header
+from sparklod_cli.codecs.rad_header import Header, read_chunk_header, read_header
 from sparklod_cli.codecs.rad_layout import choices
 from sparklod_cli.codecs.splat_encoding import SplatEncoding
 from sparklod_cli.io import read_scene
@@ -183,42 +183,54 @@ def written(path: Path, scene: Scene, options: RadOptions) -> Path:
     return path
 
 
+def width_of(path: Path, name: str) -> float:
+    """The width of the range of a property's codes, as the first chunk has it."""
+    with path.open("rb") as file:
+        read_header(file)
+        (found,) = (each for each in read_chunk_header(file).properties if each.name == name)
+    assert found.min is not None and found.max is not None
+    return found.max - found.min
+
+
 def check_close(spark: Spark, path: Path, scene: Scene, options: RadOptions) -> None:
     """Asserts that Spark reads the splats that were written, within the steps of the file and of Spark's layouts."""
     chosen = rad.settled(scene, WriteOptions(rad=options)).rad
-    ranges, splats, got = chosen.ranges, scene.splats, spark.load(path)
-    assert ranges is not None
+    splats, got = scene.splats, spark.load(path)
     center = splats.center.astype(np.float64)
     step = HALF * np.abs(center) + TINY if chosen.center.startswith("f16") else 0
     within(got.center, center, step + (0 if chosen.center_bits is None else 2.0**-chosen.center_bits / 2))
     alpha = encode_lod_alpha(splats.opacity) if scene.tree else splats.opacity
-    step = ranges.alpha_max / 510 if chosen.alpha == "r8" else HALF * alpha
+    step = width_of(path, "alpha") / 510 if chosen.alpha == "r8" else HALF * alpha
     within(got.alpha, alpha.astype(np.float64), step + HALF * alpha + TINY)
     rgb = splats.rgb.astype(np.float64)
-    step = (ranges.rgb_max - ranges.rgb_min) / 510 if chosen.rgb.startswith("r8") else HALF * np.abs(rgb)
+    step = width_of(path, "rgb") / 510 if chosen.rgb.startswith("r8") else HALF * np.abs(rgb)
     within(got.rgb, rgb, step + HALF * np.abs(rgb) + TINY)
     log = np.log(splats.scale.astype(np.float64))
-    step = (ranges.ln_scale_max - ranges.ln_scale_min) / 508 if chosen.scales == "ln_0r8" else HALF * np.abs(log)
+    step = width_of(path, "scales") / 508 if chosen.scales == "ln_0r8" else HALF * np.abs(log)
     within(got.log_scale, log, step + HALF * np.abs(log) + 1e-6)
     assert degrees_between(got.quat_xyzw, splats.quat_xyzw).max() <= DEGREES[chosen.orientation] + EXT_DEGREES
     if scene.tree:
         laws.check_tree(got, scene.tree)
     else:
         assert got.nodes is None
-    if splats.sh_degree:
-        words = without_codes(spark.load_words("Packed", path))
-        sh = packed_splats.unpack({name: words[name] for name in words if name != "lodTree"}, ranges).sh
-        check_sh(sh, splats.sh, ranges, chosen.sh)
+    check_sh(spark, path, splats.sh, chosen.sh)
 
 
-def check_sh(got: FloatArray, sh: FloatArray, ranges: SplatEncoding, encoding: str) -> None:
-    """Asserts that SH in Spark's PackedSplats are within the steps of the file and of that layout."""
-    for degree in range(1, 4):
+def check_sh(spark: Spark, path: Path, sh: FloatArray, encoding: str) -> None:
+    """Asserts that SH in Spark's PackedSplats are within the steps of the file and of that layout.
+
+    ExtSplats clamp them to a power of two, see `laws.held_by_ext_sh`.
+    """
+    ranges = header_of(path).encoding
+    assert ranges is not None
+    words = without_codes(spark.load_words("Packed", path))
+    got = packed_splats.unpack({name: words[name] for name in words if name != "lodTree"}, ranges).sh
+    assert got.shape == sh.shape
+    for degree in range(1, 1 + COEFFICIENTS.index(sh.shape[1])):
         part = slice(COEFFICIENTS[degree - 1], COEFFICIENTS[degree])
         most, values = float(ranges.sh_max(degree)), sh[:, part].astype(np.float64)
-        steps = {"s8": most / 254, "r8": most / 255}.get(encoding.partition("_")[0], HALF * most)
-        packed = most / (2.0 ** packed_splats.SH_BITS[degree] - 2)
-        within(got[:, part], values.clip(-most, most), steps + packed + TINY)
+        step = HALF * most if encoding in ("f16", "f32") else width_of(path, f"sh{degree}") / 508
+        within(got[:, part], values.clip(-most, most), step + most / (2.0 ** packed_splats.SH_BITS[degree] - 2) + TINY)
 
 
 @pytest.mark.parametrize("sh_degree", range(4))
