@@ -35,6 +35,8 @@ def lines(name: str, report: dict[str, Any]) -> Iterator[str]:
         yield _row("takes", f"{report['bytes_per_splat']:.1f} bytes a {noun}{less}")
     for note in report["notes"]:
         yield _row("note", note)
+    if report["rad"]:
+        yield from _rad(report["rad"])
     if tree:
         yield from _tree(tree)
     if values:
@@ -43,6 +45,31 @@ def lines(name: str, report: dict[str, Any]) -> Iterator[str]:
 
 def _row(name: str, text: str) -> str:
     return f"  {name:<10} {printable(text, MOST)}"
+
+
+def _rad(rad: dict[str, Any]) -> Iterator[str]:
+    where = "files of their own" if rad["chunked"] else "one file"
+    yield _row("stored", f"{where}, header {size_of(rad['header_bytes'])}, first picture {size_of(rad['first_bytes'])}")
+    if rad["chunk_bytes"]:
+        least, median, most = (size_of(rad["chunk_bytes"][name]) for name in ("min", "median", "max"))
+        yield _row("chunks", f"{least} to {most}, median {median}, of {rad['chunk_size']:,} splats")
+    if rad["palette"]:
+        yield _row("palette", count_of(rad["palette"], "entry", "entries") + " of SH")
+    if rad["ranges"]:
+        yield _row("ranges", ", ".join(f"{name} {_ranged(value)}" for name, value in rad["ranges"].items()))
+    if rad["properties"]:
+        yield _row("properties", f"{'encoding':<12} {'bytes':>13} {'share':>7}  range")
+    for name, found in rad["properties"].items():
+        ends = [f"{found[end]:g}" for end in ("min", "max") if found[end] is not None]
+        share = f"{100 * found['share']:.1f} %"
+        text = f"{found['encoding']:<12} {found['bytes']:>13,} {share:>7}  {' to '.join(ends)}"
+        yield f"    {name:<12} {text}".rstrip()
+    if rad["comment"]:
+        yield _row("comment", rad["comment"])
+
+
+def _ranged(value: float | bool) -> str:
+    return f"{value:g}" if not isinstance(value, bool) else "on" if value else "off"
 
 
 def _tree(tree: dict[str, Any]) -> Iterator[str]:

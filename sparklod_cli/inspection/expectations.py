@@ -31,6 +31,10 @@ NAMES: dict[str, Callable[[dict[str, Any]], Any]] = {
     "depth": lambda report: report["tree"]["depth"],
     "sh": lambda report: report["sh_degree"],
     "lod": lambda report: report["tree"] is not None,
+    "chunk_bytes": lambda report: report["rad"]["chunk_bytes"]["max"],
+    "first_bytes": lambda report: report["rad"]["first_bytes"],
+    "chunked": lambda report: report["rad"]["chunked"],
+    "palette": lambda report: report["rad"]["palette"],
 }
 
 #: The codes of findings about some names; that of the others is expect.value.

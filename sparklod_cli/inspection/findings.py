@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from ..codecs import rad_promises
+
 ERROR, WARNING, NOTE = "error", "warning", "note"
 
 #: Every code, its severity and its meaning. Codes do not change from version to version.
@@ -29,7 +31,7 @@ CODES: dict[str, tuple[str, str]] = {
     "values.invisible": (WARNING, "many splats (leaves of a tree) have opacity 0 or scale 0 and cannot be drawn"),
     "values.scale-clamped": (
         WARNING,
-        "scales of many splats (leaves of a tree) lie at an end of the range of SPZ",
+        "scales of many splats (leaves of a tree) lie at an end of the range of the format",
     ),
     "values.center-clamped": (ERROR, "centres lie at the end of the range of the format"),
     "values.center-far": (WARNING, "centres lie farther out than the float16 of viewers can hold"),
@@ -58,6 +60,9 @@ CODES: dict[str, tuple[str, str]] = {
     "expect.leaves": (ERROR, "the leaves are not the splats of the original file"),
     "expect.value": (ERROR, "a value of the report is not the expected one"),
 }
+
+
+CODES |= {c: (ERROR, t) for c, t in rad_promises.CODES.items()}
 
 
 @dataclass(frozen=True)

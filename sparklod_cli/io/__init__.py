@@ -2,7 +2,7 @@
 
 from .beside import companions
 from .names import is_file_name
-from .reading import examine_scene, read_arrays, read_scene, size_of_input
+from .reading import examine_scene, opened, read_arrays, read_scene, size_of_input
 from .texts import MAX_TEXT, read_rgba, read_text, read_together
 from .writing import Sink, check_writable, sink, write_stdout, write_whole
 
@@ -13,6 +13,7 @@ __all__ = [
     "companions",
     "examine_scene",
     "is_file_name",
+    "opened",
     "read_arrays",
     "read_rgba",
     "read_scene",
