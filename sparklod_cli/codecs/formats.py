@@ -27,7 +27,7 @@ class Format:
             only the suffix decides.
         companions: its files refer to others beside them; `decode` takes another argument, `beside`, which opens those.
         selective: its module also has `examine(file, *, columns, threads, progress) -> Scene`, which decodes only some
-            columns and accepts a broken tree.
+            columns and accepts a broken tree; `beside`, too, where it has companions.
     """
 
     name: str
@@ -60,6 +60,8 @@ FORMATS = (
     Format("PLY", "ply", (".ply",), rb"ply[\r\n]", writable=True),
     # Gzipped up to version 3.
     Format("SPZ", "spz", (".spz",), rb"\x1f\x8b\x08[\0-\x1f]|NGSP", writable=True, trees=True, selective=True),
+    # RADC begins a chunk, which the codec refuses with what to give instead.
+    Format("RAD", "rad", (".rad",), rb"RAD[0C]", writable=False, trees=True, companions=True, selective=True),
     # A zip, or its meta.json unpacked.
     Format("SOG", "sog", (".sog", ".json"), rb"PK\x03\x04|\s*\{\s*\"\w+\"\s*:", companions=True),
     Format("KSPLAT", "ksplat", (".ksplat",), rb"\0[\x01-\xff]\0\0"),  # version 0.1 on; as a float it would be denormal

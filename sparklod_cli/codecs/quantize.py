@@ -175,7 +175,11 @@ def encode_quat_first_three(quat_xyzw: FloatArray) -> Bytes:
 
 def decode_quat_first_three(codes: Bytes) -> FloatArray:
     """(N, 3) bytes to (N, 4) unit quaternions. Largest error: 13.4 degrees of rotation, where w is near 0."""
-    xyz = codes.astype(np.float32) / np.float32(127.5) - 1
+    return quat_of_xyz(codes.astype(np.float32) / np.float32(127.5) - 1)
+
+
+def quat_of_xyz(xyz: FloatArray) -> FloatArray:
+    """(N, 4) unit quaternions from (N, 3) x y z, whose w is not negative; too long ones are made shorter."""
     w = np.sqrt(np.maximum(0, 1 - np.einsum("ij,ij->i", xyz, xyz)))
     return normalized_quat(np.concatenate([xyz, w[:, None]], axis=1))
 

@@ -1,10 +1,18 @@
-"""`SplatEncoding`: the ranges of 8-bit codes, which Spark's PackedSplats and the RAD format share."""
+"""The 8-bit codes that Spark's PackedSplats and the RAD format share, and `SplatEncoding`, their ranges."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
+
+from ..model.splats import FloatArray
+from . import quantize
+from .octahedral import Words, to_code
+
+#: Scales below this are encoded as 0: e ** -30.
+SCALE_ZERO = np.float32(np.exp(-30))
 
 
 @dataclass(frozen=True)
@@ -45,3 +53,34 @@ class SplatEncoding:
 
 #: That of Spark.
 DEFAULT = SplatEncoding()
+
+
+def encode_linear(values: FloatArray, low: float, high: float) -> Words:
+    """Numbers to codes, low..high to 0..255; they are clamped to the range."""
+    first, width = np.float32(low), np.float32(high) - np.float32(low)
+    return to_code((values - first) / width * np.float32(255), 255)
+
+
+def decode_linear(codes: NDArray[np.uint8], low: float, high: float) -> FloatArray:
+    """Largest error: (high - low) / 510."""
+    return quantize.of_range(codes.astype(np.float32) / np.float32(255), np.float32(low), np.float32(high))
+
+
+def encode_log_scale(scale: FloatArray, low: float, high: float) -> Words:
+    """Linear scales to codes: 0 for scales below e ** -30, 1..255 for logarithms from low to high."""
+    first = np.float32(low)
+    width = np.float32(high) - first
+    zero = scale < SCALE_ZERO
+    log = np.log(np.where(zero, 1, scale).astype(np.float64)).astype(np.float32)
+    codes = 1 + to_code(np.clip((log - first) / width, 0, 1) * np.float32(254), 254)
+    codes[zero] = 0
+    return codes
+
+
+def log_scale_table(low: float, high: float) -> FloatArray:
+    """(256,) linear scales of the codes. Largest error: a factor of e ** ((high - low) / 508); exact for 0."""
+    first = np.float32(low)
+    log = first + np.arange(-1, 255, dtype=np.float32) * ((np.float32(high) - first) / np.float32(254))
+    table = np.exp(log.astype(np.float64)).astype(np.float32)
+    table[0] = 0
+    return table

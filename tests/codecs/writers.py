@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from fixtures import by_hand, by_hand_compressed_ply, by_hand_ksplat, by_hand_sog, by_hand_splat
-from sparklod_cli.codecs import ply, quantize, splat, spz
+from fixtures import by_hand, by_hand_compressed_ply, by_hand_ksplat, by_hand_rad, by_hand_sog, by_hand_splat
+from sparklod_cli.codecs import octahedral, ply, quantize, splat, spz
 from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.sh import SH_C0
@@ -76,7 +76,7 @@ def put(content: Content, directory: Path, form: str) -> Path:
     folder.mkdir()
     for name, data in content.items():
         (folder / name).write_bytes(data)
-    return folder
+    return next((folder / name for name in content if name.endswith(".rad")), folder)
 
 
 def linear(source: Scene) -> dict[str, Array]:
@@ -312,6 +312,89 @@ SPLAT = {
     ),
 }
 
+# --- RAD --------------------------------------------------------------------------------------------------------------
+
+#: Two sets of encodings that have each one between them.
+PLAIN_RAD = {
+    "center": "f32",
+    "alpha": "f32",
+    "rgb": "f32",
+    "scales": "f32",
+    "orientation": "f32",
+    "sh": "f32",
+}
+SMALL_RAD = {
+    "center": "f32_lebytes",
+    "alpha": "r8",
+    "rgb": "r8",
+    "scales": "ln_f16",
+    "orientation": "f16",
+    "sh": "s8_delta",
+}
+WIDE_RANGES = by_hand_rad.RANGES | {"rgbMin": -0.5, "rgbMax": 1.5, "sh2Max": 1.25, "sh3Max": 1.5}
+
+
+def half_spacing(values: Array) -> Array:
+    """Bounds the error of numbers as float16, of which the largest is clamped."""
+    inside = np.clip(values, -65504, 65504)
+    return np.spacing(np.abs(inside).astype(np.float16)).astype(np.float64) * 0.501 + np.abs(values - inside)
+
+
+def rad_precision(source: Scene, encodings: Mapping[str, str], ranges: Mapping[str, float]) -> Precision:
+    values = linear(source)
+    rgb, scales, sh = encodings["rgb"], encodings["scales"], encodings["sh"]
+    tops = [ranges[f"sh{degree}Max"] for degree in (1, 2, 3)]
+    step = (0.0, 0.0) if sh == "f32" else (2**-12, 2**-12) if sh == "f16" else (tops[0] / 254, max(tops[1:]) / 254)
+    if sh.startswith("r8"):
+        step = (tops[0] / 255, max(tops[1:]) / 255)
+    log_range = ranges["lnScaleMin"], ranges["lnScaleMax"]
+    alpha = {"f32": 1e-6, "f16": 2**-12, "r8": 1 / 255 if source.tree else 1 / 510}[encodings["alpha"]]
+    return Precision(
+        center=half_spacing(values["center"]) if "f16" in encodings["center"] else 0.0,
+        log_scale={
+            "f32": 2e-6,
+            "ln_f16": 2**-11 * np.abs(np.log(values["scale"])) + 1e-6,
+            "ln_0r8": 1.001 * (log_range[1] - log_range[0]) / 508,
+        }[scales],
+        # Near half a turn, w follows from x y z by a difference of nearly equal numbers: 2 ** -11 of 1 makes w 0.031.
+        degrees={"f32": 0.05, "f16": 3.6, "oct88r8": stated_degrees(octahedral.decode_axis_angle)}[
+            encodings["orientation"]
+        ],
+        opacity=1.001 * alpha,
+        merged={"f32": 1e-5, "f16": 2**-9, "r8": 4 / 255}[encodings["alpha"]] * 1.001,
+        rgb={"f32": 1e-6, "f16": half_spacing(values["rgb"])}.get(
+            rgb, 1.001 * (ranges["rgbMax"] - ranges["rgbMin"]) / 510
+        ),
+        sh=(step[0] * 1.001, step[1] * 1.001),
+        scale_range=(0, np.inf) if scales != "ln_0r8" else (np.exp(log_range[0]), np.exp(log_range[1])),
+        rgb_range=(ranges["rgbMin"], ranges["rgbMax"]) if rgb.startswith("r8") else (-np.inf, np.inf),
+        sh_range=(-min(tops), min(tops)) if sh[1:2] == "8" else (-np.inf, np.inf),
+    )
+
+
+def as_rad(source: Scene, encodings: Mapping[str, str], ranges: Mapping[str, float], stem: str) -> Content:
+    tree = None if source.tree is None else (source.tree.child_count, source.tree.child_start)
+    files = by_hand_rad.rad(
+        **linear(source), tree=tree, encodings=encodings, ranges=ranges, chunk_size=1000 if stem else 65536, stem=stem
+    )
+    return files if stem else files["scene.rad"]
+
+
+RAD = {
+    f"by hand {way}{' LoD' * lod}": Case(
+        f"RAD{' LoD' * lod}",
+        functools.partial(as_rad, encodings=encodings, ranges=ranges, stem=stem),
+        functools.partial(rad_precision, encodings=encodings, ranges=ranges),
+        lod,
+    )
+    for way, encodings, ranges, stem in (
+        ("Spark", by_hand_rad.SPARK, by_hand_rad.RANGES, ""),
+        ("plain", PLAIN_RAD, by_hand_rad.RANGES, ""),
+        ("small", SMALL_RAD, WIDE_RANGES, "scene"),
+    )
+    for lod in (False, True)
+}
+
 #: Every way to write each format of the table, by its name there.
 WRITERS: dict[str, dict[str, Case]] = {
     "PLY": PLY,
@@ -320,4 +403,5 @@ WRITERS: dict[str, dict[str, Case]] = {
     "SOG": SOG,
     "KSPLAT": KSPLAT,
     "SPLAT": SPLAT,
+    "RAD": RAD,
 }

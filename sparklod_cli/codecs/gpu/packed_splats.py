@@ -17,9 +17,9 @@ from ...model.sh import COEFFICIENTS
 from ...model.splats import FloatArray, Splats
 from ...support.errors import FormatError
 from ...support.parallel import for_blocks
-from .. import octahedral, quantize
-from ..octahedral import STEPS_8_8_8, Words, to_code
-from ..splat_encoding import DEFAULT, SplatEncoding
+from .. import octahedral
+from ..octahedral import STEPS_8_8_8, Words
+from ..splat_encoding import DEFAULT, SplatEncoding, decode_linear, encode_linear, encode_log_scale, log_scale_table
 
 SPLAT = np.dtype(
     [
@@ -39,9 +39,6 @@ assert SPLAT.itemsize == 16
 SH_WORDS = {1: 2, 2: 4, 3: 4}
 SH_BITS = {1: 7, 2: 8, 3: 6}
 
-#: Scales below this are encoded as 0: e ** -30.
-SCALE_ZERO = np.float32(np.exp(-30))
-
 
 def of_scene(scene: Scene) -> SplatEncoding:
     """The encoding that Spark sets up for a scene: an LoD tree has LoD opacities."""
@@ -58,16 +55,17 @@ def pack(splats: Splats, encoding: SplatEncoding = DEFAULT, *, threads: int = 1)
     degrees = range(1, splats.sh_degree + 1)
     arrays = {"packed": np.empty((len(splats), 4), np.uint32)}
     arrays |= {f"sh{degree}": np.empty((len(splats), SH_WORDS[degree]), np.uint32) for degree in degrees}
+    log_range = encoding.ln_scale_min, encoding.ln_scale_max
 
     @np.errstate(over="ignore")
     def encode(part: slice) -> None:
         rows = arrays["packed"][part].view(SPLAT)[:, 0]
-        rows["rgb"] = _encode_linear(splats.rgb[part], encoding.rgb_min, encoding.rgb_max)
+        rows["rgb"] = encode_linear(splats.rgb[part], encoding.rgb_min, encoding.rgb_max)
         opacity = splats.opacity[part]
         alpha = octahedral.encode_lod_alpha(opacity) if encoding.lod_opacity else opacity
-        rows["alpha"] = _encode_linear(alpha, 0, encoding.alpha_max)
+        rows["alpha"] = encode_linear(alpha, 0, encoding.alpha_max)
         rows["center"] = splats.center[part]
-        rows["log_scale"] = encode_log_scale(splats.scale[part], encoding)
+        rows["log_scale"] = encode_log_scale(splats.scale[part], *log_range)
         u, v, rows["angle"] = octahedral.encode_axis_angle(splats.quat_xyzw[part], STEPS_8_8_8)
         rows["axis"][:, 0], rows["axis"][:, 1] = u, v
         for degree in degrees:
@@ -104,14 +102,15 @@ def unpack(arrays: Mapping[str, NDArray[Any]], encoding: SplatEncoding = DEFAULT
     found = octahedral.checked_words(arrays, {"packed": 4} | {f"sh{degree}": SH_WORDS[degree] for degree in present})
     packed = found["packed"].view(SPLAT)[:, 0]
     splats = Splats.empty(len(packed), len(present))
+    scales = log_scale_table(encoding.ln_scale_min, encoding.ln_scale_max)
 
     def decode(part: slice) -> None:
         rows = packed[part]
         splats.center[part] = rows["center"]
-        splats.rgb[part] = _decode_linear(rows["rgb"], encoding.rgb_min, encoding.rgb_max)
-        alpha = _decode_linear(rows["alpha"], 0, encoding.alpha_max)
+        splats.rgb[part] = decode_linear(rows["rgb"], encoding.rgb_min, encoding.rgb_max)
+        alpha = decode_linear(rows["alpha"], 0, encoding.alpha_max)
         splats.opacity[part] = octahedral.decode_lod_alpha(alpha)
-        splats.scale[part] = decode_log_scale(rows["log_scale"], encoding)
+        splats.scale[part] = scales[rows["log_scale"]]
         u, v = rows["axis"].T
         splats.quat_xyzw[part] = octahedral.decode_axis_angle(u, v, rows["angle"], STEPS_8_8_8)
         for degree in present:
@@ -120,36 +119,6 @@ def unpack(arrays: Mapping[str, NDArray[Any]], encoding: SplatEncoding = DEFAULT
 
     for_blocks(decode, len(splats), threads, lambda _: None)
     return splats
-
-
-def _encode_linear(values: FloatArray, low: float, high: float) -> Words:
-    first, width = np.float32(low), np.float32(high) - np.float32(low)
-    return to_code((values - first) / width * np.float32(255), 255)
-
-
-def _decode_linear(codes: NDArray[np.uint8], low: float, high: float) -> FloatArray:
-    return quantize.of_range(codes.astype(np.float32) / np.float32(255), np.float32(low), np.float32(high))
-
-
-def encode_log_scale(scale: FloatArray, encoding: SplatEncoding = DEFAULT) -> Words:
-    """Linear scales to codes: 0 for scales below e ** -30, 1..255 for steps of the logarithm."""
-    low = np.float32(encoding.ln_scale_min)
-    width = np.float32(encoding.ln_scale_max) - low
-    zero = scale < SCALE_ZERO
-    log = np.log(np.where(zero, 1, scale).astype(np.float64)).astype(np.float32)
-    codes = 1 + to_code(np.clip((log - low) / width, 0, 1) * np.float32(254), 254)
-    codes[zero] = 0
-    return codes
-
-
-def decode_log_scale(codes: NDArray[np.uint8], encoding: SplatEncoding = DEFAULT) -> FloatArray:
-    """Largest error: a factor of e ** (range / 508), 4.3 % by default; exact for 0."""
-    low = np.float32(encoding.ln_scale_min)
-    step = (np.float32(encoding.ln_scale_max) - low) / np.float32(254)
-    log = low + np.arange(-1, 255, dtype=np.float32) * step
-    table = np.exp(log.astype(np.float64)).astype(np.float32)
-    table[0] = 0
-    return table[codes]
 
 
 def encode_sh(values: FloatArray, bits: int, most: np.float32) -> Words:
