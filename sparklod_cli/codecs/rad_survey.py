@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import BinaryIO
 
 from ..support.errors import FormatError
+from .rad import Beside, refuse_chunk
 from .rad_header import ChunkHeader, Header, Violation, padding, read_chunk_header, read_header
 from .rad_promises import chunk_violations, violations
 from .stream import size_of
-
-#: Opens a file beside another one by its name.
-Beside = Callable[[str], BinaryIO]
 
 
 @dataclass(frozen=True)
@@ -37,13 +35,16 @@ def survey_file(file: BinaryIO, beside: Beside) -> tuple[Header, tuple[Violation
     Raises:
         FormatError: the header cannot be read.
     """
+    refuse_chunk(file)
     size = size_of(file)
     header = read_header(file)
-    files: dict[str, int | None] = {}
+    files: dict[str, int | str] = {}
     for name in dict.fromkeys(entry.filename for entry in header.chunks if entry.filename is not None):
-        files[name] = None
-        with contextlib.suppress(FormatError), contextlib.closing(beside(name)) as chunk:
-            files[name] = size_of(chunk)
+        try:
+            with contextlib.closing(beside(name)) as chunk:
+                files[name] = size_of(chunk)
+        except FormatError as error:
+            files[name] = str(error)
     return header, tuple(violations(header, size, files))
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ..codecs import rad_promises
+from ..codecs.rad_promises import ERRORS as RAD_ERRORS
+from ..codecs.rad_promises import WARNINGS as RAD_WARNINGS
 
 ERROR, WARNING, NOTE = "error", "warning", "note"
 
@@ -23,6 +24,8 @@ CODES: dict[str, tuple[str, str]] = {
     "container.trailing": (WARNING, "bytes follow the data that belong to nothing"),
     "container.flags": (WARNING, "the header sets flags or reserved bytes without a meaning"),
     "container.left-out": (WARNING, "the file holds data that sparklod does not read"),
+    **{code: (ERROR, meaning) for code, meaning in RAD_ERRORS.items()},
+    **{code: (WARNING, meaning) for code, meaning in RAD_WARNINGS.items()},
     "values.empty": (ERROR, "there are no splats"),
     "values.non-finite": (ERROR, "a number is not finite, or a rotation has length 0"),
     "values.rotation": (ERROR, "the length of a rotation is not 1"),
@@ -60,9 +63,6 @@ CODES: dict[str, tuple[str, str]] = {
     "expect.leaves": (ERROR, "the leaves are not the splats of the original file"),
     "expect.value": (ERROR, "a value of the report is not the expected one"),
 }
-
-
-CODES |= {c: (ERROR, t) for c, t in rad_promises.CODES.items()}
 
 
 @dataclass(frozen=True)

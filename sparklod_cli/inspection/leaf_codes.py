@@ -126,7 +126,8 @@ def _rad_codes(splats: Splats, row: Row, found: PropertyFacts, encoding: str) ->
         return (codes.astype(np.uint8).view(np.int8) if encoding == "s8" else codes).astype(np.int32)
     bits = np.ascontiguousarray(codes).view(f"<i{codes.dtype.itemsize}").astype(np.int64)
     lowest = -(1 << (8 * codes.dtype.itemsize - 1))
-    return np.where(bits < 0, lowest - bits, bits).astype(np.int32)  # magnitudes with a sign, to numbers that grow with the value
+    # Magnitudes with a sign, to numbers that grow with the value.
+    return np.where(bits < 0, lowest - bits, bits).astype(np.int32)
 
 
 def _rows(parts: list[NDArray[np.uint8]]) -> NDArray[np.void]:

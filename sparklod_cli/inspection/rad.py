@@ -95,11 +95,6 @@ class Survey:
     fatal: list[Finding]
 
 
-def name_of(header: Header) -> str:
-    """The format for people, as the codec's scenes have it."""
-    return "RAD" + " LoD" * header.lod_tree
-
-
 def survey(path: Path, *, check: bool) -> Survey | None:
     """Reads the headers of a RAD file and of its chunks; None for a file of another format.
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ..codecs.rad import name_of
 from ..codecs.spz_layout import KNOWN_FLAGS
 from ..io import examine_scene, read_arrays, size_of_input
 from ..model.scene import Scene
@@ -153,11 +154,12 @@ def _of_headers(path: Path, surveyed: rad.Survey) -> Report:
     return Report(
         str(path),
         facts.bytes,
-        rad.name_of(header),
+        name_of(header),
         header.count,
         header.max_sh,
         False,
-        **_sizes(facts.bytes, header.count, header.max_sh),
+        bytes_per_splat=_bytes_per_splat(facts.bytes, header.count),
+        compression_ratio=_compression_ratio(facts.bytes, header.count, header.max_sh),
         rad=facts,
     )
 
@@ -188,7 +190,8 @@ def _of_scene(
         sh_degree=splats.sh_degree,
         antialiased=scene.antialiased,
         header=dict(scene.header),
-        **_sizes(size, count, splats.sh_degree),
+        bytes_per_splat=_bytes_per_splat(size, count),
+        compression_ratio=_compression_ratio(size, count, splats.sh_degree),
         notes=list(scene.notes),
         rad=None if surveyed is None else surveyed.facts,
         tree=facts,
@@ -197,13 +200,12 @@ def _of_scene(
     )
 
 
-def _sizes(size: int | None, count: int, sh_degree: int) -> dict[str, float | None]:
-    """What the bytes of a file are for each splat, and beside floats."""
-    floats = 4 * count * (14 + 3 * COEFFICIENTS[sh_degree])
-    return {
-        "bytes_per_splat": round(size / count, 3) if size and count else None,
-        "compression_ratio": round(floats / size, 3) if size else None,
-    }
+def _bytes_per_splat(size: int | None, count: int) -> float | None:
+    return round(size / count, 3) if size and count else None
+
+
+def _compression_ratio(size: int | None, count: int, sh_degree: int) -> float | None:
+    return round(4 * count * (14 + 3 * COEFFICIENTS[sh_degree]) / size, 3) if size else None
 
 
 def _container_findings(scene: Scene) -> list[Finding]:
