@@ -4,12 +4,15 @@ from .beside import companions
 from .names import is_file_name
 from .reading import examine_scene, opened, read_arrays, read_scene, size_of_input
 from .texts import MAX_TEXT, read_rgba, read_text, read_together
+from .together import SinkTogether, chunk_files, sink_together, write_together
 from .writing import Sink, check_writable, sink, write_stdout, write_whole
 
 __all__ = [
     "MAX_TEXT",
     "Sink",
+    "SinkTogether",
     "check_writable",
+    "chunk_files",
     "companions",
     "examine_scene",
     "is_file_name",
@@ -20,7 +23,9 @@ __all__ = [
     "read_text",
     "read_together",
     "sink",
+    "sink_together",
     "size_of_input",
     "write_stdout",
+    "write_together",
     "write_whole",
 ]

@@ -7,6 +7,7 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import BinaryIO
 
+from ..codecs import rad_header
 from ..codecs.formats import HEAD
 from ..codecs.sog_files import MAX_META, META, names_beside
 from ..support.errors import FormatError, UnreadableError
@@ -29,15 +30,25 @@ def companions(path: Path, sets: Collection[Collection[str]]) -> list[Path]:
             names = [META, *itertools.chain(*sets)]
         else:
             names = list(itertools.chain(*(names for names in sets if path.name in names)))
-        if meta.is_file() and meta.stat().st_size <= MAX_META:
-            with meta.open("rb") as file:
-                if file.read(HEAD).lstrip().startswith(b"{"):
-                    file.seek(0)
-                    names += names_beside(file.read())
+        if meta.is_file():
+            names += _named_in(meta)
         beside = [folder / name for name in names if not leads_away(name)]
         return [file for file in beside if file.is_file()]
-    except (OSError, ValueError):
+    except (OSError, ValueError, FormatError):
         return []
+
+
+def _named_in(path: Path) -> list[str]:
+    """The names of files that a splat file refers to: images of an unpacked SOG, chunks of a RAD."""
+    with path.open("rb") as file:
+        head = file.read(HEAD)
+        file.seek(0)
+        if head.startswith(rad_header.MAGIC):
+            names = (entry.filename for entry in rad_header.read_header(file).chunks)
+            return [name for name in dict.fromkeys(names) if name is not None]
+        if head.lstrip().startswith(b"{") and path.stat().st_size <= MAX_META:
+            return names_beside(file.read())
+    return []
 
 
 def in_folder(folder: Path) -> Path:

@@ -7,21 +7,13 @@ name, and is locked while its writer is alive, so that the next run can recognis
 from __future__ import annotations
 
 import contextlib
-import functools
 import os
-import secrets
 import stat
 from collections.abc import Iterable
 from pathlib import Path
 from typing import BinaryIO
 
-try:
-    import fcntl
-except ImportError:  # Windows, where a file that is open cannot be removed by others
-    fcntl = None  # type: ignore[assignment]
-
-#: Names of incomplete files.
-PARTS = ".sparklod-{}.part"
+from . import leftovers
 
 #: The flag that opens an unnamed file in a folder; None where the system has none.
 UNNAMED: int | None = getattr(os, "O_TMPFILE", None)
@@ -50,12 +42,12 @@ def write(target: Path, pieces: Iterable[bytes], *, overwrite: bool) -> int:
         FileExistsError: the file exists, and `overwrite` is not set.
         OSError: the file system reported an error.
     """
-    _sweep(target.parent)
+    leftovers.sweep(target.parent)
     descriptor = _open_unnamed(target, overwrite)
     if descriptor is None:
         return _write_named(target, pieces, overwrite)
     with os.fdopen(descriptor, "w+b") as file:
-        size = _fill(file, pieces)
+        size = fill(file, pieces)
         try:
             _name(file, target, overwrite)
         except FileExistsError:
@@ -66,7 +58,8 @@ def write(target: Path, pieces: Iterable[bytes], *, overwrite: bool) -> int:
     return size
 
 
-def _fill(file: BinaryIO, pieces: Iterable[bytes]) -> int:
+def fill(file: BinaryIO, pieces: Iterable[bytes]) -> int:
+    """Writes the content of a file and syncs it; returns its size in bytes."""
     size = sum(map(file.write, pieces))
     file.flush()
     os.fsync(file.fileno())
@@ -110,7 +103,7 @@ def _name(file: BinaryIO, target: Path, overwrite: bool) -> None:
             mode = _replaced_mode(target, overwrite)  # another process created it first
     if mode is not None:
         os.fchmod(number, mode)
-    _lock(number)
+    leftovers.lock(number)
     temporary = _part_of(target)
     try:
         _link(number, temporary)  # link() cannot replace a file, so it has two names for a moment
@@ -129,13 +122,13 @@ def _write_named(target: Path, pieces: Iterable[bytes], overwrite: bool) -> int:
     temporary, descriptor = _open_part(target, overwrite)
     try:
         with os.fdopen(descriptor, "w+b") as file:
-            size = _fill(file, pieces)
+            size = fill(file, pieces)
             mode = _replaced_mode(target, overwrite)
             if mode is not None:
                 temporary.chmod(mode)
-            if fcntl is None:
+            if not leftovers.HAS_LOCKS:
                 file.close()  # Windows cannot rename an open file
-            _rename(temporary, target, overwrite)
+            rename(temporary, target, overwrite)
     finally:
         temporary.unlink(missing_ok=True)
     return size
@@ -143,7 +136,7 @@ def _write_named(target: Path, pieces: Iterable[bytes], overwrite: bool) -> int:
 
 def _part_of(target: Path) -> Path:
     """A unique temporary name in the folder of a file."""
-    return target.with_name(PARTS.format(secrets.token_hex(8)))
+    return target.with_name(leftovers.unique(leftovers.PARTS))
 
 
 def _open_part(target: Path, overwrite: bool) -> tuple[Path, int]:
@@ -151,14 +144,15 @@ def _open_part(target: Path, overwrite: bool) -> tuple[Path, int]:
     while True:
         temporary = _part_of(target)
         descriptor = os.open(temporary, _FLAGS | os.O_CREAT | os.O_EXCL, _first_mode(target, overwrite))
-        _lock(descriptor)
+        leftovers.lock(descriptor)
         with contextlib.suppress(FileNotFoundError):  # another process removed it before it was locked
             if os.path.samestat(os.fstat(descriptor), temporary.stat()):
                 return temporary, descriptor
         os.close(descriptor)
 
 
-def _rename(temporary: Path, target: Path, overwrite: bool) -> None:
+def rename(temporary: Path, target: Path, overwrite: bool) -> None:
+    """Gives a complete file its name; `FileExistsError` if that is taken, and `overwrite` is not set."""
     if overwrite:
         temporary.replace(target)
         return
@@ -170,34 +164,3 @@ def _rename(temporary: Path, target: Path, overwrite: bool) -> None:
         if target.exists():
             raise FileExistsError from None
         temporary.replace(target)
-
-
-def _lock(descriptor: int) -> None:
-    """Locks a file until it is closed or its process ends; does nothing if the file system has no locks."""
-    if fcntl is not None:
-        with contextlib.suppress(OSError):
-            fcntl.flock(descriptor, fcntl.LOCK_EX)
-
-
-@functools.lru_cache(256)
-def _sweep(folder: Path) -> None:
-    """Removes the temporary files of killed writers from a folder; once, as it may get thousands of files."""
-    with contextlib.suppress(OSError):
-        for path in list(folder.glob(PARTS.format("*"))):
-            with contextlib.suppress(OSError):
-                if fcntl is None:
-                    path.unlink()
-                else:
-                    _remove_unlocked(path)
-
-
-def _remove_unlocked(path: Path) -> None:
-    """Removes a temporary file of this user that no process has locked; raises `OSError` if it is locked."""
-    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)  # it may be read-only
-    try:
-        status = os.fstat(descriptor)
-        if stat.S_ISREG(status.st_mode) and status.st_uid == os.geteuid():
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            path.unlink()
-    finally:
-        os.close(descriptor)

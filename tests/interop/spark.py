@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sparklod_cli.model.nodes import CHUNK_NODES
 from tests.interop.node import Node
 
 PROGRAM = Path(__file__).with_name("spark_load.mjs")
@@ -77,6 +78,20 @@ class Traversed:
     pixel_limit: float
 
 
+@dataclass(frozen=True)
+class PageUpdate:
+    """A chunk of a paged tree that is loaded into a page, or removed from it.
+
+    Attributes:
+        words: four words a node of the chunk; None removes it.
+    """
+
+    tree: int
+    chunk: int
+    page: int
+    words: NDArray[np.uint32] | None
+
+
 class Spark:
     """One Node process with Spark's worker, which loads one file after the other."""
 
@@ -132,13 +147,44 @@ class Spark:
         path.unlink()
         return tree
 
+    def new_pool(self, pages: int) -> int:
+        """Makes a page pool in Spark's worker, for trees that are loaded chunk by chunk; returns its id."""
+        pool: int = self._node.ask({"method": "newLodTree", "options": {"capacity": pages * CHUNK_NODES}})["lodId"]
+        return pool
+
+    def new_paged_tree(self, pool: int) -> int:
+        """Makes a tree in a page pool, none of its chunks resident; returns its id."""
+        tree: int = self._node.ask({"method": "newSharedLodTree", "options": {"lodId": pool}})["lodId"]
+        return tree
+
+    def update_pages(self, updates: Sequence[PageUpdate]) -> None:
+        """Puts chunks of trees into pages and removes others, in this order."""
+        ranges: list[dict[str, int]] = []
+        path, nodes = self._scratch / "tree", 0
+        with path.open("wb") as file:
+            for each in updates:
+                place = {
+                    "lodId": each.tree,
+                    "pageBase": each.page * CHUNK_NODES,
+                    "chunkBase": each.chunk * CHUNK_NODES,
+                    "count": CHUNK_NODES,  # Spark removes whole pages, however many nodes were in them
+                }
+                if each.words is not None:
+                    place |= {"count": len(each.words), "start": nodes}
+                    file.write(each.words.tobytes())
+                    nodes += len(each.words)
+                ranges.append(place)
+        self._node.ask({"method": "updateLodTrees", "path": str(path), "options": {"ranges": ranges}})
+        path.unlink()
+
     def traverse(self, budget: int, smallest: float, instances: Sequence[Mapping[str, Any]]) -> Traversed:
         """Finds a cut, as `SparkRenderer` does.
 
         Args:
             budget: number of splats at most.
             smallest: the pixel-scale limit.
-            instances: lodId, viewToObjectCols, lodScale, behindFoveate, coneFov0, coneFov and coneFoveate of each.
+            instances: lodId, viewToObjectCols, lodScale, behindFoveate, coneFov0, coneFov and coneFoveate of each, and
+                of paged trees rootPage.
         """
         options = {
             "maxSplats": budget,

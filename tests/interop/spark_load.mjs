@@ -9,6 +9,10 @@
 // answer is {counts, chunks, pixelLimit, arrays}: nodes of each instance, [lodId, chunk] of what was looked into, and
 // the nodes' indices, one instance after the other.
 //
+// A paged tree: {method: "newLodTree", options: {capacity}} makes a page pool and {method: "newSharedLodTree", options:
+// {lodId}} a tree in it; both answer {lodId}. {method: "updateLodTrees", path, options: {ranges}} puts chunks into pages,
+// or removes them: `ranges` are the worker's, with `start` in place of `lodTreeData`, the first node in the raw file.
+//
 // In a page Spark starts a Web Worker from the source that its module holds as a string, and posts it the wasm that
 // the module holds in base64. Here an EventTarget stands in for the worker's global scope.
 import { readFileSync, writeFileSync } from 'node:fs';
@@ -55,6 +59,16 @@ async function initLodTree(path) {
   return { lodId };
 }
 
+async function updateLodTrees(path, ranges) {
+  const words = path && uint32s(path);
+  const withData = ({ start, ...range }) => ({
+    ...range,
+    lodTreeData: start === undefined ? undefined : words.slice(4 * start, 4 * (start + range.count)),
+  });
+  await call('updateLodTrees', { ranges: ranges.map(withData) });
+  return {};
+}
+
 async function traverseLodTrees(options, out) {
   const keys = options.instances.map((_, at) => `instance ${at}`);
   const instances = Object.fromEntries(keys.map((key, at) => [key, { instanceId: key, ...options.instances[at] }]));
@@ -67,6 +81,8 @@ async function traverseLodTrees(options, out) {
 
 async function answer({ method, path, name, options, out }) {
   if (method === 'initLodTree') return initLodTree(path);
+  if (method === 'newLodTree' || method === 'newSharedLodTree') return call(method, options);
+  if (method === 'updateLodTrees') return updateLodTrees(path, options.ranges);
   if (method === 'traverseLodTrees') return traverseLodTrees(options, out);
   const result = await call(method, { ...options, fileBytes: new Uint8Array(readFileSync(path)), pathName: name });
   const splats = result.lodSplats ?? result;

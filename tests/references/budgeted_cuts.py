@@ -109,7 +109,7 @@ def budgeted_cut(
             break
         chunks = {int(view["chunk_base"]) + (child >> bits) for child in range(start, start + count)}
         resident = all(is_resident(chunk) for chunk in chunks)
-        if count and resident and len(drawn) + len(heap) - 1 + count > budget:
+        if count and len(drawn) + len(heap) - 1 + count > budget:
             cut.stop = number_of(own), instance, index
             break
         heapq.heappop(heap)

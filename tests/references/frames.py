@@ -138,7 +138,7 @@ def frame(
         nodes = instances[number].nodes
         count, start = int(nodes.child_count[node]), int(nodes.child_start[node])
         chunks = {start // CHUNK, (start + count - 1) // CHUNK} if count else set()
-        if count and are_resident(chunks) and len(drawn) + len(queue) - 1 + count > budget:
+        if count and len(drawn) + len(queue) - 1 + count > budget:
             reason = "budget"
             break
         heapq.heappop(queue)

@@ -112,7 +112,7 @@ def test_a_full_disk_leaves_no_part_of_a_file(tmp_path: Path, monkeypatch: pytes
     def full(file: object, pieces: object) -> int:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(atomic, "_fill", full)
+    monkeypatch.setattr(atomic, "fill", full)
     told: list[str] = []
     assert compiled(tmp_path, told)(2.0) == 4
     assert "no space left on device" in told[0]

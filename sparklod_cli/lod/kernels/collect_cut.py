@@ -37,10 +37,10 @@ def collect_cut(trees, stop, slots, wanted, cut, count, runs, low):
         trees, stop, slots, wanted, cut: as for `find_cut`; `slots.pending` is overwritten.
         count: number of slots in use.
         runs: number of refined nodes in `slots.queue`.
-        low: the bucket in which the budget ends, -1 if it does not.
+        low: the bucket in which the budget may end, -1 if it does not.
 
     Returns:
-        as `find_cut`.
+        as `find_cut`; `last` is -1 if the budget does not end in this bucket, and there is no cut unless `low` is -1.
     """
     nodes, views, _, _ = trees
     smallest, budget = stop
@@ -48,8 +48,9 @@ def collect_cut(trees, stop, slots, wanted, cut, count, runs, low):
     wanted[:] = 0
     for run in range(runs):
         at = queue[run]
-        if first[run] == first[run + 1] and (limit[at] & ~LEAF) >> BUCKET_BITS <= low:
+        if first[run] == first[run + 1]:  # missing: no longer a leaf where the queue decides, and again one above
             limit[at] &= ~LEAF
+            limit[at] |= LEAF if limit[at] >> BUCKET_BITS > low else 0
     selected, length, leaves, missing, small = 0, 0, 0, len(views) - first[0], 0
     least = INFINITE_BITS
     # Nodes from `bottom` on go through the queue, those from `top` on are refined before that.
@@ -100,8 +101,9 @@ def collect_cut(trees, stop, slots, wanted, cut, count, runs, low):
         base = view.node_base
         start = np.int64(nodes[base + node[at]].child_start)
         children = np.int64(nodes[base + node[at]].child_count)
-        can_refine = children > 0 and is_resident(trees, view, start, children)
-        if can_refine and drawn + children - 1 > budget:
+        if limit[at] >> BUCKET_BITS < low:
+            break
+        if drawn + children - 1 > budget:  # even if they are not resident, as in Spark
             for entry in range(length):
                 queued_at = heap[entry]
                 put(cut, selected, node[queued_at], path[queued_at], instance[queued_at])
@@ -117,7 +119,7 @@ def collect_cut(trees, stop, slots, wanted, cut, count, runs, low):
         sift_down(node, limit, instance, heap, length)
         if children:
             request_chunks(wanted, trees, view, start, children, from_bits(path[at]))
-        if not can_refine:
+        if children == 0 or not is_resident(trees, view, start, children):
             missing += children > 0
             put(cut, selected, node[at], path[at] | LEAF, instance[at])
             selected += 1

@@ -6,7 +6,7 @@ import numpy as np
 
 from ...support.jit import kernel
 from .collect_cut import collect_cut
-from .cut_arrays import BUCKET_BITS, FULL, INFINITE_BITS, LEAF, from_bits, is_resident, limit_bits, to_bits
+from .cut_arrays import BUCKET_BITS, BUCKETS, FULL, INFINITE_BITS, LEAF, from_bits, is_resident, limit_bits, to_bits
 from .pixel_scale import ZERO
 
 #: The first threshold without a guess, as a share of the largest root's pixel scale; least and most share to which a
@@ -24,7 +24,8 @@ def find_cut(trees, stop, guess, slots, wanted, cut):
     the path from the root to it. So all nodes with a limit above a threshold are refined, in the order in which they
     are in memory, and the threshold is lowered until their number is what the budget allows. If they are more, it is
     raised again: `slots.sums` has the number of nodes that each bucket of limits added. Only the bucket in which the
-    budget ends is refined in the order of the queue.
+    budget ends is refined in the order of the queue. A node that would exceed the budget ends the cut whether or not
+    its children are resident.
 
     Args:
         trees: `Trees`.
@@ -47,7 +48,7 @@ def find_cut(trees, stop, guess, slots, wanted, cut):
     smallest, budget = stop
     node, limit, instance, first, queue, pending, _, sums = slots
     sums[:] = 0
-    count, runs, ready, waiting = 0, 0, 0, 0
+    count, runs, ready, waiting, gaps = 0, 0, 0, 0, 0
     largest = np.int32(0)
     if len(views) > len(node):
         return 0, FULL, 0, ZERO, -1
@@ -92,6 +93,7 @@ def find_cut(trees, stop, guess, slots, wanted, cut):
             children = np.int64(nodes[base + node[at]].child_count)
             if not is_resident(trees, view, start, children):
                 limit[at] |= LEAF  # from here on a leaf
+                gaps += 1
                 continue
             if count + children > len(node):
                 return 0, FULL, 0, ZERO, -1
@@ -126,4 +128,50 @@ def find_cut(trees, stop, guess, slots, wanted, cut):
     if drawn <= budget:
         low = -1  # nothing was refined in vain
     # Literals would be compiled as types of their own.
-    return collect_cut(trees, stop, slots, wanted, cut, np.int64(count), np.int64(runs), np.int64(low))
+    count, runs, low = np.int64(count), np.int64(runs), np.int64(low)
+    bucket = low
+    if gaps:
+        sum_from_top(slots, low)
+        bucket = stopping_bucket(trees, slots, budget, runs, low, np.int64(BUCKETS))
+    while True:
+        selected, reason, missing, least, last = collect_cut(trees, stop, slots, wanted, cut, count, runs, bucket)
+        if last >= 0 or reason == FULL or bucket == low:
+            return selected, reason, missing, least, last
+        bucket = stopping_bucket(trees, slots, budget, runs, low, bucket)
+
+
+@kernel(nogil=True)
+def sum_from_top(slots, low):
+    """Turns `slots.sums` above a bucket into the number of nodes of the cut when all down to a bucket are refined."""
+    total = slots.first[0]
+    for bucket in range(BUCKETS - 1, low, -1):
+        total += slots.sums[bucket]
+        slots.sums[bucket] = total
+
+
+@kernel(nogil=True)
+def stopping_bucket(trees, slots, budget, runs, low, below):
+    """The next bucket in which the budget may end: that of a node whose children are missing, or else `low`.
+
+    As in Spark, refinement also ends at a node whose children would exceed the budget but are not resident. They are in
+    no sum. So the budget may end in a bucket where it does not suffice for all that the bucket adds and such children.
+
+    Args:
+        trees: `Trees`.
+        slots: `Slots`, after `sum_from_top`.
+        budget: number of nodes of a cut.
+        runs: number of refined nodes in `slots.queue`.
+        low: the bucket in which resident nodes exceed the budget, -1 if they do not.
+        below: only buckets below this one.
+    """
+    nodes, views, _, _ = trees
+    node, limit, instance, first, queue, _, _, sums = slots
+    found = low
+    for run in range(runs):
+        if first[run] == first[run + 1]:
+            at = queue[run]
+            bucket = np.int64((limit[at] & ~LEAF) >> BUCKET_BITS)
+            children = np.int64(nodes[views[instance[at]].node_base + node[at]].child_count)
+            if found < bucket < below and sums[bucket] + children - 1 > budget:
+                found = bucket
+    return found

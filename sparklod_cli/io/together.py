@@ -1,0 +1,98 @@
+"""Writes the files of one output, a header and its chunks, so that all of them appear or none does."""
+
+from __future__ import annotations
+
+import functools
+import os
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+from ..codecs.rad_names import CHUNK_SUFFIX, number_of
+from ..support import atomic_set
+from ..support.errors import OutputError
+from ..support.stdin import DASH
+from .names import reason_of
+from .writing import check_writable
+
+#: The name and content of each file; the header comes last.
+Files = Iterable[tuple[str, Iterable[bytes]]]
+
+#: Writes the files of an output and returns how many bytes it wrote.
+SinkTogether = Callable[[Files], int]
+
+
+def chunk_files(path: Path) -> list[Path]:
+    """The files beside a header that are called as its chunks would be, whether it names them or not.
+
+    Args:
+        path: of a header, which need not exist.
+    """
+    target = Path(os.path.realpath(path))
+    try:
+        found = {number_of(each.name, target.stem): each for each in target.parent.iterdir()}
+    except OSError:
+        return []
+    return [found[number] for number in sorted(number for number in found if number is not None)]
+
+
+def write_together(path: Path, files: Files, *, overwrite: bool) -> int:
+    """Writes a header and the files of its chunks, all or none of them, and returns their size; makes their folder.
+
+    With `overwrite`, chunks of a longer output that was there before are removed. See `atomic_set.write` for what an
+    interruption leaves.
+
+    Args:
+        path: of the header; where it is a symbolic link, all files go to where that leads.
+        files: names in the folder of the header, and their content; the last is the header, whose name is that of
+            `path`.
+        overwrite: replace existing files.
+
+    Raises:
+        OutputError: a file exists and `overwrite` is not set, or the file system refused something.
+    """
+    _check(path, overwrite=overwrite)
+    target = Path(os.path.realpath(path))
+    placed = ((name if name.endswith(CHUNK_SUFFIX) else target.name, pieces) for name, pieces in files)
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        return atomic_set.write(
+            target.parent,
+            placed,
+            overwrite=overwrite,
+            outdated=lambda names: (each.name for each in chunk_files(target) if each.name not in names),
+        )
+    except FileExistsError as error:
+        raise _taken(Path(error.filename or path)) from None
+    except OSError as error:
+        raise OutputError(f"cannot write {path}: {reason_of(error)}") from None
+
+
+def sink_together(path: Path, *, overwrite: bool) -> SinkTogether:
+    """The function that writes a header and the files of its chunks. Fails now if they cannot be written later.
+
+    Raises:
+        OutputError: it is no place for several files, or see `check_writable`.
+    """
+    _check(path, overwrite=overwrite)
+    return functools.partial(write_together, path, overwrite=overwrite)
+
+
+def _check(path: Path, *, overwrite: bool) -> None:
+    if path == DASH:
+        raise OutputError("standard output cannot take several files; name a file")
+    check_writable(path, overwrite=overwrite)
+    if path.exists() and not path.is_file():
+        raise OutputError(f"{path} is a pipe or a device, which cannot take several files; name a file")
+    for each in chunk_files(path):
+        if not overwrite or _is_no_file(each):
+            raise _taken(each)
+
+
+def _taken(path: Path) -> OutputError:
+    if _is_no_file(path):
+        return OutputError(f"{path} is not a file; move it away, or name another output")
+    return OutputError(f"{path} exists, add --overwrite to replace it")
+
+
+def _is_no_file(path: Path) -> bool:
+    return path.exists() and not path.is_file()

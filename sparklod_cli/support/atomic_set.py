@@ -1,0 +1,130 @@
+"""Atomic writes of several files that belong together: all of them get their names, or none does.
+
+They are filled and synced in a hidden folder beside their places, which is locked while its writer is alive, so that
+the next run can recognise and remove what a killed one left behind. Only then do they get their names, the one that the
+others mean nothing without last.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import shutil
+import stat
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from pathlib import Path
+
+from . import atomic, leftovers
+
+#: The folder inside the hidden one for the files that are being replaced.
+FORMER = "former"
+
+
+def write(
+    folder: Path,
+    files: Iterable[tuple[str, Iterable[bytes]]],
+    *,
+    overwrite: bool,
+    outdated: Callable[[Collection[str]], Iterable[str]] = lambda names: (),
+) -> int:
+    """Writes files of one folder that appear together, and returns their size in bytes.
+
+    The last file is the one that readers open first. Where files are replaced, that one is taken away before any other
+    is touched, and is the last to get its name: for that time, some milliseconds, there is none. An error or an
+    interrupt at any time leaves the former files; a kill within these milliseconds leaves new ones without the last.
+
+    Permissions are those of `atomic.write`.
+
+    Args:
+        folder: of all files.
+        files: the name of each, and its content in order.
+        overwrite: replace existing files.
+        outdated: given the names of the files, those of existing files that are removed where `overwrite` is set.
+
+    Raises:
+        FileExistsError: a file exists, and `overwrite` is not set; has its path.
+        OSError: the file system reported an error.
+    """
+    leftovers.sweep(folder)
+    with _stage(folder) as stage:
+        size, names = 0, list[str]()
+        for name, pieces in files:
+            with (stage / name).open("xb") as file:
+                size += atomic.fill(file, pieces)
+            names.append(name)
+        try:
+            if overwrite:
+                (stage / FORMER).mkdir()
+                _put_aside(stage, [*names[-1:], *names[:-1], *outdated(names)])
+            else:
+                _refuse_existing(folder / name for name in names)
+            for name in names:
+                atomic.rename(stage / name, folder / name, overwrite)
+        except BaseException:
+            _undo(stage, names)
+            raise
+    return size
+
+
+def _refuse_existing(paths: Iterable[Path]) -> None:
+    for path in paths:
+        if os.path.lexists(path):
+            raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))
+
+
+def _put_aside(stage: Path, names: Sequence[str]) -> None:
+    """Moves the files that will be replaced into the hidden folder; their permissions go over to the new ones."""
+    for name in names:
+        former, part = stage.parent / name, stage / name
+        with contextlib.suppress(FileNotFoundError):
+            mode = former.stat().st_mode
+            if not stat.S_ISREG(mode):
+                raise FileExistsError(errno.EEXIST, "is not a file", str(former))
+            if part.exists():
+                part.chmod(stat.S_IMODE(mode) & 0o777)
+            former.rename(stage / FORMER / name)
+
+
+def _undo(stage: Path, names: Sequence[str]) -> None:
+    """Takes the names away again that files have been given, and gives former files theirs back, the last file last.
+
+    What has been done is seen in the folders, so that an interrupt between two steps is undone, too.
+    """
+    for name in reversed(names):
+        path, part = stage.parent / name, stage / name
+        with contextlib.suppress(FileNotFoundError):
+            if not part.exists() or path.samefile(part):
+                path.unlink()
+    former = stage / FORMER
+    if former.exists():
+        last = names[-1:]
+        for path in sorted(former.iterdir(), key=lambda path: path.name in last):
+            path.replace(stage.parent / path.name)
+
+
+@contextlib.contextmanager
+def _stage(folder: Path) -> Iterator[Path]:
+    """A new hidden folder, locked, which nobody else can look into; it is removed at the end."""
+    stage, descriptor = _open_stage(folder)
+    try:
+        yield stage
+    finally:
+        shutil.rmtree(stage, ignore_errors=True)
+        if descriptor is not None:
+            os.close(descriptor)
+
+
+def _open_stage(folder: Path) -> tuple[Path, int | None]:
+    """Creates a locked, hidden folder; its path, and the descriptor that holds the lock, None where there are none."""
+    while True:
+        stage = folder / leftovers.unique(leftovers.STAGES)
+        stage.mkdir(0o700)
+        if not leftovers.HAS_LOCKS:
+            return stage, None
+        with contextlib.suppress(FileNotFoundError):  # another process removed it before it was locked
+            descriptor = os.open(stage, os.O_RDONLY | os.O_CLOEXEC)
+            leftovers.lock(descriptor)
+            if stage.exists():
+                return stage, descriptor
+            os.close(descriptor)

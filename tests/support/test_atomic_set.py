@@ -1,0 +1,271 @@
+"""Files that belong together: all of them appear or none, whatever happens on the way."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import random
+import stat
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Collection, Iterable, Iterator
+from pathlib import Path
+
+import pytest
+
+from sparklod_cli.support import atomic, atomic_set, leftovers
+from tests.conftest import ROOT
+
+pytestmark = pytest.mark.skipif(os.name != "posix", reason="POSIX only")
+
+#: Chunks and what names them, as they were and as they are to be.
+OLD = {"a-0": b"old 0", "a-1": b"old 1", "a-2": b"old 2", "a": b"old"}
+NEW = {"a-0": b"new 0", "a-1": b"new 1", "a": b"new"}
+OTHERS = {"b-0": b"precious", "a-9": b"precious"}
+
+
+def files(content: dict[str, bytes]) -> Iterable[tuple[str, Iterable[bytes]]]:
+    return ((name, [data[:2], data[2:]]) for name, data in content.items())
+
+
+def longer(names: Collection[str]) -> list[str]:
+    """The chunk that only `OLD` has."""
+    return ["a-2"] if "a-2" not in names else []
+
+
+def put(folder: Path, *contents: dict[str, bytes]) -> None:
+    for content in contents:
+        for name, data in content.items():
+            (folder / name).write_bytes(data)
+
+
+def held(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+@pytest.fixture(autouse=True)
+def first_run() -> None:
+    leftovers.sweep.cache_clear()
+
+
+def test_files_appear_together(tmp_path: Path) -> None:
+    seen: list[set[str]] = []
+
+    def some() -> Iterator[tuple[str, Iterable[bytes]]]:
+        for each in files(NEW):
+            seen.append({path.name for path in tmp_path.iterdir() if not path.name.startswith(".sparklod-")})
+            yield each
+
+    assert atomic_set.write(tmp_path, some(), overwrite=False) == sum(map(len, NEW.values()))
+    assert seen == [set()] * len(NEW)
+    assert held(tmp_path) == NEW
+
+
+def test_files_are_replaced_together_and_outdated_ones_removed(tmp_path: Path) -> None:
+    put(tmp_path, OLD, OTHERS)
+    atomic_set.write(tmp_path, files(NEW), overwrite=True, outdated=longer)
+    assert held(tmp_path) == NEW | OTHERS
+
+
+@pytest.mark.parametrize("taken", NEW)
+def test_nothing_is_replaced_without_leave(taken: str, tmp_path: Path) -> None:
+    put(tmp_path, {taken: b"precious"})
+    with pytest.raises(FileExistsError) as raised:
+        atomic_set.write(tmp_path, files(NEW), overwrite=False, outdated=longer)
+    assert raised.value.filename == str(tmp_path / taken)
+    assert held(tmp_path) == {taken: b"precious"}
+
+
+@pytest.mark.parametrize("taken", NEW)
+def test_a_name_that_is_taken_meanwhile_is_not_replaced(
+    taken: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def later(paths: Iterable[Path]) -> None:
+        put(tmp_path, {taken: b"another's"})
+
+    monkeypatch.setattr(atomic_set, "_refuse_existing", later)
+    with pytest.raises(FileExistsError):
+        atomic_set.write(tmp_path, files(NEW), overwrite=False)
+    assert held(tmp_path) == {taken: b"another's"}
+
+
+def test_a_folder_with_the_name_of_a_file_is_left_alone(tmp_path: Path) -> None:
+    put(tmp_path, OLD)
+    (tmp_path / "a-1").unlink()
+    (tmp_path / "a-1").mkdir()
+    with pytest.raises(FileExistsError, match="is not a file"):
+        atomic_set.write(tmp_path, files(NEW), overwrite=True, outdated=longer)
+    (tmp_path / "a-1").rmdir()
+    assert held(tmp_path) == {name: data for name, data in OLD.items() if name != "a-1"}
+
+
+@pytest.mark.parametrize("error", [RuntimeError("broken"), KeyboardInterrupt(), OSError(errno.ENOSPC, "full")])
+@pytest.mark.parametrize("number", range(3))
+@pytest.mark.parametrize("existing", [False, True])
+def test_an_error_while_they_are_filled_changes_nothing(
+    error: BaseException, number: int, existing: bool, tmp_path: Path
+) -> None:
+    def pieces(fails: bool) -> Iterator[bytes]:
+        yield b"half a"
+        if fails:
+            raise error
+
+    before = OLD | OTHERS if existing else OTHERS
+    put(tmp_path, before)
+    with pytest.raises(type(error)):
+        some = ((name, pieces(place == number)) for place, name in enumerate(NEW))
+        atomic_set.write(tmp_path, some, overwrite=existing, outdated=longer)
+    assert held(tmp_path) == before
+
+
+#: Where a call of the file system is broken off: before it has done its work, or after.
+Broken = Callable[..., object]
+STEPS = [(Path, "rename"), (Path, "replace"), (os, "link"), (Path, "chmod")]
+
+
+def breaking(work: Broken, call: int, after: bool, error: BaseException) -> tuple[Broken, list[int]]:
+    """A function that raises at a call, and what counts its calls."""
+    calls: list[int] = []
+
+    def wrapped(*args: object, **how: object) -> object:
+        calls.append(1)
+        if len(calls) == call + 1:
+            if after:
+                work(*args, **how)
+            raise error
+        return work(*args, **how)
+
+    return wrapped, calls
+
+
+@pytest.mark.parametrize("after", [False, True])
+@pytest.mark.parametrize("step", STEPS, ids=lambda step: step[1])
+@pytest.mark.parametrize("existing", [False, True])
+@pytest.mark.parametrize("links", [False, True])
+def test_an_error_or_interrupt_at_any_step_leaves_what_was_there(
+    step: tuple[object, str], existing: bool, after: bool, links: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if not links:
+
+        def refused(*args: object, **how: object) -> None:
+            raise PermissionError(1, "Operation not permitted")
+
+        monkeypatch.setattr(os, "link", refused)
+    reached = 0
+    for call in range(9):
+        folder = tmp_path / str(call)
+        folder.mkdir()
+        before = OLD | OTHERS if existing else OTHERS
+        put(folder, before)
+        with monkeypatch.context() as patch:
+            wrapped, calls = breaking(getattr(*step), call, after, KeyboardInterrupt())
+            patch.setattr(*step, wrapped)
+            with contextlib.suppress(KeyboardInterrupt):
+                atomic_set.write(folder, files(NEW), overwrite=existing, outdated=longer)
+                before = NEW | OTHERS
+        if len(calls) <= call:
+            break
+        reached += 1
+        assert held(folder) == before, (call, len(calls))
+    expected = {("rename", True): 4, ("replace", True): 3, ("chmod", True): 3, ("link", False): 3}
+    assert reached == (3 if not links and step[1] == "replace" else expected.get((step[1], existing), 0))
+
+
+@pytest.mark.parametrize("mask", [0o022, 0o077])
+def test_permissions_are_those_of_what_is_replaced_or_of_the_umask(mask: int, tmp_path: Path) -> None:
+    put(tmp_path, {"a-1": b"old"})
+    (tmp_path / "a-1").chmod(0o4640)
+    seen: list[int] = []
+
+    def some() -> Iterator[tuple[str, Iterable[bytes]]]:
+        for each in files(NEW):
+            seen.extend(stat.S_IMODE(path.stat().st_mode) for path in tmp_path.glob(leftovers.STAGES.format("*")))
+            yield each
+
+    before = os.umask(mask)
+    try:
+        atomic_set.write(tmp_path, some(), overwrite=True)
+    finally:
+        os.umask(before)
+    assert seen == [0o700] * 3
+    modes = {name: stat.S_IMODE((tmp_path / name).stat().st_mode) for name in NEW}
+    assert modes == {"a-0": 0o666 & ~mask, "a-1": 0o640, "a": 0o666 & ~mask}
+
+
+def stage(folder: Path, name: str = "0123456789abcdef") -> Path:
+    """A hidden folder as a killed writer leaves it."""
+    left = folder / leftovers.STAGES.format(name)
+    (left / atomic_set.FORMER).mkdir(parents=True)
+    put(left, NEW)
+    put(left / atomic_set.FORMER, OLD)
+    return left
+
+
+@pytest.mark.parametrize("one", [False, True])
+def test_the_next_run_removes_what_killed_writers_left(one: bool, tmp_path: Path) -> None:
+    stage(tmp_path)
+    kept = stage(tmp_path, "precious")
+    if one:
+        atomic.write(tmp_path / "a", [b"x"], overwrite=False)
+    else:
+        atomic_set.write(tmp_path, files(NEW), overwrite=False)
+    assert {path.name for path in tmp_path.iterdir()} == {kept.name, *(["a"] if one else NEW)}
+    assert (kept / atomic_set.FORMER / "a").exists()
+
+
+def test_the_folder_of_a_running_process_is_left_alone(tmp_path: Path) -> None:
+    def some() -> Iterator[tuple[str, Iterable[bytes]]]:
+        for each in files(NEW):
+            leftovers.sweep.cache_clear()
+            atomic.write(tmp_path / "other", [b"inner"], overwrite=True)
+            yield each
+
+    atomic_set.write(tmp_path, some(), overwrite=False)
+    assert held(tmp_path) == NEW | {"other": b"inner"}
+
+
+def test_a_folder_swept_before_it_is_locked_is_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    lock = leftovers.lock
+    rounds: list[int] = []
+
+    def late(descriptor: int) -> None:
+        if not rounds:
+            next(tmp_path.iterdir()).rmdir()
+        rounds.append(descriptor)
+        lock(descriptor)
+
+    monkeypatch.setattr(leftovers, "lock", late)
+    atomic_set.write(tmp_path, files(NEW), overwrite=False)
+    assert len(rounds) == 2
+    assert held(tmp_path) == NEW
+
+
+#: Replaces a set by another one for ever; all of its files say which they belong to.
+WRITER = """
+import itertools, pathlib, sys
+from sparklod_cli.support import atomic_set
+folder = pathlib.Path(sys.argv[1])
+print("ready", flush=True)
+for number in itertools.count():
+    text = [str(number).encode() * 1000]
+    atomic_set.write(folder, ((name, text) for name in ("a-0", "a-1", "a-2", "a")), overwrite=True)
+"""
+
+
+def test_a_killed_writer_never_leaves_two_sets_under_one_header(tmp_path: Path) -> None:
+    chance, whole = random.Random(2), 0
+    for _ in range(12):
+        with subprocess.Popen([sys.executable, "-c", WRITER, tmp_path], stdout=subprocess.PIPE, cwd=ROOT) as process:
+            assert process.stdout is not None
+            assert process.stdout.readline() == b"ready\n"
+            time.sleep(chance.uniform(0, 0.1))
+            process.kill()
+        if (tmp_path / "a").exists():
+            whole += 1
+            assert len({(tmp_path / name).read_bytes() for name in ("a-0", "a-1", "a-2", "a")}) == 1
+        leftovers.sweep.cache_clear()
+        leftovers.sweep(tmp_path)
+        assert {path.name for path in tmp_path.iterdir()} <= {"a-0", "a-1", "a-2", "a"}
+    assert whole
