@@ -38,14 +38,17 @@ def survey_file(file: BinaryIO, beside: Beside) -> tuple[Header, tuple[Violation
     refuse_chunk(file)
     size = size_of(file)
     header = read_header(file)
-    files: dict[str, int | str] = {}
-    for name in dict.fromkeys(entry.filename for entry in header.chunks if entry.filename is not None):
-        try:
-            with contextlib.closing(beside(name)) as chunk:
-                files[name] = size_of(chunk)
-        except FormatError as error:
-            files[name] = str(error)
-    return header, tuple(violations(header, size, files))
+    names = dict.fromkeys(entry.filename for entry in header.chunks if entry.filename is not None)
+    return header, tuple(violations(header, size, {name: _size_beside(name, beside) for name in names}))
+
+
+def _size_beside(name: str, beside: Beside) -> int | str:
+    """Bytes of a file that the header names, or why it cannot be opened."""
+    try:
+        with contextlib.closing(beside(name)) as file:
+            return size_of(file)
+    except FormatError as error:
+        return str(error)
 
 
 def survey_chunks(file: BinaryIO, beside: Beside, header: Header, *, paddings: bool) -> Iterator[ChunkSurvey]:

@@ -14,6 +14,9 @@ if TYPE_CHECKING:
 #: Numbers of children that get a row of their own.
 MOST_ROWS = 8
 
+#: Characters of a comment that are shown; Spark's has 800.
+MOST_COMMENT = 160
+
 #: Depths that get a row of their own; a good tree has some twenty.
 MOST_DEPTHS = 64
 
@@ -49,7 +52,8 @@ def _row(name: str, text: str) -> str:
 
 def _rad(rad: dict[str, Any]) -> Iterator[str]:
     where = "files of their own" if rad["chunked"] else "one file"
-    yield _row("stored", f"{where}, header {size_of(rad['header_bytes'])}, first picture {size_of(rad['first_bytes'])}")
+    header, first = size_of(rad["header_bytes"]), size_of(rad["first_bytes"])
+    yield _row("stored", f"{where}, header {header}, with the first chunk {first}")
     if rad["chunk_bytes"]:
         least, median, most = (size_of(rad["chunk_bytes"][name]) for name in ("min", "median", "max"))
         yield _row("chunks", f"{least} to {most}, median {median}, of {rad['chunk_size']:,} splats")
@@ -65,7 +69,7 @@ def _rad(rad: dict[str, Any]) -> Iterator[str]:
         text = f"{found['encoding']:<12} {found['bytes']:>13,} {share:>7}  {' to '.join(ends)}"
         yield f"    {name:<12} {text}".rstrip()
     if rad["comment"]:
-        yield _row("comment", rad["comment"])
+        yield _row("comment", printable(rad["comment"], MOST_COMMENT))
 
 
 def _ranged(value: float | bool) -> str:
@@ -82,6 +86,8 @@ def _tree(tree: dict[str, Any]) -> Iterator[str]:
     yield _row(
         "", f"{chunks} of 65,536 nodes, {tree['chunks_of_coarse_cut']} of them for the coarsest cut of that many nodes"
     )
+    if tree["split_siblings"]:
+        yield _row("", f"the children of {count_of(tree['split_siblings'], 'node')} lie in more than one chunk")
     counts = sorted(tree["children"].items(), key=lambda item: -item[1])
     shown = ", ".join(f"{children}: {count:,}" for children, count in counts[:MOST_ROWS])
     yield _row(

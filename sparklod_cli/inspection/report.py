@@ -27,6 +27,10 @@ SCHEMA_VERSION = 1
 TREE_COLUMNS = ("scale", "opacity")
 
 
+#: Fields for which the headers of a RAD file are enough.
+HEADER_FIELDS = ("file", "bytes", "format", "splats", "sh_degree", "bytes_per_splat", "compression_ratio", "rad")
+
+
 class NoFieldError(SparklodError):
     """A report has no such field."""
 

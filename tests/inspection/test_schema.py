@@ -171,7 +171,8 @@ def full(lod: Path) -> Report:
     """A report in which nothing is null that need not be."""
     report = report_of(lod, ReportSettings(values=True, all_quantities=True, check=True))
     finding = {"severity": "error", "code": "tree.size", "message": "node 3", "index": 3, "count": 1}
-    report = report | {"findings": [finding], "notes": ["a note"]}
+    rad = report_of(FIXTURES / "golden" / "sh1-tree.rad", ReportSettings())["rad"]
+    report = report | {"findings": [finding], "notes": ["a note"], "rad": rad}
     assert faults(report) == []
     return report
 
@@ -179,10 +180,12 @@ def full(lod: Path) -> Report:
 def may_be_null(way: tuple[Any, ...]) -> bool:
     """Whether a field may be null in a report of a file that was read."""
     if len(way) == 1:
-        return way[0] in ("bytes", "bytes_per_splat", "compression_ratio", "tree", "values", "findings")
+        return way[0] in ("bytes", "bytes_per_splat", "compression_ratio", "rad", "tree", "values", "findings")
     finding, level = way[0] == "findings", "levels" in way
     return (
         way in (("values", "box"), ("values", "box_98"), ("tree", "more_than_opaque"))
+        or way in (("rad", "chunk_bytes"), ("rad", "ranges"), ("rad", "comment"))
+        or (way[:2] == ("rad", "properties") and way[-1] in ("min", "max"))
         or (way[:2] == ("values", "quantities") and len(way) == 4)
         or (finding and way[-1] in ("index", "count"))
         or (level and way[-1] == "size")
@@ -299,10 +302,11 @@ def test_the_page_has_every_code() -> None:
 def test_the_page_has_every_field(full: Report) -> None:
     named = [row[0] for row in rows("The report, field by field")]
     for way in named:
-        value_at(full, re.sub(r"\bN\b", "0", way).replace("NAME", "opacity").replace("CHILDREN", "2"))
+        way = re.sub(r"\bN\b", "0", way).replace("NAME", "opacity").replace("CHILDREN", "2")
+        value_at(full, way.replace("KEY", "rgbMax").replace("PROPERTY", "center"))
     tops = {way.split(".")[0] for way in named}
     assert tops == SCHEMA["properties"].keys()
-    for name in ("tree", "values"):
+    for name in ("rad", "tree", "values"):
         assert {way.split(".")[1] for way in named if way.startswith(f"{name}.")} == full[name].keys()
     assert {way.split(".")[2] for way in named if way.startswith("findings.")} == full["findings"][0].keys()
 
