@@ -209,7 +209,7 @@ def test_a_missing_field_is_noticed(full: Report) -> None:
         changed = copy.deepcopy(full)
         del holder(changed, way)[way[-1]]
         optional = isinstance(way[-1], int) and way[-2] not in ("min", "max")
-        optional |= len(way) > 1 and way[-2] in ("header", "children")
+        optional |= len(way) > 1 and way[-2] in ("header", "children", "properties")
         optional |= len(way) > 1 and way[-2] == "quantities" and way[-1] not in values.MAIN
         assert bool(faults(changed)) != optional, way
 
