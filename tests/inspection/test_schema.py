@@ -199,6 +199,8 @@ def test_a_wrong_type_is_noticed(full: Report) -> None:
         for kind, other in examples.items():
             if kind is right or (kind is int and right is float):
                 continue
+            if right is type(None) and kind in (int, float):  # a range that this property does not have
+                continue
             changed = copy.deepcopy(full)
             holder(changed, way)[way[-1]] = other
             assert bool(faults(changed)) != (other is None and may_be_null(way)), (way, other)
