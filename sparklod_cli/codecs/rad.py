@@ -95,6 +95,7 @@ def examine(
     for done in ordered_map(run, all_chunks(), threads):
         progress("reading", done, header.count, "splat")
     facts = {"version": 1, "chunks": len(header.chunks), "chunk_size": header.chunk_size}
+    facts |= {"header_bytes": header.bytes}
     facts |= {"sh_codes": len(palette)} if palette is not None else {}
     name = "RAD" + " LoD" * (tree is not None)
     return Scene(splats, tree, format=name, header=facts, chunk_bytes=tuple(entry.bytes for entry in header.chunks))
