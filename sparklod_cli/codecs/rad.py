@@ -6,23 +6,31 @@ A file is a header and its chunks, or a header that names a file for each chunk;
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Collection, Iterator
+import itertools
+import json
+import tempfile
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass
 from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .. import __version__
 from ..model.lod_tree import LodTree
+from ..model.nodes import CHUNK_NODES
 from ..model.scene import Scene
 from ..model.sh import COEFFICIENTS
 from ..model.splats import COLUMNS, FloatArray, Splats
 from ..support.errors import FormatError, NotSplatsError, TreeError, TruncatedError
-from ..support.parallel import ordered_map
+from ..support.parallel import blocks_of, ordered_map
 from ..support.progress import Progress, silent
 from . import compression, rad_promises
+from .options import DEFAULTS, WriteOptions
 from .rad_decode import Packed, fill
-from .rad_header import CHUNK_MAGIC, ChunkEntry, ChunkHeader, Header, read_header
+from .rad_encode import Writing
+from .rad_header import CHUNK_MAGIC, ChunkEntry, ChunkHeader, Header, pack_header, read_header
+from .rad_options import settled as settled
 from .stream import size_of
 
 #: Opens a file that a header names.
@@ -99,6 +107,79 @@ def examine(
     facts |= {"sh_codes": len(palette)} if palette is not None else {}
     name = "RAD" + " LoD" * (tree is not None)
     return Scene(splats, tree, format=name, header=facts, chunk_bytes=tuple(entry.bytes for entry in header.chunks))
+
+
+def encode(
+    scene: Scene, options: WriteOptions = DEFAULTS, *, threads: int = 1, progress: Progress = silent
+) -> Iterator[bytes]:
+    """The bytes of one file, piece by piece; the chunks wait in a temporary file for the header, which has their sizes.
+
+    The same scene and options give the same bytes for any number of threads. Nodes keep their order; that of
+    `lod.chunk_order` is for streaming.
+
+    Raises:
+        FormatError, ValueError: see `rad_options.settled`.
+    """
+    writing = _writing(scene, options, threads)
+    sizes = []
+    with tempfile.TemporaryFile() as spool:
+        for chunk in _encoded(writing, threads, progress):
+            spool.write(chunk)
+            sizes.append(len(chunk))
+        spool.seek(0)
+        offsets = itertools.accumulate(sizes, initial=0)
+        yield pack_header(_header(writing, tuple(map(ChunkEntry, offsets, sizes))))
+        while piece := spool.read(compression.PIECE):
+            yield piece
+
+
+def encode_chunked(
+    scene: Scene, options: WriteOptions, stem: str, *, threads: int = 1, progress: Progress = silent
+) -> Iterator[tuple[str, Iterable[bytes]]]:
+    """The files of a scene whose chunks are files of their own: the name of each, and its bytes; the header is last.
+
+    Args:
+        scene, options, threads, progress: as for `encode`.
+        stem: of the names: the header's is "stem.rad", and those of the chunks are "stem-0.radc" and so on.
+
+    Raises:
+        FormatError, ValueError: see `rad_options.settled`.
+    """
+    writing = _writing(scene, options, threads)
+    entries = []
+    for number, chunk in enumerate(_encoded(writing, threads, progress)):
+        entries.append(ChunkEntry(0, len(chunk), f"{stem}-{number}.radc"))
+        yield f"{stem}-{number}.radc", [chunk]
+    yield f"{stem}.rad", [pack_header(_header(writing, tuple(entries)))]
+
+
+def _writing(scene: Scene, options: WriteOptions, threads: int) -> Writing:
+    options = settled(scene, options)
+    assert options.rad.ranges is not None
+    return Writing(scene, options.rad, options.rad.ranges, None, options.compression_level)
+
+
+def _encoded(writing: Writing, threads: int, progress: Progress) -> Iterator[bytes]:
+    """The chunks in order, a few encoded ahead."""
+    parts = blocks_of(len(writing.scene), CHUNK_NODES)
+    for part, chunk in zip(parts, ordered_map(writing.chunk, parts, threads), strict=True):
+        progress("writing", part.stop, len(writing.scene), "splat")
+        yield chunk
+
+
+def _header(writing: Writing, entries: tuple[ChunkEntry, ...]) -> Header:
+    scene = writing.scene
+    return Header(
+        len(scene),
+        scene.splats.sh_degree,
+        scene.tree is not None,
+        CHUNK_NODES,
+        sum(entry.bytes for entry in entries),
+        entries,
+        writing.ranges,
+        None if writing.palette is None else len(writing.palette.codes),
+        json.dumps({"generator": f"sparklod {__version__}"}),
+    )
 
 
 @dataclass(frozen=True, eq=False)
