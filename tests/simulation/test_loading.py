@@ -1,4 +1,4 @@
-"""What a visitor waits for who opens a page and rests there, against closed forms and the frames of a resting camera."""
+"""What a visitor waits for who opens a page and rests: closed forms, and the frames of a resting camera."""
 
 from __future__ import annotations
 
