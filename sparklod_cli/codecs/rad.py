@@ -30,8 +30,12 @@ from .options import DEFAULTS, WriteOptions
 from .rad_decode import Packed, fill
 from .rad_encode import Writing
 from .rad_header import CHUNK_MAGIC, ChunkEntry, ChunkHeader, Header, pack_header, read_header
+from .rad_names import SUFFIX, chunk_name
 from .rad_options import settled as settled
 from .stream import size_of
+
+#: Bytes of chunks that wait in memory for their header; beyond, they wait on disk.
+SPOOLED = 1 << 26
 
 #: Opens a file that a header names.
 Beside = Callable[[str], BinaryIO]
@@ -69,7 +73,8 @@ def examine(
 ) -> Scene:
     """Reads a file for inspection: the given columns of `Splats`, the others are 0; its tree may be broken.
 
-    The header of the scene has the number of chunks, their size in splats, and the number of codes of SH.
+    The header of the scene has the number of chunks, their size in splats, whether they are files of their own, and
+    the number of codes of SH where there is a palette.
 
     Raises:
         FormatError: as `decode`, but not for a broken tree.
@@ -103,7 +108,7 @@ def examine(
     for done in ordered_map(run, all_chunks(), threads):
         progress("reading", done, header.count, "splat")
     facts = {"version": 1, "chunks": len(header.chunks), "chunk_size": header.chunk_size}
-    facts |= {"header_bytes": header.bytes}
+    facts |= {"header_bytes": header.bytes, "chunked": int(header.chunked)}
     facts |= {"sh_codes": len(palette)} if palette is not None else {}
     name = "RAD" + " LoD" * (tree is not None)
     return Scene(splats, tree, format=name, header=facts, chunk_bytes=tuple(entry.bytes for entry in header.chunks))
@@ -122,7 +127,7 @@ def encode(
     """
     writing = _writing(scene, options, threads)
     sizes = []
-    with tempfile.TemporaryFile() as spool:
+    with tempfile.SpooledTemporaryFile(SPOOLED) as spool:
         for chunk in _encoded(writing, threads, progress):
             spool.write(chunk)
             sizes.append(len(chunk))
@@ -148,9 +153,10 @@ def encode_chunked(
     writing = _writing(scene, options, threads)
     entries = []
     for number, chunk in enumerate(_encoded(writing, threads, progress)):
-        entries.append(ChunkEntry(0, len(chunk), f"{stem}-{number}.radc"))
-        yield f"{stem}-{number}.radc", [chunk]
-    yield f"{stem}.rad", [pack_header(_header(writing, tuple(entries)))]
+        name = chunk_name(stem, number)
+        entries.append(ChunkEntry(0, len(chunk), name))
+        yield name, [chunk]
+    yield stem + SUFFIX, [pack_header(_header(writing, tuple(entries)))]
 
 
 def _writing(scene: Scene, options: WriteOptions, threads: int) -> Writing:
