@@ -109,7 +109,7 @@ def examine(
     for done in ordered_map(run, all_chunks(), threads):
         progress("reading", done, header.count, "splat")
     facts = {"version": 1, "chunks": len(header.chunks), "chunk_size": header.chunk_size}
-    facts |= {"chunked": int(header.chunked)}
+    facts |= {"header_bytes": header.bytes, "chunked": int(header.chunked)}
     facts |= {"sh_codes": len(palette)} if palette is not None else {}
     sizes = tuple(entry.bytes for entry in header.chunks)
     return Scene(splats, tree, format=name_of(header), header=facts, chunk_bytes=sizes)
