@@ -122,9 +122,9 @@ def held(options: WriteOptions, sh_degree: int) -> list[Range]:
             found.append(Range(row.column, *ends, zero=float(SCALE_ZERO)))
         elif encoding in RANGES:
             half = (high - low) / (508 if encoding.startswith("s8") else 510)
-            found.append(Range(row.column, low - half, high + half, numbers))
+            found.append(Range(row.column, low - half, high + half, numbers, degree=row.degree))
         elif encoding in ("f16", "f16_lebytes"):
-            found.append(Range(row.column, -most, most, numbers))
+            found.append(Range(row.column, -most, most, numbers, degree=row.degree))
     return found
 
 

@@ -282,8 +282,9 @@ def test_ranges_hold_all_scales_and_most_of_the_rest() -> None:
     assert 0.3 < ranges.sh1_max < 4 and not ranges.lod_opacity
     found = clamps.find(splats, ranges=rad_options.held(options, 3))
     assert found.splats == {"sh": 1}
-    assert {(each.column, each.above) for each in found.ends} == {("sh", True)}
-    assert len(found.ends) == 3
+    assert [(each.column, each.degree, each.both, each.splats) for each in found.ends] == [
+        ("sh", degree, True, 1) for degree in (1, 2, 3)
+    ]
 
 
 def test_colours_and_scales_of_a_wide_range_are_float16() -> None:
