@@ -1,7 +1,8 @@
-"""Values beyond the ranges of SPZ's codes, which writing clamps."""
+"""Values beyond the ranges of a format's codes, which writing clamps."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -9,6 +10,28 @@ import numpy as np
 from ..model.splats import FloatArray, Splats
 from ..support.parallel import blocks_of, ordered_map
 from . import quantize
+
+
+@dataclass(frozen=True)
+class Range:
+    """Values of a column that a format holds without clamping them.
+
+    Attributes:
+        column: of `Splats`.
+        low, high: smallest and largest value that is rounded to a code.
+        numbers: the first, and the one after the last, of the numbers of a splat that are meant; all by default.
+        zero: values below this are held as 0.
+    """
+
+    column: str
+    low: float
+    high: float
+    numbers: tuple[int, int | None] = (0, None)
+    zero: float = 0.0
+
+
+#: What SPZ holds.
+SPZ = tuple(Range(column, low, high) for column, (low, high) in quantize.CLAMPS.items())
 
 
 @dataclass(frozen=True)
@@ -43,25 +66,36 @@ class Clamps:
     ends: tuple[Clamp, ...] = ()
 
 
-def find(splats: Splats, threads: int = 1) -> Clamps:
-    """The values of splats that lie beyond the ranges of SPZ."""
-    counts, ends = {}, []
-    for name, (low, high) in quantize.CLAMPS.items():
+def find(splats: Splats, threads: int = 1, ranges: Sequence[Range] = SPZ) -> Clamps:
+    """The values of splats that lie beyond ranges, in the order of the ranges."""
+    counts: dict[str, int] = {}
+    ends = []
+    for name in dict.fromkeys(each.column for each in ranges):
+        rows = [each for each in ranges if each.column == name]
         column = getattr(splats, name).reshape(len(splats), -1)
         if not column.size:
             continue
 
-        def look(part: slice, column: FloatArray = column, low: float = low, high: float = high) -> tuple[float, ...]:
-            least, most = column[part].min(axis=1), column[part].max(axis=1)
-            below, above = least < low, most > high
-            counted = (int(np.count_nonzero(mask)) for mask in (below | above, below, above))
-            return *counted, float(least.min()), float(most.max())
+        def look(part: slice, column: FloatArray = column, rows: Sequence[Range] = rows) -> list[tuple[float, ...]]:
+            found, either = [], np.zeros(part.stop - part.start, np.bool_)
+            for each in rows:
+                values = column[part, slice(*each.numbers)]
+                if each.zero:
+                    values = np.where(values < each.zero, each.low, values)
+                least, most = values.min(axis=1), values.max(axis=1)
+                below, above = least < each.low, most > each.high
+                either |= below | above
+                counted = int(np.count_nonzero(below)), int(np.count_nonzero(above))
+                found.append((*counted, float(least.min()), float(most.max())))
+            return [(int(np.count_nonzero(either)),), *found]
 
-        either, below, above, least, most = zip(*ordered_map(look, blocks_of(len(splats)), threads), strict=True)
-        if sum(either):
-            counts[name] = int(sum(either))
-        if sum(below):
-            ends.append(Clamp(name, False, int(sum(below)), low, min(least)))
-        if sum(above):
-            ends.append(Clamp(name, True, int(sum(above)), high, max(most)))
+        parts = list(ordered_map(look, blocks_of(len(splats)), threads))
+        if total := sum(int(part[0][0]) for part in parts):
+            counts[name] = total
+        for index, each in enumerate(rows, 1):
+            below, above, least, most = zip(*(part[index] for part in parts), strict=True)
+            if sum(below):
+                ends.append(Clamp(name, False, int(sum(below)), each.low, min(least)))
+            if sum(above):
+                ends.append(Clamp(name, True, int(sum(above)), each.high, max(most)))
     return Clamps(counts, tuple(ends))

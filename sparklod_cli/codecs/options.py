@@ -3,19 +3,26 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from ..support.defaults import DEFAULT_COMPRESSION
+
+if TYPE_CHECKING:
+    from .splat_encoding import SplatEncoding
 
 
 @dataclass(frozen=True)
 class RadOptions:
-    """How to write RAD. Names of encodings are keys of the tables in `rad_encodings`; "auto" suits the scene.
+    """How to write RAD. Encodings are those of `rad_layout.choices`; "auto" suits the scene, see `rad_options`.
 
     Attributes:
         center, alpha, rgb, scales, orientation, sh: the encoding of each property.
         chunked: write each chunk into a file of its own.
         sh_codes: the most entries of a palette of spherical harmonics, which a label for each splat points into; None
             for coefficients of each splat's own.
+        center_bits: centres are rounded to multiples of 2 ** -center_bits; None leaves them as they are, but where
+            `center` is "auto" it is chosen, too.
+        ranges: of the codes; None for those that suit the scene.
     """
 
     center: str = "auto"
@@ -26,6 +33,8 @@ class RadOptions:
     sh: str = "auto"
     chunked: bool = False
     sh_codes: int | None = None
+    center_bits: int | None = None
+    ranges: SplatEncoding | None = None
 
 
 @dataclass(frozen=True)

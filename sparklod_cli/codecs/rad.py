@@ -6,24 +6,36 @@ A file is a header and its chunks, or a header that names a file for each chunk;
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Collection, Iterator
+import itertools
+import json
+import tempfile
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass
 from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .. import __version__
 from ..model.lod_tree import LodTree
+from ..model.nodes import CHUNK_NODES
 from ..model.scene import Scene
 from ..model.sh import COEFFICIENTS
 from ..model.splats import COLUMNS, FloatArray, Splats
 from ..support.errors import FormatError, NotSplatsError, TreeError, TruncatedError
-from ..support.parallel import ordered_map
+from ..support.parallel import blocks_of, ordered_map
 from ..support.progress import Progress, silent
 from . import compression, rad_promises
+from .options import DEFAULTS, WriteOptions
 from .rad_decode import Packed, fill
-from .rad_header import CHUNK_MAGIC, ChunkEntry, ChunkHeader, Header, read_header
+from .rad_encode import Writing
+from .rad_header import CHUNK_MAGIC, ChunkEntry, ChunkHeader, Header, pack_header, read_header
+from .rad_names import SUFFIX, chunk_name
+from .rad_options import settled as settled
 from .stream import size_of
+
+#: Bytes of chunks that wait in memory for their header; beyond, they wait on disk.
+SPOOLED = 1 << 26
 
 #: Opens a file that a header names.
 Beside = Callable[[str], BinaryIO]
@@ -61,13 +73,14 @@ def examine(
 ) -> Scene:
     """Reads a file for inspection: the given columns of `Splats`, the others are 0; its tree may be broken.
 
-    The header of the scene has the number of chunks, their size in splats, and the number of codes of SH.
+    The header of the scene has the number of chunks, their size in splats, whether they are files of their own, and
+    the number of codes of SH where there is a palette.
 
     Raises:
         FormatError: as `decode`, but not for a broken tree.
     """
     size = size_of(file)
-    _refuse_chunk(file)
+    refuse_chunk(file)
     header = read_header(file)
     files = _sizes_beside(header, beside)
     rad_promises.check(rad_promises.violations(header, size, files))
@@ -84,7 +97,8 @@ def examine(
         start, stop = packed.header.base, packed.header.base + packed.header.count
         part = _rows(splats, tree, slice(start, stop))
         if fill(packed, header, *part, palette, columns) is not None:
-            raise FormatError(f"chunk {packed.number:,} has labels of SH, but there is no palette")
+            text = f"chunk {packed.number:,} has labels of SH, but there is no palette"
+            raise rad_promises.error_of("rad.palette", text)
         return stop
 
     def all_chunks() -> Iterator[Packed]:
@@ -95,9 +109,89 @@ def examine(
     for done in ordered_map(run, all_chunks(), threads):
         progress("reading", done, header.count, "splat")
     facts = {"version": 1, "chunks": len(header.chunks), "chunk_size": header.chunk_size}
+    facts |= {"header_bytes": header.bytes, "chunked": int(header.chunked)}
     facts |= {"sh_codes": len(palette)} if palette is not None else {}
-    name = "RAD" + " LoD" * (tree is not None)
-    return Scene(splats, tree, format=name, header=facts, chunk_bytes=tuple(entry.bytes for entry in header.chunks))
+    sizes = tuple(entry.bytes for entry in header.chunks)
+    return Scene(splats, tree, format=name_of(header), header=facts, chunk_bytes=sizes)
+
+
+def name_of(header: Header) -> str:
+    """The format of a file for people, as `Scene.format` has it."""
+    return "RAD" + " LoD" * header.lod_tree
+
+
+def encode(
+    scene: Scene, options: WriteOptions = DEFAULTS, *, threads: int = 1, progress: Progress = silent
+) -> Iterator[bytes]:
+    """The bytes of one file, piece by piece; the chunks wait in a temporary file for the header, which has their sizes.
+
+    The same scene and options give the same bytes for any number of threads. Nodes keep their order; that of
+    `lod.chunk_order` is for streaming.
+
+    Raises:
+        FormatError, ValueError: see `rad_options.settled`.
+    """
+    writing = _writing(scene, options, threads)
+    sizes = []
+    with tempfile.SpooledTemporaryFile(SPOOLED) as spool:
+        for chunk in _encoded(writing, threads, progress):
+            spool.write(chunk)
+            sizes.append(len(chunk))
+        spool.seek(0)
+        offsets = itertools.accumulate(sizes, initial=0)
+        yield pack_header(_header(writing, tuple(map(ChunkEntry, offsets, sizes))))
+        while piece := spool.read(compression.PIECE):
+            yield piece
+
+
+def encode_chunked(
+    scene: Scene, options: WriteOptions, stem: str, *, threads: int = 1, progress: Progress = silent
+) -> Iterator[tuple[str, Iterable[bytes]]]:
+    """The files of a scene whose chunks are files of their own: the name of each, and its bytes; the header is last.
+
+    Args:
+        scene, options, threads, progress: as for `encode`.
+        stem: of the names: the header's is "stem.rad", and those of the chunks are "stem-0.radc" and so on.
+
+    Raises:
+        FormatError, ValueError: see `rad_options.settled`.
+    """
+    writing = _writing(scene, options, threads)
+    entries = []
+    for number, chunk in enumerate(_encoded(writing, threads, progress)):
+        name = chunk_name(stem, number)
+        entries.append(ChunkEntry(0, len(chunk), name))
+        yield name, [chunk]
+    yield stem + SUFFIX, [pack_header(_header(writing, tuple(entries)))]
+
+
+def _writing(scene: Scene, options: WriteOptions, threads: int) -> Writing:
+    options = settled(scene, options)
+    assert options.rad.ranges is not None
+    return Writing(scene, options.rad, options.rad.ranges, None, options.compression_level)
+
+
+def _encoded(writing: Writing, threads: int, progress: Progress) -> Iterator[bytes]:
+    """The chunks in order, a few encoded ahead."""
+    parts = blocks_of(len(writing.scene), CHUNK_NODES)
+    for part, chunk in zip(parts, ordered_map(writing.chunk, parts, threads), strict=True):
+        progress("writing", part.stop, len(writing.scene), "splat")
+        yield chunk
+
+
+def _header(writing: Writing, entries: tuple[ChunkEntry, ...]) -> Header:
+    scene = writing.scene
+    return Header(
+        len(scene),
+        scene.splats.sh_degree,
+        scene.tree is not None,
+        CHUNK_NODES,
+        sum(entry.bytes for entry in entries),
+        entries,
+        writing.ranges,
+        None if writing.palette is None else len(writing.palette.codes),
+        json.dumps({"generator": f"sparklod {__version__}"}),
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,7 +240,8 @@ def read_chunk(file: BinaryIO, entry: ChunkEntry, header: Header, palette: Float
     return Chunk(packed.header, splats, tree, own, labels)
 
 
-def _refuse_chunk(file: BinaryIO) -> None:
+def refuse_chunk(file: BinaryIO) -> None:
+    """Raises `NotSplatsError`, which says what to give, where a file is a single chunk; leaves it at its beginning."""
     if file.read(len(CHUNK_MAGIC)) == CHUNK_MAGIC:
         raise NotSplatsError("it is one chunk of a RAD file; give the .rad file beside it, which names all chunks")
     file.seek(0)

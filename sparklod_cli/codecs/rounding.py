@@ -41,9 +41,17 @@ def _spz(scene: Scene, threads: int) -> Splats:
     return spz.decode(io.BytesIO(data), threads=threads).splats
 
 
+def _rad(scene: Scene, threads: int) -> Splats:
+    from . import rad
+
+    options = WriteOptions(compression_level=1)  # as for SPZ
+    data = b"".join(rad.encode(scene, options, threads=threads))
+    return rad.decode(io.BytesIO(data), threads=threads).splats
+
+
 #: Round trips by the name that `--through` knows: PackedSplats as Spark has them for such a scene, ExtSplats, and SPZ
-#: as build-lod writes it.
-ROUND_TRIPS: dict[str, Callable[[Scene, int], Splats]] = {"packed": _packed, "ext": _ext, "spz": _spz}
+#: and RAD as build-lod writes them.
+ROUND_TRIPS: dict[str, Callable[[Scene, int], Splats]] = {"packed": _packed, "ext": _ext, "spz": _spz, "rad": _rad}
 
 
 def after(through: str | None, file: Path, scene: Scene, threads: int = 1) -> Splats:

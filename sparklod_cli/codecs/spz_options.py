@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,14 +12,11 @@ from ..support.defaults import DEFAULT_SPZ_VERSION, MAX_FRACTIONAL_BITS, SPZ_VER
 from ..support.errors import FormatError
 from . import quantize
 from .options import WriteOptions
+from .steps import fine_bits
 
 #: The largest code that a coordinate is given, 2 ** 23 - 2. Writers clamp what does not fit to the code after it, of
 #: either sign, so `inspect` takes a coordinate that has that one for clamped.
 LAST_CODE = quantize.FIXED24_MAX - 1
-
-#: A step of the positions is at most a 16th of the standard deviation of a small splat, so that rounding shifts it by
-#: at most a 32nd; small are the splats at this quantile of the largest scales. See docs/decisions.
-STEPS_A_SPLAT, SMALL_QUANTILE = 16, 0.01
 
 
 def largest_fractional_bits(center: NDArray[np.float32]) -> int:
@@ -43,7 +39,7 @@ def settled(scene: Scene, options: WriteOptions) -> WriteOptions:
     """These options with nothing left open: `encode` writes the scene with them.
 
     Positions get as many fractional bits as all nodes allow, up to where a step is far below the smallest splats of
-    full detail (`STEPS_A_SPLAT`): merged splats are larger.
+    full detail (`steps.STEPS_A_SPLAT`): merged splats are larger.
 
     Raises:
         FormatError: a coordinate does not fit the fractional bits; the text names the most that would.
@@ -54,9 +50,7 @@ def settled(scene: Scene, options: WriteOptions) -> WriteOptions:
         raise ValueError(f"SPZ version {version} is not one of {SPZ_VERSIONS}")
     bits, most = options.fractional_bits, largest_fractional_bits(scene.splats.center)
     if bits is None:
-        scale = scene.splats.scale if scene.tree is None else scene.splats.scale[scene.tree.is_leaf]
-        small = float(np.quantile(scale.max(axis=1), SMALL_QUANTILE))
-        bits = max(0, min(most, math.ceil(math.log2(STEPS_A_SPLAT / small))))
+        bits = max(0, min(most, fine_bits(scene)))
     if bits > most:
         raise FormatError(f"a coordinate does not fit {bits} fractional bits; use at most {most}")
     return dataclasses.replace(options, spz_version=version, fractional_bits=bits)

@@ -12,8 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fixtures import by_hand, by_hand_compressed_ply, by_hand_ksplat, by_hand_rad, by_hand_sog, by_hand_splat
-from sparklod_cli.codecs import octahedral, ply, quantize, splat, spz
-from sparklod_cli.codecs.options import WriteOptions
+from sparklod_cli.codecs import octahedral, ply, quantize, rad, splat, spz
+from sparklod_cli.codecs.options import RadOptions, WriteOptions
+from sparklod_cli.codecs.rad_header import ENCODING_KEYS
+from sparklod_cli.codecs.rad_layout import choices
+from sparklod_cli.codecs.splat_encoding import SplatEncoding
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.sh import SH_C0
 from sparklod_cli.model.splats import Splats
@@ -36,7 +39,7 @@ class Precision:
     sh: tuple[float, float] = (0.0, 0.0)  # degree 1, degrees above
     scale_range: tuple[float, float] = (0.0, np.inf)
     rgb_range: tuple[float, float] = (-np.inf, np.inf)
-    sh_range: tuple[float, float] = (-np.inf, np.inf)
+    sh_range: tuple[float | Array, float | Array] = (-np.inf, np.inf)
 
 
 def exact(source: Scene) -> Precision:
@@ -337,20 +340,26 @@ WIDE_RANGES = by_hand_rad.RANGES | {"rgbMin": -0.5, "rgbMax": 1.5, "sh2Max": 1.2
 def half_spacing(values: Array) -> Array:
     """Bounds the error of numbers as float16, of which the largest is clamped."""
     inside = np.clip(values, -65504, 65504)
-    return np.spacing(np.abs(inside).astype(np.float16)).astype(np.float64) * 0.501 + np.abs(values - inside)
+    return np.spacing(np.minimum(np.abs(inside), 60000).astype(np.float16)).astype(np.float64) * 0.501 + np.abs(
+        values - inside
+    )
 
 
-def rad_precision(source: Scene, encodings: Mapping[str, str], ranges: Mapping[str, float]) -> Precision:
+def rad_precision(
+    source: Scene, encodings: Mapping[str, str], ranges: SplatEncoding, bits: int | None = None
+) -> Precision:
     values = linear(source)
     rgb, scales, sh = encodings["rgb"], encodings["scales"], encodings["sh"]
-    tops = [ranges[f"sh{degree}Max"] for degree in (1, 2, 3)]
-    step = (0.0, 0.0) if sh == "f32" else (2**-12, 2**-12) if sh == "f16" else (tops[0] / 254, max(tops[1:]) / 254)
-    if sh.startswith("r8"):
-        step = (tops[0] / 255, max(tops[1:]) / 255)
-    log_range = ranges["lnScaleMin"], ranges["lnScaleMax"]
+    tops = np.repeat([float(ranges.sh_max(degree)) for degree in (1, 2, 3)], [3, 5, 7])
+    steps = {"f32": 0 * tops, "f16": 2**-11 * np.ones(15), "r8": tops / 255, "s8": tops / 254}[
+        sh.removesuffix("_delta")
+    ]
+    log_range = ranges.ln_scale_min, ranges.ln_scale_max
     alpha = {"f32": 1e-6, "f16": 2**-12, "r8": 1 / 255 if source.tree else 1 / 510}[encodings["alpha"]]
+    center = half_spacing(values["center"]) if "f16" in encodings["center"] else np.zeros(1)
+    top = tops[: source.splats.sh.shape[1], None]
     return Precision(
-        center=half_spacing(values["center"]) if "f16" in encodings["center"] else 0.0,
+        center=center if bits is None else center + 0.5 * 2.0**-bits,
         log_scale={
             "f32": 2e-6,
             "ln_f16": 2**-11 * np.abs(np.log(values["scale"])) + 1e-6,
@@ -362,17 +371,15 @@ def rad_precision(source: Scene, encodings: Mapping[str, str], ranges: Mapping[s
         ],
         opacity=1.001 * alpha,
         merged={"f32": 1e-5, "f16": 2**-9, "r8": 4 / 255}[encodings["alpha"]] * 1.001,
-        rgb={"f32": 1e-6, "f16": half_spacing(values["rgb"])}.get(
-            rgb, 1.001 * (ranges["rgbMax"] - ranges["rgbMin"]) / 510
-        ),
-        sh=(step[0] * 1.001, step[1] * 1.001),
+        rgb={"f32": 1e-6, "f16": half_spacing(values["rgb"])}.get(rgb, 1.001 * (ranges.rgb_max - ranges.rgb_min) / 510),
+        sh=(steps[0] * 1.001, steps[3:].max() * 1.001),
         scale_range=(0, np.inf) if scales != "ln_0r8" else (np.exp(log_range[0]), np.exp(log_range[1])),
-        rgb_range=(ranges["rgbMin"], ranges["rgbMax"]) if rgb.startswith("r8") else (-np.inf, np.inf),
-        sh_range=(-min(tops), min(tops)) if sh[1:2] == "8" else (-np.inf, np.inf),
+        rgb_range=(ranges.rgb_min, ranges.rgb_max) if rgb.startswith("r8") else (-np.inf, np.inf),
+        sh_range=(-top, top) if sh[1] == "8" else (-np.inf, np.inf),
     )
 
 
-def as_rad(source: Scene, encodings: Mapping[str, str], ranges: Mapping[str, float], stem: str) -> Content:
+def by_hand_rad_files(source: Scene, encodings: Mapping[str, str], ranges: Mapping[str, float], stem: str) -> Content:
     tree = None if source.tree is None else (source.tree.child_count, source.tree.child_start)
     files = by_hand_rad.rad(
         **linear(source), tree=tree, encodings=encodings, ranges=ranges, chunk_size=1000 if stem else 65536, stem=stem
@@ -380,11 +387,15 @@ def as_rad(source: Scene, encodings: Mapping[str, str], ranges: Mapping[str, flo
     return files if stem else files["scene.rad"]
 
 
-RAD = {
+def encoding_of(ranges: Mapping[str, float]) -> SplatEncoding:
+    return SplatEncoding(**{ENCODING_KEYS[key]: value for key, value in ranges.items()})
+
+
+BY_HAND_RAD = {
     f"by hand {way}{' LoD' * lod}": Case(
         f"RAD{' LoD' * lod}",
-        functools.partial(as_rad, encodings=encodings, ranges=ranges, stem=stem),
-        functools.partial(rad_precision, encodings=encodings, ranges=ranges),
+        functools.partial(by_hand_rad_files, encodings=encodings, ranges=ranges, stem=stem),
+        functools.partial(rad_precision, encodings=encodings, ranges=encoding_of(ranges)),
         lod,
     )
     for way, encodings, ranges, stem in (
@@ -393,6 +404,45 @@ RAD = {
         ("small", SMALL_RAD, WIDE_RANGES, "scene"),
     )
     for lod in (False, True)
+}
+
+
+def as_rad(source: Scene, options: RadOptions) -> Content:
+    if not options.chunked:
+        return b"".join(rad.encode(source, WriteOptions(rad=options)))
+    files = rad.encode_chunked(source, WriteOptions(rad=options), "scene")
+    return {name: b"".join(pieces) for name, pieces in files}
+
+
+def written_rad_precision(source: Scene, options: RadOptions) -> Precision:
+    chosen = rad.settled(source, WriteOptions(rad=options)).rad
+    assert chosen.ranges is not None
+    ranges = chosen.ranges  # those of SH are for viewers; codes in a file reach at least from -1 to 1
+    tops = {f"sh{degree}_max": max(1.0, float(ranges.sh_max(degree))) for degree in (1, 2, 3)}
+    encodings = {name: getattr(chosen, name) for name in SMALL_RAD}
+    return rad_precision(source, encodings, dataclasses.replace(ranges, **tops), chosen.center_bits)
+
+
+def rad_encodings(number: int) -> RadOptions:
+    """The n-th encoding of each property; where it has fewer, they are repeated."""
+    return RadOptions(**{name: known[number % len(known)] for name in SMALL_RAD for known in [choices(name)[1:]]})
+
+
+RAD_OPTIONS = {
+    "auto": RadOptions(),
+    "chunked": RadOptions(chunked=True),
+    **{f"encodings {number}": rad_encodings(number) for number in range(len(choices("sh")) - 1)},
+}
+
+RAD = BY_HAND_RAD | {
+    f"{way}{' LoD' * lod}": Case(
+        f"RAD{' LoD' * lod}",
+        functools.partial(as_rad, options=options),
+        functools.partial(written_rad_precision, options=options),
+        lod,
+    )
+    for index, (way, options) in enumerate(RAD_OPTIONS.items())
+    for lod in ((False, True) if index < 2 else (bool(index % 2),))
 }
 
 #: Every way to write each format of the table, by its name there.

@@ -32,6 +32,21 @@ class Picture:
     nodes: NDArray[np.uint32] | None
 
 
+@dataclass(frozen=True)
+class Request:
+    """A request of Spark's for a file of a scene.
+
+    Attributes:
+        name: of the file.
+        bytes: that were sent.
+        ranged: whether it asked for a range of bytes, not for all.
+    """
+
+    name: str
+    bytes: int
+    ranged: bool
+
+
 class Page:
     """One browser with Spark, which shows one file at a time.
 
@@ -46,11 +61,22 @@ class Page:
         self._node = Node([str(PROGRAM), str(package_dir), chromium], scratch / "stderr.txt")
         self.close = self._node.close
 
-    def open(self, file: Path, camera: Camera, settings: RasterSettings) -> int:
-        """Loads a file, for the size of `camera` and the planes of `settings`; returns its splats or nodes."""
+    def open(self, file: Path, camera: Camera, settings: RasterSettings, *, layout: str = "Ext", pages: int = 0) -> int:
+        """Loads a file, for the size of `camera` and the planes of `settings`; returns its splats or nodes.
+
+        Args:
+            layout: "Packed" or "Ext", in which Spark keeps the splats.
+            pages: of 65,536 nodes, into which Spark fetches chunks of a RAD file as it needs them; 0 for all at once.
+        """
         size = {"width": camera.width, "height": camera.height, "near": settings.near, "far": settings.far}
-        answer = self._node.ask({"do": "open", "path": str(file.resolve()), **size})
+        how = {"layout": layout, "paged": pages > 0, "pages": pages}
+        answer = self._node.ask({"do": "open", "path": str(file.resolve()), **size, **how})
         return int(answer["lod"] or answer["numSplats"])
+
+    def requests(self) -> list[Request]:
+        """Returns what Spark asked for of the file and those beside it since it was opened, in order."""
+        found = self._node.ask({"do": "requests"})["requests"]
+        return [Request(each["name"], each["bytes"], each["range"] is not None) for each in found]
 
     def draw(self, camera: Camera, settings: RasterSettings, *, budget: int | None = None) -> Picture:
         """Draws the picture of a camera.

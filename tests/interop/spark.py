@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -101,18 +102,39 @@ class Spark:
         self._node = Node([str(PROGRAM), str(package_dir)], scratch / "stderr.txt")
         self.close = self._node.close
 
-    def _ask(self, method: str, source: bytes | Path, options: Mapping[str, Any]) -> Reply:
+    def _ask(
+        self,
+        method: str,
+        source: bytes | Path,
+        options: Mapping[str, Any],
+        codes: Mapping[str, NDArray[np.uint32]] | None = None,
+    ) -> Reply:
         self._asked += 1
         out = self._scratch / str(self._asked)
         path = source if isinstance(source, Path) else out.with_suffix(".spz")
         if isinstance(source, bytes):
             path.write_bytes(source)
         request = {"method": method, "path": str(path), "name": path.name, "options": options, "out": str(out)}
-        answer = self._node.ask(request)
+        with self._files(codes or {}) as words:
+            answer = self._node.ask(request | {"words": words})
         words = {name: np.fromfile(file, "<u4") for name, file in answer["arrays"].items()}
         for file in answer["arrays"].values():
             Path(file).unlink()
         return Reply(answer["numSplats"], answer["lod"], words)
+
+    @contextmanager
+    def _files(self, arrays: Mapping[str, NDArray[np.uint32]]) -> Iterator[dict[str, str | list[str]]]:
+        """Writes arrays to files for a request: a path for each option, or several if its names are "option.0" etc."""
+        paths: dict[str, str | list[str]] = {}
+        files = []
+        for name, words in arrays.items():
+            files.append(self._scratch / name)
+            words.tofile(files[-1])
+            option, _, number = name.partition(".")
+            paths[option] = [*paths.get(option, []), str(files[-1])] if number else str(files[-1])
+        yield paths
+        for file in files:
+            file.unlink()
 
     def load(self, source: bytes | Path, *, lod: bool = False) -> ExtSplats:
         """Loads a file, or the bytes of an SPZ file, as ExtSplats; `lod` builds a tree if it has none."""
@@ -130,13 +152,21 @@ class Spark:
             nodes=nodes,
         )
 
-    def load_words(self, layout: str, source: bytes | Path, **options: Any) -> dict[str, NDArray[np.uint32]]:
+    def load_words(
+        self,
+        layout: str,
+        source: bytes | Path,
+        *,
+        codes: Mapping[str, NDArray[np.uint32]] | None = None,
+        **options: Any,
+    ) -> dict[str, NDArray[np.uint32]]:
         """Loads a file in a layout, "Packed" or "Ext"; returns its arrays as (N, words), one row a splat.
 
+        `codes` is the palette of SH for a chunk of a RAD file: the arrays whose names have "Codes" of its first chunk.
         `options` go to the worker: `lod` builds a tree, `encoding` sets the ranges of PackedSplats.
         """
-        reply = self._ask(f"load{layout}Splats", source, options)
-        width = {"sh1": 2 if layout == "Packed" else 4}
+        reply = self._ask(f"load{layout}Splats", source, options, codes)
+        width = dict.fromkeys(("sh1", "sh1Codes"), 2 if layout == "Packed" else 4)
         return {name: words.reshape(-1, width.get(name, 4))[: reply.count] for name, words in reply.words.items()}
 
     def keep_tree(self, words: NDArray[np.uint32]) -> int:

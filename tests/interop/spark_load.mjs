@@ -1,8 +1,10 @@
 // Loads splat files with the real Spark: node spark_load.mjs FOLDER, whose node_modules holds @sparkjsdev/spark.
 //
-// A request a line on stdin, {method, path, name, options, out}: calls the worker's `method` (loadExtSplats or
-// loadPackedSplats) with the bytes at `path`, as if they had come from `name`. An answer a line on stdout:
-// {numSplats, lod, arrays}, or {error}. Each array is a raw file of uint32, `arrays` has its path by name.
+// A request a line on stdin, {method, path, name, options, words, out}: calls the worker's `method` (loadExtSplats or
+// loadPackedSplats) with the bytes at `path`, as if they had come from `name`. `words` has paths of raw files of uint32
+// by the option that they are for, or a list of paths where the option is a list of arrays. An answer a line on stdout:
+// {numSplats, lod, encoding, arrays}, or {error}. Each array is a raw file of uint32, `arrays` has its path by name;
+// those of a list are named "name.0" and so on.
 //
 // {method: "initLodTree", path} keeps the tree of that raw file of four uint32 a node; the answer is {lodId}. With it,
 // {method: "traverseLodTrees", options, out} finds a cut; `options` are the worker's, but for `instances`, a list. The
@@ -79,21 +81,26 @@ async function traverseLodTrees(options, out) {
   return { counts: cuts.map(({ numSplats }) => numSplats), chunks, pixelLimit, arrays: { indices: out } };
 }
 
-async function answer({ method, path, name, options, out }) {
+async function answer({ method, path, name, options, words, out }) {
   if (method === 'initLodTree') return initLodTree(path);
   if (method === 'newLodTree' || method === 'newSharedLodTree') return call(method, options);
   if (method === 'updateLodTrees') return updateLodTrees(path, options.ranges);
   if (method === 'traverseLodTrees') return traverseLodTrees(options, out);
-  const result = await call(method, { ...options, fileBytes: new Uint8Array(readFileSync(path)), pathName: name });
+  const given = Object.entries(words ?? {}).map(([key, file]) => [key, Array.isArray(file) ? file.map(uint32s) : uint32s(file)]);
+  const fileBytes = new Uint8Array(readFileSync(path));
+  const result = await call(method, { ...options, ...Object.fromEntries(given), fileBytes, pathName: name });
   const splats = result.lodSplats ?? result;
-  const found = { ext0: splats.extArrays?.[0], ext1: splats.extArrays?.[1], packed: splats.packedArray, ...splats.extra };
+  const lists = Object.entries(splats.extra).filter(([, value]) => Array.isArray(value));
+  const parts = lists.flatMap(([key, list]) => list.map((value, at) => [`${key}.${at}`, value]));
+  const [ext0, ext1] = splats.extArrays ?? [];
+  const found = { ext0, ext1, packed: splats.packedArray, ...splats.extra, ...Object.fromEntries(parts) };
   const arrays = {};
   for (const [key, values] of Object.entries(found)) {
     if (!(values instanceof Uint32Array)) continue;
     arrays[key] = `${out}.${key}`;
     writeFileSync(arrays[key], new Uint8Array(values.buffer, values.byteOffset, values.byteLength));
   }
-  return { numSplats: splats.numSplats, lod: result.lodSplats !== undefined, arrays };
+  return { numSplats: splats.numSplats, lod: result.lodSplats !== undefined, encoding: splats.splatEncoding, arrays };
 }
 
 for await (const line of createInterface({ input: process.stdin })) {

@@ -2,23 +2,26 @@
 // holds @sparkjsdev/spark, three and playwright-core, CHROMIUM is the browser's program.
 //
 // A request a line on stdin, an answer a line on stdout:
-//   {do: 'open', path, width, height, near, far}
-//                       a new page with that file in it: {numSplats, lod}, how many splats it has, and nodes if it is a
-//                       LoD tree
+//   {do: 'open', path, width, height, near, far, layout, paged}
+//                       a new page with that file in it, which Spark keeps in a layout, "Packed" or "Ext"; `paged` has it
+//                       fetch a RAD file chunk by chunk, as cuts need them: {numSplats, lod}, how many splats the file
+//                       has, and nodes if it is a LoD tree
 //   {do: 'draw', viewToWorld, fovy, budget, radial, out}
 //                       draws that file as a camera sees it, sixteen numbers column by column and degrees; from a tree
 //                       `budget` nodes at most, all directions alike. {drawn, files}: how many splats, and the paths of
 //                       raw files: `rounded`, RGBA, a byte each, the lower row first; `exact`, the same in float32, for
 //                       which nothing was rounded while blending; `indices`, uint32, the nodes of the tree, if it is one
+//   {do: 'requests'}    {requests}: what the page asked for of the file and of those beside it since it was opened, in
+//                       order: {name, range, bytes}, range a list of first and last byte or null for a whole file
 // and {error} where it fails.
 //
 // Spark draws whatever it has sorted last, and finds cuts in the background. So that a picture does not show the order
 // or the cut of the view before, it does not update by itself here (`autoUpdate` is false) but is asked to, until the
-// camera that it has the cut and the order of is ours.
+// camera that it has the cut and the order of is ours; and of a paged file, until all chunks that the cut wants are there.
 import { createReadStream, existsSync, statSync, writeFileSync } from 'node:fs';
 import { createServer } from 'node:http';
 import { createRequire } from 'node:module';
-import { join, resolve } from 'node:path';
+import { basename, dirname, join, resolve } from 'node:path';
 import { createInterface } from 'node:readline';
 
 console.log = console.error; // stdout is for the answers
@@ -41,25 +44,43 @@ function inPage(THREE, Spark) {
     speck = new THREE.WebGLRenderTarget(1, 1);
     scene = new THREE.Scene();
     const evenly = { coneFov0: 0, coneFov: 0, coneFoveate: 1, behindFoveate: 1 };
-    spark = new Spark.SparkRenderer({ renderer, autoUpdate: false, accumExtSplats: true, lodRaycast: 0, ...evenly });
+    const extSplats = options.layout === 'Ext';
+    const pages = { pagedExtSplats: extSplats, maxPagedSplats: options.pages * 65536 };
+    const quiet = { autoUpdate: false, lodRaycast: 0, ...evenly };
+    spark = new Spark.SparkRenderer({ renderer, accumExtSplats: true, ...pages, ...quiet });
     scene.add(spark);
     const take = spark.updateLodIndices.bind(spark); // what it keeps of a second cut is on the GPU only
     spark.updateLodIndices = (meshes, cuts) => {
       [cut] = Object.values(cuts);
       take(meshes, cuts);
     };
-    mesh = new Spark.SplatMesh({ url: options.url, extSplats: true });
+    mesh = new Spark.SplatMesh({ url: options.url, ...(options.paged ? { paged: true } : { extSplats }) });
     await mesh.initialized;
     scene.add(mesh);
-    const { numSplats, lodSplats } = mesh.extSplats;
+    if (mesh.paged) return { numSplats: (await mesh.paged.getRadMeta()).meta.count, lod: null };
+    const { numSplats, lodSplats } = mesh.splats;
     return { numSplats, lod: lodSplats?.numSplats ?? null };
   };
 
+  /** Whether a paged file has all chunks that the cut wants, and none is on its way. */
+  const isResident = ({ fetchPriority, fetchers, fetched, lodTreeUpdates, newUploads, readyUploads, ...pager }) =>
+    [fetchers, fetched, lodTreeUpdates, newUploads, readyUploads, spark.lodUpdates].every((list) => !list.length) &&
+    fetchPriority.length > 0 &&
+    fetchPriority.every(({ splats, chunk }) => pager.splatsChunkToPage.get(splats)?.[chunk]);
+
   /** Whether the cut that is there is of this camera. */
   const isCutFor = (camera) => {
-    if (!mesh.extSplats.lodSplats) return true;
+    if (!mesh.paged && !mesh.splats.lodSplats) return true;
+    if (mesh.paged && !(spark.pager && isResident(spark.pager))) return false;
     const found = spark.currentLod;
     return Boolean(found) && found === spark.lastLod && !spark.lodDirty && found.pos.distanceTo(camera.position) < 1e-6;
+  };
+
+  /** The nodes of a cut: of a paged file Spark has where they are in its pages, 65,536 nodes each. */
+  const nodesOf = ({ indices, numSplats }) => {
+    const nodes = indices.slice(0, numSplats);
+    const pages = mesh.paged ? spark.pager.pageToSplatsChunk : null;
+    return pages ? nodes.map((index) => (pages[index >>> 16].chunk << 16) | (index & 0xffff)) : nodes;
   };
 
   const pause = () => new Promise((done) => setTimeout(done, 5));
@@ -115,7 +136,7 @@ function inPage(THREE, Spark) {
       drawn: spark.activeSplats,
       rounded: await base64(rounded),
       exact: await base64(exact),
-      indices: cut ? await base64(cut.indices.subarray(0, cut.numSplats)) : null,
+      indices: cut ? await base64(nodesOf(cut)) : null,
     };
   };
 }
@@ -130,15 +151,29 @@ import * as THREE from 'three'; import * as Spark from '@sparkjsdev/spark'; (${i
 </script>`;
 
 let scenePath = '';
+let requests = [];
+
+/** Sends a file, or the bytes of it that the request's Range names. */
+function send(file, request, response) {
+  const size = statSync(file).size;
+  const range = /^bytes=(\d+)-(\d+)$/.exec(request.headers.range ?? '')?.slice(1).map(Number) ?? null;
+  const [start, end] = range ? [range[0], Math.min(range[1], size - 1)] : [0, size - 1];
+  response.setHeader('content-type', file.endsWith('.js') ? 'text/javascript' : 'application/octet-stream');
+  response.setHeader('content-length', end - start + 1);
+  if (range) response.writeHead(206, { 'content-range': `bytes ${start}-${end}/${size}` });
+  createReadStream(file, { start, end }).pipe(response);
+  return { range, bytes: end - start + 1 };
+}
+
 const server = createServer((request, response) => {
   const { pathname } = new URL(request.url, 'http://localhost');
-  const file = pathname.startsWith('/scene/') ? scenePath : join(packages, pathname);
+  const name = pathname.startsWith('/scene/') ? basename(pathname) : null;
+  const file = name ? join(dirname(scenePath), name) : join(packages, pathname);
   if (pathname === '/') response.setHeader('content-type', 'text/html').end(page);
   else if (!existsSync(file)) response.writeHead(404).end();
   else {
-    response.setHeader('content-type', file.endsWith('.js') ? 'text/javascript' : 'application/octet-stream');
-    response.setHeader('content-length', statSync(file).size);
-    createReadStream(file).pipe(response);
+    const sent = send(file, request, response);
+    if (name) requests.push({ name, ...sent });
   }
 });
 await new Promise((done) => server.listen(0, '127.0.0.1', done));
@@ -150,12 +185,13 @@ let tab;
 async function open({ path, ...options }) {
   await tab?.close();
   scenePath = path;
+  requests = [];
   tab = await browser.newPage();
   tab.on('console', (message) => console.error(message.text()));
   tab.on('pageerror', (error) => console.error(error));
   await tab.goto(`http://127.0.0.1:${server.address().port}`);
   await tab.waitForFunction('window.ready');
-  return tab.evaluate((given) => window.open_(given), { ...options, url: `/scene/${path.split('/').pop()}` });
+  return tab.evaluate((given) => window.open_(given), { ...options, url: `/scene/${basename(path)}` });
 }
 
 async function draw({ out, ...options }) {
@@ -171,7 +207,7 @@ async function draw({ out, ...options }) {
 
 for await (const line of createInterface({ input: process.stdin })) {
   const { do: name, ...request } = JSON.parse(line);
-  const answer = await { open, draw }[name](request).catch((error) => ({ error: String(error?.message ?? error) }));
+  const answer = await { open, draw, requests: async () => ({ requests }) }[name](request).catch((error) => ({ error: String(error?.message ?? error) }));
   process.stdout.write(JSON.stringify(answer) + '\n');
 }
 await browser.close();

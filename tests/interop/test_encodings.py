@@ -7,10 +7,8 @@ the share that was measured.
 from __future__ import annotations
 
 import json
-import re
 import shutil
 import subprocess
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -31,59 +29,13 @@ from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.sh import SH_C0
 from sparklod_cli.model.splats import Splats
 from tests.conftest import real_scene
-from tests.interop import ties
 from tests.interop.spark import Spark
-from tests.interop.ties import Floats, Words, check, ext_codes, ext_steps, packed_codes, packed_steps
+from tests.interop.ties import Floats, check, ext_codes, ext_steps, packed_codes, packed_steps
+from tests.interop.words import check_file, check_tree, spark_encoding
 from tests.scenes import random_splats
 
 WIDE = SplatEncoding(rgb_min=-0.5, rgb_max=2, ln_scale_min=-8, ln_scale_max=1, sh1_max=0.5, sh2_max=2, sh3_max=0.25)
 PROGRAM = Path(__file__).with_name("spark_encode.mjs")
-
-
-def spark_encoding(encoding: SplatEncoding) -> dict[str, Any]:
-    """Returns an encoding by Spark's names."""
-    return {re.sub("_(.)", lambda match: match[1].upper(), name): value for name, value in asdict(encoding).items()}
-
-
-def check_file(spark: Spark, path: Path, share: float, encoding: SplatEncoding = DEFAULT) -> None:
-    """Compares both layouts and the tree of a file: those of Spark's worker, and ours of the same file."""
-    scene = read_scene(path)
-    splats, lod = scene.splats, scene.tree is not None
-    encoding = SplatEncoding(**asdict(encoding) | {"lod_opacity": lod})
-
-    ours = packed_splats.pack(splats, encoding)
-    theirs = spark.load_words("Packed", path, encoding=spark_encoding(encoding))
-    check(packed_codes(ours), packed_codes(theirs), packed_steps(splats, encoding), share)
-    assert theirs.keys() - {"lodTree"} == ours.keys()
-    for name in ours.keys() - {"packed"}:
-        np.testing.assert_array_equal(ours[name], theirs[name])
-    if scene.tree:
-        held = packed_splats.unpack({"packed": theirs["packed"]}, encoding)
-        check_tree(lod_tree.pack(held, scene.tree)["lod_tree"], theirs["lodTree"], held, share)
-
-    ours, theirs = ext_splats.pack(splats), spark.load_words("Ext", path)
-    np.testing.assert_array_equal(ours["ext0"][:, :3], theirs["ext0"][:, :3])
-    check(ext_codes(ours), ext_codes(theirs), ext_steps(splats), share)
-    assert theirs.keys() - {"lodTree"} == ours.keys()
-    np.testing.assert_array_equal(ext_sh(ours), ext_sh(theirs))
-    if scene.tree:
-        held = ext_splats.unpack({name: theirs[name] for name in ("ext0", "ext1")})
-        check_tree(lod_tree.pack(held, scene.tree)["lod_tree"], theirs["lodTree"], held, share)
-
-
-def ext_sh(words: Words) -> NDArray[np.uint32]:
-    """Returns the words of SH without unused ones, in which Spark leaves what its buffer had before."""
-    names = [name for name in ("sh1", "sh2", "sh3a", "sh3b") if name in words]
-    everything = np.concatenate([words["ext0"][:, :0], *(words[name] for name in names)], axis=1)
-    return everything[:, : (0, 3, 8, 0, 15)[len(names)]]
-
-
-def check_tree(ours: NDArray[np.uint32], theirs: NDArray[np.uint32], held: Splats, share: float) -> None:
-    one, other = (words.view(lod_tree.NODE)[:, 0] for words in (ours, theirs))
-    for name in ("center", "child_count", "child_start"):
-        np.testing.assert_array_equal(one[name], other[name])
-    steps, error = ties.half(gaussian.spark_size(held))
-    check({"size": one["size"]}, {"size": other["size"]}, {"size": (steps, 4 * error)}, share)
 
 
 # --- The worker -------------------------------------------------------------------------------------------------------

@@ -204,7 +204,7 @@ def appearance_options(command: Command) -> Command:
         add(
             "--through",
             type=click.Choice(list(ROUND_TRIPS)),
-            help="Draw splats as Spark's PackedSplats or ExtSplats, or SPZ, round them; cuts stay those of the"
+            help="Draw splats as Spark's PackedSplats or ExtSplats, SPZ or RAD round them; cuts stay those of the"
             " file.  [default: as in the file]",
         ),
         add(
