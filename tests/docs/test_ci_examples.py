@@ -156,7 +156,9 @@ def test_hooks_look_at_splat_files(files: str, name: str) -> None:
     assert re.search(files, name)
 
 
-@pytest.mark.parametrize("name", ["scene.spz.md", "spz", "scenespz", "scene.spz/readme", "splat.py", "x.plyx", "a-0.radc"])
+@pytest.mark.parametrize(
+    "name", ["scene.spz.md", "spz", "scenespz", "scene.spz/readme", "splat.py", "x.plyx", "a-0.radc"]
+)
 @pytest.mark.parametrize("files", [OURS["files"], LOCAL["files"]])
 def test_hooks_leave_other_files_alone(files: str, name: str) -> None:
     assert not re.search(files, name)
