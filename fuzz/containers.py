@@ -15,7 +15,7 @@ import numpy as np
 import zstandard
 from PIL import Image
 
-from fixtures import by_hand, by_hand_sog
+from fixtures import by_hand, by_hand_rad, by_hand_sog
 
 from .case import Rng
 from .mutate import INTEGERS, json_mutated, mutated, pick, text_mutated
@@ -32,7 +32,10 @@ LARGEST = 32_000
 HEADER = 120
 
 #: Exceptions that reading a broken container raises.
-BROKEN = (EOFError, OSError, ValueError, struct.error, zipfile.BadZipFile, zlib.error, zstandard.ZstdError)
+BROKEN = (
+    *(EOFError, KeyError, OSError, TypeError, ValueError),
+    *(struct.error, zipfile.BadZipFile, zlib.error, zstandard.ZstdError),
+)
 
 Parts = Mapping[str, bytes]
 
@@ -51,9 +54,13 @@ def valid_seeds() -> tuple[str, ...]:
     return tuple(name for name in seeds() if not name.startswith("faults/"))
 
 
-def folder_seed() -> dict[str, bytes]:
-    """The files of an unpacked SOG, by name."""
-    return {path.name: path.read_bytes() for path in sorted((FIXTURES / "golden" / "sh1-sog").iterdir())}
+#: Folders of files that belong together, and the names by which a command is given them.
+FOLDERS = {"sh1-sog": (".", "meta.json"), "sh3-rad": ("sh3.rad",)}
+
+
+def folder_seed(name: str) -> dict[str, bytes]:
+    """The files of one of `FOLDERS`, by name."""
+    return {path.name: path.read_bytes() for path in sorted((FIXTURES / "golden" / name).iterdir())}
 
 
 def split_file(data: bytes) -> tuple[Parts, Callable[[Parts], bytes]]:
@@ -64,6 +71,9 @@ def split_file(data: bytes) -> tuple[Parts, Callable[[Parts], bytes]]:
             return {"header": raw[:16], "payload": raw[16:]}, _gzipped
         if data[:4] == b"NGSP":
             return _spz_4(data)
+        if data[:3] == b"RAD":
+            rad = by_hand_rad.split(data)
+            return rad, functools.partial(by_hand_rad.joined, original=rad)
         if data[:4] == b"PK\x03\x04":
             with zipfile.ZipFile(io.BytesIO(data)) as archive:
                 return {name: archive.read(name) for name in archive.namelist()}, by_hand_sog.zipped

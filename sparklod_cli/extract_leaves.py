@@ -12,13 +12,10 @@ import numpy as np
 from .codecs.formats import WRITABLE
 from .codecs.options import WriteOptions
 from .codecs.spz_options import like
-from .io import read_scene, sink
+from .io import read_scene, scene_sink
 from .model.scene import Scene
 from .support.errors import FormatError, memory_errors_translated
 from .support.progress import Progress, silent
-
-#: Of outputs whose name has none.
-SUFFIX = ".spz"
 
 
 @dataclass(frozen=True)
@@ -60,6 +57,7 @@ def extract_leaves(
     target: Path,
     options: WriteOptions,
     *,
+    suffix: str,
     overwrite: bool = False,
     threads: int = 1,
     progress: Progress = silent,
@@ -68,27 +66,24 @@ def extract_leaves(
 
     Args:
         source: a Level-of-Detail file; - is standard input.
-        target: its suffix tells the format, which is SPZ where it has none; - is standard output.
+        target: of any name; - is standard output.
         options: how to write; what is None is taken from the input, which keeps its values as they are.
+        suffix: of the format, one of `WRITABLE`.
         overwrite: replace a file that exists.
         threads: to work on.
         progress: told of the stages.
 
     Raises:
-        FormatError, OutputError: see `io.read_scene` and `io.sink`; the file has no tree.
+        FormatError, OutputError: see `io.read_scene` and `io.scene_sink`; the file has no tree.
         OutOfMemoryError: it does not fit into memory.
-        ValueError: no format of plain splats has that suffix.
     """
     with memory_errors_translated():
-        write = sink(target, overwrite=overwrite)
-        suffix = target.suffix.lower() or SUFFIX
-        if suffix not in WRITABLE:
-            raise ValueError(f"{suffix} is not one of {', '.join(WRITABLE)}")
+        write = scene_sink(target, WRITABLE[suffix], chunked=options.rad.chunked, overwrite=overwrite)
         start = time.perf_counter()
         scene = read_scene(source, threads=threads, progress=progress)
         leaves = leaves_of(scene)
         read_done = time.perf_counter()
-        size = write(WRITABLE[suffix].codec().encode(leaves, like(scene, options), threads=threads, progress=progress))
+        size = write(leaves, like(scene, options), threads=threads, progress=progress)
         seconds = {"read": read_done - start, "write": time.perf_counter() - read_done}
     return Extracted(
         format=scene.format,

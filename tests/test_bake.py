@@ -141,7 +141,7 @@ def refused(error: SparklodError) -> bool:
 @settings(max_examples=300, deadline=None)
 def test_baked_files_pass_inspect_check(splats: Splats, method: str, version: int, bits: int | None) -> None:
     with tempfile.TemporaryDirectory() as folder:
-        how = BakeSettings(method=method, spz=WriteOptions(spz_version=version, fractional_bits=bits))
+        how = BakeSettings(method=method, options=WriteOptions(spz_version=version, fractional_bits=bits))
         try:
             found = findings_of(file_of(folder, splats), how)
         except SparklodError as error:
@@ -160,7 +160,7 @@ def test_a_coordinate_is_written_up_to_the_last_but_one_code(bits: int | None, m
         splats.center[:] = 0
         splats.center[3, 1] = sign * (spz_options.LAST_CODE + code) * step
         source = file_of(tmp_path, splats)
-        how = BakeSettings(method=method, spz=WriteOptions(fractional_bits=bits))
+        how = BakeSettings(method=method, options=WriteOptions(fractional_bits=bits))
         if code < 1:
             assert [each.code for each in findings_of(source, how) if each.severity == ERROR] == []
         else:

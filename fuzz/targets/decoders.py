@@ -8,20 +8,24 @@ from sparklod_cli.io import examine_scene, read_scene
 
 from .. import laws
 from ..case import Case, Rng
-from ..containers import folder_seed, mutated_part, mutated_scene, seeds, valid_seeds
+from ..containers import FOLDERS, folder_seed, mutated_part, mutated_scene, seeds, valid_seeds
 from ..mutate import pick
 
 THREADS = (1, 2)
 
 
 def make(rng: Rng) -> Case:
-    """Changes one of the seeds; one case in thirty is an unpacked SOG."""
+    """Changes one of the seeds; one case in twenty is a folder of files that belong together."""
     threads = pick(rng, THREADS)
-    if rng.integers(30) == 0:
-        files = folder_seed()
+    if rng.integers(20) == 0:
+        folder = pick(rng, list(FOLDERS))
+        files = folder_seed(folder)
         name = pick(rng, list(files))
-        files[name] = mutated_part(rng, name, files[name])
-        return Case(f"sh1-sog, {name}", files, {"path": pick(rng, (".", "meta.json")), "threads": threads})
+        if Path(name).suffix in (".rad", ".radc"):
+            files[name] = mutated_scene(rng, files[name], files[pick(rng, list(files))])[1]
+        else:
+            files[name] = mutated_part(rng, name, files[name])
+        return Case(f"{folder}, {name}", files, {"path": pick(rng, FOLDERS[folder]), "threads": threads})
     name = pick(rng, valid_seeds() if rng.integers(5) else list(seeds()))
     other = pick(rng, list(seeds()))
     changed, data = mutated_scene(rng, seeds()[name], seeds()[other])

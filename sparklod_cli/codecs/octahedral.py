@@ -27,17 +27,17 @@ _PI = np.float32(np.pi)
 #: Sine of half the angle below which the axis is noise: Spark uses the x axis instead.
 _NO_ROTATION = np.float32(1e-6)
 #: Added before truncation, this rounds ties up; unlike 1 / 2 itself it does not round the float32 below 1 / 2 up to 1.
-_ALMOST_HALF = np.nextafter(np.float32(0.5), np.float32(0))
+ALMOST_HALF = np.nextafter(np.float32(0.5), np.float32(0))
 
 
 def round_half_away(values: FloatArray) -> FloatArray:
     """float32 numbers rounded to whole ones, ties away from zero, as Rust's `round` does and numpy's does not."""
-    return np.trunc(values + np.copysign(_ALMOST_HALF, values))
+    return np.trunc(values + np.copysign(ALMOST_HALF, values))
 
 
 def to_code(values: FloatArray, most: int) -> NDArray[np.uint32]:
     """float32 numbers in units of codes to whole codes, clamped to 0..most, ties up."""
-    return (np.clip(values, 0, np.float32(most)) + _ALMOST_HALF).astype(np.uint32)
+    return (np.clip(values, 0, np.float32(most)) + ALMOST_HALF).astype(np.uint32)
 
 
 def encode_axis_angle(quat_xyzw: FloatArray, steps: tuple[int, int]) -> tuple[Words, Words, Words]:

@@ -30,8 +30,12 @@ from .options import DEFAULTS, WriteOptions
 from .rad_decode import Packed, fill
 from .rad_encode import Writing
 from .rad_header import CHUNK_MAGIC, ChunkEntry, ChunkHeader, Header, pack_header, read_header
+from .rad_names import SUFFIX, chunk_name
 from .rad_options import settled as settled
 from .stream import size_of
+
+#: Bytes of chunks that wait in memory for their header; beyond, they wait on disk.
+SPOOLED = 1 << 26
 
 #: Opens a file that a header names.
 Beside = Callable[[str], BinaryIO]
@@ -69,13 +73,14 @@ def examine(
 ) -> Scene:
     """Reads a file for inspection: the given columns of `Splats`, the others are 0; its tree may be broken.
 
-    The header of the scene has the number of chunks, their size in splats, and the number of codes of SH.
+    The header of the scene has the number of chunks, their size in splats, whether they are files of their own, and
+    the number of codes of SH where there is a palette.
 
     Raises:
         FormatError: as `decode`, but not for a broken tree.
     """
     size = size_of(file)
-    _refuse_chunk(file)
+    refuse_chunk(file)
     header = read_header(file)
     files = _sizes_beside(header, beside)
     rad_promises.check(rad_promises.violations(header, size, files))
@@ -92,7 +97,8 @@ def examine(
         start, stop = packed.header.base, packed.header.base + packed.header.count
         part = _rows(splats, tree, slice(start, stop))
         if fill(packed, header, *part, palette, columns) is not None:
-            raise FormatError(f"chunk {packed.number:,} has labels of SH, but there is no palette")
+            text = f"chunk {packed.number:,} has labels of SH, but there is no palette"
+            raise rad_promises.error_of("rad.palette", text)
         return stop
 
     def all_chunks() -> Iterator[Packed]:
@@ -103,9 +109,15 @@ def examine(
     for done in ordered_map(run, all_chunks(), threads):
         progress("reading", done, header.count, "splat")
     facts = {"version": 1, "chunks": len(header.chunks), "chunk_size": header.chunk_size}
+    facts |= {"header_bytes": header.bytes, "chunked": int(header.chunked)}
     facts |= {"sh_codes": len(palette)} if palette is not None else {}
-    name = "RAD" + " LoD" * (tree is not None)
-    return Scene(splats, tree, format=name, header=facts, chunk_bytes=tuple(entry.bytes for entry in header.chunks))
+    sizes = tuple(entry.bytes for entry in header.chunks)
+    return Scene(splats, tree, format=name_of(header), header=facts, chunk_bytes=sizes)
+
+
+def name_of(header: Header) -> str:
+    """The format of a file for people, as `Scene.format` has it."""
+    return "RAD" + " LoD" * header.lod_tree
 
 
 def encode(
@@ -121,7 +133,7 @@ def encode(
     """
     writing = _writing(scene, options, threads)
     sizes = []
-    with tempfile.TemporaryFile() as spool:
+    with tempfile.SpooledTemporaryFile(SPOOLED) as spool:
         for chunk in _encoded(writing, threads, progress):
             spool.write(chunk)
             sizes.append(len(chunk))
@@ -147,9 +159,10 @@ def encode_chunked(
     writing = _writing(scene, options, threads)
     entries = []
     for number, chunk in enumerate(_encoded(writing, threads, progress)):
-        entries.append(ChunkEntry(0, len(chunk), f"{stem}-{number}.radc"))
-        yield f"{stem}-{number}.radc", [chunk]
-    yield f"{stem}.rad", [pack_header(_header(writing, tuple(entries)))]
+        name = chunk_name(stem, number)
+        entries.append(ChunkEntry(0, len(chunk), name))
+        yield name, [chunk]
+    yield stem + SUFFIX, [pack_header(_header(writing, tuple(entries)))]
 
 
 def _writing(scene: Scene, options: WriteOptions, threads: int) -> Writing:
@@ -227,7 +240,8 @@ def read_chunk(file: BinaryIO, entry: ChunkEntry, header: Header, palette: Float
     return Chunk(packed.header, splats, tree, own, labels)
 
 
-def _refuse_chunk(file: BinaryIO) -> None:
+def refuse_chunk(file: BinaryIO) -> None:
+    """Raises `NotSplatsError`, which says what to give, where a file is a single chunk; leaves it at its beginning."""
     if file.read(len(CHUNK_MAGIC)) == CHUNK_MAGIC:
         raise NotSplatsError("it is one chunk of a RAD file; give the .rad file beside it, which names all chunks")
     file.seek(0)

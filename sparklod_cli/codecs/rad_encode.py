@@ -17,7 +17,8 @@ from . import octahedral
 from .options import RadOptions
 from .rad_encodings import CODINGS
 from .rad_header import GZ, ChunkHeader, Property, pack_chunk_header, padding
-from .rad_layout import PROPERTIES, RANGES, Row
+from .rad_layout import PROPERTIES, RANGES, SIZES, Row
+from .rad_options import code_range
 from .splat_encoding import SplatEncoding
 
 _RAW = -zlib_ng.MAX_WBITS
@@ -62,8 +63,8 @@ class Writing:
         payload, properties, at = [], [], 0
         for row in self._rows(first=part.start == 0):
             encoding = getattr(self.options, row.option) if row.option else row.encodings[0]
-            low, high = self._ends(row)
-            data = self._deflated(CODINGS[encoding].encode(self._values(row, encoding, part), low, high))
+            low, high = code_range(row, self.ranges)
+            data = self._deflated(CODINGS[encoding].encode(self._values(row, encoding, part), low, high), encoding)
             ends = (low, high) if RANGES.get(encoding) else (None, None)
             properties.append(Property(at, len(data), row.name, encoding, GZ, *ends))
             payload += [data, bytes(padding(len(data)))]
@@ -87,18 +88,6 @@ class Writing:
             if present:
                 yield row
 
-    def _ends(self, row: Row) -> tuple[float, float]:
-        """The range of a property's codes."""
-        ranges = self.ranges
-        if row.degree:
-            most = float(ranges.sh_max(row.degree))
-            return -most, most
-        if row.column == "rgb":
-            return ranges.rgb_min, ranges.rgb_max
-        if row.column == "scale":
-            return ranges.ln_scale_min, ranges.ln_scale_max
-        return 0, ranges.alpha_max
-
     def _values(self, row: Row, encoding: str, part: slice) -> NDArray[Any]:
         """(n, numbers) values of a property, as its encoding takes them."""
         splats, tree = self.scene.splats, self.scene.tree
@@ -117,8 +106,13 @@ class Writing:
             return rounded(column, self.options.center_bits)
         return column if column.ndim == 2 else column[:, None]
 
-    def _deflated(self, codes: NDArray[Any]) -> bytes:
-        packer = zlib_ng.compressobj(self.level, zlib_ng.DEFLATED, _RAW)
+    def _deflated(self, codes: NDArray[Any], encoding: str) -> bytes:
+        """A raw deflate stream.
+
+        Of codes of a byte, only runs are looked for: longer matches are chance, which makes them longer and slower.
+        """
+        strategy = zlib_ng.Z_RLE if SIZES[encoding] == 1 else zlib_ng.Z_DEFAULT_STRATEGY
+        packer = zlib_ng.compressobj(self.level, zlib_ng.DEFLATED, _RAW, zlib_ng.DEF_MEM_LEVEL, strategy)
         return packer.compress(codes.data.cast("B")) + packer.flush()
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..model.splats import FloatArray
 from . import octahedral, splat_encoding
-from .octahedral import STEPS_8_8_8, round_half_away
+from .octahedral import STEPS_8_8_8
 from .quantize import Bytes
 
 #: Largest finite float16. Larger values are clamped to it: rounded they would be infinite.
@@ -91,8 +91,11 @@ def _by_table(
 
 
 def _encode_signed(values: FloatArray, low: float, high: float) -> NDArray[Any]:
-    steps = np.clip(values / np.float32(high) * np.float32(127), -127, 127)
-    return round_half_away(steps).astype(np.int8).view(np.uint8)
+    steps = values / np.float32(high)
+    steps *= np.float32(127)
+    np.clip(steps, -127, 127, out=steps)
+    steps += np.copysign(octahedral.ALMOST_HALF, steps)
+    return steps.astype(np.int8).view(np.uint8)
 
 
 def _signed_table(low: float, high: float) -> FloatArray:
@@ -105,7 +108,7 @@ def _encode_log(values: NDArray[Any], low: float, high: float) -> NDArray[Any]:
 
 
 def _decode_log_f16(codes: Bytes, count: int, numbers: int, low: float, high: float) -> NDArray[Any]:
-    with np.errstate(over="ignore"):
+    with np.errstate(over="ignore", invalid="ignore"):  # a stranger's logarithm may be any
         return np.exp(_F16.decode(codes, count, numbers, low, high).astype(np.float32))
 
 

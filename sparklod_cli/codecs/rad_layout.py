@@ -81,6 +81,9 @@ PROPERTIES = (
 
 BY_NAME = {row.name: row for row in PROPERTIES}
 
+#: The fields of `RadOptions` that choose an encoding.
+OPTIONS = tuple(dict.fromkeys(row.option for row in PROPERTIES if row.option))
+
 
 def choices(option: str) -> tuple[str, ...]:
     """The encodings that a field of `RadOptions` may name, "auto" first."""

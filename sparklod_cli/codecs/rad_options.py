@@ -15,12 +15,12 @@ from ..support.errors import FormatError
 from .clamps import Range
 from .options import RadOptions, WriteOptions
 from .rad_encodings import LARGEST_F16
-from .rad_layout import AUTO, choices
+from .rad_layout import AUTO, PROPERTIES, RANGES, Row, choices
 from .splat_encoding import SCALE_ZERO, SplatEncoding
 from .steps import SMALL_QUANTILE, fine_bits
 
 #: What "auto" stands for, where the scene does not decide.
-AUTOMATIC = RadOptions("f32_lebytes", "r8", "r8_delta", "ln_0r8", "oct88r8", "s8")
+AUTOMATIC = RadOptions("f32_lebytes", "r8", "r8", "ln_0r8", "oct88r8", "s8")
 
 #: Range of the logarithms of scales up to which none is clamped: 254 steps of 4.7 % at most. Beyond, the smallest
 #: `SMALL_QUANTILE` of the scales may be; those are flat splats' thicknesses.
@@ -29,11 +29,23 @@ LOG_RANGE = 12.0
 #: Range from which float16 is used: as Spark does, which is also where its error of 2 ** -11 becomes the smaller one.
 WIDE_LOG_RANGE = 25.0
 
+#: Range of colours from which float16 is used: a code would be 3 steps of 8-bit colour and more.
+WIDE_RGB_RANGE = 3.0
+
 #: Ranges end at multiples of this, so that their numbers are short and exact.
 GRID = 1 / 64
 
-#: Values that ranges are fitted to: more would not change them, but take longer.
-SAMPLE = 1 << 18
+#: Least range of codes of SH in a file: their steps of 1 / 127 are below what colours of 8 bits show, and finer ones
+#: take more room. The splatEncoding of the header has the fitted range all the same, since a viewer that packs SH into
+#: 6 to 8 bits takes that.
+LEAST_SH_MAX = 1.0
+
+#: Numbers that ranges are fitted to, about: more would not change them, but take longer.
+SAMPLE = 1 << 16
+
+#: An error of a colour or a coefficient from which more is no worse: a colour is then a wrong one. Otherwise a single
+#: splat far from all others would decide the steps of all.
+WORST = 0.5
 
 #: Ends of ranges that are tried, as shares of the values that lie inside.
 SHARES = 1 - np.array([0.0, 1e-4, 3e-4, 1e-3, 3e-3, 1e-2])
@@ -57,6 +69,8 @@ def settled(scene: Scene, options: WriteOptions) -> WriteOptions:
     chosen = {name: getattr(AUTOMATIC, name) if value == AUTO else value for name, value in given.items()}
     if rad.scales == AUTO and ranges.ln_scale_max - ranges.ln_scale_min > WIDE_LOG_RANGE:
         chosen["scales"] = "ln_f16"
+    if rad.rgb == AUTO and ranges.rgb_max - ranges.rgb_min > WIDE_RGB_RANGE:
+        chosen["rgb"] = "f16"
     bits = rad.center_bits
     if rad.center == AUTO and bits is None:
         # The lowest bytes of rounded float32 are mostly zeros, which take no room.
@@ -75,6 +89,19 @@ def fitted(scene: Scene) -> SplatEncoding:
     return SplatEncoding(rgb_min, rgb_max, low, high, tops[0], tops[1], tops[2], scene.tree is not None)
 
 
+def code_range(row: Row, ranges: SplatEncoding) -> tuple[float, float]:
+    """The range of a property's codes in a file; (0, 0) where it has none."""
+    if row.degree:
+        most = max(LEAST_SH_MAX, float(ranges.sh_max(row.degree)))
+        return -most, most
+    ends = {
+        "rgb": (ranges.rgb_min, ranges.rgb_max),
+        "scale": (ranges.ln_scale_min, ranges.ln_scale_max),
+        "opacity": (0.0, float(ranges.alpha_max)),
+    }
+    return ends.get(row.column, (0.0, 0.0))
+
+
 def held(options: WriteOptions, sh_degree: int) -> list[Range]:
     """The values that a file with these settled options holds without clamping them.
 
@@ -82,31 +109,38 @@ def held(options: WriteOptions, sh_degree: int) -> list[Range]:
         options: of `settled`.
         sh_degree: of the scene.
     """
-    rad, found = options.rad, []
-    ranges = rad.ranges or SplatEncoding()
-    most = float(LARGEST_F16)
-    if rad.center.startswith("f16"):
-        found.append(Range("center", -most, most))
-    if rad.scales == "ln_0r8":
-        half = (ranges.ln_scale_max - ranges.ln_scale_min) / 508
-        low, high = math.exp(ranges.ln_scale_min - half), math.exp(min(ranges.ln_scale_max + half, 88.0))
-        found.append(Range("scale", low, high, zero=float(SCALE_ZERO)))
-    if rad.rgb.startswith("r8"):
-        half = (ranges.rgb_max - ranges.rgb_min) / 510
-        found.append(Range("rgb", ranges.rgb_min - half, ranges.rgb_max + half))
-    elif rad.rgb == "f16":
-        found.append(Range("rgb", -most, most))
-    for degree in range(1, sh_degree + 1):
-        numbers = (3 * COEFFICIENTS[degree - 1], 3 * COEFFICIENTS[degree])
-        top = most if rad.sh == "f16" else float(ranges.sh_max(degree)) * (1 + 1 / 254)
-        if rad.sh != "f32":
-            found.append(Range("sh", -top, top, numbers))
+    rad, found, most = options.rad, [], float(LARGEST_F16)
+    for row in PROPERTIES:
+        encoding = getattr(rad, row.option) if row.option else ""
+        if row.codes or row.degree > sh_degree or row.column == "opacity" or rad.ranges is None:
+            continue
+        numbers = (3 * COEFFICIENTS[row.degree - 1], 3 * COEFFICIENTS[row.degree]) if row.degree else (0, None)
+        low, high = code_range(row, rad.ranges)
+        if encoding == "ln_0r8":
+            half = (high - low) / 508
+            ends = math.exp(low - half), math.exp(min(high + half, 88.0))
+            found.append(Range(row.column, *ends, zero=float(SCALE_ZERO)))
+        elif encoding in RANGES:
+            half = (high - low) / (508 if encoding.startswith("s8") else 510)
+            found.append(Range(row.column, low - half, high + half, numbers))
+        elif encoding in ("f16", "f16_lebytes"):
+            found.append(Range(row.column, -most, most, numbers))
     return found
 
 
 def _sampled(values: FloatArray) -> NDArray[np.float64]:
-    flat = values.reshape(-1)
-    return flat[:: max(1, flat.size // SAMPLE)].astype(np.float64)
+    """Numbers of every so many splats."""
+    step = max(1, values.size // SAMPLE)
+    return values[::step].reshape(-1).astype(np.float64)
+
+
+def _quantiles(ordered: NDArray[np.float64], shares: NDArray[np.float64]) -> NDArray[np.float64]:
+    return ordered[np.rint(shares * (len(ordered) - 1)).astype(np.intp)]
+
+
+def _squared(beyond: NDArray[np.float64], step: float) -> float:
+    """The mean squared error of values that lie so far beyond a range, where others are rounded to steps."""
+    return float(np.mean(np.minimum(beyond, WORST) ** 2)) + step**2 / 12
 
 
 def _outward(value: float, up: bool) -> float:
@@ -118,12 +152,12 @@ def _linear_range(values: FloatArray) -> tuple[float, float]:
     sample = np.sort(_sampled(values))
     if not sample.size:
         return 0.0, 1.0
-    lows = np.unique(np.minimum(np.quantile(sample, 1 - SHARES), 0))
-    highs = np.unique(np.maximum(np.quantile(sample, SHARES), 1))
+    lows = np.unique(np.minimum(_quantiles(sample, 1 - SHARES), 0))
+    highs = np.unique(np.maximum(_quantiles(sample, SHARES), 1))
 
     def error(low: float, high: float) -> float:
         beyond = np.maximum(low - sample, 0) + np.maximum(sample - high, 0)
-        return float(np.mean(beyond**2)) + ((high - low) / 255) ** 2 / 12
+        return _squared(beyond, (high - low) / 255)
 
     best = min((error(low, high), low, high) for low in lows for high in highs)
     return _outward(best[1], False), _outward(best[2], True)
@@ -131,14 +165,14 @@ def _linear_range(values: FloatArray) -> tuple[float, float]:
 
 def _largest(values: FloatArray) -> float:
     """The largest coefficient for 254 steps with the least squared error, of rounding and of clamping together."""
-    sample = np.abs(_sampled(values))
+    sample = np.sort(np.abs(_sampled(values)))
     if not sample.size:
         return 1.0
 
     def error(top: float) -> float:
-        return float(np.mean(np.maximum(sample - top, 0) ** 2)) + (top / 127) ** 2 / 12
+        return _squared(np.maximum(sample - top, 0), top / 127)
 
-    return max(GRID, _outward(min(np.quantile(sample, SHARES), key=error), True))
+    return max(GRID, _outward(min(_quantiles(sample, SHARES), key=error), True))
 
 
 def _log_range(scale: FloatArray) -> tuple[float, float]:
@@ -147,6 +181,7 @@ def _log_range(scale: FloatArray) -> tuple[float, float]:
     if not visible.size:
         return SplatEncoding.ln_scale_min, SplatEncoding.ln_scale_max
     least, most = (float(np.log(np.float64(end))) for end in (visible.min(), visible.max()))
-    low = max(least, min(float(np.quantile(np.log(_sampled(visible)), SMALL_QUANTILE)), most - LOG_RANGE))
+    small = float(np.log(_quantiles(np.sort(_sampled(visible)), np.array(SMALL_QUANTILE))))
+    low = max(least, min(small, most - LOG_RANGE))
     low, high = _outward(low, False), _outward(most, True)
     return low, high if high > low else low + GRID

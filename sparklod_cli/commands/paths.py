@@ -103,6 +103,13 @@ def keep_apart(ctx: click.Context, stands_for: Mapping[str, Iterable[Path]] | No
             )
 
 
+def with_chunks(headers: Iterable[Path]) -> list[Path]:
+    """Outputs whose chunks are files of their own, and the files beside them that are replaced or removed with them."""
+    from ..io import chunk_files
+
+    return [path for header in headers for path in (header, *chunk_files(header))]
+
+
 def claim_stdout(ctx: click.Context, name: str, *, as_json: bool, binary: bool = False) -> None:
     """Raises a `click.UsageError` where an output is - and standard output is taken, or no place for it.
 

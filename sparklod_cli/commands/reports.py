@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from ..codecs.clamps import Clamp
 
 #: What clamping does to a scene and what to do about it, by column of `Splats` and whether the upper end clamps.
-CLAMPED = {
+CLAMPED_BY_SPZ = {
     ("scale", False): (
         "scales",
         "too small to be seen from farther away than 0.1 units; if the whole scene is that small, enlarge it (--scale)",
@@ -28,15 +28,28 @@ CLAMPED = {
     ("sh", False): ("SH", "reflections get weaker; render --diff shows whether it matters"),
     ("sh", True): ("SH", "reflections get weaker; render --diff shows whether it matters"),
 }
+_THIN, _WIDE = "mostly how thick flat splats are; --rad-scales ln_f16 keeps them", "--rad-scales ln_f16 keeps them"
+_FAR, _COLORS = "--rad-center f32_lebytes keeps them", "the loss is hardly visible; --rad-rgb f16 keeps them"
+CLAMPED_BY_RAD = {
+    ("center", False): ("coordinates", _FAR),
+    ("center", True): ("coordinates", _FAR),
+    ("scale", False): ("scales", _THIN),
+    ("scale", True): ("scales", _WIDE),
+    ("rgb", False): ("colours", _COLORS),
+    ("rgb", True): ("colours", _COLORS),
+    ("sh", False): ("SH", "reflections get weaker; --rad-sh f16 keeps them"),
+    ("sh", True): ("SH", "reflections get weaker; --rad-sh f16 keeps them"),
+}
 
 
 def report_baked(console: Console, source: Path, target: Path, baked: Baked) -> None:
     """A line about the file, and one for each thing that a person should know."""
     from ..model.selection import describe
 
+    chunks = f", {count_of(baked.chunks, 'chunk')}" if baked.chunks else ""
     console.say(
         f"{name_of(source)}  {count_of(baked.splats, 'splat')}, SH {baked.sh_degree}  ->  {_name(target)} "
-        f" {count_of(baked.nodes, 'node')}, depth {baked.levels - 1},"
+        f" {count_of(baked.nodes, 'node')}, depth {baked.levels - 1}{chunks},"
         f" {size_of(baked.bytes)}, {_total(baked.seconds)}"
     )
     if baked.dropped:
@@ -44,22 +57,31 @@ def report_baked(console: Console, source: Path, target: Path, baked: Baked) -> 
     for note in baked.notes:
         console.say(f"  {note}")
     for clamp in baked.clamps:
-        console.say(f"  {_clamped(clamp, baked.nodes)}")
+        console.say(f"  {_clamped(clamp, baked)}")
+    tree = f"{baked.method} tree" if baked.method is not None else "the same tree"
+    console.detail(f"  {baked.format} -> {tree} -> {_written(baked)}; {_stages(baked.seconds)}")
+
+
+def _written(baked: Baked) -> str:
+    """The format of the output and the choices that were made for it."""
     if baked.arrays:
-        written = ", ".join(f"{name} uint32{list(shape)}" for name, shape in baked.arrays.items())
-    else:
-        written = f"SPZ {baked.version} LoD, {baked.fractional_bits} fractional bits"
-    console.detail(f"  {baked.format} -> {baked.method} tree -> {written}; {_stages(baked.seconds)}")
+        return ", ".join(f"{name} uint32{list(shape)}" for name, shape in baked.arrays.items())
+    if baked.chunks is None:
+        return f"SPZ {baked.version} LoD, {baked.fractional_bits} fractional bits"
+    palette = f", a palette of {baked.sh_codes:,} SH" if baked.sh_codes else ""
+    encodings = ", ".join(f"{name} {encoding}" for name, encoding in baked.encodings.items())
+    return f"RAD LoD, {encodings}{palette}"
 
 
-def _clamped(clamp: Clamp, nodes: int) -> str:
+def _clamped(clamp: Clamp, baked: Baked) -> str:
     """How many nodes have values that were clamped, how far these were off, and what that means."""
-    name, advice = CLAMPED[clamp.column, clamp.above]
-    share = f"{count_of(clamp.splats, 'node')} ({100 * clamp.splats / nodes:.3g} %)"
+    form, table = ("SPZ", CLAMPED_BY_SPZ) if baked.chunks is None else ("RAD", CLAMPED_BY_RAD)
+    name, advice = table[clamp.column, clamp.above]
+    share = f"{count_of(clamp.splats, 'node')} ({100 * clamp.splats / baked.nodes:.3g} %)"
     where, way = ("above", "up") if clamp.above else ("below", "down")
     farthest = clamp.farthest or 0.0  # no -0
     return (
-        f"{name} of {share} are {where} {clamp.end:.3g}, {way} to {farthest:.3g}, and are clamped to what SPZ holds:"
+        f"{name} of {share} are {where} {clamp.end:.3g}, {way} to {farthest:.3g}, and are clamped to what {form} holds:"
         f" {advice}"
     )
 

@@ -2,13 +2,15 @@
 
 from .beside import companions
 from .names import is_file_name
-from .reading import examine_scene, read_arrays, read_scene, size_of_input
+from .reading import examine_scene, opened, read_arrays, read_scene, size_of_input
+from .scenes import SceneSink, scene_sink
 from .texts import MAX_TEXT, read_rgba, read_text, read_together
 from .together import SinkTogether, chunk_files, sink_together, write_together
 from .writing import Sink, check_writable, sink, write_stdout, write_whole
 
 __all__ = [
     "MAX_TEXT",
+    "SceneSink",
     "Sink",
     "SinkTogether",
     "check_writable",
@@ -16,11 +18,13 @@ __all__ = [
     "companions",
     "examine_scene",
     "is_file_name",
+    "opened",
     "read_arrays",
     "read_rgba",
     "read_scene",
     "read_text",
     "read_together",
+    "scene_sink",
     "sink",
     "sink_together",
     "size_of_input",

@@ -21,6 +21,9 @@ MAX_FRACTIONAL_BITS = 24
 #: Deflate levels, and the default; measured in docs/decisions.
 MIN_COMPRESSION, MAX_COMPRESSION, DEFAULT_COMPRESSION = 1, 9, 5
 
+#: Entries of a palette of spherical harmonics: Spark's labels have 16 bits.
+MIN_SH_CODES, MAX_SH_CODES = 2, 65_536
+
 #: Quantities by which `inspect` can colour a picture.
 PLOT_BY = ("level", "opacity", "size", "chunk")
 

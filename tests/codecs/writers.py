@@ -417,7 +417,10 @@ def as_rad(source: Scene, options: RadOptions) -> Content:
 def written_rad_precision(source: Scene, options: RadOptions) -> Precision:
     chosen = rad.settled(source, WriteOptions(rad=options)).rad
     assert chosen.ranges is not None
-    return rad_precision(source, {name: getattr(chosen, name) for name in SMALL_RAD}, chosen.ranges, chosen.center_bits)
+    ranges = chosen.ranges  # those of SH are for viewers; codes in a file reach at least from -1 to 1
+    tops = {f"sh{degree}_max": max(1.0, float(ranges.sh_max(degree))) for degree in (1, 2, 3)}
+    encodings = {name: getattr(chosen, name) for name in SMALL_RAD}
+    return rad_precision(source, encodings, dataclasses.replace(ranges, **tops), chosen.center_bits)
 
 
 def rad_encodings(number: int) -> RadOptions:

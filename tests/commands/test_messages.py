@@ -11,7 +11,7 @@ import pytest
 
 from sparklod_cli.cli import run
 from sparklod_cli.codecs import ply
-from sparklod_cli.commands.reports import CLAMPED
+from sparklod_cli.commands.reports import CLAMPED_BY_SPZ
 from sparklod_cli.io import read_scene
 from tests.conftest import FIXTURES
 
@@ -100,7 +100,7 @@ def test_what_is_clamped_is_said_with_its_end_and_what_to_do(
 ) -> None:
     assert run(["build-lod", str(clamped_scene(tmp_path, **{name: value}))]) == 0
     err = capsys.readouterr().err
-    advice = CLAMPED[name, "above" in said][1]
+    advice = CLAMPED_BY_SPZ[name, "above" in said][1]
     assert re.search(rf"\n  {said}, and are clamped to what SPZ holds: {re.escape(advice)}\n", err), err
     assert err.count("clamped to") == 1
 

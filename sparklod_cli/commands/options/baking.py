@@ -8,27 +8,55 @@ from typing import TYPE_CHECKING
 import click
 
 from ...codecs.gpu.table import ENCODINGS, NPZ, RAW_SUFFIXES
+from ...codecs.rad_layout import OPTIONS as PROPERTIES
+from ...codecs.rad_layout import choices
 from ...lod.builders import BUILDERS, METHODS
 from ...support import defaults
 from ..command import COMMON, option, with_options
 from ..paths import InputPath
-from ..usage import is_given, refuse
+from ..usage import given, is_given, refuse
 from .common import Command
-from .types import AutoOr, Ball, Numbers, Real
+from .types import AutoOr, Ball, Codes, Numbers, Real
 
 if TYPE_CHECKING:
     from ...api.file_jobs import BakeSettings
     from ...codecs.options import WriteOptions
 
 TREE, SELECTION, PLACE, FORMAT = "Tree", "Selection", "Rotation, scale and position", "File format"
+RAD = "RAD"
+
+#: Values of --format: the suffix of the file, and whether each chunk gets a file of its own.
+FORMS = {"spz": (".spz", False), "rad": (".rad", False), "rad-chunked": (".rad", True)}
+
+#: What the properties of RAD are called in --help.
+NAMES = {
+    "center": "centres",
+    "alpha": "opacities",
+    "rgb": "colours",
+    "scales": "scales",
+    "orientation": "rotations",
+    "sh": "spherical harmonics",
+}
 
 #: Parameters of the headings above, of which a file that is only converted back has nothing.
 OF_TREES = ("method", "base", "growth", "max_sh")
 OF_SELECTION = ("min_opacity", "min_box", "max_box", "within", "on_invalid", "rgba")
 OF_PLACE = ("up", "rotate", "scale", "translate")
-OF_SPZ = ("spz_version", "fractional_bits", "compression_level")
+OF_SPZ = ("spz_version", "fractional_bits")
+OF_RAD = (*(f"rad_{name}" for name in PROPERTIES), "cluster_sh")
+OF_BOTH = ("compression_level",)
 
 OPTIONS: tuple[Callable[[Command], Command], ...] = (
+    option(
+        "--format",
+        "form",
+        heading=COMMON,
+        type=click.Choice(list(FORMS)),
+        help="Format of the output. rad is what Spark streams; rad-chunked writes each chunk to a file of its own,"
+        " NAME-lod-0.radc and so on, beside NAME-lod.rad. A Level-of-Detail file of another format keeps its tree. "
+        " [default: by the suffix of FILE, or spz]",
+        show_default=False,
+    ),
     option(
         "--method",
         heading=COMMON,
@@ -137,7 +165,7 @@ OPTIONS: tuple[Callable[[Command], Command], ...] = (
         "--encoding",
         heading=FORMAT,
         type=click.Choice(list(ENCODINGS)),
-        help=f"Write arrays in a viewer's memory layout instead of SPZ: a {NPZ} file, or the words alone if FILE ends"
+        help=f"Write arrays in a viewer's memory layout instead: a {NPZ} file, or the words alone if FILE ends"
         f" in {' or '.join(RAW_SUFFIXES)}.",
     ),
     option(
@@ -161,7 +189,26 @@ OPTIONS: tuple[Callable[[Command], Command], ...] = (
         metavar="N",
         type=click.IntRange(defaults.MIN_COMPRESSION, defaults.MAX_COMPRESSION),
         default=defaults.DEFAULT_COMPRESSION,
-        help="Compression of SPZ, from 1 (fast) to 9 (small).",
+        help="Compression of SPZ and RAD, from 1 (fast) to 9 (small).",
+    ),
+    *(
+        option(
+            f"--rad-{name}",
+            heading=RAD,
+            type=click.Choice(choices(name)),
+            default="auto",
+            help=f"Encoding of {NAMES[name]}; auto suits the scene.",
+        )
+        for name in PROPERTIES
+    ),
+    option(
+        "--cluster-sh",
+        heading=RAD,
+        type=Codes(defaults.MIN_SH_CODES, defaults.MAX_SH_CODES),
+        is_flag=False,
+        flag_value=str(defaults.MAX_SH_CODES),
+        help="Write spherical harmonics as a palette of at most N entries, 2 to 65,536, and a label for each splat: the"
+        " file gets smaller, and reflections less exact. N is 65,536 if it is left out.",
     ),
 )
 
@@ -179,51 +226,61 @@ def check_method(ctx: click.Context) -> None:
             refuse(ctx, [row.setting], f"is an option of --method {method}, not of {chosen}")
 
 
-def bake_settings(ctx: click.Context, *, raw: bool) -> BakeSettings:
+def bake_settings(ctx: click.Context, *, suffix: str, raw: bool, converts: bool) -> BakeSettings:
     """What the options ask for; loads numpy.
 
     Args:
         ctx: of the command.
+        suffix: of the format of the output.
         raw: write the words of --encoding alone.
+        converts: somebody chose the format of the output, so that the tree of an input is kept.
     """
     from ...api.file_jobs import BakeSettings
     from ...model.selection import Selection
     from ...model.transforms import Transform
 
-    given = ctx.params
+    asked = ctx.params
     try:
         transform = Transform.from_parts(
-            up=given["up"], rotate=given["rotate"], scale=given["scale"], translate=given["translate"]
+            up=asked["up"], rotate=asked["rotate"], scale=asked["scale"], translate=asked["translate"]
         )
     except ValueError as error:
         raise click.UsageError(str(error)) from None
     return BakeSettings(
-        method=given["method"],
-        base=given["base"],
-        growth=given["growth"],
-        max_sh=given["max_sh"],
+        method=asked["method"],
+        base=asked["base"],
+        growth=asked["growth"],
+        max_sh=asked["max_sh"],
         selection=Selection(
-            drop_invalid=given["on_invalid"] == "drop",
-            min_opacity=given["min_opacity"],
-            min_box=given["min_box"],
-            max_box=given["max_box"],
-            within=given["within"],
+            drop_invalid=asked["on_invalid"] == "drop",
+            min_opacity=asked["min_opacity"],
+            min_box=asked["min_box"],
+            max_box=asked["max_box"],
+            within=asked["within"],
         ),
         transform=transform,
-        rgba=given["rgba"],
-        spz=write_options(ctx),
-        encoding=given["encoding"],
+        rgba=asked["rgba"],
+        suffix=suffix,
+        options=write_options(ctx),
+        encoding=asked["encoding"],
         raw=raw,
+        converts=converts,
+        unused=tuple(given(ctx, (*OF_TREES, *OF_SELECTION, *OF_PLACE))),
     )
 
 
 def write_options(ctx: click.Context) -> WriteOptions:
-    """How to write SPZ; what nobody chose is left to the library, which may take it from the input."""
-    from ...codecs.options import WriteOptions
+    """How to write SPZ and RAD; what nobody chose is left to the library, which may take it from the input."""
+    from ...codecs.options import RadOptions, WriteOptions
 
-    given = ctx.params
+    asked = ctx.params
     return WriteOptions(
-        spz_version=int(given["spz_version"]) if is_given(ctx, "spz_version") else None,
-        fractional_bits=given["fractional_bits"],
-        compression_level=given["compression_level"],
+        spz_version=int(asked["spz_version"]) if is_given(ctx, "spz_version") else None,
+        fractional_bits=asked["fractional_bits"],
+        compression_level=asked["compression_level"],
+        rad=RadOptions(
+            **{name: asked[f"rad_{name}"] for name in PROPERTIES},
+            chunked=asked["form"] is not None and FORMS[asked["form"]][1],
+            sh_codes=asked["cluster_sh"],
+        ),
     )

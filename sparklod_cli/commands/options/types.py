@@ -82,6 +82,20 @@ class AutoOr(click.IntRange):
         return "auto|N"
 
 
+class Codes(click.IntRange):
+    """A number that may be left out, so that an input after its option is taken for it; says what to do then."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
+        if isinstance(value, str) and not value.lstrip("-").isdigit() and param is not None:
+            flag = param.opts[0]
+            self.fail(f"{value!r} is no number; put {flag} after the inputs, or write {flag}={self.max}", param, ctx)
+        number: int = super().convert(value, param, ctx)
+        return number
+
+    def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:
+        return "[N]"
+
+
 class Quantity(click.ParamType):
     """A text such as 20Mbit that a function of the library makes a number of, or says in a `ValueError` why not."""
 

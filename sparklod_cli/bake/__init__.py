@@ -1,0 +1,6 @@
+"""Baking: from a splat file to a Level-of-Detail file."""
+
+from .baking import Baked, bake
+from .settings import BakeSettings
+
+__all__ = ["BakeSettings", "Baked", "bake"]

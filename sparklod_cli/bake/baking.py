@@ -1,0 +1,168 @@
+"""From a splat file to a Level-of-Detail file, or from one format of such files to another."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ..io import read_rgba, read_scene
+from ..model.lod_tree import LodTree
+from ..model.scene import Scene
+from ..model.splats import Splats
+from ..model.transforms import Transform
+from ..support.errors import InvalidSplatsError, memory_errors_translated
+from ..support.progress import Progress, silent
+from ..support.threads import on_threads
+from .kept_tree import check_kept
+from .output import Output, WrittenTree, output_of
+from .settings import BakeSettings
+
+
+@dataclass(frozen=True, kw_only=True)
+class Baked(WrittenTree):
+    """What was baked.
+
+    Attributes:
+        format: of the input, for display.
+        read: the number of splats in the input, which are nodes where it has a tree.
+        splats, sh_degree: of those that were kept; the leaves of a tree.
+        dropped: the number of splats that were left out, by reason (`selection.REASONS`).
+        method: that built the tree; None for the tree of the input.
+        nodes, levels: of the tree; levels is its depth and 1, so that a tree of one node has one.
+        notes: what the reader had to leave out, for display.
+        seconds: by stage (read, build, arrange, write).
+    """
+
+    format: str
+    read: int
+    splats: int
+    sh_degree: int
+    dropped: dict[str, int]
+    method: str | None
+    nodes: int
+    levels: int
+    notes: tuple[str, ...]
+    seconds: dict[str, float]
+
+
+class _Clock:
+    """How long the stages took."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._start = time.perf_counter()
+
+    def end(self, stage: str) -> None:
+        """Ends a stage; the next one begins."""
+        now = time.perf_counter()
+        self.seconds[stage] = round(now - self._start, 4)
+        self._start = now
+
+
+#: Nodes and their tree, the number of leaves, and the splats that were left out, by reason.
+_Made = tuple[Splats, LodTree, int, dict[str, int]]
+
+
+def bake(
+    source: Path,
+    target: Path,
+    settings: BakeSettings,
+    *,
+    overwrite: bool = False,
+    threads: int = 1,
+    progress: Progress = silent,
+) -> Baked:
+    """Reads a splat file, builds its tree and writes a Level-of-Detail file. A tree that it has may be kept.
+
+    Args:
+        source: of any format that is read; - is standard input.
+        target: a file of the format that is set, or one of arrays, whatever its name; - is standard output.
+        settings: how.
+        overwrite: replace files that exist.
+        threads: to work on.
+        progress: told of the stages.
+
+    Raises:
+        FormatError, InvalidSplatsError, OutputError: see `io.read_scene`, `Selection.apply` and `io.scene_sink`; or the
+            input has a tree, and the settings do not keep it.
+        OutOfMemoryError: it does not fit into memory.
+    """
+    with memory_errors_translated():
+        output, clock = output_of(target, settings, overwrite=overwrite), _Clock()
+        # A list, so that whoever takes the scene out of it can free it.
+        scenes = [read_scene(source, threads=threads, progress=progress)]
+        form, notes, read = scenes[0].format, scenes[0].notes, len(scenes[0])
+        antialiased, has_tree = scenes[0].antialiased, scenes[0].tree is not None
+        if has_tree:
+            splats, tree, leaves, dropped = _kept(scenes, settings, clock)
+        else:
+            splats, tree, leaves, dropped = _built(scenes, settings, output, clock, threads, progress)
+        written = output.write(Scene(splats, tree, antialiased), threads, progress)
+        clock.end("write")
+    return Baked(
+        **vars(written),
+        format=form,
+        read=read,
+        splats=leaves,
+        sh_degree=splats.sh_degree,
+        dropped=dropped,
+        method=None if has_tree else settings.method,
+        nodes=len(splats),
+        levels=int(tree.depths().max()) + 1,
+        notes=notes,
+        seconds=clock.seconds,
+    )
+
+
+def _kept(scenes: list[Scene], settings: BakeSettings, clock: _Clock) -> _Made:
+    """The tree that the input has."""
+    scene = scenes.pop()
+    check_kept(scene, settings)
+    assert scene.tree is not None
+    clock.end("read")
+    return scene.splats, scene.tree, int(np.count_nonzero(scene.tree.is_leaf)), {}
+
+
+def _built(
+    scenes: list[Scene], settings: BakeSettings, output: Output, clock: _Clock, threads: int, progress: Progress
+) -> _Made:
+    """A tree of the splats of the input."""
+    scene = scenes.pop()
+    kept, dropped = settings.selection.apply(_recolored(scene.splats, settings.rgba).with_max_sh(settings.max_sh))
+    kept = _transformed(kept, settings.transform)
+    clock.end("read")
+    output.check(Scene(kept))  # before building, so that what does not fit is said at once
+    leaves = len(kept)
+    # The builder frees its input as it goes, if nobody else holds it: a third of the peak.
+    handed_over = [kept]
+    del scene, kept
+    with on_threads(threads):
+        nodes, tree = settings.builder()(handed_over.pop(), progress=progress)
+    clock.end("build")
+    return nodes, tree, leaves, dropped
+
+
+def _transformed(splats: Splats, transform: Transform) -> Splats:
+    """Splats turned, scaled and moved.
+
+    Raises:
+        InvalidSplatsError: one leaves the range of float32.
+    """
+    turned = transform.apply(splats)
+    if turned is not splats and turned.invalid():
+        raise InvalidSplatsError(
+            "scaled and moved like this, it leaves the range of float32; give a smaller --scale or --translate"
+        )
+    return turned
+
+
+def _recolored(splats: Splats, rgba: Path | None) -> Splats:
+    """The splats with the colours and opacities of a file; their SH stay, as where Spark is given new colours."""
+    if rgba is None:
+        return splats
+    values = read_rgba(rgba, len(splats))
+    return dataclasses.replace(splats, rgb=np.ascontiguousarray(values[:, :3]), opacity=values[:, 3].copy())

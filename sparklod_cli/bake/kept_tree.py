@@ -1,0 +1,36 @@
+"""Which inputs that have a tree are written in another format with that tree."""
+
+from __future__ import annotations
+
+from ..codecs.formats import WRITABLE
+from ..codecs.rad_names import SUFFIX as RAD
+from ..model.scene import Scene
+from ..support.errors import FormatError
+from .settings import SPZ, BakeSettings
+
+
+def check_kept(scene: Scene, settings: BakeSettings) -> None:
+    """Checks that a scene that has a tree can be written with it.
+
+    Raises:
+        FormatError: nobody asked for another format than that of the scene, or for something that only splats without
+            a tree can be given.
+    """
+    held = scene.format.split()[0]
+    if settings.encoding is not None or not settings.converts or _is_same(scene, held, settings):
+        other = next(each for each in (WRITABLE[RAD], WRITABLE[SPZ]) if each.name != held)
+        raise FormatError(
+            "it is a Level-of-Detail file already; --unlod writes its splats back out, and --format"
+            f" {other.suffixes[0][1:]} its tree as {other.name}"
+        )
+    if settings.unused:
+        raise FormatError(
+            f"it has a tree, which is written as it is; leave out {', '.join(settings.unused)}, or give the splats that"
+            " the tree was built from"
+        )
+
+
+def _is_same(scene: Scene, held: str, settings: BakeSettings) -> bool:
+    """Whether the format that is written is that of the scene."""
+    chunked = bool(scene.header.get("chunked"))
+    return held == WRITABLE[settings.suffix].name and chunked == settings.options.rad.chunked

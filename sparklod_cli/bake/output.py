@@ -1,0 +1,149 @@
+"""Writing a tree in the format that is set, and what is to be said of the output."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol
+
+from ..codecs import clamps, rad_options
+from ..codecs.clamps import Clamp
+from ..codecs.formats import WRITABLE, Format
+from ..codecs.gpu import dump
+from ..codecs.options import WriteOptions
+from ..codecs.rad_layout import OPTIONS
+from ..codecs.rad_names import SUFFIX as RAD
+from ..io import SceneSink, Sink, scene_sink, sink
+from ..model.nodes import CHUNK_NODES
+from ..model.scene import Scene
+from ..support.progress import Progress
+from .settings import BakeSettings
+
+
+@dataclass(frozen=True, kw_only=True)
+class WrittenTree:
+    """What was written.
+
+    Attributes:
+        output_format: "spz", "rad", "rad-chunked", or the name of the encoding of arrays.
+        bytes: of the output, all of its files.
+        version, fractional_bits: of an SPZ output, else None.
+        chunks: of a RAD output, else None.
+        encodings: of a RAD output, by the field of `RadOptions`.
+        sh_codes: the most entries of the SH palette of a RAD output; None without one.
+        arrays: shapes of the arrays of another output, in its order.
+        clamped: by the column of `Splats`, the number of nodes with a value that the output cannot hold.
+        clamps: at which ends, and how far beyond.
+    """
+
+    output_format: str
+    bytes: int
+    version: int | None = None
+    fractional_bits: int | None = None
+    chunks: int | None = None
+    encodings: dict[str, str] = field(default_factory=dict)
+    sh_codes: int | None = None
+    arrays: dict[str, tuple[int, ...]] = field(default_factory=dict)
+    clamped: dict[str, int] = field(default_factory=dict)
+    clamps: tuple[Clamp, ...] = ()
+
+
+class Output(Protocol):
+    """Where a tree goes."""
+
+    @property
+    def in_chunks(self) -> bool:
+        """Whether it is read in chunks, so that nodes are put in an order for that first."""
+
+    def check(self, scene: Scene) -> None:
+        """Raises `FormatError` where a tree of these splats cannot be written."""
+
+    def write(self, scene: Scene, threads: int, progress: Progress) -> WrittenTree:
+        """Writes a tree."""
+
+
+def output_of(target: Path, settings: BakeSettings, *, overwrite: bool) -> Output:
+    """The output that settings ask for; fails now if it cannot be written later.
+
+    Raises:
+        OutputError: see `io.scene_sink`.
+    """
+    if settings.encoding is not None:
+        return _Arrays(settings.encoding, settings.raw, sink(target, overwrite=overwrite))
+    form, chunked = WRITABLE[settings.suffix], settings.options.rad.chunked
+    write = scene_sink(target, form, chunked=chunked, overwrite=overwrite)
+    return _File(form, settings.options, write, in_chunks=settings.suffix == RAD)
+
+
+@dataclass(frozen=True)
+class _Arrays:
+    """Arrays in the layout of a viewer's memory.
+
+    Attributes:
+        encoding: of `codecs.gpu.table.ENCODINGS`.
+        raw: their words alone, rather than a .npz.
+        sink: writes them.
+        in_chunks: see `Output`.
+    """
+
+    encoding: str
+    raw: bool
+    sink: Sink
+    in_chunks: bool = False
+
+    def check(self, scene: Scene) -> None:
+        """They hold anything."""
+
+    def write(self, scene: Scene, threads: int, progress: Progress) -> WrittenTree:
+        """Writes them."""
+        arrays = dump.pack(scene, self.encoding, threads)
+        size = self.sink(dump.encode_raw(arrays) if self.raw else dump.encode_npz(arrays))
+        shapes = {name: words.shape for name, words in arrays.items()}
+        return WrittenTree(output_format=self.encoding, bytes=size, arrays=shapes)
+
+
+@dataclass(frozen=True)
+class _File:
+    """A splat file.
+
+    Attributes:
+        form: its format.
+        options: how it is written.
+        sink: writes it.
+        in_chunks: see `Output`; RAD is.
+    """
+
+    form: Format
+    options: WriteOptions
+    sink: SceneSink
+    in_chunks: bool
+
+    def check(self, scene: Scene) -> None:
+        """The codec knows."""
+        self.form.codec().settled(scene, self.options)
+
+    def write(self, scene: Scene, threads: int, progress: Progress) -> WrittenTree:
+        """Writes it."""
+        options: WriteOptions = self.form.codec().settled(scene, self.options)
+        size = self.sink(scene, options, threads=threads, progress=progress)
+        if not self.in_chunks:
+            beyond = clamps.find(scene.splats, threads)
+            return WrittenTree(
+                output_format="spz",
+                bytes=size,
+                version=options.spz_version,
+                fractional_bits=options.fractional_bits,
+                clamped=beyond.splats,
+                clamps=beyond.ends,
+            )
+        degree = scene.splats.sh_degree
+        beyond = clamps.find(scene.splats, threads, rad_options.held(options, degree))
+        return WrittenTree(
+            output_format="rad-chunked" if options.rad.chunked else "rad",
+            bytes=size,
+            chunks=-(-len(scene) // CHUNK_NODES),
+            encodings={name: getattr(options.rad, name) for name in OPTIONS if degree or name != "sh"},
+            sh_codes=options.rad.sh_codes if degree else None,
+            clamped=beyond.splats,
+            clamps=beyond.ends,
+        )

@@ -1,0 +1,59 @@
+"""`BakeSettings`, how to bake."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from ..codecs.options import WriteOptions
+from ..lod.builders import BUILDERS, METHODS
+from ..model.lod_tree import LodTree
+from ..model.selection import Selection
+from ..model.splats import Splats
+from ..model.transforms import Transform
+from ..support.defaults import DEFAULT_BASE, DEFAULT_GROWTH, MAX_SH_DEGREE
+
+#: Suffix of the format that is written unless another one is chosen.
+SPZ = ".spz"
+
+
+@dataclass(frozen=True)
+class BakeSettings:
+    """How to bake.
+
+    Attributes:
+        method: of `lod.builders.BUILDERS`.
+        base: of quick, growth of the voxel grid from level to level, 1.1 to 2.0.
+        growth: of quality, the largest number of nodes for each leaf, 1.05 to 2.0.
+        max_sh: the highest SH degree that is kept.
+        selection: which splats are kept; its coordinates are those of the input.
+        transform: turns, scales and moves the splats that are kept.
+        rgba: a file of colours and opacities that replace the splats' own, see `io.read_rgba`.
+        suffix: of the format, one of `WRITABLE` that holds trees.
+        options: how to write it.
+        encoding: of `codecs.gpu.table.ENCODINGS`, to write arrays in that layout instead.
+        raw: write their words alone, rather than as .npz.
+        converts: an input that has a tree keeps it, if its format is another one; otherwise it is refused.
+        unused: flags of options that were given and mean nothing to an input that has a tree, which is refused then.
+    """
+
+    method: str = METHODS[0]
+    base: float = DEFAULT_BASE
+    growth: float = DEFAULT_GROWTH
+    max_sh: int = MAX_SH_DEGREE
+    selection: Selection = field(default_factory=Selection)
+    transform: Transform = field(default_factory=Transform)
+    rgba: Path | None = None
+    suffix: str = SPZ
+    options: WriteOptions = field(default_factory=WriteOptions)
+    encoding: str | None = None
+    raw: bool = False
+    converts: bool = False
+    unused: tuple[str, ...] = ()
+
+    def builder(self) -> Callable[..., tuple[Splats, LodTree]]:
+        """What makes `(nodes, tree)` of splats; takes `progress`, too."""
+        row = BUILDERS[self.method]
+        return functools.partial(row.load().build, **{row.setting: getattr(self, row.setting)})

@@ -1,0 +1,128 @@
+"""Outputs of `sparklod build-lod`: their names and formats, and which options suit these."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import click
+
+from ..codecs.formats import FORMATS, WRITABLE
+from ..codecs.gpu.table import NPZ, RAW_SUFFIXES
+from ..support.stdin import DASH
+from .options.baking import FORMS, OF_BOTH, OF_PLACE, OF_RAD, OF_SELECTION, OF_SPZ, OF_TREES
+from .paths import stem_of
+from .usage import refuse
+
+#: Suffixes of the formats in which a tree can be written, and what they are called; the first one is the default.
+TREES = {suffix: form.name for suffix, form in WRITABLE.items() if form.trees}
+SPZ = next(iter(TREES))
+
+#: Suffixes of formats that hold no tree.
+PLAIN = {suffix for form in FORMATS for suffix in form.suffixes if not form.trees}
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """Where outputs go.
+
+    Attributes:
+        output: the file of a single input.
+        output_dir: the folder of all of them.
+        overwrite: replace files that exist.
+        unlod: write the splats of trees.
+        form: of the outputs, a key of `FORMS`; None where nobody chose.
+        encoding: of array files.
+    """
+
+    output: Path | None
+    output_dir: Path | None
+    overwrite: bool
+    unlod: bool
+    form: str | None
+    encoding: str | None
+
+    @property
+    def named_suffix(self) -> str:
+        """Of the output that was named, if one was."""
+        return self.output.suffix.lower() if self.output is not None and self.output != DASH else ""
+
+    @property
+    def is_raw(self) -> bool:
+        """Whether words go out alone: what is named is no .npz."""
+        return self.output is not None and self.named_suffix != NPZ
+
+    @property
+    def suffix(self) -> str:
+        """Of the format that is written, which a name need not have."""
+        if self.encoding:
+            return NPZ
+        return FORMS[self.form][0] if self.form is not None else self.named_suffix or SPZ
+
+    @property
+    def is_chunked(self) -> bool:
+        """Whether chunks are files of their own."""
+        return self.form is not None and FORMS[self.form][1]
+
+    @property
+    def format_is_asked_for(self) -> bool:
+        """Whether somebody chose the format, by --format or by a name."""
+        return self.form is not None or self.named_suffix in TREES
+
+    def target(self, source: Path) -> Path:
+        """Where an input goes."""
+        return self.output or (self.output_dir or source.parent) / self._name(source)
+
+    def _name(self, source: Path) -> str:
+        stem = stem_of(source)
+        if self.unlod:
+            return f"{stem.removesuffix('-lod')}-unlod{self.suffix}"
+        if self.form is not None and source.suffix.lower() in TREES:  # a tree in another format has its name
+            stem = stem.removesuffix("-lod")
+        return f"{stem}-lod{self.suffix}"
+
+
+def check_formats(ctx: click.Context, outputs: Outputs) -> None:
+    """Raises a `click.UsageError` where the options of formats, and the name of the output, contradict each other."""
+    suffix = outputs.named_suffix
+    if outputs.is_chunked and outputs.output == DASH:
+        raise click.UsageError("--format rad-chunked writes several files; name the output, or use --format rad")
+    if outputs.encoding:
+        refuse(ctx, ("form",), "cannot be used with --encoding")
+        refuse(ctx, OF_SPZ, "is an option of SPZ, not of --encoding")
+        refuse(ctx, OF_RAD, "is an option of RAD, not of --encoding")
+        refuse(ctx, OF_BOTH, "is an option of SPZ and RAD, not of --encoding")
+    if outputs.form is not None and suffix not in ("", outputs.suffix):
+        raise click.UsageError(f"--format {outputs.form} writes {outputs.suffix}, not {suffix}")
+    if outputs.unlod:
+        _check_unlod(ctx, suffix)
+    elif outputs.encoding:
+        if suffix not in ("", NPZ, *RAW_SUFFIXES):
+            raise click.UsageError(f"--encoding writes {', '.join((NPZ, *RAW_SUFFIXES))}, not {suffix}")
+        return
+    else:
+        _check_tree(suffix)
+    name = TREES.get(outputs.suffix)
+    if name != TREES[SPZ]:
+        refuse(ctx, OF_SPZ, f"is an option of SPZ, not of {name or suffix}")
+    if name != "RAD":
+        refuse(ctx, OF_RAD, f"is an option of RAD, not of {name or suffix}; name the output .rad, or add --format rad")
+    if name is None:
+        refuse(ctx, OF_BOTH, f"is an option of SPZ and RAD, not of {suffix}")
+
+
+def _check_unlod(ctx: click.Context, suffix: str) -> None:
+    refuse(ctx, (*OF_TREES, *OF_SELECTION, *OF_PLACE, "encoding"), "cannot be used with --unlod")
+    if suffix not in ("", *WRITABLE):
+        raise click.UsageError(f"--unlod writes {', '.join(WRITABLE)}, not {suffix}")
+
+
+def _check_tree(suffix: str) -> None:
+    known = " or ".join(TREES)
+    if suffix in (NPZ, *RAW_SUFFIXES):
+        raise click.UsageError(f"{suffix} is a file of arrays; choose their layout with --encoding")
+    if suffix in PLAIN:
+        raise click.UsageError(f"{suffix} cannot hold a tree; name the output {known}")
+    if suffix not in ("", *TREES):
+        names = " or ".join(TREES.values())
+        raise click.UsageError(f"trees are written as {names}, not as {suffix}; name the output {known}")

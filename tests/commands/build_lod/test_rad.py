@@ -1,0 +1,257 @@
+"""RAD out of `sparklod build-lod`: one file or chunks, trees that keep their nodes, options, refusals, reports."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sparklod_cli.codecs import rad, rad_layout, spz
+from sparklod_cli.codecs.options import WriteOptions
+from sparklod_cli.codecs.rad_header import read_chunk_header, read_header
+from sparklod_cli.io import read_scene
+from sparklod_cli.lod import quick
+from sparklod_cli.model.scene import Scene
+from tests.commands.build_lod.runs import ONE, SMALL, build
+from tests.conftest import FIXTURES
+from tests.scenes import random_splats
+
+TREE = FIXTURES / "golden" / "tree-v3.spz"
+
+
+@pytest.fixture(scope="module")
+def large(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An LoD SPZ of more nodes than a chunk has."""
+    path = tmp_path_factory.mktemp("large") / "scene-lod.spz"
+    splats = random_splats(60_000, extent=50)
+    path.write_bytes(b"".join(spz.encode(Scene(*quick.build(splats)), WriteOptions(compression_level=1))))
+    return path
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def rows(scene: Scene) -> np.ndarray:
+    """(N, 9) what is the same in both formats up to rounding, in an order that does not depend on that of the nodes."""
+    assert scene.tree is not None
+    count, start = scene.tree.child_count.astype(np.int64), scene.tree.child_start.astype(np.int64)
+    first = np.where(count[:, None] > 0, scene.splats.center[np.minimum(start, len(count) - 1)], 0)
+    found = np.column_stack([scene.splats.center, first, count, scene.splats.opacity > 1])
+    return np.array(sorted(map(tuple, np.round(found, 1).tolist())))
+
+
+@pytest.mark.parametrize("arguments", [["--format", "rad"], ["-o", "scene-lod.rad"], ["-o", "scene-lod.RAD"]])
+def test_rad_is_written_where_it_is_asked_for(
+    arguments: list[str], scene: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(scene.parent)
+    assert build(scene, *arguments) == 0
+    (made,) = (path for path in scene.parent.iterdir() if path.suffix.lower() == ".rad")
+    baked = read_scene(made)
+    assert baked.tree is not None
+    assert (baked.format, baked.header["chunked"]) == ("RAD LoD", 0)
+    assert baked.tree.is_leaf.sum() == len(read_scene(scene).splats)
+    assert f"{len(baked):,} nodes, depth {baked.tree.depths().max()}, 1 chunk, " in capsys.readouterr().err
+
+
+def test_chunks_are_files_beside_their_header(large: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert build(large, "--format", "rad-chunked", "--output-dir", tmp_path / "web", "--json") == 0
+    record = json.loads(capsys.readouterr().out)
+    assert names(tmp_path / "web") == ["scene-lod-0.radc", "scene-lod-1.radc", "scene-lod.rad"]
+    assert (record["output_format"], record["chunks"]) == ("rad-chunked", 2)
+    assert record["bytes"] == sum(path.stat().st_size for path in (tmp_path / "web").iterdir())
+    assert build(large, "-o", tmp_path / "one.rad") == 0
+    one, many = read_scene(tmp_path / "one.rad"), read_scene(tmp_path / "web" / "scene-lod.rad")
+    assert (one.chunk_bytes, one.tree) != (None, None)
+    assert one.chunk_bytes == many.chunk_bytes
+    np.testing.assert_array_equal(one.splats.center, many.splats.center)
+    assert build(large, "--format", "rad-chunked", "--output-dir", tmp_path / "web") == 1
+    assert "scene-lod.rad exists, add --overwrite" in capsys.readouterr().err
+    (tmp_path / "web" / "scene-lod.rad").unlink()
+    assert build(large, "--format", "rad-chunked", "--output-dir", tmp_path / "web") == 1
+    assert "scene-lod-0.radc exists, add --overwrite" in capsys.readouterr().err
+
+
+def test_a_shorter_output_removes_the_chunks_of_a_longer_one(large: Path, tmp_path: Path) -> None:
+    assert build(large, "--format", "rad-chunked", "-o", tmp_path / "x.rad") == 0
+    assert build(ONE, "--format", "rad-chunked", "-o", tmp_path / "x.rad", "--overwrite") == 0
+    assert names(tmp_path) == ["x-0.radc", "x.rad"]
+    assert len(read_scene(tmp_path / "x.rad")) == 1
+
+
+def test_a_tree_is_the_same_in_the_other_format(
+    large: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = read_scene(large)
+    assert build(large, "-o", tmp_path / "there.rad", "-v", "--json") == 0
+    out, err = capsys.readouterr()
+    record = json.loads(out)
+    assert before.tree is not None
+    leaves = int(before.tree.is_leaf.sum())
+    assert (record["read"], record["nodes"], record["splats"]) == (len(before), len(before), leaves)
+    assert (record["method"], record["dropped"]) == (None, {})
+    assert "build" not in record["seconds"]
+    assert "SPZ 3 LoD -> the same tree -> RAD LoD, center f32_lebytes" in err
+    assert build(tmp_path / "there.rad", "-o", tmp_path / "back.spz") == 0
+    there, back = read_scene(tmp_path / "there.rad"), read_scene(tmp_path / "back.spz")
+    assert there.tree is not None and back.tree is not None
+    np.testing.assert_array_equal(rows(there), rows(before))
+    # From RAD to SPZ, nodes keep the order that they have.
+    np.testing.assert_array_equal(back.tree.child_start, there.tree.child_start)
+    np.testing.assert_allclose(back.splats.center, there.splats.center, atol=1e-3)
+    assert build(tmp_path / "there.rad", "--format", "rad-chunked", "-o", tmp_path / "many.rad") == 0
+    np.testing.assert_array_equal(read_scene(tmp_path / "many.rad").splats.center, there.splats.center)
+
+
+def test_a_converted_tree_has_the_name_of_the_other_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    source = tmp_path / "scene-lod.spz"
+    shutil.copy(TREE, source)
+    assert build(source, "--format", "rad") == 0
+    assert names(tmp_path) == ["scene-lod.rad", "scene-lod.spz"]
+    for form, path in (
+        ("spz", source),
+        ("rad", source.with_suffix(".rad")),
+        ("rad-chunked", source.with_suffix(".rad")),
+    ):
+        before = path.read_bytes()
+        assert build(path, "--format", form, "--overwrite") == 2
+        assert f"{path} is an input; name another output" in capsys.readouterr().err
+        assert path.read_bytes() == before
+
+
+def test_a_tree_is_refused_where_nothing_is_to_be_converted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name, options in {"tree.rad": [], "many.rad": ["--format", "rad-chunked"]}.items():
+        assert build(TREE, "-o", tmp_path / name, *options) == 0
+    whole, many = tmp_path / "tree.rad", tmp_path / "many.rad"
+    refused = [
+        (TREE, [], "rad its tree as RAD"),
+        (TREE, ["--format", "spz"], "rad its tree as RAD"),
+        (TREE, ["--encoding", "ext"], "rad its tree as RAD"),
+        (whole, [], "spz its tree as SPZ"),
+        (whole, ["--format", "rad"], "spz its tree as SPZ"),
+        (many, ["--format", "rad-chunked"], "spz its tree as SPZ"),
+        (many, ["--encoding", "ext"], "spz its tree as SPZ"),
+    ]
+    capsys.readouterr()
+    for source, options, hint in refused:
+        assert build(source, "-o", tmp_path / "out", *options) == 1
+        said = f"it is a Level-of-Detail file already; --unlod writes its splats back out, and --format {hint}\n"
+        assert said in capsys.readouterr().err
+    for options in (
+        ["--base", "1.5"],
+        ["--max-sh", "3"],
+        ["--up", "-y"],
+        ["--within", "0,0,0,1"],
+        ["--method", "quick"],
+    ):
+        assert build(TREE, "-o", tmp_path / "out", "--format", "rad", *options) == 1
+        assert f"it has a tree, which is written as it is; leave out {options[0]}, " in capsys.readouterr().err
+    assert names(tmp_path) == ["many-0.radc", "many.rad", "tree.rad"]
+
+
+@pytest.mark.parametrize("name", rad_layout.OPTIONS)
+def test_every_encoding_reaches_the_file_and_the_report(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for encoding in rad_layout.choices(name)[1:]:
+        output = tmp_path / f"{encoding}.rad"
+        assert build(SMALL, "-o", output, f"--rad-{name}", encoding, "--json") == 0
+        assert json.loads(capsys.readouterr().out)["encodings"][name] == encoding
+        with output.open("rb") as file:
+            read_header(file)
+            written = {each.name: each.encoding for each in read_chunk_header(file).properties}
+        assert written["sh1" if name == "sh" else name] == encoding
+
+
+def test_options_of_both_formats_reach_rad(scene: Path, tmp_path: Path) -> None:
+    sizes = []
+    for level in (1, 9):
+        assert build(FIXTURES / "demo.ply", "-o", tmp_path / f"{level}.rad", "--compression-level", level) == 0
+        sizes.append((tmp_path / f"{level}.rad").stat().st_size)
+    assert sizes[1] < sizes[0]
+
+
+def test_the_splats_of_a_rad_are_written_back_out(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert build(scene, "-o", tmp_path / "scene-lod.rad") == 0
+    baked = read_scene(tmp_path / "scene-lod.rad")
+    assert baked.tree is not None
+    leaves = baked.splats.take(baked.tree.is_leaf)
+    for options, name in ((["--format", "rad"], "scene-unlod.rad"), ([], "scene-unlod.spz")):
+        assert build("--unlod", tmp_path / "scene-lod.rad", *options) == 0
+        back = read_scene(tmp_path / name)
+        assert back.tree is None
+        np.testing.assert_allclose(back.splats.center, leaves.center, atol=1e-3)
+    assert build("--unlod", tmp_path / "scene-lod.rad", "-o", tmp_path / "many.rad", "--format", "rad-chunked") == 0
+    assert read_scene(tmp_path / "many.rad").header["chunked"] == 1
+    assert build("--unlod", tmp_path / "scene-lod.rad", "-o", tmp_path / "back.ply") == 0
+    np.testing.assert_array_equal(read_scene(tmp_path / "back.ply").splats.center, leaves.center)
+    capsys.readouterr()
+
+
+def test_what_is_clamped_is_said_with_the_range_of_the_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    splats = random_splats(40)
+    splats.center[3] = 1e6
+    source = tmp_path / "far.rad"
+    source.write_bytes(b"".join(rad.encode(Scene(splats), WriteOptions())))
+    assert build(source, "-o", tmp_path / "out.rad", "--rad-center", "f16", "--json") == 0
+    out, err = capsys.readouterr()
+    record = json.loads(out)
+    assert record["clamped"]["center"] > 0
+    assert ("center", True, 65504.0) in {(each["column"], each["above"], each["end"]) for each in record["clamps"]}
+    assert "are above 6.55e+04, up to 1e+06, and are clamped to what RAD holds: --rad-center f32_lebytes keeps" in err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--format", "spz", "-o", "x.rad"], "--format spz writes .spz, not .rad"),
+        (["--format", "rad", "-o", "x.spz"], "--format rad writes .rad, not .spz"),
+        (["--format", "rad-chunked", "-o", "x.ply"], "--format rad-chunked writes .rad, not .ply"),
+        (["--format", "rad-chunked", "-o", "-"], "rad-chunked writes several files; name the output"),
+        (["--format", "radc"], "--format"),
+        (["--format", "rad", "--spz-version", "2"], "--spz-version is an option of SPZ, not of RAD"),
+        (["-o", "x.rad", "--fractional-bits", "9"], "--fractional-bits is an option of SPZ, not of RAD"),
+        (["--rad-sh", "f16"], "--rad-sh is an option of RAD, not of SPZ; name the output .rad, or add --format rad"),
+        (["-o", "x.spz", "--cluster-sh"], "--cluster-sh is an option of RAD, not of SPZ"),
+        (["--encoding", "ext", "--format", "rad"], "--format cannot be used with --encoding"),
+        (["--encoding", "ext", "--cluster-sh", "9"], "--cluster-sh is an option of RAD, not of --encoding"),
+        (["--encoding", "ext", "--compression-level", "9"], "an option of SPZ and RAD, not of --encoding"),
+        (["--unlod", "-o", "x.ply", "--rad-rgb", "f32"], "--rad-rgb is an option of RAD, not of .ply"),
+        (["--unlod", "-o", "x.ply", "--format", "rad"], "--format rad writes .rad, not .ply"),
+        (["--unlod", "-o", "x.splat", "--compression-level", "2"], "an option of SPZ and RAD, not of .splat"),
+        (["--format", "rad", "--rad-center", "r8"], "--rad-center"),
+        (["--format", "rad", "--cluster-sh", "1"], "2<=x<=65536"),
+        (["--format", "rad", "--cluster-sh", "65537"], "2<=x<=65536"),
+        (
+            ["--format", "rad", "--cluster-sh", "scene.ply"],
+            "put --cluster-sh after the inputs, or write --cluster-sh=65536",
+        ),
+    ],
+)
+def test_options_that_do_not_suit_the_format_are_refused(
+    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert build("a.ply", *arguments) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_a_palette_without_spherical_harmonics_is_no_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert build(ONE, "-o", tmp_path / "x.rad", "--max-sh", "0", "--cluster-sh", "--json") == 0
+    record = json.loads(capsys.readouterr().out)
+    assert record["sh_codes"] is None
+    assert "sh" not in record["encodings"]
+
+
+def test_chunks_of_an_input_are_not_replaced(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert build(ONE, "--format", "rad-chunked", "-o", tmp_path / "a.rad") == 0
+    moved = (tmp_path / "a.rad").rename(tmp_path / "b.rad")  # it still names a-0.radc
+    before = (tmp_path / "a-0.radc").read_bytes()
+    assert build(moved, "--unlod", "--format", "rad-chunked", "-o", tmp_path / "a.rad", "--overwrite") == 2
+    assert "a-0.radc is an input; name another output" in capsys.readouterr().err
+    assert (tmp_path / "a-0.radc").read_bytes() == before
