@@ -270,7 +270,7 @@ def test_an_exported_site_works_without_sparklod_and_without_ranges(
         assert state["files"][0].endswith("loaded whole: this host sends no ranges")
         theirs = tab.picture(tmp_path / "page.png")
         ours = rendered(trees / "demo.rad", state["camera"].split(), tmp_path / "r.png")
-    assert psnr(theirs - ours) >= LEAST
+        assert psnr(theirs - ours) >= LEAST
         tab.ask("drop", name="path.json", text=json.dumps(PATH))
         tab.until(lambda state: state["path"] is not None)
         tab.ask("fill", id="scrub", value="500")
