@@ -2,7 +2,7 @@
 
 from .beside import companions
 from .names import is_file_name
-from .reading import examine_scene, read_arrays, read_scene, size_of_input
+from .reading import examine_scene, opened, read_arrays, read_scene, size_of_input
 from .scenes import SceneSink, scene_sink
 from .texts import MAX_TEXT, read_rgba, read_text, read_together
 from .together import SinkTogether, chunk_files, sink_together, write_together
@@ -18,6 +18,7 @@ __all__ = [
     "companions",
     "examine_scene",
     "is_file_name",
+    "opened",
     "read_arrays",
     "read_rgba",
     "read_scene",
