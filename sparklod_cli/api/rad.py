@@ -1,0 +1,47 @@
+"""RAD files in parts: the header alone, one chunk alone, and the order of nodes for streaming."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from .. import io
+from ..model.splats import FloatArray
+from ..support.errors import memory_errors_translated
+from .files import naming
+
+if TYPE_CHECKING:
+    from ..codecs.rad import Chunk
+    from ..codecs.rad_header import Header
+
+
+def read_rad_header(path: Path | str) -> Header:
+    """Reads the header of a RAD file and nothing else; the chunks need not be there.
+
+    Args:
+        path: of a .rad file, whole or with chunks in files of their own.
+
+    Raises:
+        FormatError: it cannot be read, is no such header, or promises what cannot be.
+    """
+    path = Path(path)
+    with naming(path):
+        return io.read_rad_header(path)
+
+
+def read_rad_chunk(path: Path | str, number: int, *, palette: FloatArray | None = None) -> Chunk:
+    """Reads the header of a RAD file and the bytes of one chunk, as a viewer does that streams it.
+
+    Args:
+        path: of a .rad file, whole or with chunks in files of their own.
+        number: of the chunk, from 0; `read_rad_header(path).chunks` has them all.
+        palette: (codes, K, 3) SH coefficients, the `palette` of chunk 0, where the file has one. Without it, the other
+            chunks of such a file have `labels` and no SH.
+
+    Raises:
+        FormatError: the header or the chunk cannot be read, or is broken.
+        ValueError: there is no such chunk.
+    """
+    path = Path(path)
+    with naming(path), memory_errors_translated():
+        return io.read_rad_chunk(path, number, palette=palette)
