@@ -24,6 +24,7 @@ COMMANDS = {
     "inspect": "Report on splat files and check them.",
     "traverse": "Simulate what a viewer draws along a camera path.",
     "render": "Draw pictures of splat files, and compare them.",
+    "view": "Show splat files in Spark, in a browser.",
     "warmup": "Compile all kernels ahead of the first run.",
     "doctor": "Check the installation, and say what to do.",
     "help": "Print the help of a command.",

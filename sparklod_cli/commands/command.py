@@ -32,6 +32,9 @@ ALIASES = {
     "draw": "render",
     "preview": "render",
     "compile": "warmup",
+    "serve": "view",
+    "show": "view",
+    "open": "view",
 }
 
 

@@ -37,6 +37,7 @@ INPUTS: dict[str, dict[str, tuple[object, ...]]] = {
         "world_transform": (LOD, *LOOK, "--world-transform", "X"),
         "diff": (LOD, *LOOK, "--diff", "X"),
     },
+    "view": {"files": ("X",), "camera_path": (LOD, "--camera-path", "X"), "spark_dir": (LOD, "--spark-dir", "X")},
 }
 
 #: How each command is told to write the file Y, by the parameter that says so.
@@ -45,6 +46,7 @@ OUTPUTS: dict[str, dict[str, tuple[str, ...]]] = {
     "inspect": {"plot": ("--plot", "Y"), "html": ("--html", "Y")},
     "traverse": {"output": ("-o", "Y"), "plot": ("--plot", "Y")},
     "render": {"output": ("-o", "Y"), "plot": ("--compare", "--plot", "Y")},
+    "view": {},
 }
 
 #: Names that the command's outputs can have.

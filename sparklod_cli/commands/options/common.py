@@ -119,12 +119,13 @@ def common_options(
     *,
     json: str = "Print one JSON object for each file on standard output.",
     quiet: str = "Print nothing but errors.",
+    verbose: str = "Print how long each stage took, and which settings were chosen.",
 ) -> Command:
     """`--threads`, `--json`, `-q`, `-v`, `--version`, of which `General` has the values.
 
     Args:
         command: that gets them.
-        json, quiet: help texts of the options of these names.
+        json, quiet, verbose: help texts of the options of these names.
     """
     return with_options(
         command,
@@ -139,6 +140,6 @@ def common_options(
         ),
         option("--json", "as_json", heading=GENERAL, is_flag=True, help=json),
         option("-q", "--quiet", heading=GENERAL, is_flag=True, help=quiet),
-        verbose_option("Print how long each stage took, and which settings were chosen."),
+        verbose_option(verbose),
         click.version_option(__version__, package_name="sparklod"),
     )

@@ -1,0 +1,116 @@
+"""Writes a site into a folder, from which any web server can serve it: whole or not at all."""
+
+from __future__ import annotations
+
+import contextlib
+import secrets
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+from ..io import read_text, write_whole
+from ..io.names import reason_of
+from ..io.plain import open_plain
+from ..support.errors import OutputError, SparklodError
+from ..support.progress import Progress, silent
+from ..support.untrusted import parse_json
+from .site import GENERATOR, SETTINGS, Site
+
+#: Names of folders that are incomplete, or about to be removed.
+PARTS = ".sparklod-{}.part"
+
+#: Bytes that are copied at a time.
+PIECE = 1 << 20
+
+
+def check_folder(folder: Path, site: Site | None = None, *, overwrite: bool) -> None:
+    """Raises an `OutputError` where a site cannot be written into a folder.
+
+    A folder that exists is replaced only if it is empty or a site that was exported before: what else somebody keeps
+    in a folder is not ours to remove.
+
+    Args:
+        folder: of the site.
+        site: that will be written; its files must lie elsewhere.
+        overwrite: replace a site that is there.
+    """
+    try:
+        if folder.exists() and not folder.is_dir():
+            raise OutputError(f"{folder} is a file; name a folder for the site")
+        if folder.is_dir() and any(folder.iterdir()):
+            if not overwrite:
+                raise OutputError(f"{folder} exists, add --overwrite to replace the site in it")
+            if not _is_site(folder):
+                raise OutputError(f"{folder} holds something else than a site of sparklod view; name another folder")
+        real = folder.resolve()
+    except OSError as error:
+        raise OutputError(f"cannot write {folder}: {reason_of(error)}") from None
+    for content in site.resources.values() if site is not None else ():
+        if isinstance(content, Path) and content.is_relative_to(real):
+            raise OutputError(f"{folder} holds {content.name}, which is to be shown; name another folder")
+
+
+def _is_site(folder: Path) -> bool:
+    try:
+        settings = parse_json(read_text(folder / SETTINGS))
+    except (SparklodError, ValueError):
+        return False
+    return isinstance(settings, dict) and settings.get("generator") == GENERATOR
+
+
+def export(site: Site, folder: Path, *, overwrite: bool, progress: Progress = silent) -> int:
+    """Writes a site and returns its bytes.
+
+    Args:
+        site: that is written.
+        folder: that gets it; appears when it is complete.
+        overwrite: replace a site that is there.
+        progress: called with how much is done.
+
+    Raises:
+        OutputError: see `check_folder`, or the file system refused something.
+    """
+    check_folder(folder, site, overwrite=overwrite)
+    real = folder.resolve()
+    part = real.with_name(PARTS.format(secrets.token_hex(8)))
+    total = sum(_size(content) for content in site.resources.values())
+    done = 0
+    try:
+        real.parent.mkdir(parents=True, exist_ok=True)
+        part.mkdir()
+        for name, content in site.resources.items():
+            pieces = [content] if isinstance(content, bytes) else _pieces(content)
+            done += write_whole(part / name, pieces, overwrite=False)
+            progress("export", done, total, "B")
+        _replace(real, part)
+    except OSError as error:
+        raise OutputError(f"cannot write {folder}: {reason_of(error)}") from None
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+    return done
+
+
+def _size(content: bytes | Path) -> int:
+    return len(content) if isinstance(content, bytes) else content.stat().st_size
+
+
+def _pieces(path: Path) -> Iterator[bytes]:
+    with open_plain(path) as file:
+        while piece := file.read(PIECE):
+            yield piece
+
+
+def _replace(folder: Path, part: Path) -> None:
+    """Gives a complete folder its name; what had it before is put aside, and back where that fails."""
+    if not folder.exists():
+        part.rename(folder)
+        return
+    aside = part.with_name(PARTS.format(secrets.token_hex(8)))
+    folder.rename(aside)
+    try:
+        part.rename(folder)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            aside.rename(folder)
+        raise
+    shutil.rmtree(aside, ignore_errors=True)

@@ -1,0 +1,120 @@
+"""Spark and three.js, which the page draws with: from a CDN at fixed versions, or from a folder of node_modules."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from ..io import read_text
+from ..support.errors import SparklodError
+from ..support.printable import printable
+from ..support.untrusted import parse_json
+
+SPARK, THREE = "@sparkjsdev/spark", "three"
+
+#: The versions that the page was tested with.
+VERSIONS = {SPARK: "2.2.0", THREE: "0.187.0"}
+
+#: Serves the files of npm packages as they were published.
+CDN = "https://cdn.jsdelivr.net/npm"
+
+#: The modules by package and path in it, with the SHA-384 of those of `VERSIONS`: a browser refuses a module of the CDN
+#: that has another one. Spark imports one module of three's examples, three's first module imports its core.
+MODULES = {
+    (SPARK, "dist/spark.module.js"): "OQEdbh3DPqIT6IsNEl9DQBNeBw4p2sTknDP1lrT6MjlQoTIEtzzM5LZ4ljB1QCh3",
+    (THREE, "build/three.module.js"): "T/E3B9AvPtLn5PKD7aTSFqizQcA4kHDfU0lub7u0fvM4w9BMGcSb3yI7r5LqMAMn",
+    (THREE, "build/three.core.js"): "drH6BueSlcvoXCwAqWkNJvXwu2Ax3mnGOmZnIXaomedIw+uXSP9Bf/XIUINgLUW+",
+    (THREE, "examples/jsm/postprocessing/Pass.js"): "927X5fcqlqKPsXZV1w3tv5BZx797OXX3D/TDJk0FHwJd12z58B5aqS77g5LZoprI",
+}
+
+#: What the page and Spark call modules, and what those names begin or are.
+NAMES = {
+    SPARK: (SPARK, "dist/spark.module.js"),
+    THREE: (THREE, "build/three.module.js"),
+    "three/addons/": (THREE, "examples/jsm/"),
+}
+
+#: Accompanies the modules, as the licenses of both packages ask for.
+LICENSE = "LICENSE"
+
+
+@dataclass(frozen=True)
+class Libraries:
+    """Where the page finds Spark and three.js.
+
+    Attributes:
+        versions: by package.
+        source: for display: the address of the CDN, or the folder.
+        base: of the addresses of all packages, absolute or relative to the page.
+        integrity: of the modules, by address; empty where the site itself has them.
+        files: that the site itself has, by the names that they are served under.
+    """
+
+    versions: Mapping[str, str]
+    source: str
+    base: str
+    integrity: Mapping[str, str]
+    files: Mapping[str, Path]
+
+    def import_map(self) -> dict[str, dict[str, str]]:
+        """What `<script type="importmap">` holds."""
+        imports = {name: self._url(package, path) for name, (package, path) in NAMES.items()}
+        return {"imports": imports} | ({"integrity": dict(self.integrity)} if self.integrity else {})
+
+    def _url(self, package: str, path: str) -> str:
+        return _url(self.base, package, self.versions[package] if self.integrity else None, path)
+
+    def notes(self) -> list[str]:
+        """What a person should know of the versions."""
+        return [
+            f"{self.source} has {package} {version}; the page was tested with {VERSIONS[package]}"
+            for package, version in self.versions.items()
+            if version != VERSIONS[package]
+        ]
+
+
+def _url(base: str, package: str, version: str | None, path: str) -> str:
+    return f"{base}/{package}{f'@{version}' if version else ''}/{path}"
+
+
+def from_cdn() -> Libraries:
+    """The libraries of the CDN."""
+    integrity = {
+        _url(CDN, package, VERSIONS[package], path): f"sha384-{digest}" for (package, path), digest in MODULES.items()
+    }
+    return Libraries(VERSIONS, CDN, CDN, integrity, {})
+
+
+def from_folder(folder: Path) -> Libraries:
+    """The libraries of a folder that has a node_modules, or is one.
+
+    Raises:
+        SparklodError: a package, or a module of it, is missing; the text says how to install it.
+    """
+    packages = folder if folder.name == "node_modules" else folder / "node_modules"
+    install = f"npm install --prefix {folder} " + " ".join(f"{name}@{version}" for name, version in VERSIONS.items())
+    versions, files = {}, {}
+    for package in VERSIONS:
+        if not (packages / package).is_dir():
+            raise SparklodError(f"{packages} has no {package}; install it with {install}")
+        versions[package] = _version(packages / package)
+        files[f"lib/{package}/{LICENSE}"] = packages / package / LICENSE
+    for package, path in MODULES:
+        files[f"lib/{package}/{path}"] = packages / package / path
+    # A link, such as those of pnpm, is followed here, once.
+    files = {name: path.resolve() for name, path in files.items() if path.is_file()}
+    for package, path in NAMES.values():
+        name = f"lib/{package}/{path}"
+        if not path.endswith("/") and name not in files:
+            raise SparklodError(f"{packages / package} has no {path}; install {package} anew with {install}")
+    return Libraries(versions, str(folder), "./lib", {}, files)
+
+
+def _version(package: Path) -> str:
+    """The version of an installed package."""
+    try:
+        value = parse_json(read_text(package / "package.json"))
+        return printable(str(value["version"]), 40)
+    except (ValueError, KeyError, TypeError):
+        raise SparklodError(f"{package / 'package.json'} has no version; install it anew with npm") from None

@@ -1,0 +1,32 @@
+// Starts the page, or says why it cannot start: no WebGL 2, or no libraries.
+import { fail } from './panel.js';
+
+const read = async (name) => {
+  const response = await fetch(name);
+  if (!response.ok) throw new Error(`${name}: ${response.status} ${response.statusText}`);
+  return response.json();
+};
+
+async function boot() {
+  const settings = await read('./view.json').catch((error) => {
+    throw new Error(`What to show cannot be read: ${error.message}. Is the server still running?`);
+  });
+  if (!document.createElement('canvas').getContext('webgl2')) {
+    throw new Error('This browser has no WebGL 2, which Spark draws with. Use another one, or switch on hardware acceleration.');
+  }
+  // Imported late, as a module that cannot be loaded would otherwise take this one with it.
+  const { view } = await import('./view.js').catch((error) => {
+    const { source, versions } = settings.libraries;
+    const names = Object.entries(versions).map(([name, version]) => `${name} ${version}`);
+    throw new Error(
+      `${names.join(' and ')} cannot be loaded from ${source} (${error.message}). ` +
+        'Without a network, start sparklod view with --spark-dir.',
+    );
+  });
+  await view(settings);
+}
+
+boot().catch((error) => {
+  console.error(error);
+  fail(error.message);
+});

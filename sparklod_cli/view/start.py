@@ -1,0 +1,165 @@
+"""Where the camera of a page starts, and how large the scene is."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ..cameras import framing
+from ..cameras.camera import Camera, Matrix
+from ..cameras.defaults import ELEVATION
+from ..cameras.frame import DEFAULT_FOV_Y, Settings
+from ..cameras.sources import Views, WholeScene
+from ..codecs.rad import read_chunk
+from ..codecs.rad_header import Header
+from ..io import examine_scene
+from ..io.names import reason_of
+from ..io.plain import open_plain
+from ..model.balls import Balls, balls_of
+from ..model.splats import Splats
+from ..support.errors import InvalidSplatsError, SparklodError, UnreadableError
+from ..support.progress import Progress, silent
+from .files import ShownFile
+
+#: x, y and z in world units.
+Point = tuple[float, float, float]
+
+#: Width and height of the picture that the first look is framed for; the page steps back where its window is narrower.
+FRAME = (1280, 720)
+
+#: Vertical field of view where none is given, degrees.
+FOV = round(math.degrees(DEFAULT_FOV_Y), 9)
+
+
+#: The feature sizes that colours tell apart, as percentiles of all: of trees, few nodes are coarse.
+SIZES = 1, 99.9
+
+#: How many times smaller the splats of a large RAD tree are than those of its first chunk: some levels.
+BELOW = 8
+
+
+@dataclass(frozen=True)
+class Extent:
+    """What a file holds.
+
+    Attributes:
+        splats: how many, nodes where it is a tree.
+        leaves: how many of a tree, or nodes where it is not read to its end; None without one.
+        balls: what its splats cover; only the coarsest of a large RAD tree.
+        sizes: (2,) the range of the feature sizes of its splats, but for a few at either end, world units.
+    """
+
+    splats: int
+    leaves: int | None
+    balls: Balls
+    sizes: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Start:
+    """The first look at the scene.
+
+    Attributes:
+        eye, target: of the camera, world units.
+        fov: vertical field of view, degrees.
+        center: the middle of the scene, world units.
+        radius: of a ball around the middle that most splats are in, world units.
+        sizes: the range of the feature sizes, smallest and largest, world units.
+        chosen: the view was chosen for the scene, not given.
+    """
+
+    eye: Point
+    target: Point
+    fov: float
+    center: Point
+    radius: float
+    sizes: tuple[float, float]
+    chosen: bool
+
+
+def extent_of(shown: ShownFile, *, threads: int = 1, progress: Progress = silent) -> Extent:
+    """What a file holds.
+
+    Raises:
+        SparklodError: it is broken; the text names it.
+    """
+    try:
+        if shown.header is not None and shown.header.lod_tree and len(shown.header.chunks) > 1:
+            return _coarse_extent(shown, shown.header)
+        scene = examine_scene(shown.path, columns=("center", "scale"), threads=threads, progress=progress)
+    except SparklodError as error:
+        raise type(error)(f"{shown.path}: {error}") from None
+    except OSError as error:
+        raise UnreadableError(f"{shown.path}: cannot be read: {reason_of(error)}") from None
+    leaves = None if scene.tree is None else np.flatnonzero(scene.tree.is_leaf)
+    index = slice(None) if leaves is None else leaves
+    balls = balls_of(scene.splats, index, np.eye(4))
+    return Extent(len(scene.splats), None if leaves is None else len(leaves), balls, _sizes(scene.splats))
+
+
+def _coarse_extent(shown: ShownFile, header: Header) -> Extent:
+    """That of a RAD tree by its first chunk alone, as a viewer first has it: a file may have gigabytes.
+
+    A cut through the chunk, its nodes that have no children in it, covers the whole scene.
+    """
+    entry = header.chunks[0]
+    name = shown.path.name if entry.filename is None else entry.filename
+    with open_plain(next(path for key, path in shown.files.items() if Path(key).name == name)) as file:
+        chunk = read_chunk(file, entry, header)
+    assert chunk.tree is not None
+    start, count = (column.astype(np.int64) for column in (chunk.tree.child_start, chunk.tree.child_count))
+    cut = np.flatnonzero((count == 0) | (start + count > len(chunk.splats)))
+    smallest, largest = _sizes(chunk.splats)
+    balls = balls_of(chunk.splats, cut, np.eye(4))
+    return Extent(header.count, header.count, balls, (smallest / BELOW, largest))
+
+
+def _sizes(splats: Splats) -> tuple[float, float]:
+    """The range of the feature sizes of some splats, as if none had a D above 1; both ends are above 0."""
+    sizes = 2 * splats.scale[:: max(len(splats) // framing.SAMPLE, 1)].mean(axis=1, dtype=np.float64)
+    sizes = sizes[np.isfinite(sizes) & (sizes > 0)]
+    if not len(sizes):
+        return 1.0, 1.0
+    smallest, largest = (float(end) for end in np.percentile(sizes, SIZES))
+    return smallest, largest
+
+
+def start_of(extents: Sequence[Extent], view: tuple[Point, Point] | None, up: Point, fov: float) -> Start:
+    """The first look at some files together.
+
+    Args:
+        extents: of the files.
+        view: eye and target, where they are given; else the whole scene is in view, from its front.
+        up: direction that is up.
+        fov: vertical field of view, degrees.
+
+    Raises:
+        CameraPathError: the camera makes no sense.
+    """
+    balls = Balls.concat(extent.balls for extent in extents)
+    settings = Settings(size=FRAME, fov_y=math.radians(fov), up=up)
+    try:
+        middle, radius = framing.framing(balls.center)
+    except InvalidSplatsError:  # nothing that could be framed
+        middle, radius, view = np.zeros(3), 1.0, view or ((0.0, 0.0, 3.0), (0.0, 0.0, 0.0))
+    source = WholeScene(ELEVATION) if view is None else Views((view,))
+    (camera,) = source.cameras(settings, lambda: balls).cameras
+    sizes = min(extent.sizes[0] for extent in extents), max(extent.sizes[1] for extent in extents)
+    target = view[1] if view is not None else _ahead(camera, middle)
+    return Start(_point(camera.position), _point(target), fov, _point(middle), radius, sizes, chosen=view is None)
+
+
+def _ahead(camera: Camera, middle: Matrix) -> Matrix:
+    """The point on the axis of a camera that is nearest to the middle of the scene."""
+    away = float((middle - camera.position) @ camera.forward)
+    point: Matrix = camera.position + camera.forward * (away if away > 0 else 1.0)
+    return point
+
+
+def _point(values: Sequence[float] | Matrix) -> Point:
+    x, y, z = (float(value) for value in values)
+    return x, y, z

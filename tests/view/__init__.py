@@ -1,0 +1,1 @@
+"""Tests of `sparklod_cli.view` and of the command."""

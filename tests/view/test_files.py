@@ -1,0 +1,174 @@
+"""Which files are served, and what the page is told of them."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import sparklod_cli as sparklod
+from sparklod_cli.api import viewing
+from sparklod_cli.codecs.rad_header import ChunkEntry, Header, pack_header
+from sparklod_cli.support.errors import CameraPathError, FormatError, SparklodError
+from sparklod_cli.view.files import shown_files
+from tests.conftest import FIXTURES
+from tests.view.conftest import CHUNKED, PLAIN, TREE, prepared
+
+GOLDEN = FIXTURES / "golden"
+
+
+def settings_of(*paths: Path, settings: viewing.ViewSettings = PLAIN) -> dict:  # type: ignore[type-arg]
+    content = prepared(paths, settings).resources["view.json"]
+    assert isinstance(content, bytes)
+    return json.loads(content)
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "leaves"),
+    [
+        ("../sh1.ply", "ply", None),
+        ("sh3-compressed.ply", "ply", None),
+        ("sh3-v3.spz", "spz", None),
+        ("tree-v3.spz", "spz", True),
+        ("sh0.splat", "splat", None),
+        ("sh2-level1.ksplat", "ksplat", None),
+        ("sh3-v2.sog", "pcsogszip", None),
+        ("sh1-sog", "pcsogs", None),
+        ("sh1-tree.rad", "rad", True),
+    ],
+)
+def test_the_page_is_told_what_each_file_is(name: str, kind: str, leaves: bool | None) -> None:
+    (file,) = settings_of(GOLDEN / name)["files"]
+    scene = sparklod.read(GOLDEN / name)
+    assert (file["type"], file["splats"]) == (kind, len(scene.splats))
+    assert (file["leaves"] is not None) == bool(leaves)
+    if kind == "spz" and scene.tree is not None:
+        assert file["leaves"] == int(scene.tree.is_leaf.sum())
+
+
+def test_files_of_the_same_name_have_different_addresses() -> None:
+    first, second = settings_of(TREE, TREE)["files"]
+    assert first["name"] == second["name"]
+    assert first["url"] != second["url"]
+
+
+def test_an_unpacked_sog_is_served_with_its_images() -> None:
+    (shown,) = shown_files([GOLDEN / "sh1-sog"])
+    names = {Path(name).name for name in shown.files}
+    assert names == {path.name for path in (GOLDEN / "sh1-sog").iterdir()}
+    assert shown.name == "sh1-sog"
+
+
+def test_the_size_counts_chunk_files() -> None:
+    (shown,) = shown_files([CHUNKED])
+    assert shown.bytes == sum(path.stat().st_size for path in CHUNKED.parent.iterdir())
+
+
+@pytest.mark.parametrize("content", [None, b"", b"neither of both"])
+def test_a_file_that_cannot_be_shown_is_named(tmp_path: Path, content: bytes | None) -> None:
+    path = tmp_path / "scene.spz"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(FormatError, match=f"^{path}: "):
+        shown_files([path])
+
+
+def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "scene.spz")
+    with pytest.raises(FormatError, match="a pipe or a device"):
+        shown_files([tmp_path / "scene.spz"])
+
+
+def test_a_missing_chunk_file_is_named(tmp_path: Path) -> None:
+    shutil.copytree(CHUNKED.parent, tmp_path / "rad")
+    (tmp_path / "rad" / "sh3-1.radc").unlink()
+    with pytest.raises(FormatError, match=r"its chunk file 'sh3-1.radc' is missing"):
+        shown_files([tmp_path / "rad" / CHUNKED.name])
+
+
+def test_a_chunk_file_that_is_a_link_to_elsewhere_is_refused(tmp_path: Path) -> None:
+    shutil.copytree(CHUNKED.parent, tmp_path / "rad")
+    chunk = tmp_path / "rad" / "sh3-1.radc"
+    chunk.rename(tmp_path / "elsewhere.radc")
+    chunk.symlink_to(tmp_path / "elsewhere.radc")
+    with pytest.raises(FormatError, match="link to another folder"):
+        shown_files([tmp_path / "rad" / CHUNKED.name])
+
+
+@pytest.mark.parametrize("name", ["../secret", "/etc/passwd", "..", "a\\b", "https://elsewhere.example/x"])
+def test_a_chunk_file_outside_of_the_folder_is_refused(tmp_path: Path, name: str) -> None:
+    (tmp_path / "secret").write_text("not yours")
+    folder = tmp_path / "rad"
+    folder.mkdir()
+    header = Header(10, 0, True, 65_536, 5, (ChunkEntry(0, 5, name),))
+    (folder / "scene.rad").write_bytes(pack_header(header))
+    with pytest.raises(FormatError, match="which is not a file beside it"):
+        shown_files([folder / "scene.rad"])
+
+
+def test_a_link_that_the_user_names_is_followed_once(tmp_path: Path) -> None:
+    (tmp_path / "link.spz").symlink_to(TREE)
+    (shown,) = shown_files([tmp_path / "link.spz"])
+    assert list(shown.files.items()) == [("data/0/link.spz", TREE.resolve())]
+
+
+# --- the first look
+
+
+def test_the_first_look_is_that_of_render() -> None:
+    from sparklod_cli.cameras.frame import Settings
+    from sparklod_cli.cameras.sources import WholeScene
+    from sparklod_cli.model.instances import instances_of
+    from sparklod_cli.scenes.reading import read_scenes
+
+    start = settings_of(TREE)["start"]
+    scenes = read_scenes(instances_of([TREE]))
+    (camera,) = WholeScene().cameras(Settings(size=(1280, 720)), scenes.balls).cameras
+    assert start["eye"] == pytest.approx(camera.position.tolist())
+    ahead = np.subtract(start["target"], start["eye"])
+    assert ahead / np.linalg.norm(ahead) == pytest.approx(camera.forward)
+
+
+def test_a_large_rad_tree_is_framed_by_its_first_chunk_alone(tmp_path: Path) -> None:
+    shutil.copytree(CHUNKED.parent, tmp_path / "rad")
+    whole = settings_of(tmp_path / "rad" / CHUNKED.name)["start"]
+    for number in (1, 2):  # which would be found to be damaged
+        (tmp_path / "rad" / f"sh3-{number}.radc").write_bytes(b"RADC")
+    coarse = settings_of(tmp_path / "rad" / CHUNKED.name)["start"]
+    assert coarse == whole
+    scene = sparklod.read(CHUNKED)
+    distance = np.linalg.norm(scene.splats.center - np.array(coarse["center"]), axis=1)
+    assert coarse["radius"] == pytest.approx(float(np.quantile(distance, 0.9)), rel=0.5)
+
+
+def test_the_options_of_the_first_look_are_told() -> None:
+    look = ((1.0, 2.0, 3.0), (0.0, 0.0, 0.0))
+    told = settings_of(TREE, settings=viewing.ViewSettings(look, 40.0, (0.0, 0.0, 1.0), 500, None, None))
+    assert (told["start"]["eye"], told["start"]["target"], told["start"]["fov"]) == ([1, 2, 3], [0, 0, 0], 40)
+    assert (told["up"], told["budget"], told["start"]["chosen"]) == ([0, 0, 1], 500, False)
+    assert settings_of(TREE)["start"]["fov"] == 60
+    with pytest.raises(CameraPathError):
+        settings_of(TREE, settings=viewing.ViewSettings(((1.0,) * 3, (1.0,) * 3), None, None, None, None, None))
+
+
+def test_a_camera_path_is_told() -> None:
+    path = FIXTURES / "cameras" / "sparklod.json"
+    told = settings_of(TREE, settings=viewing.ViewSettings(None, None, None, None, path, None))["path"]
+    assert len(told["frames"]) == len(sparklod.read_cameras(path))
+
+
+def test_a_scene_of_one_point_can_be_shown() -> None:
+    start = settings_of(FIXTURES / "one.ply")["start"]
+    assert start["radius"] > 0
+    assert 0 < start["sizes"][0] <= start["sizes"][1]
+
+
+def test_a_broken_file_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "scene.spz"
+    path.write_bytes(TREE.read_bytes()[:-20])
+    with pytest.raises(SparklodError, match=f"^{path}: "):
+        settings_of(path)
