@@ -12,6 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sparklod_cli.codecs import rad
+from sparklod_cli.codecs.options import DEFAULTS
 from sparklod_cli.io import read_scene
 from sparklod_cli.model.foveation import Cones, Frustum
 from sparklod_cli.model.gaussian import moved, placed, spark_size
@@ -157,6 +159,31 @@ def test_chunks_share_the_bytes_of_a_file() -> None:
         nodes = np.minimum(len(tree.splats) - CHUNK_NODES * np.arange(len(sizes)), CHUNK_NODES)
         assert (np.abs(sizes - nodes * tree.bytes / len(tree.splats)) <= 1).all()  # each its share of the nodes
     assert made.forest.chunks == sum(tree.chunks for tree in made.loaded) == 1 + 3 + 1
+
+
+def test_chunks_of_rad_have_the_sizes_that_they_have_in_the_file(tmp_path: Path) -> None:
+    """Those that follow the header in one file, and those that are files of their own."""
+    scene = read_scene(TOWN)
+    (tmp_path / "whole.rad").write_bytes(b"".join(rad.encode(scene)))
+    for name, pieces in rad.encode_chunked(scene, DEFAULTS, "parts"):
+        (tmp_path / name).write_bytes(b"".join(pieces))
+    whole, parts, town = read_scenes(
+        [Instance(path) for path in (tmp_path / "whole.rad", tmp_path / "parts.rad", TOWN)]
+    ).loaded
+    assert whole.header_bytes + whole.chunk_bytes().sum() == (tmp_path / "whole.rad").stat().st_size
+    assert parts.header_bytes == (tmp_path / "parts.rad").stat().st_size
+    files = [(tmp_path / f"parts-{number}.radc").stat().st_size for number in range(3)]
+    assert parts.chunk_bytes().tolist() == whole.chunk_bytes().tolist() == files
+    assert town.header_bytes == 0
+
+
+def test_chunks_of_another_size_than_sparks_are_not_those_that_it_streams() -> None:
+    """Spark's pages have 65,536 nodes; a file of smaller chunks counts as if it were cut evenly."""
+    (tree,) = read_scenes([Instance(FIXTURES / "golden" / "sh1-tree.rad")]).trees
+    assert tree.scene.chunk_bytes is not None
+    assert tree.scene.header["chunk_size"] != CHUNK_NODES
+    assert tree.chunk_bytes().tolist() == [tree.bytes]
+    assert tree.header_bytes == 0
 
 
 @pytest.mark.parametrize("nodes", [1, CHUNK_NODES - 1, CHUNK_NODES, CHUNK_NODES + 1, 3 * CHUNK_NODES])

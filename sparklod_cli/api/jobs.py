@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from ..simulation.streaming import StreamingSettings
     from ..simulation.summary import Summary
     from ..tables.assertions import Assertion, Outcome
+    from ..tables.columns import Row
     from ..tables.comparison import BudgetSummary
     from ..tables.output import Filter, TableOutput
 
@@ -241,8 +242,9 @@ def traverse_files(
         UnfitError: the budget, or the chunk cache, is too small for the roots.
         SparklodError: a file cannot be read or written, or is no tree.
     """
-    from ..simulation.columns import EMPTY
+    from ..simulation.columns import EMPTY, LOADING
     from ..simulation.frames import Simulation
+    from ..simulation.loading import Loader
     from ..simulation.outputs import write_frames
     from ..simulation.summary import summarize
     from ..tables.assertions import check
@@ -257,5 +259,8 @@ def traverse_files(
         raise UnfitError(str(error)) from None
     ready(path, scenes)
     progress = files.progress if bar else silent
+    loading = None if streaming.network.instant else Loader(scenes, settings, streaming).load(path.cameras[0])
     frames = write_frames(simulation, path, outputs, threads=files.threads, progress=progress, passed=passed)
-    return Traversed(frames, path, summarize(frames.rows), check(asserts, frames.rows, empty=EMPTY))
+    nothing: Row = dict.fromkeys(column.name for column in LOADING)
+    asserted = [row | (loading or nothing if not at else nothing) for at, row in enumerate(frames.rows)]
+    return Traversed(frames, path, summarize(frames.rows, loading), check(asserts, asserted, empty=EMPTY))

@@ -80,7 +80,7 @@ def examine(
         FormatError: as `decode`, but not for a broken tree.
     """
     size = size_of(file)
-    _refuse_chunk(file)
+    refuse_chunk(file)
     header = read_header(file)
     files = _sizes_beside(header, beside)
     rad_promises.check(rad_promises.violations(header, size, files))
@@ -97,7 +97,8 @@ def examine(
         start, stop = packed.header.base, packed.header.base + packed.header.count
         part = _rows(splats, tree, slice(start, stop))
         if fill(packed, header, *part, palette, columns) is not None:
-            raise FormatError(f"chunk {packed.number:,} has labels of SH, but there is no palette")
+            text = f"chunk {packed.number:,} has labels of SH, but there is no palette"
+            raise rad_promises.error_of("rad.palette", text)
         return stop
 
     def all_chunks() -> Iterator[Packed]:
@@ -108,10 +109,15 @@ def examine(
     for done in ordered_map(run, all_chunks(), threads):
         progress("reading", done, header.count, "splat")
     facts = {"version": 1, "chunks": len(header.chunks), "chunk_size": header.chunk_size}
-    facts |= {"chunked": int(header.chunked)}
+    facts |= {"header_bytes": header.bytes, "chunked": int(header.chunked)}
     facts |= {"sh_codes": len(palette)} if palette is not None else {}
-    name = "RAD" + " LoD" * (tree is not None)
-    return Scene(splats, tree, format=name, header=facts, chunk_bytes=tuple(entry.bytes for entry in header.chunks))
+    sizes = tuple(entry.bytes for entry in header.chunks)
+    return Scene(splats, tree, format=name_of(header), header=facts, chunk_bytes=sizes)
+
+
+def name_of(header: Header) -> str:
+    """The format of a file for people, as `Scene.format` has it."""
+    return "RAD" + " LoD" * header.lod_tree
 
 
 def encode(
@@ -234,7 +240,8 @@ def read_chunk(file: BinaryIO, entry: ChunkEntry, header: Header, palette: Float
     return Chunk(packed.header, splats, tree, own, labels)
 
 
-def _refuse_chunk(file: BinaryIO) -> None:
+def refuse_chunk(file: BinaryIO) -> None:
+    """Raises `NotSplatsError`, which says what to give, where a file is a single chunk; leaves it at its beginning."""
     if file.read(len(CHUNK_MAGIC)) == CHUNK_MAGIC:
         raise NotSplatsError("it is one chunk of a RAD file; give the .rad file beside it, which names all chunks")
     file.seek(0)

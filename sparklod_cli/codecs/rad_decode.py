@@ -152,7 +152,7 @@ def fill(
     if labels is not None and palette is not None:
         if labels.max(initial=0) >= len(palette):
             where = f"SH label {labels.max():,} of chunk {packed.number:,}"
-            raise FormatError(f"{where} is beyond the {len(palette):,} codes of the palette")
+            raise rad_promises.error_of("rad.palette", f"{where} is beyond the {len(palette):,} codes of the palette")
         if "sh" in columns:
             np.take(palette, labels, axis=0, out=splats.sh)
         return None

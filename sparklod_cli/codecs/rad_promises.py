@@ -11,35 +11,49 @@ from ..support.errors import FormatError
 from ..support.untrusted import quoted_value
 from .quantize import LARGEST
 from .rad_header import ALIGNMENT, GZ, ChunkEntry, ChunkHeader, Header, Property, Violation, padding
-from .rad_layout import BY_NAME, RANGES
+from .rad_layout import BY_NAME, PROPERTIES, RANGES, Row
 
-#: What is wrong with each promise, by its code; the text of a violation has the values.
-CODES = {
+#: What is wrong with each promise, by its code; the text of a violation has the values. Other formats break some of
+#: these promises, too: their codes are "container.cut-short", "container.trailing" and "container.version".
+ERRORS = {
     "rad.chunks": "the number of chunks or their size is not that of the splats",
-    "rad.degree": "the SH degree is unknown",
-    "rad.sizes": "sizes disagree",
-    "rad.cut-short": "a chunk lies beyond the end of its file",
     "rad.offsets": "chunks or properties do not lie one after the other",
-    "rad.padding": "padding is missing or not zeros",
-    "rad.trailing": "bytes follow the last chunk",
-    "rad.chunk-files": "a file of a chunk is missing, or not of its size",
-    "rad.chunk-size": "chunks are not of the size that Spark streams",
+    "rad.sizes": "sizes disagree",
+    "rad.chunk-files": "the file of a chunk is missing, cut short, or not in the folder",
+    "rad.chunk-header": "the header of a chunk cannot be read",
     "rad.bases": "a chunk is not of the splats that its place in the file tells",
-    "rad.chunk-header": "a chunk's header disagrees with that of the file",
-    "rad.properties": "a property is unknown, missing or twice there",
-    "rad.encoding": "a property's encoding or its range is unknown or impossible",
+    "rad.kind": "maxSh or lodTree of a chunk is not that of the file",
+    "rad.properties": "a property is unknown, missing, there twice, or does not belong there",
+    "rad.encoding": "the encoding or the range of a property is unknown or impossible",
     "rad.palette": "the palette of spherical harmonics and its labels do not belong together",
-    "rad.opacity": "opacities of a tree are not marked as such",
+    "rad.header-limit": "the header is larger than 1 MiB, and Spark does not page the file",
 }
+WARNINGS = {
+    "rad.header-large": "the header is larger than the 64 KiB that Spark asks for at first",
+    "rad.chunk-size": "chunks do not have the 65,536 splats by which Spark streams",
+    "rad.total": "allChunkBytes is not the sum of the sizes of the chunks",
+    "rad.padding": "padding is missing or not zeros",
+    "rad.order": "properties are not in the order in which Spark writes them",
+    "rad.ranges": "splatEncoding of a chunk is not that of the file",
+    "rad.opacity": "splatEncoding does not mark the opacities of a tree as such",
+}
+
+#: Bytes of a file in which Spark looks for the header at first, and at most.
+FIRST_LOOK, LAST_LOOK = 1 << 16, 1 << 20
 
 
 def check(broken: Iterator[Violation]) -> None:
     """Raises a `FormatError` with the code and the text of the first fatal violation."""
     for violation in broken:
         if violation.fatal:
-            error = FormatError(violation.text)
-            error.code = violation.code
-            raise error
+            raise error_of(violation.code, violation.text)
+
+
+def error_of(code: str, text: str) -> FormatError:
+    """The error for a broken promise, which has its code."""
+    error = FormatError(text)
+    error.code = code
+    return error
 
 
 def expected_chunks(header: Header) -> int:
@@ -53,16 +67,22 @@ def expected_count(header: Header, number: int) -> int:
 
 
 def violations(
-    header: Header, file_size: int | None = None, files: Mapping[str, int | None] | None = None
+    header: Header, file_size: int | None = None, files: Mapping[str, int | str] | None = None
 ) -> Iterator[Violation]:
-    """The broken promises of a file's header, in the order of `CODES`.
+    """The broken promises of a file's header.
 
     Args:
         header: as read.
         file_size: bytes of the file that it was read from; without, nothing is said about where its chunks are.
-        files: sizes of the files that it names for chunks; None for one that is missing. Without,
-            they are not looked at.
+        files: sizes of the files that it names for chunks, or why one cannot be opened. Without, they are not looked
+            at.
     """
+    if header.bytes > LAST_LOOK:
+        text = f"its header has {header.bytes:,} bytes; Spark pages files with at most {LAST_LOOK:,}"
+        yield Violation("rad.header-limit", text, fatal=False)
+    elif header.bytes > FIRST_LOOK:
+        text = f"its header has {header.bytes:,} bytes; Spark asks for {FIRST_LOOK:,} at first"
+        yield Violation("rad.header-large", text, fatal=False)
     wanted = expected_chunks(header)
     if len(header.chunks) != wanted or (header.count and not header.chunk_size):
         yield Violation(
@@ -70,16 +90,16 @@ def violations(
             f"{len(header.chunks):,} chunks of {header.chunk_size:,} splats; {header.count:,} splats need {wanted:,}",
         )
     if header.max_sh > MAX_SH_DEGREE:
-        yield Violation("rad.degree", f"it has SH degree {header.max_sh}; RAD has 0 to {MAX_SH_DEGREE}")
+        yield Violation("container.version", f"it has SH degree {header.max_sh}; RAD has 0 to {MAX_SH_DEGREE}")
     total = sum(entry.bytes for entry in header.chunks)
     if total != header.all_chunk_bytes:
         text = f"allChunkBytes is {header.all_chunk_bytes:,}, but its chunks have {total:,} bytes"
-        yield Violation("rad.sizes", text, fatal=False)
+        yield Violation("rad.total", text, fatal=False)
     if file_size is not None:
         yield from _places(header, file_size, files)
     if not header.padded_with_zeros:
         yield Violation("rad.padding", "the padding of its header is not zeros", fatal=False)
-    if header.chunk_size != CHUNK_NODES and header.count > header.chunk_size:
+    if 0 < header.chunk_size != CHUNK_NODES and header.count > min(header.chunk_size, CHUNK_NODES):
         text = f"its chunks have {header.chunk_size:,} splats; Spark streams only chunks of {CHUNK_NODES:,}"
         yield Violation("rad.chunk-size", text, fatal=False)
     if header.sh_code_count is not None and header.sh_code_count != expected_count(header, 0):
@@ -92,40 +112,48 @@ def violations(
         yield Violation("rad.opacity", "it has a tree, but its splatEncoding has no lodOpacity", fatal=False)
 
 
-def _places(header: Header, file_size: int, files: Mapping[str, int | None] | None) -> Iterator[Violation]:
+def _places(header: Header, file_size: int, files: Mapping[str, int | str] | None) -> Iterator[Violation]:
     """Of chunks in their files."""
     by_file: dict[str | None, list[tuple[int, ChunkEntry]]] = defaultdict(list)
     for number, entry in enumerate(header.chunks):
         by_file[entry.filename].append((number, entry))
     for name, entries in by_file.items():
-        at = 0
+        at, in_order = 0, True
         for number, entry in entries:
             if entry.offset < at:
                 yield Violation("rad.offsets", f"chunk {number:,} begins at {entry.offset:,}, inside the one before it")
             elif entry.offset > at:
                 text = f"chunk {number:,} begins at {entry.offset:,}, but the one before it ends at {at:,}"
                 yield Violation("rad.offsets", text, fatal=name is None)
+            in_order &= entry.offset == at
             if entry.bytes % ALIGNMENT:
                 text = f"chunk {number:,} has {entry.bytes:,} bytes, which is no multiple of {ALIGNMENT}"
                 yield Violation("rad.padding", text, fatal=False)
             at = max(at, entry.offset + entry.bytes)
-        if name is None:
-            size: int | None = file_size - header.bytes
-        elif files is None:
-            continue
-        else:
-            size = files.get(name)
-            if size is None:
-                yield Violation("rad.chunk-files", f"there is no file {quoted_value(name)}, which it names")
-                continue
-        if size is not None and size < at:
-            where = "it" if name is None else quoted_value(name)
-            text = f"cut short: {where} lacks {at - size:,} bytes of chunk {entries[-1][0]:,}"
-            yield Violation("rad.cut-short" if name is None else "rad.chunk-files", text)
-        elif size is not None and size > at:
-            where = "its last chunk" if name is None else f"the chunk in {quoted_value(name)}"
-            code = "rad.trailing" if name is None else "rad.chunk-files"
-            yield Violation(code, f"{size - at:,} bytes follow {where}", fatal=False)
+        if name is not None and files is not None:
+            yield from _end_of_file(name, files[name], at, entries[-1][0])
+        elif name is None and in_order:
+            yield from _end(file_size - header.bytes, at, entries[-1][0])
+
+
+def _end(size: int, end: int, last: int) -> Iterator[Violation]:
+    """Of the chunks in the file of the header, which has so many bytes behind that."""
+    if size < end:
+        yield Violation("container.cut-short", f"cut short: it lacks {end - size:,} bytes of chunk {last:,}")
+    elif size > end:
+        yield Violation("container.trailing", f"{size - end:,} bytes follow its last chunk", fatal=False)
+
+
+def _end_of_file(name: str, size: int | str, end: int, last: int) -> Iterator[Violation]:
+    """Of the chunks in another file."""
+    if isinstance(size, str):
+        yield Violation("rad.chunk-files", size)
+    elif size < end:
+        text = f"cut short: {quoted_value(name)} lacks {end - size:,} bytes of chunk {last:,}"
+        yield Violation("rad.chunk-files", text)
+    elif size > end:
+        text = f"{size - end:,} bytes follow the chunk in {quoted_value(name)}"
+        yield Violation("container.trailing", text, fatal=False)
 
 
 def chunk_violations(header: Header, number: int, chunk: ChunkHeader, size: int) -> Iterator[Violation]:
@@ -154,44 +182,72 @@ def chunk_violations(header: Header, number: int, chunk: ChunkHeader, size: int)
         yield Violation("rad.sizes", text, fatal=False)
     if not chunk.padded_with_zeros:
         yield Violation("rad.padding", f"the padding of the header of {name} is not zeros", fatal=False)
-    mine, theirs = (chunk.max_sh, chunk.lod_tree, chunk.encoding), (header.max_sh, header.lod_tree, header.encoding)
-    if mine != theirs:
-        text = f"maxSh, lodTree or splatEncoding of {name} is not that of the file"
-        yield Violation("rad.chunk-header", text, fatal=False)
-    yield from _properties(header, number, chunk, size - chunk.bytes)
+    if (chunk.max_sh, chunk.lod_tree) != (header.max_sh, header.lod_tree):
+        text = f"{name} has {_kind_of(chunk)}, but the file {_kind_of(header)}"
+        yield Violation("rad.kind", text, fatal=False)
+    if chunk.encoding != header.encoding:
+        yield Violation("rad.ranges", f"splatEncoding of {name} is not that of the file", fatal=False)
+    yield from _payload(number, chunk, size - chunk.bytes)
+    yield from _names(header, number, [each.name for each in chunk.properties])
+    for each in chunk.properties:
+        yield from _encodings(each, f"property {quoted_value(each.name)} of {name}")
 
 
-def _properties(header: Header, number: int, chunk: ChunkHeader, payload: int) -> Iterator[Violation]:
+def _kind_of(header: Header | ChunkHeader) -> str:
+    return f"SH degree {header.max_sh} and {'a tree' if header.lod_tree else 'no tree'}"
+
+
+def _payload(number: int, chunk: ChunkHeader, payload: int) -> Iterator[Violation]:
     at = 0
     for each in chunk.properties:
         what = f"property {quoted_value(each.name)} of chunk {number:,}"
         if each.offset != at:
-            yield Violation(
-                "rad.offsets", f"{what} begins at {each.offset:,}, not at {at:,}, where the one before ends"
-            )
+            text = f"{what} begins at {each.offset:,}, not at {at:,}, where the one before ends"
+            yield Violation("rad.offsets", text)
         at = each.offset + each.bytes + padding(each.bytes)
         if each.offset + each.bytes > payload:
             yield Violation("rad.sizes", f"{what} ends at {each.offset + each.bytes:,}, of {payload:,} bytes")
-        yield from _encodings(each, what)
-    names = [each.name for each in chunk.properties]
+    if at < payload:
+        text = f"the properties of chunk {number:,} end at {at:,}, of {payload:,} bytes"
+        yield Violation("rad.sizes", text, fatal=False)
+
+
+def _names(header: Header, number: int, names: list[str]) -> Iterator[Violation]:
+    where = f"chunk {number:,}"
     twice = {name for name in names if names.count(name) > 1} if len(names) <= len(BY_NAME) else set(names)
     if twice:
-        yield Violation("rad.properties", f"chunk {number:,} has {quoted_value(min(twice))} more than once")
-    needed = ["center", "alpha", "rgb", "scales", "orientation"]
-    if "sh_label" in names:
-        if "sh1" in names:
-            yield Violation("rad.palette", f"chunk {number:,} has both labels and coefficients of SH")
-        needed += [f"sh{degree}_code" for degree in range(1, header.max_sh + 1) if number == 0]
-    else:
-        needed += [f"sh{degree}" for degree in range(1, header.max_sh + 1)]
-    missing = [
-        name for name in (*needed, *(["child_count", "child_start"] if header.lod_tree else [])) if name not in names
-    ]
-    if missing:
-        text = f"chunk {number:,} has no {', '.join(missing)}; its splats get 0"
-        yield Violation("rad.properties", text, fatal=False)
+        yield Violation("rad.properties", f"{where} has {quoted_value(min(twice))} more than once")
+    labels = "sh_label" in names
+    if labels and any(name in BY_NAME and BY_NAME[name].column == "sh" and not BY_NAME[name].codes for name in names):
+        yield Violation("rad.palette", f"{where} has both labels and coefficients of SH")
+    if header.max_sh and labels != (header.sh_code_count is not None):
+        text = f"{where} has {'' if labels else 'no '}labels of SH, but the file {'no' if labels else 'a'} palette"
+        yield Violation("rad.palette", text, fatal=False)
     if number and any(name in BY_NAME and BY_NAME[name].codes for name in names):
-        yield Violation("rad.palette", f"chunk {number:,} has a palette of SH; only the first chunk may have one")
+        yield Violation("rad.palette", f"{where} has a palette of SH; only the first chunk may have one")
+    wanted = [row.name for row in PROPERTIES if _belongs(row, header, number, labels=labels)]
+    missing = [name for name in wanted if name not in names]
+    if missing:
+        yield Violation("rad.properties", f"{where} has no {', '.join(missing)}; its splats get 0", fatal=False)
+    extra = [name for name in names if name in BY_NAME and not _belongs(BY_NAME[name], header, None, labels=labels)]
+    if extra:
+        yield Violation("rad.properties", f"{where} has {', '.join(extra)}, which does not belong there", fatal=False)
+    known = [name for name in names if name in BY_NAME]
+    if not twice and known != [name for name in BY_NAME if name in known]:
+        yield Violation("rad.order", f"the properties of {where} are in the order {', '.join(known)}", fatal=False)
+
+
+def _belongs(row: Row, header: Header, number: int | None, *, labels: bool) -> bool:
+    """Whether a property belongs into a chunk of this number, or into any."""
+    if row.column in ("child_count", "child_start"):
+        return header.lod_tree
+    if row.codes and number:
+        return False
+    if row.column == "labels":
+        return labels and header.max_sh > 0
+    if row.degree:
+        return row.degree <= header.max_sh and (row.codes == labels or number is None)
+    return True
 
 
 def _encodings(each: Property, what: str) -> Iterator[Violation]:
@@ -209,3 +265,8 @@ def _encodings(each: Property, what: str) -> Iterator[Violation]:
         value = ends[key]
         if value is None or abs(value) > LARGEST:
             yield Violation("rad.encoding", f"{what} is in {each.encoding}, but its {key} is {quoted_value(value)}")
+            return
+    low = each.min if "min" in RANGES.get(each.encoding, ()) else 0.0
+    if each.encoding in RANGES and low is not None and each.max is not None and not low < each.max:
+        text = f"{what} is in {each.encoding}, but its max, {each.max:g}, is not above {low:g}"
+        yield Violation("rad.encoding", text, fatal=False)

@@ -81,7 +81,7 @@ def inspect(ctx: click.Context, /, files: tuple[Path, ...], **_: Any) -> None:
 
 def _report_settings(checks: Checks, output: Output, expected: Expectations | None, *, as_json: bool) -> ReportSettings:
     """What the report must have for what is printed and checked."""
-    from ..inspection.report import ReportSettings
+    from ..inspection.report import HEADER_FIELDS, ReportSettings
 
     field = output.field or ""
     about = [condition.name for condition in expected.conditions()] if expected else []
@@ -94,6 +94,7 @@ def _report_settings(checks: Checks, output: Output, expected: Expectations | No
     drawn = output.html is not None or output.plot is not None
     printed = not (as_json or field or checks.holds)
     return ReportSettings(
+        headers_only=field.partition(".")[0] in HEADER_FIELDS and not (drawn or everything or checks.holds),
         values=everything or drawn or printed,
         all_quantities=everything or output.html is not None,
         check=checks.holds or field.startswith("findings"),

@@ -14,6 +14,9 @@ if TYPE_CHECKING:
 #: Numbers of children that get a row of their own.
 MOST_ROWS = 8
 
+#: Characters of a comment that are shown; Spark's has 800.
+MOST_COMMENT = 160
+
 #: Depths that get a row of their own; a good tree has some twenty.
 MOST_DEPTHS = 64
 
@@ -35,6 +38,8 @@ def lines(name: str, report: dict[str, Any]) -> Iterator[str]:
         yield _row("takes", f"{report['bytes_per_splat']:.1f} bytes a {noun}{less}")
     for note in report["notes"]:
         yield _row("note", note)
+    if report["rad"]:
+        yield from _rad(report["rad"])
     if tree:
         yield from _tree(tree)
     if values:
@@ -43,6 +48,32 @@ def lines(name: str, report: dict[str, Any]) -> Iterator[str]:
 
 def _row(name: str, text: str) -> str:
     return f"  {name:<10} {printable(text, MOST)}"
+
+
+def _rad(rad: dict[str, Any]) -> Iterator[str]:
+    where = "files of their own" if rad["chunked"] else "one file"
+    header, first = size_of(rad["header_bytes"]), size_of(rad["first_bytes"])
+    yield _row("stored", f"{where}, header {header}, with the first chunk {first}")
+    if rad["chunk_bytes"]:
+        least, median, most = (size_of(rad["chunk_bytes"][name]) for name in ("min", "median", "max"))
+        yield _row("chunks", f"{least} to {most}, median {median}, of {rad['chunk_size']:,} splats")
+    if rad["palette"]:
+        yield _row("palette", count_of(rad["palette"], "entry", "entries") + " of SH")
+    if rad["ranges"]:
+        yield _row("ranges", ", ".join(f"{name} {_ranged(value)}" for name, value in rad["ranges"].items()))
+    if rad["properties"]:
+        yield _row("properties", f"{'encoding':<12} {'bytes':>13} {'share':>7}  range")
+    for name, found in rad["properties"].items():
+        ends = [f"{found[end]:g}" for end in ("min", "max") if found[end] is not None]
+        share = f"{100 * found['share']:.1f} %"
+        text = f"{found['encoding']:<12} {found['bytes']:>13,} {share:>7}  {' to '.join(ends)}"
+        yield f"    {name:<12} {text}".rstrip()
+    if rad["comment"]:
+        yield _row("comment", printable(rad["comment"], MOST_COMMENT))
+
+
+def _ranged(value: float | bool) -> str:
+    return f"{value:g}" if not isinstance(value, bool) else "on" if value else "off"
 
 
 def _tree(tree: dict[str, Any]) -> Iterator[str]:
@@ -55,6 +86,8 @@ def _tree(tree: dict[str, Any]) -> Iterator[str]:
     yield _row(
         "", f"{chunks} of 65,536 nodes, {tree['chunks_of_coarse_cut']} of them for the coarsest cut of that many nodes"
     )
+    if tree["split_siblings"]:
+        yield _row("", f"the children of {count_of(tree['split_siblings'], 'node')} lie in more than one chunk")
     counts = sorted(tree["children"].items(), key=lambda item: -item[1])
     shown = ", ".join(f"{children}: {count:,}" for children, count in counts[:MOST_ROWS])
     yield _row(

@@ -10,6 +10,7 @@ from .console import count_of, size_of
 
 if TYPE_CHECKING:
     from ..simulation.summary import Moment, Quantity, Summary
+    from ..tables.columns import Row
 
 #: No line is longer; names of frames are cut to fit.
 WIDTH = 100
@@ -61,6 +62,8 @@ def _lines(summary: Summary) -> Iterator[str]:
     if summary.chunks:
         first = f"{size_of(summary.bytes_first)} of it in {count_of(summary.chunks_first, 'chunk')} for the first frame"
         yield _row("fetches", f"{size_of(summary.bytes)} in {count_of(summary.chunks, 'chunk')}, {first}")
+    if summary.loading:
+        yield _row("opens", _loading(summary.loading))
     if summary.quantities:
         yield _row("a frame", f"{'':<18} {'min':>12} {'median':>12} {'p95':>12} {'max':>12}")
         for quantity in summary.quantities:
@@ -73,6 +76,16 @@ def _lines(summary: Summary) -> Iterator[str]:
 
 def _row(name: str, text: str) -> str:
     return f"  {name:<10} {text}".rstrip()
+
+
+def _loading(figures: Row) -> str:
+    """What a visitor waits for who opens the page in front of the first camera."""
+    parts = []
+    for what, name in (("first picture", "first_picture"), ("90 %", "resident_90"), ("all", "resident_all")):
+        seconds, size = figures[f"{name}_s"], figures.get(f"{name}_bytes")
+        text = "never" if seconds is None else f"after {seconds:.2f} s"
+        parts.append(f"{what} {text}" + (f" and {size_of(size)}" if isinstance(size, int) else ""))
+    return ", ".join(parts)
 
 
 def _quantity(quantity: Quantity) -> str:

@@ -57,7 +57,7 @@ def inspect(
         findings += expectations.check(found, settings.expected)
     if settings.original is not None:
         nothing = [Finding("expect.leaves", "the file does not contain all of its splats, so they cannot be compared")]
-        findings += nothing if scene is None else leaves.check(scene, settings.original)
+        findings += nothing if scene is None else leaves.check(scene, settings.original, found.rad)
     return dataclasses.replace(found, findings=findings), scene
 
 

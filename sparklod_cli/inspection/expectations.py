@@ -31,7 +31,14 @@ NAMES: dict[str, Callable[[dict[str, Any]], Any]] = {
     "depth": lambda report: report["tree"]["depth"],
     "sh": lambda report: report["sh_degree"],
     "lod": lambda report: report["tree"] is not None,
+    "chunk_bytes": lambda report: report["rad"]["chunk_bytes"]["max"],
+    "first_bytes": lambda report: report["rad"]["first_bytes"],
+    "chunked": lambda report: report["rad"]["chunked"],
+    "palette": lambda report: report["rad"]["palette"],
 }
+
+#: Those of them that only a RAD file has.
+OF_RAD = ("chunk_bytes", "first_bytes", "chunked", "palette")
 
 #: The codes of findings about some names; that of the others is expect.value.
 CODES = {
@@ -169,7 +176,7 @@ def _value(plain: dict[str, Any], name: str) -> Any:
     try:
         return NAMES[name](plain)
     except TypeError:
-        raise NoFieldError("the file has no tree") from None
+        raise NoFieldError("the file is not RAD" if name in OF_RAD else "the file has no tree") from None
 
 
 def check(report: Report, expected: Expectations) -> list[Finding]:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from ..codecs.rad_promises import ERRORS as RAD_ERRORS
+from ..codecs.rad_promises import WARNINGS as RAD_WARNINGS
+
 ERROR, WARNING, NOTE = "error", "warning", "note"
 
 #: Every code, its severity and its meaning. Codes do not change from version to version.
@@ -21,6 +24,8 @@ CODES: dict[str, tuple[str, str]] = {
     "container.trailing": (WARNING, "bytes follow the data that belong to nothing"),
     "container.flags": (WARNING, "the header sets flags or reserved bytes without a meaning"),
     "container.left-out": (WARNING, "the file holds data that sparklod does not read"),
+    **{code: (ERROR, meaning) for code, meaning in RAD_ERRORS.items()},
+    **{code: (WARNING, meaning) for code, meaning in RAD_WARNINGS.items()},
     "values.empty": (ERROR, "there are no splats"),
     "values.non-finite": (ERROR, "a number is not finite, or a rotation has length 0"),
     "values.rotation": (ERROR, "the length of a rotation is not 1"),
@@ -29,7 +34,7 @@ CODES: dict[str, tuple[str, str]] = {
     "values.invisible": (WARNING, "many splats (leaves of a tree) have opacity 0 or scale 0 and cannot be drawn"),
     "values.scale-clamped": (
         WARNING,
-        "scales of many splats (leaves of a tree) lie at an end of the range of SPZ",
+        "scales of many splats (leaves of a tree) lie at an end of the range of the format",
     ),
     "values.center-clamped": (ERROR, "centres lie at the end of the range of the format"),
     "values.center-far": (WARNING, "centres lie farther out than the float16 of viewers can hold"),

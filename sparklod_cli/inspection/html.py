@@ -147,6 +147,8 @@ def _section(section: Section, anchor: str) -> str:
         figure_of(section.thumbnail, small=True),
         figure_of(section.picture),
     ]
+    if report.get("rad"):
+        parts.append(_rad(report["rad"]))
     if report.get("tree"):
         parts.append(_tree(report["tree"]))
     if report.get("values"):
@@ -204,6 +206,31 @@ def _findings(report: Mapping[str, Any]) -> str:
     if len(findings) > MAX_FINDINGS:
         items.append(f"<li>{number_text(len(findings) - MAX_FINDINGS)} more findings are not listed.</li>")
     return panel("Findings", f'<ul class="findings">{"".join(items)}</ul>{notes}')
+
+
+def _rad(rad: Mapping[str, Any]) -> str:
+    rows = []
+    for name, found in (rad.get("properties") or {}).items():
+        ends = [number_text(found[end]) for end in ("min", "max") if found.get(end) is not None]
+        share = f"{100 * found['share']:.1f} %"
+        cells = [text_of(found["encoding"]), size_text(found["bytes"]), share, " to ".join(ends)]
+        rows.append([text_of(name), *cells, bar(found["share"])])
+    head = ("Property", "Encoding", "Size", "Share", "Range", "")
+    properties = table_of(head, rows, "As stored, in all chunks.") if rows else ""
+    facts = [
+        ["Chunks", "files of their own" if rad.get("chunked") else "in one file"],
+        ["Header", size_text(rad["header_bytes"])],
+        ["Header and first chunk", size_text(rad["first_bytes"])],
+    ]
+    if rad.get("chunk_bytes"):
+        sizes = [size_text(rad["chunk_bytes"][name]) for name in ("min", "median", "max")]
+        facts.append(["Smallest, median and largest chunk", ", ".join(sizes)])
+    if rad.get("palette"):
+        facts.append(["Palette of SH", f"{number_text(rad['palette'])} entries"])
+    facts += [[text_of(name), text_of(value)] for name, value in (rad.get("ranges") or {}).items()]
+    comment = f"<p>{text_of(rad['comment'])}</p>" if rad.get("comment") else ""
+    stored = table_of(("RAD", ""), facts, "As its header says.")
+    return f'<div class="two">{panel("Properties", properties)}{panel("Container", stored + comment)}</div>'
 
 
 def _tree(tree: Mapping[str, Any]) -> str:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ..codecs.rad import name_of
 from ..codecs.spz_layout import KNOWN_FLAGS
 from ..io import examine_scene, read_arrays, size_of_input
 from ..model.scene import Scene
@@ -16,7 +17,7 @@ from ..support.errors import FormatError, SparklodError
 from ..support.printable import printable
 from ..support.progress import Progress, silent
 from ..support.untrusted import QUOTED
-from . import arrays, tree, values
+from . import arrays, rad, tree, values
 from .findings import Finding
 
 #: Version of the report: counts up when a field changes its meaning or is removed. schema.json describes this one.
@@ -24,6 +25,10 @@ SCHEMA_VERSION = 1
 
 #: Columns that the facts of a tree are computed from.
 TREE_COLUMNS = ("scale", "opacity")
+
+
+#: Fields for which the headers of a RAD file are enough.
+HEADER_FIELDS = ("file", "bytes", "format", "splats", "sh_degree", "bytes_per_splat", "compression_ratio", "rad")
 
 
 class NoFieldError(SparklodError):
@@ -38,8 +43,10 @@ class ReportSettings:
         values: statistics of the splats.
         all_quantities: all of their quantities, instead of the main ones.
         check: findings.
+        headers_only: read no more than the headers of a RAD file; its tree and values are left out.
     """
 
+    headers_only: bool = False
     values: bool = False
     all_quantities: bool = False
     check: bool = False
@@ -59,6 +66,7 @@ class Report:
         bytes_per_splat: size over splats.
         compression_ratio: size of the decoded splats, as 4-byte floats, over that of the file.
         notes: data that the reader left out.
+        rad: what the headers of a RAD file tell; None for other formats.
         tree: facts of the Level-of-Detail tree; None without one.
         values: statistics of the splats; None if not asked for.
         findings: None if not asked for, unless the file could not be read.
@@ -74,6 +82,7 @@ class Report:
     bytes_per_splat: float | None = None
     compression_ratio: float | None = None
     notes: list[str] = dataclasses.field(default_factory=list)
+    rad: rad.RadFacts | None = None
     tree: tree.TreeFacts | None = None
     values: values.ValueFacts | None = None
     findings: list[Finding] | None = None
@@ -124,24 +133,60 @@ def inspect(
     """
     columns = COLUMNS if settings.values or settings.check else TREE_COLUMNS
     size = size_of_input(path)
+    surveyed = None
     try:
         held = read_arrays(path)
         if held is not None:
             facts_of_arrays, scene_of_arrays = arrays.examine(held, settings, threads=threads)
             return Report(**arrays.as_report_fields(facts_of_arrays, path, size, settings)), scene_of_arrays
+        surveyed = rad.survey(path, check=settings.check)
+        if surveyed is not None and surveyed.facts is None:
+            return Report(str(path), size, findings=surveyed.findings if settings.check else surveyed.fatal), None
+        if surveyed is not None and settings.headers_only:
+            return _of_headers(path, surveyed), None
         scene = examine_scene(path, columns=columns, threads=threads, progress=progress)
     except FormatError as error:
-        return Report(str(path), size, findings=[Finding(error.code, str(error))]), None
+        found = surveyed.findings if surveyed is not None and settings.check else []
+        return Report(str(path), size, findings=[*found, Finding(error.code, str(error))]), None
+    return _of_scene(path, scene, size, settings, surveyed), scene
+
+
+def _of_headers(path: Path, surveyed: rad.Survey) -> Report:
+    """The report on a RAD file of which only the headers were read."""
+    header, facts = surveyed.header, surveyed.facts
+    assert facts is not None
+    return Report(
+        str(path),
+        facts.bytes,
+        name_of(header),
+        header.count,
+        header.max_sh,
+        False,
+        bytes_per_splat=_bytes_per_splat(facts.bytes, header.count),
+        compression_ratio=_compression_ratio(facts.bytes, header.count, header.max_sh),
+        rad=facts,
+    )
+
+
+def _of_scene(
+    path: Path, scene: Scene, size: int | None, settings: ReportSettings, surveyed: rad.Survey | None
+) -> Report:
     splats, count = scene.splats, len(scene.splats)
     size = scene.header.get("bytes", size)
+    ends = values.ends_of(scene)
     findings = _container_findings(scene)
+    if surveyed is not None and surveyed.facts is not None:
+        size, ends = surveyed.facts.bytes, rad.ends_of(surveyed.facts)
+        findings += surveyed.findings
     facts = None
     if scene.tree is not None and count:
-        facts, found = tree.examine(splats, scene.tree, check=settings.check, scale_ends=values.scale_ends(scene))
+        facts, found = tree.examine(
+            splats, scene.tree, check=settings.check, scale_ends=ends.scale, in_chunks=surveyed is not None
+        )
         findings += found
     if settings.check:
-        findings += values.check(scene)
-    report = Report(
+        findings += values.check(scene, ends)
+    return Report(
         file=str(path),
         bytes=size,
         format=scene.format,
@@ -149,14 +194,22 @@ def inspect(
         sh_degree=splats.sh_degree,
         antialiased=scene.antialiased,
         header=dict(scene.header),
-        bytes_per_splat=round(size / count, 3) if size and count else None,
-        compression_ratio=round(4 * count * (14 + 3 * COEFFICIENTS[splats.sh_degree]) / size, 3) if size else None,
+        bytes_per_splat=_bytes_per_splat(size, count),
+        compression_ratio=_compression_ratio(size, count, splats.sh_degree),
         notes=list(scene.notes),
+        rad=None if surveyed is None else surveyed.facts,
         tree=facts,
         values=values.examine(splats, all_quantities=settings.all_quantities) if settings.values else None,
         findings=findings if settings.check else None,
     )
-    return report, scene
+
+
+def _bytes_per_splat(size: int | None, count: int) -> float | None:
+    return round(size / count, 3) if size and count else None
+
+
+def _compression_ratio(size: int | None, count: int, sh_degree: int) -> float | None:
+    return round(4 * count * (14 + 3 * COEFFICIENTS[sh_degree]) / size, 3) if size else None
 
 
 def _container_findings(scene: Scene) -> list[Finding]:

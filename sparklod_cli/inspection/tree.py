@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..lod.kernels.tree_links import find_cycles, find_depths, find_parents, mean_child_sizes, sum_by_depth
 from ..model.gaussian import spark_size
 from ..model.lod_tree import LodTree
-from ..model.nodes import CHUNK_NODES
+from ..model.nodes import CHUNK_BITS, CHUNK_NODES
 from ..model.splats import FloatArray, Splats
 from .findings import Finding
 
@@ -61,6 +61,7 @@ class TreeFacts:
         chunks: of `CHUNK_NODES` nodes.
         chunks_of_coarse_cut: chunks that a viewer needs for a coarse cut: the one of at most `CHUNK_NODES` nodes that
             refines the largest nodes first.
+        split_siblings: inner nodes whose children lie in more than one chunk.
     """
 
     leaves: int
@@ -73,10 +74,16 @@ class TreeFacts:
     more_than_opaque: float | None
     chunks: int
     chunks_of_coarse_cut: int
+    split_siblings: int
 
 
 def examine(
-    splats: Splats, tree: LodTree, *, check: bool = True, scale_ends: tuple[float, float] = (0.0, math.inf)
+    splats: Splats,
+    tree: LodTree,
+    *,
+    check: bool = True,
+    scale_ends: tuple[float, float] = (0.0, math.inf),
+    in_chunks: bool = False,
 ) -> tuple[TreeFacts, list[Finding]]:
     """The facts of a tree and findings about it; of a broken tree, the facts of the nodes that its root leads to.
 
@@ -86,6 +93,7 @@ def examine(
         check: look for faults.
         scale_ends: smallest and largest scale that the format holds, world units. A scale at one of them may have been
             clamped.
+        in_chunks: the format orders nodes by chunks, so that they need not be coarse before fine.
     """
     size = spark_size(splats)
     depth, limit = find_depths(tree.child_count, tree.child_start, size)
@@ -107,6 +115,7 @@ def examine(
         more_than_opaque=round(float(np.count_nonzero(splats.opacity > 1)) / len(tree), 4),
         chunks=-(-len(tree) // CHUNK_NODES),
         chunks_of_coarse_cut=len(np.unique(_coarse_cut(tree, limit) // CHUNK_NODES)),
+        split_siblings=_split_siblings(tree),
     )
     if not check:
         return facts, []
@@ -114,7 +123,7 @@ def examine(
     return facts, [
         *_link_findings(tree, parent, references, depth),
         *_node_findings(splats, tree, parent, size, scale_ends),
-        *_order_findings(parent, limit),
+        *([] if in_chunks else _order_findings(parent, limit)),
     ]
 
 
@@ -132,6 +141,13 @@ def _coarse_cut(tree: LodTree, limit: FloatArray) -> NDArray[np.int64]:
     children = np.repeat(start - (np.cumsum(count) - count), count) + np.arange(count.sum())
     nodes = np.concatenate([np.zeros(1, np.int64), children])
     return np.setdiff1d(nodes[nodes < len(tree)], refined)
+
+
+def _split_siblings(tree: LodTree) -> int:
+    inner = np.flatnonzero(~tree.is_leaf)
+    first = tree.child_start[inner].astype(np.int64)
+    last = first + tree.child_count[inner] - 1
+    return int(np.count_nonzero(first >> CHUNK_BITS != last >> CHUNK_BITS))
 
 
 def _found(code: str, mask: Mask, what: str) -> list[Finding]:

@@ -156,16 +156,37 @@ def _numbers(values: NDArray[Any]) -> list[float]:
     return [_number(value) for value in values]
 
 
-def scale_ends(scene: Scene) -> tuple[float, float]:
-    """Smallest and largest scale that the format of the file holds, world units; 0 and infinity for floats."""
-    if "fractional_bits" not in scene.header:
-        return 0.0, math.inf
+@dataclass(frozen=True)
+class Ends:
+    """The numbers at which a file's codes end; values at one of them may have been clamped.
+
+    Attributes:
+        scale: smallest and largest scale, world units; 0 and infinity for floats.
+        center: largest absolute coordinate, world units.
+    """
+
+    scale: tuple[float, float] = (0.0, math.inf)
+    center: float = math.inf
+
+
+def ends_of(scene: Scene) -> Ends:
+    """The ends of the codes of an SPZ file, and none for other formats, whose numbers are floats."""
+    header = scene.header
+    if "fractional_bits" not in header:
+        return Ends()
     low, high = quantize.decode_log_scale(np.array([0, 255], np.uint8))
-    return low, high
+    fixed = header["version"] >= 2  # version 1 has floats
+    return Ends((low, high), quantize.FIXED24_MAX * 2.0 ** -int(header["fractional_bits"]) if fixed else math.inf)
 
 
-def check(scene: Scene) -> list[Finding]:
-    """Findings about the values of a scene."""
+def check(scene: Scene, ends: Ends | None = None) -> list[Finding]:
+    """Findings about the values of a scene.
+
+    Args:
+        scene: as it was read.
+        ends: of its codes; None for `ends_of(scene)`.
+    """
+    ends = ends_of(scene) if ends is None else ends
     splats = scene.splats
     if not len(splats):
         return [Finding("values.empty", "there are no splats")]
@@ -192,19 +213,18 @@ def check(scene: Scene) -> list[Finding]:
         checked = int(np.count_nonzero(scene.tree.is_leaf))
     if np.count_nonzero(invisible) > MANY_INVISIBLE * checked:
         report("values.invisible", valid & invisible, "cannot be drawn, as its opacity or scale is 0")
-    header = scene.header
-    if header.get("version", 0) >= 2 and "fractional_bits" in header:  # SPZ version 1 has floats
-        most = quantize.FIXED24_MAX * 2.0 ** -int(header["fractional_bits"])
-        clamped = valid & (np.abs(splats.center) >= most).any(axis=1)
-        report("values.center-clamped", clamped, f"a coordinate is {most:g}, the end of the range of its code")
-    if "fractional_bits" in header:
-        low, high = scale_ends(scene)
+    if ends.center < math.inf:
+        clamped = valid & (np.abs(splats.center) >= ends.center).any(axis=1)
+        report("values.center-clamped", clamped, f"a coordinate is {ends.center:g}, the end of the range of its code")
+    low, high = ends.scale
+    if high < math.inf:
         most = splats.scale.max(axis=1)  # a smallest scale that was clamped is not visible
-        clamped = (most <= low) | (most >= high)
+        clamped = (most > 0) & ((most <= low) | (most >= high))
         if scene.tree is not None:  # merged splats of leaves far apart may be larger than any code
             clamped &= scene.tree.is_leaf
         if np.count_nonzero(clamped) > MANY_CLAMPED * checked:
-            report("values.scale-clamped", clamped, f"a scale is {low:.2g} or {high:.0f}, the ends of the range of SPZ")
+            text = f"a scale is {low:.2g} or {high:.0f}, the ends of the range of its code"
+            report("values.scale-clamped", clamped, text)
     far = valid & (np.abs(splats.center) >= FLOAT16_END).any(axis=1)
     report("values.center-far", far, f"a coordinate is {FLOAT16_END:,} or more, which float16 cannot hold")
     return found

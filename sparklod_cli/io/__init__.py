@@ -3,7 +3,7 @@
 from .beside import companions
 from .chunks import read_rad_chunk, read_rad_header
 from .names import is_file_name
-from .reading import examine_scene, read_arrays, read_scene, size_of_input
+from .reading import examine_scene, opened, read_arrays, read_scene, size_of_input
 from .scenes import SceneSink, scene_sink
 from .texts import MAX_TEXT, read_rgba, read_text, read_together
 from .together import SinkTogether, chunk_files, sink_together, write_together
@@ -19,6 +19,7 @@ __all__ = [
     "companions",
     "examine_scene",
     "is_file_name",
+    "opened",
     "read_arrays",
     "read_rad_chunk",
     "read_rad_header",

@@ -35,7 +35,7 @@ def read_scene(path: Path, *, threads: int = 1, progress: Progress = silent) -> 
     Raises:
         FormatError: it is not a file, empty, of no known format, or broken.
     """
-    with _opened(path) as (file, form, more):
+    with opened(path) as (file, form, more):
         scene: Scene = form.codec().decode(file, threads=threads, progress=progress, **more)
     return scene
 
@@ -54,7 +54,7 @@ def examine_scene(
     Raises:
         FormatError: as `read_scene`, but for the tree.
     """
-    with _opened(path) as (file, form, more):
+    with opened(path) as (file, form, more):
         codec = form.codec()
         if form.selective:
             scene: Scene = codec.examine(file, columns=columns, threads=threads, progress=progress, **more)
@@ -64,8 +64,12 @@ def examine_scene(
 
 
 @contextlib.contextmanager
-def _opened(path: Path) -> Iterator[tuple[BinaryIO, Format, dict[str, Any]]]:
-    """A splat file, its format, and what else its codec takes."""
+def opened(path: Path) -> Iterator[tuple[BinaryIO, Format, dict[str, Any]]]:
+    """A splat file of any known format, the format, and what else its codec takes.
+
+    Raises:
+        FormatError: it is not a file, empty, or of no known format; an `OSError` of the body becomes one.
+    """
     try:
         if path.is_dir():
             path = in_folder(path)

@@ -87,11 +87,24 @@ class LoadedScene:
         """How many chunks it has, of 65,536 splats each."""
         return -(-len(self.splats) // CHUNK_NODES)
 
+    @property
+    def has_chunks(self) -> bool:
+        """Whether its format has chunks of as many splats as Spark streams (RAD)."""
+        sizes, splats = self.scene.chunk_bytes, self.scene.header.get("chunk_size")
+        return sizes is not None and len(sizes) == self.chunks and splats == CHUNK_NODES
+
     def chunk_bytes(self) -> NDArray[np.int64]:
-        """(chunks,) bytes of each, as if the file were cut evenly: SPZ has no chunks of its own."""
+        """(chunks,) bytes of each in the file; without chunks of its own (SPZ) as if the file were cut evenly."""
+        if self.has_chunks:
+            return np.array(self.scene.chunk_bytes, np.int64)
         nodes = len(self.splats)
         ends = np.minimum(np.arange(1, self.chunks + 1) * CHUNK_NODES, nodes)
         return np.diff(ends * self.bytes // nodes, prepend=0)
+
+    @property
+    def header_bytes(self) -> int:
+        """Bytes that a viewer needs before it can ask for a chunk; 0 where the format has no chunks."""
+        return self.scene.header.get("header_bytes", 0) if self.has_chunks else 0
 
 
 @dataclass(frozen=True, eq=False)

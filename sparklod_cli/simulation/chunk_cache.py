@@ -3,11 +3,32 @@
 from __future__ import annotations
 
 import copy
+from bisect import bisect_right
 from collections import OrderedDict
 from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+#: How many bytes Spark's pager asks for at first, then if they do not hold the whole header of a file.
+HEADER_REQUESTS = (64 << 10, 256 << 10, 1 << 20)
+
+
+def header_answers(header_bytes: int, file_bytes: int) -> tuple[int, ...]:
+    """Sizes of the answers that Spark's pager waits for before it can ask for a chunk of a file.
+
+    It does not know how long the header is, so it asks for the beginning of the file, and for more of it as long as the
+    header is not whole. What it gets of the first chunk along with it is thrown away.
+
+    Args:
+        header_bytes: of the header; 0 where the format has none that a viewer would need.
+        file_bytes: of the file that it is in.
+    """
+    answers: list[int] = []
+    for request in HEADER_REQUESTS:
+        if (answers[-1] if answers else 0) < header_bytes:
+            answers.append(min(request, file_bytes))
+    return tuple(answers)
 
 
 class Chunks:
@@ -17,18 +38,24 @@ class Chunks:
 
     Args:
         sizes: for each tree the sizes of its chunks in the file, bytes.
+        headers: for each tree the sizes of the answers that a viewer waits for, one after the other, before it can ask
+            for a chunk, see `header_answers`; none unless given.
 
     Attributes:
         sizes: of each chunk, bytes.
         roots: the first chunk of each tree, which holds its root.
+        headers: for each tree.
 
     Raises:
-        ValueError: a tree has no chunks, or a size is negative.
+        ValueError: a tree has no chunks, or a size is negative; or there are not as many headers as trees.
     """
 
-    def __init__(self, sizes: Sequence[ArrayLike]) -> None:
+    def __init__(self, sizes: Sequence[ArrayLike], headers: Sequence[Sequence[int]] | None = None) -> None:
         self.sizes: list[int] = []
         self.roots: list[int] = []
+        self.headers = [tuple(each) for each in headers or [()] * len(sizes)]
+        if len(self.headers) != len(sizes):
+            raise ValueError(f"there are {len(self.headers)} headers of {len(sizes)} trees")
         for tree, of_tree in enumerate(sizes):
             column = np.asarray(of_tree, np.int64)
             if column.ndim != 1 or not len(column) or column.min() < 0:
@@ -38,6 +65,10 @@ class Chunks:
 
     def __len__(self) -> int:
         return len(self.sizes)
+
+    def tree_of(self, chunk: int) -> int:
+        """The tree of a chunk."""
+        return bisect_right(self.roots, chunk) - 1
 
     def bytes_of(self, chunks: Iterable[int]) -> int:
         """The total size of some chunks."""

@@ -66,7 +66,14 @@ COLUMNS = (
         "chunks of 65,536 nodes that the search for the cut reads, or would read if they were resident",
     ),
     Column("chunks_new", int, "", "chunks", "chunks that arrived since the previous frame"),
-    Column("bytes_new", int, "", "bytes", "bytes of the file that those chunks take"),
+    Column(
+        "bytes_new",
+        int,
+        "",
+        "bytes",
+        "bytes that arrived since the previous frame: chunks and header of RAD; of SPZ, which has no chunks, as if the "
+        "file were cut evenly",
+    ),
     Column("chunks_resident", int, "", "chunks", "chunks in the cache after this frame"),
     Column(
         "missing",
@@ -94,6 +101,16 @@ COLUMNS = (
     Column("traverse_ms", float, ".3f", "ms", "time to find the cut, on one thread; left out with `--no-timing`"),
 )
 
+#: Figures of a visitor who opens a page in front of the first camera and waits there, with `--bandwidth`. No table has
+#: them, but the summary, and assertions can be about them.
+LOADING = (
+    Column("first_picture_s", float, ".4f", "s", "time until anything is drawn"),
+    Column("resident_90_s", float, ".4f", "s", "time until 90 % of the splats of the cut are resident"),
+    Column("resident_90_bytes", int, "", "bytes", "bytes that have arrived by then"),
+    Column("resident_all_s", float, ".4f", "s", "time until the whole cut is resident"),
+    Column("resident_all_bytes", int, "", "bytes", "bytes that have arrived by then"),
+)
+
 #: Columns that differ from run to run.
 TIMING = ("traverse_ms",)
 
@@ -107,7 +124,7 @@ EMPTY = {
     "churn": "it compares a frame with the one before, and there is only one frame",
     "projected_px_p50": "no splat is inside the frustum on any frame",
     "projected_px_p95": "no splat is inside the frustum on any frame",
-}
+} | dict.fromkeys((column.name for column in LOADING), "it needs --bandwidth, and a --chunk-cache that suffices")
 
 
 class UnknownColumnError(SparklodError):

@@ -20,8 +20,8 @@ from ..scenes.loaded import Scenes
 from ..support.parallel import ordered_map
 from ..support.progress import Progress, silent
 from ..tables.columns import Row
-from .chunk_cache import Chunks
 from .columns import COLUMNS
+from .loading import chunks_of
 from .streaming import Stream, StreamingSettings
 
 
@@ -80,7 +80,7 @@ class Simulation:
         self._traversal = scenes.traversal(settings)
         depths = [tree.depth for tree in scenes.trees]
         self._depth = np.concatenate([depth for depth in depths if depth is not None])
-        self._chunks = Chunks([tree.chunk_bytes() for tree in scenes.trees])
+        self._chunks = chunks_of(scenes)
         self._names = [instance.name for instance in scenes.instances]
         self._stream()  # raises what would fail at the first frame
 
@@ -144,7 +144,7 @@ class Simulation:
         return drawn, {
             "chunks_touched": len(stream.cache.wanted),
             "chunks_new": len(arrived),
-            "bytes_new": self._chunks.bytes_of(arrived),
+            "bytes_new": stream.take_bytes(),
             "chunks_resident": len(stream.cache),
             "complete_in_s": None if instant else stream.complete_in(wanted),
         }

@@ -67,6 +67,9 @@ class Stream:
     cancelled, as in Spark; a chunk that is no longer wanted when it arrives goes into the cache if there
     is room, or in place of one that has not been used for longer. Decoding takes no time, and no request fails.
 
+    Where a viewer needs headers first (`Chunks.headers`), they are requested at the start, all at once and besides the
+    fetchers; a fetcher with a chunk of such a tree waits for its header, as in Spark.
+
     The state changes at events only, so the result does not depend on the steps in which time advances.
 
     Args:
@@ -78,6 +81,7 @@ class Stream:
     Attributes:
         cache: the resident chunks.
         now: the current time, seconds.
+        received: bytes that have arrived since the start, of headers too.
 
     Raises:
         ValueError: the capacity is less than the number of trees.
@@ -92,8 +96,13 @@ class Stream:
         self.now = start
         self._next = 0  # all admitted chunks before this one are resident or under way
         self._under_way: set[int] = set()
-        # (Time of its first byte, chunk), in order, since all have the same latency.
+        # (Time of its first byte, chunk), in order, since all have the same latency. -1 - t is the header of tree t.
         self._requested: deque[tuple[float, int]] = deque()
+        # For each tree whose header is under way, the answers that are still to come, and the chunks that wait for it.
+        self._headers = {tree: answers for tree, answers in enumerate(chunks.headers) if answers}
+        self._waiting: dict[int, tuple[int, ...]] = dict.fromkeys(self._headers, ())
+        self._requested.extend((start + self._network.latency, -1 - tree) for tree in self._headers)
+        self.received = self._taken = 0
         # Concurrent transfers share the bandwidth equally. `_served` is the number of bytes that a transfer which began
         # with the first would have received at time `_since`; a transfer ends when that has grown by its size.
         self._transfers: list[tuple[float, int, int]] = []  # heap of (`_served` at its end, number, chunk)
@@ -130,6 +139,17 @@ class Stream:
         arrived, self._arrived = self._arrived, []
         return arrived
 
+    def take_bytes(self) -> int:
+        """Bytes of what has arrived since the last call, headers and chunks."""
+        taken, self._taken = self.received - self._taken, self.received
+        return taken
+
+    def step(self) -> bool:
+        """Goes on to the next event, the start or end of a transfer; False if there is none."""
+        going = self._step(math.inf)
+        self.now = self._since if going else self.now
+        return going
+
     def complete_in(self, wanted: Iterable[int]) -> float | None:
         """Seconds until all these chunks are resident if no others are requested.
 
@@ -153,6 +173,7 @@ class Stream:
         twin.cache = self.cache.copy()
         twin._under_way, twin._requested = self._under_way.copy(), self._requested.copy()
         twin._transfers, twin._arrived = self._transfers.copy(), self._arrived.copy()
+        twin._headers, twin._waiting = self._headers.copy(), self._waiting.copy()
         return twin
 
     def _request(self, time: float) -> None:
@@ -163,11 +184,15 @@ class Stream:
             self._next += 1
             if chunk not in self.cache and chunk not in self._under_way:
                 self._under_way.add(chunk)
-                self._requested.append((time + self._network.latency, chunk))
+                tree = self._chunks.tree_of(chunk)
+                if tree in self._waiting:
+                    self._waiting[tree] += (chunk,)
+                else:
+                    self._requested.append((time + self._network.latency, chunk))
 
     def _step(self, until: float) -> bool:
         """Processes the next event, the start or end of a transfer; False if there is none until a time."""
-        if not self._under_way:
+        if not self._requested and not self._transfers:
             return False
         begin = self._requested[0][0] if self._requested else math.inf
         end = math.inf
@@ -189,7 +214,8 @@ class Stream:
         self._since = time
         _, chunk = self._requested.popleft()
         self._begun += 1
-        heappush(self._transfers, (self._served + self._chunks.sizes[chunk], self._begun, chunk))
+        size = self._chunks.sizes[chunk] if chunk >= 0 else self._headers[-1 - chunk][0]
+        heappush(self._transfers, (self._served + size, self._begun, chunk))
 
     def _end(self, time: float) -> None:
         """The last byte of the transfer that ends next arrives, and its fetcher starts another request."""
@@ -197,7 +223,23 @@ class Stream:
         if not self._transfers:
             self._served = 0.0  # keeps the numbers small, for precision
         self._since = time
+        if chunk < 0:
+            self._end_header(-1 - chunk, time)
+            return
+        self.received += self._chunks.sizes[chunk]
         self._under_way.remove(chunk)
         self._arrived.append(chunk)
         self.cache.arrive(chunk)
         self._request(time)
+
+    def _end_header(self, tree: int, time: float) -> None:
+        """An answer with the beginning of a file has arrived: the next one is requested, or the chunks that wait."""
+        answer, *rest = self._headers[tree]
+        self.received += answer
+        if rest:
+            self._headers[tree] = tuple(rest)
+            requests: tuple[int, ...] = (-1 - tree,)
+        else:
+            del self._headers[tree]
+            requests = self._waiting.pop(tree)
+        self._requested.extend((time + self._network.latency, chunk) for chunk in requests)

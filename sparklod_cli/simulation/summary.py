@@ -78,6 +78,7 @@ class Summary:
         stop_reasons: shares of the frames, 0..1, the most frequent first.
         quantities: statistics; quantities without a value on any frame are omitted.
         moments: the most extreme frames; criteria that no frame meets are omitted.
+        loading: times and bytes of `columns.LOADING`, by name; None without a network.
     """
 
     frames: int
@@ -89,6 +90,7 @@ class Summary:
     stop_reasons: dict[str, float]
     quantities: tuple[Quantity, ...]
     moments: tuple[Moment, ...]
+    loading: Row | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """As plain lists, dicts and numbers, for JSON; quantities and moments by their names."""
@@ -98,7 +100,7 @@ class Summary:
         return plain
 
 
-def summarize(rows: Iterable[Row]) -> Summary:
+def summarize(rows: Iterable[Row], loading: Row | None = None) -> Summary:
     """Summary of the rows of all frames, in order; rows of single instances are ignored."""
     frames = totals(rows)
     times = numbers(frames, "time_s")
@@ -114,6 +116,7 @@ def summarize(rows: Iterable[Row]) -> Summary:
         stop_reasons={reason: round(count / reasons.total(), 6) for reason, count in reasons.most_common()},
         quantities=tuple(quantity for name in QUANTITIES if (quantity := _quantity(name, frames)) is not None),
         moments=tuple(look_at(frames)),
+        loading=loading,
     )
 
 

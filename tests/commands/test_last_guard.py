@@ -24,7 +24,7 @@ def broken(monkeypatch: pytest.MonkeyPatch) -> Break:
         def fail(*args: object, **kwargs: object) -> None:
             raise error
 
-        monkeypatch.setattr(reading, "_opened", fail)
+        monkeypatch.setattr(reading, "opened", fail)
 
     return end_in
 

@@ -8,7 +8,7 @@ import re
 import numpy as np
 import pytest
 
-from sparklod_cli.simulation.columns import COLUMNS
+from sparklod_cli.simulation.columns import COLUMNS, LOADING
 from sparklod_cli.simulation.summary import MOMENTS, QUANTITIES
 from sparklod_cli.tables.assertions import check, parse
 from tests.conftest import ROOT
@@ -36,12 +36,13 @@ def with_columns(text: str) -> str:
 
 @pytest.mark.parametrize("text", re.findall(r"--assert '(.*?)'", PAGE.read_text()))
 def test_assertions_on_the_page_are_understood(text: str) -> None:
-    assert check([parse(text, COLUMNS)], flight(20))
+    rows = [row | {column.name: 1 for column in LOADING} for row in flight(20)]
+    assert check([parse(text, (*COLUMNS, *LOADING))], rows)
 
 
 def test_the_page_names_what_is_in_the_summary() -> None:
     names = set(re.findall(r"`(\w+)`", PAGE.read_text().partition("\n## Summary\n")[2].partition("\n## ")[0]))
-    assert set(QUANTITIES) | set(MOMENTS) <= names
+    assert set(QUANTITIES) | set(MOMENTS) | {column.name for column in LOADING} <= names
 
 
 def test_the_biker_of_the_picture_stands_upright() -> None:

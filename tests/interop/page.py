@@ -39,12 +39,12 @@ class Request:
     Attributes:
         name: of the file.
         bytes: that were sent.
-        ranged: whether it asked for a range of bytes, not for all.
+        start: of the range of bytes that it asked for; None for the whole file.
     """
 
     name: str
     bytes: int
-    ranged: bool
+    start: int | None
 
 
 class Page:
@@ -76,7 +76,7 @@ class Page:
     def requests(self) -> list[Request]:
         """Returns what Spark asked for of the file and those beside it since it was opened, in order."""
         found = self._node.ask({"do": "requests"})["requests"]
-        return [Request(each["name"], each["bytes"], each["range"] is not None) for each in found]
+        return [Request(each["name"], each["bytes"], each["range"] and each["range"][0]) for each in found]
 
     def draw(self, camera: Camera, settings: RasterSettings, *, budget: int | None = None) -> Picture:
         """Draws the picture of a camera.

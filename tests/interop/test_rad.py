@@ -8,27 +8,46 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from sparklod_cli.codecs import rad
-from sparklod_cli.codecs.rad_header import Header, read_header
+from sparklod_cli.codecs.gpu import packed_splats
+from sparklod_cli.codecs.octahedral import encode_lod_alpha
+from sparklod_cli.codecs.options import RadOptions, WriteOptions
+from sparklod_cli.codecs.rad_header import Header, read_chunk_header, read_header
+from sparklod_cli.codecs.rad_layout import choices
 from sparklod_cli.codecs.splat_encoding import SplatEncoding
 from sparklod_cli.io import read_scene
+from sparklod_cli.lod import quick
+from sparklod_cli.model.nodes import CHUNK_NODES
 from sparklod_cli.model.scene import Scene
+from sparklod_cli.model.sh import COEFFICIENTS
 from sparklod_cli.model.splats import FloatArray
 from tests.conftest import FIXTURES, real_scene
+from tests.interop import laws
+from tests.interop.laws import EXT_DEGREES, HALF, TINY, degrees_between, within
 from tests.interop.spark import Spark
 from tests.interop.ties import Words
 from tests.interop.words import check_ext, check_packed
+from tests.scenes import random_splats
 
 #: Spark's encoding of a chunk that it reads alone: the header that has the file's ranges is not there.
 ALONE = SplatEncoding(lod_opacity=True)
 #: Of codes that ties may decide, see `ties`.
 SHARE = 2e-3
 LAYOUTS = ("Packed", "Ext")
+
+#: Error of a rotation in a file, in degrees. oct88r8: see `octahedral.decode_axis_angle`. The others have x, y and z,
+#: which are off by up to 2 ** -12 or 2 ** -25 each, together by r = sqrt(3) times that; as in `laws.SPZ_DEGREES`, w is
+#: off by up to sqrt(2 * r).
+DEGREES = {"oct88r8": 1.94} | {
+    name: np.degrees(2 * np.hypot(np.sqrt(2 * r), r))
+    for name, r in (("f16", np.sqrt(3) * 2.0**-12), ("f32", np.sqrt(3) * 2.0**-25))
+}
 
 
 def header_of(path: Path) -> Header:
@@ -135,3 +154,111 @@ def test_both_read_the_same_out_of_files_written_by_hand(spark: Spark, tmp_path:
     assert check_chunks(spark, path, tmp_path) == 3
     if not header_of(path).chunked:
         check_whole(spark, path)
+
+
+# --- Our files --------------------------------------------------------------------------------------------------------
+
+
+def ways() -> Iterator[RadOptions]:
+    """Options that have every encoding of every property at least once, and what is written where nobody chooses."""
+    names = {field: choices(field)[1:] for field in ("center", "alpha", "rgb", "scales", "orientation", "sh")}
+    for number in range(max(map(len, names.values()))):
+        yield RadOptions(**{field: each[number % len(each)] for field, each in names.items()})
+    yield RadOptions()
+
+
+WAYS = {
+    "-".join(getattr(way, row) for row in ("center", "alpha", "rgb", "scales", "orientation", "sh")): way
+    for way in ways()
+}
+
+
+@cache
+def tree(sh_degree: int, count: int = 1_500) -> Scene:
+    return Scene(*quick.build(random_splats(count, sh_degree=sh_degree)))
+
+
+def written(path: Path, scene: Scene, options: RadOptions) -> Path:
+    path.write_bytes(b"".join(rad.encode(scene, WriteOptions(rad=options), threads=2)))
+    return path
+
+
+def width_of(path: Path, name: str) -> float:
+    """The width of the range of a property's codes, as the first chunk has it."""
+    with path.open("rb") as file:
+        read_header(file)
+        (found,) = (each for each in read_chunk_header(file).properties if each.name == name)
+    assert found.min is not None and found.max is not None
+    return found.max - found.min
+
+
+def check_close(spark: Spark, path: Path, scene: Scene, options: RadOptions) -> None:
+    """Asserts that Spark reads the splats that were written, within the steps of the file and of Spark's layouts."""
+    chosen = rad.settled(scene, WriteOptions(rad=options)).rad
+    splats, got = scene.splats, spark.load(path)
+    center = splats.center.astype(np.float64)
+    step = HALF * np.abs(center) + TINY if chosen.center.startswith("f16") else 0
+    within(got.center, center, step + (0 if chosen.center_bits is None else 2.0**-chosen.center_bits / 2))
+    alpha = encode_lod_alpha(splats.opacity) if scene.tree else splats.opacity
+    step = width_of(path, "alpha") / 510 if chosen.alpha == "r8" else HALF * alpha
+    within(got.alpha, alpha.astype(np.float64), step + HALF * alpha + TINY)
+    rgb = splats.rgb.astype(np.float64)
+    step = width_of(path, "rgb") / 510 if chosen.rgb.startswith("r8") else HALF * np.abs(rgb)
+    within(got.rgb, rgb, step + HALF * np.abs(rgb) + TINY)
+    log = np.log(splats.scale.astype(np.float64))
+    step = width_of(path, "scales") / 508 if chosen.scales == "ln_0r8" else HALF * np.abs(log)
+    within(got.log_scale, log, step + HALF * np.abs(log) + 1e-6)
+    assert degrees_between(got.quat_xyzw, splats.quat_xyzw).max() <= DEGREES[chosen.orientation] + EXT_DEGREES
+    if scene.tree:
+        laws.check_tree(got, scene.tree)
+    else:
+        assert got.nodes is None
+    check_sh(spark, path, splats.sh, chosen.sh)
+
+
+def check_sh(spark: Spark, path: Path, sh: FloatArray, encoding: str) -> None:
+    """Asserts that SH in Spark's PackedSplats are within the steps of the file and of that layout.
+
+    ExtSplats clamp them to a power of two, see `laws.held_by_ext_sh`.
+    """
+    ranges = header_of(path).encoding
+    assert ranges is not None
+    words = without_codes(spark.load_words("Packed", path))
+    got = packed_splats.unpack({name: words[name] for name in words if name != "lodTree"}, ranges).sh
+    assert got.shape == sh.shape
+    for degree in range(1, 1 + COEFFICIENTS.index(sh.shape[1])):
+        part = slice(COEFFICIENTS[degree - 1], COEFFICIENTS[degree])
+        most, values = float(ranges.sh_max(degree)), sh[:, part].astype(np.float64)
+        step = HALF * most if encoding in ("f16", "f32") else width_of(path, f"sh{degree}") / 508
+        within(got[:, part], values.clip(-most, most), step + most / (2.0 ** packed_splats.SH_BITS[degree] - 2) + TINY)
+
+
+@pytest.mark.parametrize("sh_degree", range(4))
+@pytest.mark.parametrize("way", WAYS)
+def test_spark_reads_every_encoding_as_it_was_written(spark: Spark, tmp_path: Path, way: str, sh_degree: int) -> None:
+    """Whole, and each chunk alone; and as sparklod reads it."""
+    path = written(tmp_path / "tree.rad", tree(sh_degree), WAYS[way])
+    check_close(spark, path, tree(sh_degree), WAYS[way])
+    check_whole(spark, path)
+    assert check_chunks(spark, path, tmp_path) == 1
+
+
+@pytest.mark.parametrize("sh_degree", [0, 3])
+def test_spark_reads_splats_without_a_tree(spark: Spark, tmp_path: Path, sh_degree: int) -> None:
+    scene = Scene(random_splats(1_500, sh_degree=sh_degree))
+    path = written(tmp_path / "plain.rad", scene, RadOptions())
+    check_close(spark, path, scene, RadOptions())
+    check_whole(spark, path)
+
+
+def test_spark_reads_each_of_several_chunks(spark: Spark, tmp_path: Path) -> None:
+    """The same in one file, and in files of their own."""
+    scene = tree(2, 60_000)
+    assert len(scene) > CHUNK_NODES
+    path = written(tmp_path / "whole.rad", scene, RadOptions())
+    check_close(spark, path, scene, RadOptions())
+    check_whole(spark, path)
+    assert check_chunks(spark, path, tmp_path) == 2
+    for name, pieces in rad.encode_chunked(scene, WriteOptions(), "tree", threads=2):
+        (tmp_path / name).write_bytes(b"".join(pieces))
+    assert check_chunks(spark, tmp_path / "tree.rad", tmp_path) == 2

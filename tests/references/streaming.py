@@ -64,7 +64,13 @@ class Fetch:
 
 @dataclass
 class Twin:
-    """Does what `Stream` does, in fractions and one event at a time."""
+    """Does what `Stream` does, in fractions and one event at a time.
+
+    Attributes:
+        opening: for each tree, the beginnings of its file that are still to come; their fetches have negative numbers.
+        waiting: chunks that wait for them.
+        received: bytes of all that has come.
+    """
 
     chunks: Chunks
     network: Network
@@ -73,6 +79,24 @@ class Twin:
     fetches: list[Fetch] = field(default_factory=list)
     arrivals: list[tuple[Fraction, int]] = field(default_factory=list)
     tied: bool = False  # rounding may have decided otherwise
+    opening: list[list[int]] = field(init=False)
+    waiting: list[int] = field(default_factory=list)
+    received: int = 0
+
+    def __post_init__(self) -> None:
+        self.opening = [list(each) for each in self.chunks.headers]
+        for tree, answers in enumerate(self.opening):
+            if answers:
+                self.fetch(-1 - tree)
+
+    def size(self, number: int) -> int:
+        return self.chunks.sizes[number] if number >= 0 else self.opening[-1 - number][0]
+
+    def tree(self, chunk: int) -> int:
+        return sum(root <= chunk for root in self.chunks.roots) - 1
+
+    def fetch(self, number: int) -> None:
+        self.fetches.append(Fetch(self.now, number, Fraction(self.network.latency), Fraction(self.size(number))))
 
     def advance(self, to_time: Fraction) -> None:
         while True:
@@ -80,7 +104,7 @@ class Twin:
             rate = Fraction(self.network.bandwidth) / max(1, len(active))
             due = [fetch.left / rate for fetch in active]
             due += [fetch.latency for fetch in self.fetches if fetch.latency > 0]
-            ends = sorted((fetch.left / rate, fetch.asked, self.chunks.sizes[fetch.chunk]) for fetch in active)
+            ends = sorted((fetch.left / rate, fetch.asked, self.size(fetch.chunk)) for fetch in active)
             self.tied |= any(b[0] - a[0] <= TIE and a != b for a, b in itertools.pairwise(ends))
             self.tied |= any(abs(end[0] - (to_time - self.now)) <= TIE for end in ends)
             step = min([to_time - self.now, *due])
@@ -95,6 +119,10 @@ class Twin:
                 return
             for fetch in done[:1]:
                 self.fetches.remove(fetch)
+                self.received += self.size(fetch.chunk)
+                if fetch.chunk < 0:
+                    self.opened(-1 - fetch.chunk)
+                    continue
                 self.arrivals.append((self.now, fetch.chunk))
                 self.cache.arrive(fetch.chunk)
                 self.ask()
@@ -103,10 +131,22 @@ class Twin:
         self.cache.want(roots_first(self.chunks, wanted))
         self.ask()
 
+    def opened(self, tree: int) -> None:
+        """The beginning of a file has come: a longer one is fetched, or the chunks that wait for it."""
+        self.opening[tree].pop(0)
+        if self.opening[tree]:
+            self.fetch(-1 - tree)
+            return
+        for chunk in [each for each in self.waiting if self.tree(each) == tree]:
+            self.waiting.remove(chunk)
+            self.fetch(chunk)
+
     def ask(self) -> None:
         for place, chunk in enumerate(self.cache.wanted):
-            if place < self.cache.capacity and len(self.fetches) < self.network.fetchers:
-                under_way = [fetch.chunk for fetch in self.fetches]
-                if chunk not in self.cache.used and chunk not in under_way:
-                    latency = Fraction(self.network.latency)
-                    self.fetches.append(Fetch(self.now, chunk, latency, Fraction(self.chunks.sizes[chunk])))
+            under_way = [fetch.chunk for fetch in self.fetches if fetch.chunk >= 0] + self.waiting
+            is_free = place < self.cache.capacity and len(under_way) < self.network.fetchers
+            if is_free and chunk not in self.cache.used and chunk not in under_way:
+                if self.opening[self.tree(chunk)]:
+                    self.waiting.append(chunk)
+                else:
+                    self.fetch(chunk)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from sparklod_cli.codecs import rad
+from sparklod_cli.io import read_scene
 from sparklod_cli.model.foveation import Frustum
 from sparklod_cli.model.instances import Instance
 from sparklod_cli.scenes.loaded import Scenes
@@ -17,6 +19,14 @@ from tests.simulation.paths import HAND, TOWN
 def town() -> Scenes:
     """165,205 nodes in three chunks."""
     return read_scenes([Instance(TOWN, "town")], columns=TRAVERSED, trees_only=True)
+
+
+@pytest.fixture(scope="package")
+def rad_town(tmp_path_factory: pytest.TempPathFactory) -> Scenes:
+    """The town as RAD."""
+    path = tmp_path_factory.mktemp("rad") / "town.rad"
+    path.write_bytes(b"".join(rad.encode(read_scene(TOWN))))
+    return read_scenes([Instance(path, "town")], columns=TRAVERSED, trees_only=True)
 
 
 @pytest.fixture(scope="package")

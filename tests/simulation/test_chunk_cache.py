@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sparklod_cli.simulation.chunk_cache import ChunkCache, Chunks, by_priority
+from sparklod_cli.simulation.chunk_cache import ChunkCache, Chunks, by_priority, header_answers
 from tests.references.streaming import NaiveCache, roots_first
 
 
@@ -121,3 +121,17 @@ def test_priority_is_the_greatest_pixel_scale_of_a_chunk(looks: list[tuple[int, 
     expected = sorted(greatest, key=lambda chunk: (-greatest[chunk], chunk))
     touched = np.array([chunk for chunk, _ in looks], np.int64)
     assert by_priority(touched, np.array([scale for _, scale in looks], np.float32)) == expected
+
+
+def test_a_viewer_asks_for_more_until_the_header_is_whole() -> None:
+    kb, mb = 1 << 10, 1 << 20
+    assert header_answers(0, 9 * mb) == ()
+    assert header_answers(1, 9 * mb) == header_answers(64 * kb, 9 * mb) == (64 * kb,)
+    assert header_answers(64 * kb + 1, 9 * mb) == (64 * kb, 256 * kb)
+    assert header_answers(300 * kb, 9 * mb) == (64 * kb, 256 * kb, mb)
+    assert header_answers(1_616, 1_616) == (1_616,)  # a file that names others and has nothing but the header
+
+
+def test_headers_are_of_trees() -> None:
+    with pytest.raises(ValueError, match="there are 2 headers of 1 trees"):
+        Chunks([[1]], [[1], [2]])

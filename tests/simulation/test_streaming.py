@@ -21,6 +21,8 @@ networks = st.builds(
     latency=st.integers(0, 400).map(lambda ms: ms / 1000),
     fetchers=st.integers(1, 5),
 )
+#: What has to come before the chunks of each tree: nothing, or one answer or more.
+headers = st.lists(st.lists(st.integers(1, 4000), max_size=3), min_size=3, max_size=3)
 tree_sizes = st.lists(st.lists(st.integers(1, 9999), min_size=1, max_size=6), min_size=1, max_size=3)
 
 
@@ -41,9 +43,11 @@ def rest(stream: Stream, wanted: list[int]) -> list[tuple[float, int]]:
 
 
 @settings(max_examples=400)  # what goes wrong here takes several steps that suit each other
-@given(st.data(), tree_sizes, networks)
-def test_a_stream_does_what_its_twin_does(data: st.DataObject, sizes: list[list[int]], network: Network) -> None:
-    chunks = Chunks(sizes)
+@given(st.data(), tree_sizes, headers, networks)
+def test_a_stream_does_what_its_twin_does(
+    data: st.DataObject, sizes: list[list[int]], headers: list[list[int]], network: Network
+) -> None:
+    chunks = Chunks(sizes, headers[: len(sizes)])
     capacity = data.draw(st.none() | st.integers(len(sizes), len(chunks)))
     stream, twin = Stream(chunks, network, capacity=capacity), Twin(chunks, network, NaiveCache(capacity))
     seen: list[int] = []
@@ -57,6 +61,7 @@ def test_a_stream_does_what_its_twin_does(data: st.DataObject, sizes: list[list[
         stream.advance(time)
         seen += stream.take_arrivals()
         assert seen == [chunk for _, chunk in twin.arrivals]
+        assert stream.received == twin.received
         assert here(stream) == set(twin.cache.used)
         assert capacity is None or len(stream.cache) <= capacity
     complete_in = stream.complete_in(wanted)
@@ -187,6 +192,28 @@ def test_one_chunk_takes_the_latency_and_its_bytes() -> None:
     stream.advance(0.461)
     assert stream.take_arrivals() == [0]
     assert stream.complete_in([0]) == 0
+
+
+def test_no_chunk_is_asked_for_before_the_header_is_there() -> None:
+    """The header takes no fetcher, and what it brings of the first chunk is not counted as the chunk."""
+    stream = Stream(Chunks([[MB, MB]], [[MB // 2]]), Network(MB, 0.1, 1))
+    stream.want([])
+    stream.advance(0.599)
+    assert stream.take_bytes() == 0
+    stream.advance(0.601)
+    assert (stream.take_bytes(), stream.take_arrivals()) == (MB // 2, [])
+    assert stream.complete_in([0, 1]) == pytest.approx(0.6 + 1.1 + 1.1 - 0.601)
+    stream.advance(1.701)
+    assert (stream.take_bytes(), stream.take_arrivals()) == (MB, [0])
+
+
+def test_headers_of_several_trees_come_at_once() -> None:
+    """Each with half of the bandwidth; the second one has to be asked for twice."""
+    chunks = Chunks([[MB], [MB]], [[MB], [MB, 2 * MB]])
+    assert rest(Stream(chunks, Network(2 * MB, 0.5, 1)), []) == [
+        (pytest.approx(0.5 + 1 + 0.5 + 1), 0),  # while half of the longer answer arrives
+        (pytest.approx(3.0 + 0.5 + 0.5 + 0.5), 1),
+    ]
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 6, 8])

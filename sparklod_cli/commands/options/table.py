@@ -93,11 +93,11 @@ class Table:
         Raises:
             click.UsageError: an assertion cannot be understood.
         """
-        from ...simulation.columns import COLUMNS
+        from ...simulation.columns import COLUMNS, LOADING
         from ...tables import assertions
 
         with assert_errors():
-            return [assertions.parse(text, COLUMNS) for text in self.asserts]
+            return [assertions.parse(text, (*COLUMNS, *LOADING)) for text in self.asserts]
 
 
 def table_options(command: Command) -> Command:

@@ -11,6 +11,7 @@ from sparklod_cli.cli import run
 from tests.conftest import FIXTURES
 
 TREE, PLAIN = FIXTURES / "golden" / "hand-tree-v3.spz", FIXTURES / "sh2.ply"
+RAD = FIXTURES / "golden" / "sh1-tree.rad"
 FOLDER = FIXTURES / "golden" / "sh1-sog"
 FAULTS = FIXTURES / "faults"
 CORRUPT, WARNED, NOTED = FAULTS / "spz-flipped-bit.spz", FAULTS / "spz-flags.spz", FAULTS / "tree-fine-first.spz"

@@ -1,0 +1,135 @@
+"""Splats as the codes of a tree's file, in which its leaves are compared with the splats of another file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..codecs.octahedral import STEPS_8_8_8, encode_axis_angle, encode_lod_alpha
+from ..codecs.rad_encodings import CODINGS
+from ..codecs.rad_layout import PROPERTIES, Row
+from ..codecs.spz_layout import LOD, Layout
+from ..model.scene import Scene
+from ..model.sh import COEFFICIENTS
+from ..model.splats import Splats
+from .rad import PropertyFacts, RadFacts
+
+#: Largest differences of the codes of one splat: writers round, truncate or go through float16. SPZ's codes of SH keep
+#: upper bits only, so that a step of theirs is a bucket of 16; logarithms of scales as float32 differ in last bits.
+STEPS, SH_STEPS, F32_STEPS = 1, 16, 64
+
+#: Largest angle in degrees between two codes of one rotation: by the bytes of an SPZ code, and by RAD's encoding.
+DEGREES = {3: 14.0, 4: 0.8}
+RAD_DEGREES = {"oct88r8": 4.0, "f16": 0.2, "f32": 0.2}
+
+#: The columns of SPZ whose codes may differ by a step, in the order in which `Coded.numbers` has them.
+COLUMNS = ("center", "opacity", "rgb", "scale", "sh")
+
+#: Encodings of RAD that only order the bytes of another one in a way that compresses better.
+PLAIN = {"f32_lebytes": "f32", "f16_lebytes": "f16", "r8_delta": "r8", "s8_delta": "s8"}
+
+
+@dataclass(frozen=True)
+class Coded:
+    """N splats as codes.
+
+    Attributes:
+        rows: (N,) all bytes of a splat as one value, to compare whole splats.
+        numbers: (N, n) int32 codes; the first three are those of the centre.
+        quat_xyzw: (N, 4) rotations.
+    """
+
+    rows: NDArray[np.void]
+    numbers: NDArray[np.int32]
+    quat_xyzw: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Coding:
+    """How the splats of a file are compared.
+
+    Attributes:
+        encode: N splats to codes.
+        steps: (n,) int64 largest differences of `Coded.numbers` between two codes of one splat.
+        degrees: largest angle between two codes of one rotation.
+    """
+
+    encode: Callable[[Splats], Coded]
+    steps: NDArray[np.int64]
+    degrees: float
+
+
+def of_spz(scene: Scene) -> Coding:
+    """The coding of an SPZ file that a scene was read from."""
+    version, bits = max(2, int(scene.header["version"])), int(scene.header["fractional_bits"])
+    degree = scene.splats.sh_degree
+    steps = np.full(3 + 1 + 3 + 3 + 3 * COEFFICIENTS[degree], STEPS)
+    steps[10:] = SH_STEPS
+
+    def encode(splats: Splats) -> Coded:
+        parts, numbers = [], {}
+        for stream in Layout(version, len(splats), degree, bits, LOD).streams():
+            if not hasattr(splats, stream.column):
+                continue  # the columns of the tree
+            values = np.ascontiguousarray(stream.encode(getattr(splats, stream.column)))
+            codes = values.view(np.uint8).reshape(len(splats), stream.size)
+            parts.append(codes)
+            numbers[stream.column] = codes.astype(np.int32)
+        center = numbers["center"].reshape(-1, 3, 3) @ np.array([1, 1 << 8, 1 << 16], np.int32)
+        numbers["center"] = np.where(center >= 1 << 23, center - (1 << 24), center)
+        columns = [numbers[name] for name in COLUMNS if name in numbers]
+        return Coded(_rows(parts), np.concatenate(columns, axis=1), splats.quat_xyzw)
+
+    return Coding(encode, steps, DEGREES[3 if version == 2 else 4])
+
+
+def of_rad(facts: RadFacts) -> Coding | str:
+    """The coding of a RAD file; or why there is none. A palette of SH, whose entries stand for many, is left out."""
+    mixed = [name for name, found in facts.properties.items() if "," in found.encoding]
+    if mixed:
+        return f"its chunks have {mixed[0]} in several encodings, in which leaves cannot be compared"
+    compared = [
+        (row, facts.properties[row.name], PLAIN.get(facts.properties[row.name].encoding))
+        for row in PROPERTIES
+        if row.name in facts.properties and row.option and not row.codes and row.name != "orientation"
+    ]
+    properties = [(row, found, plain or found.encoding) for row, found, plain in compared]
+    steps = [np.full(row.numbers, F32_STEPS if name == "f32" else STEPS) for row, _, name in properties]
+    rotation = facts.properties["orientation"].encoding if "orientation" in facts.properties else "oct88r8"
+
+    def numbers_of(splats: Splats) -> Iterator[NDArray[Any]]:
+        for row, found, name in properties:
+            yield _rad_codes(splats, row, found, name)
+
+    def encode(splats: Splats) -> Coded:
+        numbers = np.concatenate(list(numbers_of(splats)), axis=1)
+        axis = np.stack(encode_axis_angle(splats.quat_xyzw, STEPS_8_8_8), axis=1)
+        parts = [np.ascontiguousarray(each).view(np.uint8).reshape(len(splats), -1) for each in (numbers, axis)]
+        return Coded(_rows(parts), numbers, splats.quat_xyzw)
+
+    return Coding(encode, np.concatenate(steps), RAD_DEGREES[rotation])
+
+
+def _rad_codes(splats: Splats, row: Row, found: PropertyFacts, encoding: str) -> NDArray[np.int32]:
+    """(N, numbers) codes of a property, in the order of their values."""
+    values = getattr(splats, row.column)
+    if row.column == "sh":
+        values = values[:, COEFFICIENTS[row.degree - 1] : COEFFICIENTS[row.degree]]
+    elif row.column == "opacity":
+        values = encode_lod_alpha(values)
+    codes = CODINGS[encoding].encode(values.reshape(len(splats), -1), found.min or 0.0, found.max or 0.0).T
+    if codes.dtype.kind != "f":
+        return (codes.astype(np.uint8).view(np.int8) if encoding == "s8" else codes).astype(np.int32)
+    bits = np.ascontiguousarray(codes).view(f"<i{codes.dtype.itemsize}").astype(np.int64)
+    lowest = -(1 << (8 * codes.dtype.itemsize - 1))
+    # Magnitudes with a sign, to numbers that grow with the value.
+    return np.where(bits < 0, lowest - bits, bits).astype(np.int32)
+
+
+def _rows(parts: list[NDArray[np.uint8]]) -> NDArray[np.void]:
+    together = np.ascontiguousarray(np.concatenate(parts, axis=1))
+    return together.view(np.dtype((np.void, together.shape[1])))[:, 0]

@@ -1,0 +1,196 @@
+"""Facts of a RAD file that its headers tell, and findings about the promises that they break."""
+
+from __future__ import annotations
+
+import statistics
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from ..codecs.rad_encodings import LARGEST_F16
+from ..codecs.rad_header import ENCODING_KEYS, ChunkHeader, Header, Violation
+from ..codecs.rad_layout import BY_NAME, PROPERTIES, SIZES
+from ..codecs.rad_survey import survey_chunks, survey_file
+from ..codecs.splat_encoding import log_scale_table
+from ..io import opened
+from ..support.printable import MOST, printable
+from .findings import Finding
+from .values import Ends
+
+#: Name of the format in `codecs.formats`.
+FORMAT = "RAD"
+
+
+@dataclass(frozen=True)
+class PropertyFacts:
+    """A property of all chunks.
+
+    Attributes:
+        encoding: its name; several with commas between, where chunks differ.
+        bytes: as stored, of all chunks.
+        share: of all bytes of the file.
+        min, max: ends of the range of its codes over all chunks; None where its encoding has none.
+    """
+
+    encoding: str
+    bytes: int
+    share: float
+    min: float | None
+    max: float | None
+
+
+@dataclass(frozen=True)
+class ChunkBytes:
+    """Sizes of chunks, bytes."""
+
+    min: int
+    median: int
+    max: int
+
+
+@dataclass(frozen=True)
+class RadFacts:
+    """What the headers tell.
+
+    Attributes:
+        chunked: whether the chunks are files of their own.
+        bytes: of the file, or of the header and the files of all chunks.
+        header_bytes: of the header.
+        first_bytes: of the header and the first chunk, which a viewer needs before it can show anything.
+        chunk_size: splats of a chunk.
+        chunk_bytes: sizes of the chunks; None without any.
+        palette: entries of the palette of spherical harmonics; 0 without one.
+        ranges: "splatEncoding" of the header, by its keys; None without one.
+        comment: free text of the header, on one line and shortened; None without one.
+        properties: by name.
+    """
+
+    chunked: bool
+    bytes: int
+    header_bytes: int
+    first_bytes: int
+    chunk_size: int
+    chunk_bytes: ChunkBytes | None
+    palette: int
+    ranges: dict[str, float | bool] | None
+    comment: str | None
+    properties: dict[str, PropertyFacts]
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What the headers of a file tell and break.
+
+    Attributes:
+        header: of the file.
+        facts: what they tell; None where a promise is broken without which the rest cannot be trusted.
+        findings: broken promises, one for each code.
+        fatal: findings because of which the file cannot be read.
+    """
+
+    header: Header
+    facts: RadFacts | None
+    findings: list[Finding]
+    fatal: list[Finding]
+
+
+def survey(path: Path, *, check: bool) -> Survey | None:
+    """Reads the headers of a RAD file and of its chunks; None for a file of another format.
+
+    Args:
+        path: of the file; - is standard input.
+        check: look at the padding of properties, too.
+
+    Raises:
+        FormatError: the header of the file cannot be read, or the path no splat file.
+    """
+    with opened(path) as (file, form, more):
+        if form.name != FORMAT:
+            return None
+        header, violations = survey_file(file, more["beside"])
+        gathered = _Gathered()
+        if not any(each.fatal for each in violations):
+            for chunk in survey_chunks(file, more["beside"], header, paddings=check):
+                violations += chunk.violations
+                if chunk.header is not None:
+                    gathered.add(chunk.header)
+    fatal = _findings(each for each in violations if each.fatal)
+    facts = None if fatal else _facts(header, gathered)
+    return Survey(header, facts, _findings(violations), fatal)
+
+
+@dataclass
+class _Gathered:
+    """Properties of the chunks so far, by name."""
+
+    encodings: dict[str, dict[str, None]] = field(default_factory=dict)
+    bytes: Counter[str] = field(default_factory=Counter)
+    low: dict[str, float] = field(default_factory=dict)
+    high: dict[str, float] = field(default_factory=dict)
+
+    def add(self, chunk: ChunkHeader) -> None:
+        for each in chunk.properties:
+            if each.name not in BY_NAME or each.encoding not in SIZES:
+                continue  # a finding says so
+            self.encodings.setdefault(each.name, {})[each.encoding] = None
+            self.bytes[each.name] += each.bytes
+            if each.min is not None:
+                self.low[each.name] = min(each.min, self.low.get(each.name, each.min))
+            if each.max is not None:
+                self.high[each.name] = max(each.max, self.high.get(each.name, each.max))
+
+
+def _facts(header: Header, gathered: _Gathered) -> RadFacts:
+    sizes = [entry.bytes for entry in header.chunks]
+    total = header.bytes + sum(sizes)
+    chunk_bytes = ChunkBytes(min(sizes), round(statistics.median(sizes)), max(sizes)) if sizes else None
+    ranges = None
+    if header.encoding is not None:
+        ranges = {key: getattr(header.encoding, name) for key, name in ENCODING_KEYS.items()}
+    comment = None if header.comment is None else printable(" ".join(header.comment.split()), MOST)
+    names = [row.name for row in PROPERTIES if row.name in gathered.encodings]
+    return RadFacts(
+        chunked=header.chunked,
+        bytes=total,
+        header_bytes=header.bytes,
+        first_bytes=header.bytes + (sizes[0] if sizes else 0),
+        chunk_size=header.chunk_size,
+        chunk_bytes=chunk_bytes,
+        palette=header.sh_code_count or 0,
+        ranges=ranges,
+        comment=comment,
+        properties={
+            name: PropertyFacts(
+                encoding=", ".join(gathered.encodings[name]),
+                bytes=gathered.bytes[name],
+                share=round(gathered.bytes[name] / total, 4),
+                min=gathered.low.get(name),
+                max=gathered.high.get(name),
+            )
+            for name in names
+        },
+    )
+
+
+def ends_of(facts: RadFacts) -> Ends:
+    """The ends of the codes of a file; there are none where chunks have several encodings."""
+    center, scales = facts.properties.get("center"), facts.properties.get("scales")
+    ends = Ends()
+    if center is not None and center.encoding in ("f16", "f16_lebytes"):
+        ends = replace(ends, center=float(LARGEST_F16))
+    if scales is not None and scales.encoding == "ln_0r8" and scales.min is not None and scales.max is not None:
+        table = log_scale_table(scales.min, scales.max)
+        ends = replace(ends, scale=(float(table[1]), float(table[-1])))
+    return ends
+
+
+def _findings(violations: Iterable[Violation]) -> list[Finding]:
+    """A finding for each code: the text of its first violation, and how many more there are."""
+    by_code: dict[str, list[str]] = {}
+    for each in violations:
+        by_code.setdefault(each.code, []).append(each.text)
+    return [
+        Finding(code, texts[0] + (f" (and {len(texts) - 1:,} more like it)" if len(texts) > 1 else ""))
+        for code, texts in by_code.items()
+    ]

@@ -1,0 +1,125 @@
+"""Loading: what a visitor sees who opens a page with trees and waits, arrival by arrival."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..cameras.camera import Camera
+from ..lod.settings import LodSettings
+from ..lod.traversal import TreeCut
+from ..model.nodes import CHUNK_BITS
+from ..scenes.finder import view_of
+from ..scenes.loaded import Cut, Scenes
+from ..tables.columns import Row
+from .chunk_cache import Chunks, header_answers
+from .columns import LOADING
+from .streaming import Stream, StreamingSettings
+
+#: The share of a cut that makes a picture almost what it will be; chosen.
+MOST = 0.9
+
+
+@dataclass(frozen=True)
+class Arrival:
+    """What is there when a chunk has arrived.
+
+    Attributes:
+        seconds: since the page was opened.
+        bytes: that have arrived so far, of headers too.
+        share: 0..1 of the splats of the whole cut that are resident.
+        resident: (chunks,) bool, of all trees.
+    """
+
+    seconds: float
+    bytes: int
+    share: float
+    resident: NDArray[np.bool_]
+
+
+class Loader:
+    """Opens a page with scenes that are all trees, for one camera after another.
+
+    Args:
+        scenes: the scenes.
+        settings: of the cuts; continuous cuts are not simulated.
+        streaming: network and cache.
+
+    Raises:
+        ValueError: the budget, or the cache, is too small for the roots; or there are too many instances.
+    """
+
+    def __init__(self, scenes: Scenes, settings: LodSettings, streaming: StreamingSettings) -> None:
+        self.scenes, self.settings, self._streaming = scenes, settings, streaming
+        self._traversal = scenes.traversal(settings)
+        self._chunks = chunks_of(scenes)
+        self._stream()  # raises what would fail later
+
+    def _stream(self) -> Stream:
+        return Stream(self._chunks, self._streaming.network, capacity=self._streaming.chunk_cache)
+
+    def arrivals(self, camera: Camera) -> Iterator[Arrival]:
+        """The state at the beginning and after each arrival of a chunk, as long as any are wanted.
+
+        The camera rests. As soon as a chunk has arrived, the viewer looks for the chunks that the cut needs, as far as
+        it can tell from those that it has; Spark does so with the next picture that it draws.
+        """
+        per_chunk = self._splats_of(self._cut(camera))
+        total = max(1, int(per_chunk.sum()))
+        stream = self._stream()
+        stream.want([])
+        while True:
+            resident = stream.cache.resident()
+            yield Arrival(stream.now, stream.received, float(per_chunk[resident].sum()) / total, resident)
+            stream.want(self._cut(camera, resident).chunks())
+            while not stream.take_arrivals():
+                if not stream.step():
+                    return
+
+    def load(self, camera: Camera) -> Row:
+        """What a visitor waits for who opens the page in front of a camera and stays: `LOADING`, rounded.
+
+        None for what never comes, since the cache is too small.
+        """
+        figures: Row = dict.fromkeys(column.name for column in LOADING)
+        for arrival in self.arrivals(camera):
+            if figures["first_picture_s"] is None and arrival.resident[self._chunks.roots].any():
+                figures["first_picture_s"] = arrival.seconds
+            for name, share in (("resident_90", MOST), ("resident_all", 1)):
+                if figures[f"{name}_s"] is None and arrival.share >= share:
+                    figures[f"{name}_s"], figures[f"{name}_bytes"] = arrival.seconds, arrival.bytes
+            if arrival.share == 1:
+                break
+        return {column.name: column.rounded(figures[column.name]) for column in LOADING}
+
+    def cut_at(self, camera: Camera, seconds: float) -> Cut:
+        """What is drawn for a camera so many seconds after the page was opened in front of it."""
+        resident = np.zeros(len(self._chunks), np.bool_)
+        for arrival in self.arrivals(camera):
+            if arrival.seconds > seconds:
+                break
+            resident = arrival.resident
+        return self.scenes.cut_of(self._cut(camera, resident))
+
+    def _cut(self, camera: Camera, resident: NDArray[np.bool_] | None = None) -> TreeCut:
+        limit = self.settings.limit(camera.fov_y, camera.height)
+        return self._traversal.cut(view_of(camera), budget=self.settings.budget, smallest=limit, resident=resident)
+
+    def _splats_of(self, cut: TreeCut) -> NDArray[np.int64]:
+        """(chunks,) how many splats of a cut are in each chunk of all trees."""
+        counts = np.zeros(len(self._chunks), np.int64)
+        for view, nodes in zip(cut.views, cut.indices(), strict=True):
+            chunks, splats = np.unique(nodes >> CHUNK_BITS, return_counts=True)
+            counts[int(view["chunk_base"]) + chunks.astype(np.int64)] += splats
+        return counts
+
+
+def chunks_of(scenes: Scenes) -> Chunks:
+    """The chunks of all trees of scenes, and what a viewer needs before it can ask for them."""
+    return Chunks(
+        [tree.chunk_bytes() for tree in scenes.trees],
+        [header_answers(tree.header_bytes, tree.bytes) for tree in scenes.trees],
+    )

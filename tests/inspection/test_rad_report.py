@@ -1,0 +1,259 @@
+"""What a report says of a RAD file: encodings, sizes, ranges, and what can be expected of them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sparklod_cli.cli import run
+from sparklod_cli.codecs import rad as codec
+from sparklod_cli.codecs import rad_survey
+from sparklod_cli.inspection import leaves, rad
+from sparklod_cli.inspection.html import Section, page
+from sparklod_cli.inspection.rad import PropertyFacts
+from sparklod_cli.inspection.report import ReportSettings, inspect
+from sparklod_cli.io import examine_scene, read_scene
+from sparklod_cli.model.scene import Scene
+from tests.conftest import FIXTURES, real_scene
+from tests.inspection.rad_files import CHUNK, RANGES, Rad, tree, with_chunk, with_fields
+
+Said = pytest.CaptureFixture[str]
+PALETTE = tree(24, max_sh=2, palette=True)
+
+
+def facts_of(path: Path) -> rad.RadFacts:
+    found = rad.survey(path, check=False)
+    assert found is not None
+    assert found.facts is not None
+    return found.facts
+
+
+@pytest.mark.parametrize("chunked", [False, True])
+def test_the_facts_are_those_of_the_headers(chunked: bool, tmp_path: Path) -> None:
+    written = replace(tree(CHUNK + 8, max_sh=1), stem="a" if chunked else None)
+    header, chunks = written.packed()
+    facts = facts_of(written.write(tmp_path / "a.rad"))
+    sizes = sorted(map(len, chunks))
+    assert facts.chunked is chunked
+    assert facts.bytes == len(header) + sum(sizes) == sum(path.stat().st_size for path in tmp_path.iterdir())
+    assert (facts.header_bytes, facts.first_bytes) == (len(header), len(header) + len(chunks[0]))
+    assert facts.chunk_size == CHUNK
+    assert facts.chunk_bytes == rad.ChunkBytes(sizes[0], round(sum(sizes) / 2), sizes[1])
+    assert (facts.palette, facts.comment, facts.ranges) == (0, None, RANGES)
+    assert list(facts.properties) == [column.name for column in written.chunks[0].columns]
+    for name, found in facts.properties.items():
+        columns = [column for chunk in written.chunks for column in chunk.columns if column.name == name]
+        assert found.encoding == columns[0].encoding
+        assert found.bytes == sum(len(column.packed) for column in columns)
+        assert found.share == round(found.bytes / facts.bytes, 4)
+        assert (found.min, found.max) == (columns[0].fields.get("min"), columns[0].fields.get("max"))
+
+
+def test_chunks_may_differ(tmp_path: Path) -> None:
+    def change(chunk: Any) -> Any:
+        wider = {"min": -1.0, "max": 3.0}
+        chunk = chunk.changed("rgb", lambda each: replace(each, fields=wider))
+        return chunk.changed("orientation", lambda each: replace(each, encoding="f16", data=bytes(8 * 6)))
+
+    path = with_chunk(tree(CHUNK + 8), 1, change).write(tmp_path / "a.rad")
+    properties = facts_of(path).properties
+    assert properties["orientation"].encoding == "oct88r8, f16"
+    assert (properties["rgb"].min, properties["rgb"].max) == (-1, 3)
+
+
+def test_a_comment_is_shown_on_a_line_and_shortened(tmp_path: Path, capsys: Said) -> None:
+    comment = "made by\n\x1b[31m" + "me " * 400
+    path = with_fields(tree(24), comment=comment).write(tmp_path / "a.rad")
+    found = facts_of(path).comment
+    assert found is not None
+    assert found.startswith("made by \\x1b[31mme me")
+    assert len(found) == 500
+    assert run(["inspect", str(path)]) == 0
+    assert max(map(len, capsys.readouterr().out.splitlines())) < 180
+
+
+def test_a_person_reads_what_is_stored_how(tmp_path: Path, capsys: Said) -> None:
+    path = PALETTE.write(tmp_path / "a.rad")
+    assert run(["inspect", str(path)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith(f"{path}  RAD LoD, ")
+    for part in ("stored     one file, header", "palette    24 entries of SH", "rgbMin 0, rgbMax 1", "lodOpacity on"):
+        assert any(part in line for line in lines), part
+    (scales,) = (line.split() for line in lines if line.startswith("    scales"))
+    assert scales[1] == "ln_0r8"
+    assert scales[-3:] == ["-12", "to", "9"]
+
+
+def test_the_page_has_the_properties(tmp_path: Path) -> None:
+    report, _ = inspect(PALETTE.write(tmp_path / "a.rad"), ReportSettings())
+    text = page([Section(report.as_dict())])
+    for part in ("Properties", "ln_0r8", "sh2_code", "Palette of SH", "24 entries", "Header and first chunk"):
+        assert part in text
+
+
+FIELDS = {
+    "rad.chunked": "false",
+    "rad.palette": "24",
+    "rad.properties.sh1_code.encoding": "s8",
+    "rad.ranges.lnScaleMax": "9.0",
+    "format": "RAD LoD",
+    "splats": "24",
+    "sh_degree": "2",
+}
+
+
+@pytest.mark.parametrize(("name", "expected"), FIELDS.items())
+def test_a_field_of_the_headers_needs_no_data(
+    name: str, expected: str, tmp_path: Path, capsys: Said, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*arguments: object, **options: object) -> None:
+        raise AssertionError("the file is decoded")
+
+    monkeypatch.setattr(codec, "examine", fail)
+    path = PALETTE.write(tmp_path / "a.rad")
+    assert run(["inspect", str(path), "--field", name]) == 0
+    assert capsys.readouterr().out.strip() == expected
+
+
+@pytest.mark.parametrize(
+    "name", ["bytes", "splats", "sh_degree", "format", "bytes_per_splat", "compression_ratio", "rad"]
+)
+def test_headers_alone_give_what_the_whole_file_gives(name: str, tmp_path: Path) -> None:
+    path = replace(PALETTE, stem="a").write(tmp_path / "a.rad")
+    short, scene = inspect(path, ReportSettings(headers_only=True))
+    whole, _ = inspect(path, ReportSettings())
+    assert scene is None
+    assert short.value_at(name) == whole.value_at(name)
+
+
+def test_the_headers_of_many_chunks_are_not_kept(tmp_path: Path) -> None:
+    path = tree(24 * 50, chunk=24).write(tmp_path / "a.rad")
+    with path.open("rb") as file:
+        header, _ = rad_survey.survey_file(file, lambda name: file)
+        chunks = rad_survey.survey_chunks(file, lambda name: file, header, paddings=True)
+        assert next(chunks).number == 0
+        assert file.tell() < header.bytes + header.chunks[0].bytes + header.chunks[1].bytes
+
+
+EXPECTED: list[tuple[str, bool]] = [
+    ("chunk_bytes<=1MB", True),
+    ("chunk_bytes<100", False),
+    ("first_bytes<2k", True),
+    ("chunked==true", False),
+    ("palette>0", True),
+    ("rad.chunk_bytes.max<1MB", True),
+    ('rad.properties.center.encoding=="f32"', True),
+    ('rad.properties.center.encoding=="f16"', False),
+    ("rad.properties.sh1_code.share<0.001", False),
+    ("tree.split_siblings==0", True),
+]
+
+
+@pytest.mark.parametrize(("text", "holds"), EXPECTED)
+def test_what_can_be_expected(text: str, holds: bool, tmp_path: Path, capsys: Said) -> None:
+    path = PALETTE.write(tmp_path / "a.rad")
+    assert run(["inspect", str(path), "--assert", text]) == (0 if holds else 3)
+    out = capsys.readouterr().out
+    assert ("expect.value" in out) == (not holds)
+
+
+@pytest.mark.parametrize("name", ["chunk_bytes", "first_bytes", "chunked", "palette"])
+def test_other_formats_have_no_chunks_to_expect_something_of(name: str, capsys: Said) -> None:
+    assert run(["inspect", str(FIXTURES / "golden" / "tree-v3.spz"), "--assert", f"{name}==1"]) == 3
+    assert "the file is not RAD" in capsys.readouterr().out
+
+
+def test_siblings_in_two_chunks_are_counted(tmp_path: Path) -> None:
+    report, _ = inspect(tree(CHUNK + 8).write(tmp_path / "a.rad"), ReportSettings())
+    assert report.value_at("tree.split_siblings") == 1
+    report, _ = inspect(tree(CHUNK).write(tmp_path / "a.rad"), ReportSettings())
+    assert report.value_at("tree.split_siblings") == 0
+
+
+def test_scales_at_an_end_of_their_range_are_found(tmp_path: Path) -> None:
+    path = tree(24).write(tmp_path / "a.rad")
+    for code, expected in ((150, []), (1, ["values.scale-clamped"]), (0, ["values.invisible"])):
+        clamped = with_chunk(
+            tree(24),
+            0,
+            lambda chunk, code=code: chunk.changed("scales", lambda each: replace(each, data=bytes([code]) * 72)),
+        )
+        report, _ = inspect(clamped.write(path), ReportSettings(check=True))
+        assert [found.code for found in report.findings or [] if found.code != "tree.size"] == expected
+
+
+def test_coordinates_at_the_end_of_float16_are_found(tmp_path: Path) -> None:
+    data = np.full(72, 65504, "<f2").tobytes()
+    clamped = with_chunk(
+        tree(24), 0, lambda chunk: chunk.changed("center", lambda each: replace(each, encoding="f16", data=data))
+    )
+    report, _ = inspect(clamped.write(tmp_path / "a.rad"), ReportSettings(check=True))
+    assert "values.center-clamped" in [found.code for found in report.findings or []]
+
+
+# --- Leaves -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "original"),
+    [("rad/biker-spark.rad", "biker.ply"), ("rad/playbot-125k-spark/p-lod.rad", "playbot-125k.ply")],
+)
+def test_leaves_of_files_that_spark_wrote_are_the_splats_of_their_scenes(
+    name: str, original: str, capsys: Said
+) -> None:
+    assert run(["inspect", str(real_scene(name)), "--leaves-of", str(real_scene(original))]) == 0
+    capsys.readouterr()
+
+
+def leaves_of(path: Path, change: Callable[[Scene], None]) -> list[str]:
+    """Messages on a file whose original is its own leaves, changed."""
+    original = read_scene(path)
+    change(original)
+    return [found.message for found in leaves.check(examine_scene(path), original, facts_of(path))]
+
+
+GOLDEN = FIXTURES / "golden" / "sh1-tree.rad"
+
+
+def test_the_leaves_of_a_file_are_its_own() -> None:
+    assert leaves_of(GOLDEN, lambda scene: None) == []
+
+
+@pytest.mark.parametrize("column", ["center", "scale", "quat_xyzw", "opacity", "rgb", "sh"])
+def test_a_leaf_with_another_value_is_found(column: str) -> None:
+    def change(scene: Scene) -> None:
+        assert scene.tree is not None
+        leaf = int(np.flatnonzero(scene.tree.is_leaf)[-1])
+        values = getattr(scene.splats, column)
+        if column == "quat_xyzw":
+            values[leaf] = [0.6, 0, 0, 0.8]
+        elif column == "opacity":
+            values[leaf] = 0.5 * values[leaf] + 0.3
+        else:
+            values[leaf] = values[leaf][..., ::-1].copy() * 0.5
+
+    found = leaves_of(GOLDEN, change)
+    assert len(found) == 1
+    assert "1 leaves are not splats of the original" in found[0]
+
+
+def test_leaves_in_several_encodings_cannot_be_compared() -> None:
+    facts = facts_of(GOLDEN)
+    mixed = PropertyFacts("f16, f32", 1, 0.1, None, None)
+    facts = replace(facts, properties=facts.properties | {"center": mixed})
+    (found,) = leaves.check(examine_scene(GOLDEN), read_scene(GOLDEN), facts)
+    assert "center in several encodings" in found.message
+
+
+def test_json_has_the_facts(tmp_path: Path, capsys: Said) -> None:
+    path = Rad(PALETTE.chunks, 2, PALETTE.fields).write(tmp_path / "a.rad")
+    assert run(["inspect", str(path), "--json"]) == 0
+    plain = json.loads(capsys.readouterr().out)
+    assert plain["rad"]["properties"]["sh_label"]["encoding"] == "u16"
+    assert plain["bytes"] == path.stat().st_size
