@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from .api.cameras import orbit, read_cameras
     from .api.files import build_lod, extract_leaves, inspect, pack, read, unpack
-    from .api.rad import read_rad_chunk, read_rad_header
+    from .api.rad import arrange_chunks, read_rad_chunk, read_rad_header
     from .api.results import ComparisonTable, Frames, Picture, show
     from .api.views import compare, cut, psnr, render, ssim, traverse
     from .api.writing import Written, write
@@ -59,7 +59,7 @@ __version__ = "0.1.0"
 _MODULES = {
     "api.cameras": ("orbit", "read_cameras"),
     "api.files": ("build_lod", "extract_leaves", "inspect", "pack", "read", "unpack"),
-    "api.rad": ("read_rad_chunk", "read_rad_header"),
+    "api.rad": ("arrange_chunks", "read_rad_chunk", "read_rad_header"),
     "api.results": ("ComparisonTable", "Frames", "Picture", "show"),
     "api.views": ("compare", "cut", "psnr", "render", "ssim", "traverse"),
     "api.writing": ("Written", "write"),
@@ -129,6 +129,7 @@ __all__ = [
     "Tree",
     "TreeError",
     "Written",
+    "arrange_chunks",
     "build_lod",
     "compare",
     "cut",

@@ -148,5 +148,18 @@ def test_plain_splats_are_written_and_read(scene: sparklod.Scene, tmp_path: Path
 def test_a_file_is_what_the_command_writes(tmp_path: Path) -> None:
     command("build-lod", DEMO, "-o", tmp_path / "theirs.rad", "-q")
     tree = sparklod.build_lod(sparklod.read(DEMO))
-    sparklod.write(tmp_path / "ours.rad", tree)
+    sparklod.write(tmp_path / "ours.rad", sparklod.arrange_chunks(tree))
     assert (tmp_path / "ours.rad").read_bytes() == (tmp_path / "theirs.rad").read_bytes()
+
+
+def test_the_order_for_streaming_keeps_the_tree(large: sparklod.Tree, scene: sparklod.Scene) -> None:
+    streamed = sparklod.arrange_chunks(large)
+    streamed.tree.validate()
+    assert not np.array_equal(streamed.splats.center, large.splats.center)
+    for name in ("center", "opacity"):
+        ours, theirs = getattr(streamed.splats, name), getattr(large.splats, name)
+        np.testing.assert_array_equal(np.sort(ours, axis=0), np.sort(theirs, axis=0))
+    one = sparklod.arrange_chunks(large, threads=1)
+    np.testing.assert_array_equal(one.splats.center, streamed.splats.center)
+    with pytest.raises(sparklod.FormatError, match="no Level-of-Detail tree; build_lod makes one"):
+        sparklod.arrange_chunks(scene)
