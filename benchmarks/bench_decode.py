@@ -100,7 +100,7 @@ def made(source: Path, millions: float, folder: Path, transform: SplatTransform)
     splats = tiled(load(source), int(millions * 1e6))
     stem = f"tiled-{millions:g}M"
     plain, bare = folder / f"{stem}.ply", folder / f"{stem}-sh0.ply"
-    for path, degree in ((plain, 3), (bare, 0), (folder / f"{stem}.splat", 0)):
+    for path, degree in ((plain, 3), (bare, 0), (folder / f"{stem}.splat", 0), (folder / f"{stem}.rad", 3)):
         sparklod.write(path, sparklod.Scene(splats.with_max_sh(degree)), overwrite=True)
         if path != bare:
             yield path
