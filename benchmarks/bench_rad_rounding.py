@@ -21,11 +21,13 @@ import sparklod_cli as sparklod
 from sparklod_cli import Splats
 from sparklod_cli.codecs import rad, spz
 from sparklod_cli.codecs.gpu import packed_splats
-from sparklod_cli.codecs.options import RadOptions, WriteOptions
+from sparklod_cli.codecs.options import DEFAULTS, RadOptions, WriteOptions
 from sparklod_cli.codecs.splat_encoding import SplatEncoding
+from sparklod_cli.model.sh import COEFFICIENTS
 
-#: What Spark's program chooses, in its ranges; it widens those of colours and SH if many values are outside.
-SPARK = RadOptions("f32_lebytes", "f16", "r8_delta", "ln_0r8", "oct88r8", "s8", ranges=SplatEncoding(lod_opacity=True))
+#: The encodings that Spark's program chooses for a tree, and the ranges that it widens if many values are outside.
+SPARK = RadOptions("f32_lebytes", "f16", "r8_delta", "ln_0r8", "oct88r8", "s8")
+SPARK_RANGES = SplatEncoding(lod_opacity=True)
 
 #: Most nodes of the first cut are merged; the second is full detail.
 BUDGETS = ("25%", "100%")
@@ -50,14 +52,30 @@ def through_spz(tree: sparklod.Tree) -> tuple[Splats, int]:
     return spz.decode(io.BytesIO(data), threads=2).splats, len(data)
 
 
-def through_rad(options: RadOptions) -> Callable[[sparklod.Tree], tuple[Splats, int]]:
-    """Through RAD with these options."""
+def through_rad(tree: sparklod.Tree, options: WriteOptions = DEFAULTS) -> tuple[Splats, int]:
+    """Through RAD."""
+    data = b"".join(rad.encode(tree, options, threads=2))
+    return rad.decode(io.BytesIO(data), threads=2).splats, len(data)
 
-    def read(tree: sparklod.Tree) -> tuple[Splats, int]:
-        data = b"".join(rad.encode(tree, WriteOptions(rad=options), threads=2))
-        return rad.decode(io.BytesIO(data), threads=2).splats, len(data)
 
-    return read
+def through_sparks_encodings(tree: sparklod.Tree) -> tuple[Splats, int]:
+    """Through RAD as Spark's program writes it, which goes by quantiles: of scales by those of the larger two."""
+    low, high = np.quantile(tree.splats.rgb, [0.01, 0.99])
+    logs = np.log(np.sort(tree.splats.scale, axis=1)[:, 1:].clip(1e-30))
+    least, most = np.quantile(logs, [0.01, 0.99])
+    tops = {}
+    for degree in range(1, tree.splats.sh_degree + 1):
+        ends = np.quantile(tree.splats.sh[:, COEFFICIENTS[degree - 1] : COEFFICIENTS[degree]], [0.05, 0.95])
+        tops[f"sh{degree}_max"] = max(1.0, *np.abs(ends).tolist())
+    ranges = replace(
+        SPARK_RANGES,
+        rgb_min=min(float(low), SPARK_RANGES.rgb_min),
+        rgb_max=max(float(high), SPARK_RANGES.rgb_max),
+        ln_scale_min=min(float(least), SPARK_RANGES.ln_scale_min),
+        ln_scale_max=max(float(most), SPARK_RANGES.ln_scale_max),
+        **tops,
+    )
+    return through_rad(tree, WriteOptions(rad=replace(SPARK, ranges=ranges)))
 
 
 def paged(way: Way) -> Way:
@@ -65,16 +83,15 @@ def paged(way: Way) -> Way:
 
     def read(tree: sparklod.Tree) -> tuple[Splats, int]:
         splats, size = way.read(tree)
-        ranges = SplatEncoding(lod_opacity=True)
-        return packed_splats.unpack(packed_splats.pack(splats, ranges), ranges), size
+        return packed_splats.unpack(packed_splats.pack(splats, SPARK_RANGES), SPARK_RANGES), size
 
     return Way(f"{way.name}, in PackedSplats pages", read)
 
 
 FILES = (
     Way("LoD SPZ", through_spz),
-    Way("RAD, Spark's encodings", through_rad(SPARK)),
-    Way("RAD, ours", through_rad(RadOptions())),
+    Way("RAD, Spark's encodings", through_sparks_encodings),
+    Way("RAD, ours", through_rad),
 )
 
 
