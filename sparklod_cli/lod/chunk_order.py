@@ -1,0 +1,205 @@
+"""The order of nodes for streaming: chunks of which viewers need as few as possible.
+
+A viewer fetches a tree chunk by chunk. It needs the chunks that hold the children of the nodes that it refines, so the
+unit of an order is the *family*, the children of one node. The first chunk holds the largest families: a coarse picture
+of the whole. The rest is split in two, again and again, until each part is a chunk: along x, y or z between subtrees,
+or by size, where the coarse part comes first. Of these, the split is taken after which viewers at quasi-random
+viewpoints, with budgets of all sizes, are expected to fetch the fewest bytes; docs/streaming.md says how it compares.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..model.foveation import SPARK
+from ..model.gaussian import spark_size
+from ..model.lod_tree import LodTree
+from ..model.nodes import CHUNK_NODES
+from ..model.splats import FloatArray, Splats
+from ..support.jit import threads_for
+from ..support.progress import Progress, silent
+from .foveation import set_foveation
+from .kernels.chunk_demand import fill_demand
+from .kernels.chunk_inside import sort_within_chunks
+from .kernels.chunk_sets import Families, split_sets
+from .kernels.pixel_scale import NODE, VIEW
+from .kernels.sort import sort_by_key
+from .kernels.tree_links import find_depths, find_parents
+
+#: Viewpoints: half outside of the scene looking at it, a quarter anywhere inside, a quarter near a node. Chosen: 16
+#: are as good for large trees, not for those of four chunks (docs/decisions/2026-11-22-chunk-order.md).
+VIEWPOINTS = 64
+
+#: Distances of viewpoints from the middle of the scene, or from a node, in radii of the scene: log-uniform. Chosen.
+OUTSIDE, NEAR = (0.5, 4.0), (0.02, 0.2)
+
+#: Share of the centres, at either end of each axis, that the box of the scene leaves out. Chosen.
+OUTLIERS = 0.02
+
+#: The least budget of viewers, as a share of the nodes, but no more than one chunk. Chosen.
+LEAST_BUDGET = 1 / 16
+
+#: Bases of the Halton sequences that viewpoints are made of.
+PRIMES = (2, 3, 5, 7, 11, 13, 17)
+
+Matrix = NDArray[np.float64]
+Index = NDArray[np.int32]
+
+
+def arrange(splats: Splats, tree: LodTree, *, progress: Progress = silent) -> tuple[Splats, LodTree]:
+    """The same tree with its nodes in the order for streaming.
+
+    The root is node 0, siblings are consecutive and come after their parent. No siblings lie in two chunks, unless
+    families are so large that chunks cannot be filled with whole ones. The result does not depend on the number of
+    threads.
+
+    Args:
+        splats: M nodes.
+        tree: their children; `LodTree.validate` accepts it.
+        progress: called with the number of nodes that have a chunk.
+    """
+    order, child_start = chunk_order(splats, tree, progress=progress)
+    return splats.take(order), LodTree(tree.child_count[order], child_start)
+
+
+def chunk_order(
+    splats: Splats, tree: LodTree, *, progress: Progress = silent
+) -> tuple[NDArray[np.uint32], NDArray[np.uint32]]:
+    """The order of `arrange`: (M,) uint32 the node at each place, and (M,) uint32 the `child_start` of each place."""
+    total = len(tree)
+    order, child_start = np.zeros(total, np.uint32), np.zeros(total, np.uint32)
+    inner = int(np.count_nonzero(tree.child_count))
+    if not inner:
+        return order, child_start
+    with threads_for(inner) as threads:
+        size = np.fmax(spark_size(splats), np.float32(0))
+        _, limit = find_depths(tree.child_count, tree.child_start, size)
+        nodes = _largest_first(tree, limit, threads)
+        families = _families(splats.center, size, tree, nodes, threads)
+        sequence = _sequence(families, total, progress)
+    parents = nodes[sequence]
+    count = tree.child_count[parents].astype(np.int64)
+    first = np.cumsum(count) - count
+    order[1:] = np.repeat(tree.child_start[parents] - first, count) + np.arange(total - 1)
+    place = np.empty(total, np.uint32)
+    place[order] = np.arange(total, dtype=np.uint32)
+    child_start[place[parents]] = first + 1
+    return order, child_start
+
+
+def _largest_first(tree: LodTree, limit: FloatArray, threads: int) -> NDArray[np.uint32]:
+    """(F,) the nodes with children, parents first: by descending limit, the least size from the root to the node."""
+    nodes = np.flatnonzero(tree.child_count).astype(np.uint32)
+    keys = np.uint64(0x7FFFFFFF) - limit[nodes].view(np.uint32).astype(np.uint64)
+    return sort_by_key(keys, nodes, 31, threads)[1]
+
+
+def _families(center: FloatArray, size: FloatArray, tree: LodTree, nodes: NDArray[np.uint32], threads: int) -> Families:
+    """The families of these nodes."""
+    number = np.full(len(tree), -1, np.int32)
+    number[nodes] = np.arange(len(nodes), dtype=np.int32)
+    parent, _ = find_parents(tree.child_count, tree.child_start)
+    parent = np.where(parent[nodes] < 0, np.int32(-1), number[parent[nodes]])
+    centers = center[nodes]
+    rank = np.empty((len(nodes), 3), np.int32)
+    for axis in range(3):
+        bits = centers[:, axis].view(np.uint32)
+        ordered = np.where(bits >> 31, ~bits, bits | np.uint32(1 << 31))  # in the order of the numbers
+        _, by_place = sort_by_key(ordered.astype(np.uint64), np.arange(len(nodes), dtype=np.uint32), 32, threads)
+        rank[by_place, axis] = np.arange(len(nodes), dtype=np.int32)
+    records = np.empty(len(nodes), NODE)
+    records["x"], records["y"], records["z"] = centers.T
+    records["size"], records["child_count"] = size[nodes], tree.child_count[nodes]
+    records["child_start"] = 0  # not read
+    demand = np.empty((len(nodes), VIEWPOINTS), np.uint8)
+    least = min(len(tree) * LEAST_BUDGET, float(CHUNK_NODES))
+    fill_demand(records, parent, viewpoints(centers), least, float(len(tree)), demand)
+    return Families(parent, tree.child_count[nodes].astype(np.int32), rank, demand)
+
+
+def _sequence(families: Families, total: int, progress: Progress) -> Index:
+    """(F,) the families in the order in which they are written.
+
+    Args:
+        families: F at least 1.
+        total: number of nodes: those of the families, and the root.
+        progress: of `arrange`.
+    """
+    length = len(families.count)
+    sequence = np.arange(length, dtype=np.int32)
+    set_of, root, spare = (np.full(length, -1, np.int32) for _ in range(3))
+    weight = np.empty(length, np.int64)
+    # Where a set begins, where it ends, its nodes, and for the first one how many of its nodes fit beside the root.
+    sets, ends, used = [(0, length, total - 1, CHUNK_NODES - 1)], [0], 0
+    while sets:
+        rows = [
+            (begin, end, used + number, CHUNK_NODES, -(-nodes // CHUNK_NODES), room)
+            for number, (begin, end, nodes, room) in enumerate(sets)
+        ]
+        lengths = np.zeros(len(sets), np.int64)
+        split_sets(families, np.array(rows, np.int64), sequence, set_of, root, weight, spare, lengths)
+        used += len(sets)
+        parts = []
+        for (begin, end, nodes, _), first in zip(sets, lengths.tolist(), strict=True):
+            filled = int(families.count[sequence[begin : begin + first]].sum(dtype=np.int64))
+            parts += [(begin, begin + first, filled, 0), (begin + first, end, nodes - filled, 0)]
+        ends += [end for _, end, nodes, _ in parts if nodes <= CHUNK_NODES]
+        sets = [part for part in parts if part[2] > CHUNK_NODES]
+        progress("arranging", total - sum(nodes for _, _, nodes, _ in sets), total, "node")
+    bits = (length - 1).bit_length()
+    sort_within_chunks(np.unique(ends), families.parent, families.rank, bits, sequence, set_of, root)
+    return sequence
+
+
+def viewpoints(centers: FloatArray) -> NDArray[np.void]:
+    """(VIEWPOINTS,) `pixel_scale.VIEW` with Spark's foveation, spread evenly by Halton sequences.
+
+    Args:
+        centers: (F, 3) of the nodes that viewers may look at, F at least 1.
+    """
+    low, high = np.percentile(centers, [100 * OUTLIERS, 100 - 100 * OUTLIERS], axis=0).astype(np.float64)
+    middle, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
+    u = [_halton(base) for base in PRIMES]
+    direction, gaze = _on_sphere(u[0], u[1]), _on_sphere(u[2], u[3])
+    outside = middle + direction * _log_uniform(OUTSIDE, u[4]) * radius
+    inside = low + (high - low) * np.stack([u[0], u[1], u[4]], axis=1)
+    some = centers[(u[5] * len(centers)).astype(np.int64)]
+    near = some + direction * _log_uniform(NEAR, u[4]) * radius
+    kind = np.arange(VIEWPOINTS)[:, None] % 4
+    eye = np.where(kind < 2, outside, np.where(kind == 2, inside, near))
+    ahead = np.where(kind < 2, middle + gaze * (u[6][:, None] * radius / 2) - outside, gaze)
+    length = np.linalg.norm(ahead, axis=1, keepdims=True)
+    ahead = np.where(length > 0, ahead / np.where(length > 0, length, 1), gaze)
+    views = np.zeros(VIEWPOINTS, VIEW)
+    for axis, name in enumerate("xyz"):
+        views[f"origin_{name}"], views[f"forward_{name}"] = eye[:, axis], ahead[:, axis]
+    views["lod_scale"] = 1
+    for view in views:
+        set_foveation(view, SPARK, math.pi / 2, math.pi / 2)
+    return views
+
+
+def _halton(base: int) -> Matrix:
+    """(VIEWPOINTS,) of the Halton sequence, from its second element on: evenly spread in 0..1, without its ends."""
+    left, share, out = np.arange(1, VIEWPOINTS + 1), 1.0, np.zeros(VIEWPOINTS)
+    while left.any():
+        share /= base
+        out += share * (left % base)
+        left //= base
+    return out
+
+
+def _on_sphere(u: Matrix, v: Matrix) -> Matrix:
+    """(N, 3) directions, evenly spread if (u, v) are so in the unit square."""
+    z = 2 * u - 1
+    across = np.sqrt(1 - z * z)
+    return np.stack([across * np.cos(2 * np.pi * v), across * np.sin(2 * np.pi * v), z], axis=1)
+
+
+def _log_uniform(bounds: tuple[float, float], u: Matrix) -> Matrix:
+    """(N, 1) numbers between bounds, with logarithms spread as u is in 0..1."""
+    low, high = bounds
+    return low * (high / low) ** u[:, None]
