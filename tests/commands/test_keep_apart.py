@@ -43,7 +43,7 @@ INPUTS: dict[str, dict[str, tuple[object, ...]]] = {
 #: How each command is told to write the file Y, by the parameter that says so.
 OUTPUTS: dict[str, dict[str, tuple[str, ...]]] = {
     "build-lod": {"output": ("-o", "Y")},
-    "inspect": {"plot": ("--plot", "Y"), "html": ("--html", "Y")},
+    "inspect": {"plot": ("--plot", "Y"), "html": ("--html", "Y"), "chunks_out": ("--chunks-out", "Y")},
     "traverse": {"output": ("-o", "Y"), "plot": ("--plot", "Y")},
     "render": {"output": ("-o", "Y"), "plot": ("--compare", "--plot", "Y")},
     "view": {},
