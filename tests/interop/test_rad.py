@@ -274,3 +274,12 @@ def test_spark_reads_real_scenes_as_build_lod_writes_them(spark: Spark, tmp_path
     check_whole(spark, whole)
     assert check_chunks(spark, header, tmp_path) == len(header_of(header).chunks) > 2
     assert [data for data, _, _ in chunks_of(whole)] == [data for data, _, _ in chunks_of(header)]
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_both_read_the_same_palette(spark: Spark, tmp_path: Path, degree: int) -> None:
+    """It has as many codes as the first chunk has splats, since Spark takes so many whatever the header says."""
+    path = written(tmp_path / "scene.rad", tree(degree), RadOptions(sh_codes=300))
+    assert header_of(path).sh_code_count == len(tree(degree)) > 300
+    check_whole(spark, path)
+    assert check_chunks(spark, path, tmp_path) == 1
