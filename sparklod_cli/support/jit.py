@@ -48,6 +48,7 @@ SOURCES = (
     "support/fast_math.py",
     "support/jit.py",
     "support/jit_cache.py",
+    "support/leftovers.py",
     "codecs/kernels/*.py",
     "lod/kernels/*.py",
     "render/kernels/*.py",

@@ -1,0 +1,263 @@
+"""Palettes of spherical harmonics: a few codes for the coefficients of many splats, and a label for each splat.
+
+The codes are those of a k-means clustering. Its distance is the squared error of the coefficients, which is the squared
+error of the colour over all directions, as spherical harmonics are orthonormal. With few rows to a code, the error
+depends more on where k-means starts than on its passes, which take their time to find the nearest code of each row. So:
+
+1. Equal rows become one row with their weight.
+2. Bisection: the cell of rows whose halves have the least error in proportion to its own is halved, until there are as
+   many cells as codes; that is, always the cell that gains most. A cell is cut across its direction of largest spread.
+3. Passes of k-means that look for the code of a row among the neighbours of the code that it has.
+
+There are no random numbers, and no sum depends on the number of threads: the same rows always give the same palette.
+docs/decisions/2026-11-22-sh-palette.md has what it was measured against.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..model.splats import FloatArray, Splats
+from ..support.progress import Progress, silent
+from ..support.threads import on_threads
+
+#: The most codes of a palette: labels have 16 bits in RAD and in SOG.
+MAX_CODES = 1 << 16
+
+#: Passes of k-means. Measured: more gain less than 0.5 % of the error.
+PASSES = 6
+
+#: The passes, from 0, before which the neighbours of all codes are found anew.
+FRESH = (0, 3)
+
+#: Neighbours of a code among which the codes of its rows are looked for, a multiple of `nearest.LANES`; and the groups
+#: of `nearest.GROUP` codes that are searched for them. Measured.
+NEIGHBOURS, SEARCH = 48, 16
+
+#: Cells are halved together whose gain is at least this share of the largest. Measured: 0.8 takes three times as many
+#: rounds for less than 1.5 % of the error.
+TOGETHER = 0.5
+
+#: Least weight of a row, as a share of the mean: rows without weight get codes, too. Chosen.
+WEIGHT_FLOOR = 1e-6
+
+#: Power of the seen area in `visible_weight`. Measured: 1 is better in far views, 0.5 in near ones.
+AREA_POWER = 0.75
+
+Indices = NDArray[np.uint32]
+Weights = NDArray[np.float64]
+Offsets = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class ShPalette:
+    """A palette.
+
+    Attributes:
+        codes: (C, K, 3) float32 coefficients, in the order of `Splats.sh`. Each is the code of some row.
+        labels: (N,) uint32, the code of each row.
+    """
+
+    codes: FloatArray
+    labels: Indices
+
+    def expand(self) -> FloatArray:
+        """(N, K, 3) float32, the code of each row."""
+        return self.codes[self.labels]
+
+
+def visible_weight(splats: Splats) -> Weights:
+    """(N,) how much an error in the SH of a splat is seen: (opacity * area) ** AREA_POWER.
+
+    The area is that of its two longest axes. Splats of any size are seen at some distance; the power below 1 leaves the
+    small ones, which are seen near by, their part.
+    """
+    axes = np.sort(splats.scale.astype(np.float64), axis=1)
+    weight: Weights = (splats.opacity * axes[:, 1] * axes[:, 2]) ** AREA_POWER
+    return weight
+
+
+def cluster(
+    sh: FloatArray, codes: int, *, weight: ArrayLike | None = None, threads: int | None = 1, progress: Progress = silent
+) -> ShPalette:
+    """Finds a palette for the coefficients of splats.
+
+    The result is the same for any number of threads. If there are at most `codes` different rows, the palette holds
+    just these, exactly. The code of a row is the nearest one or, of rows between many codes, nearly: their squared
+    error is about 1 % larger in all than with the nearest.
+
+    Args:
+        sh: (N, K, 3) finite float32 coefficients, K at least 1.
+        codes: the most codes, 1 to MAX_CODES.
+        weight: (N,) how much the squared error of each row counts, finite and at least 0; None for 1 each.
+        threads: to work on; None for all processors.
+        progress: is told how many cells there are, and then the passes of k-means.
+
+    Raises:
+        ValueError: an argument is out of its range or has another shape.
+    """
+    if sh.ndim != 3 or not sh.shape[1] or sh.shape[2] != 3:
+        raise ValueError(f"sh has the shape {sh.shape}; give (N, K, 3) with K at least 1")
+    if not 1 <= codes <= MAX_CODES:
+        raise ValueError(f"codes is {codes}; give 1 to {MAX_CODES:,}")
+    rows = np.ascontiguousarray(sh, np.float32).reshape(len(sh), 3 * sh.shape[1])
+    if len(rows) and not (np.isfinite(rows.min()) and np.isfinite(rows.max())):
+        raise ValueError("sh holds NaN or infinity; give finite coefficients")
+    of_rows = _weights(weight, len(rows))
+    with on_threads(threads):  # loads numba
+        first, inverse = _distinct(rows)
+        if len(first) <= codes:
+            return ShPalette(sh[first], inverse)
+        of_first = np.zeros(len(first))
+        np.add.at(of_first, inverse, of_rows)
+        clustering = _Clustering(rows, first, of_first, progress)
+        found, labels = clustering.run(codes)
+    return ShPalette(found.reshape(len(found), *sh.shape[1:]), labels[inverse])
+
+
+def _weights(weight: ArrayLike | None, count: int) -> Weights:
+    """The weights of rows, positive, 1 in the mean."""
+    if weight is None:
+        return np.ones(count)
+    given = np.asarray(weight, np.float64)
+    if given.shape != (count,):
+        raise ValueError(f"weight has the shape {given.shape}; give ({count},), a weight for each row")
+    if not (np.isfinite(given) & (given >= 0)).all():
+        raise ValueError("weight holds a number below 0, NaN or infinity; give finite weights of at least 0")
+    largest = given.max(initial=0)
+    if not largest > 0:
+        return np.ones(count)
+    relative = given / largest
+    relative /= relative.mean()
+    return np.maximum(relative, WEIGHT_FLOOR)
+
+
+def _distinct(rows: FloatArray) -> tuple[Indices, Indices]:
+    """The first of each set of equal rows, ascending, and for each row its place among these."""
+    from .kernels.row_hash import hash_rows
+
+    key = hash_rows((rows + np.float32(0)).view(np.uint32))  # -0 becomes 0
+    order = np.argsort(key, kind="stable")
+    is_first = np.ones(len(rows), np.bool_)
+    same_key = np.flatnonzero(key[order[1:]] == key[order[:-1]])
+    is_first[1:][same_key] = (rows[order[same_key + 1]] != rows[order[same_key]]).any(axis=1)
+    group = np.cumsum(is_first) - 1
+    first = order[is_first]
+    rank = np.empty(len(first), np.uint32)
+    ascending = np.argsort(first)
+    rank[ascending] = np.arange(len(first), dtype=np.uint32)
+    inverse = np.empty(len(rows), np.uint32)
+    inverse[order] = rank[group]
+    return first[ascending].astype(np.uint32), inverse
+
+
+class _Clustering:
+    """Rows while they are clustered.
+
+    Args:
+        rows: (N, D) float32.
+        first: (M,) the rows to cluster.
+        weight: (M,) of each of them.
+        progress: see `cluster`.
+    """
+
+    def __init__(self, rows: FloatArray, first: Indices, weight: Weights, progress: Progress) -> None:
+        self._rows = rows
+        self._first = first
+        self._weight = np.zeros(len(rows))
+        self._weight[first] = weight
+        self._progress = progress
+
+    def run(self, codes: int) -> tuple[FloatArray, Indices]:
+        """(C, D) codes, and the (M,) labels of the rows."""
+        from .kernels.cells import average_cells
+        from .kernels.nearest import choose_codes
+
+        members, begin = self._bisect(codes)
+        table = np.empty((len(begin) - 1, self._rows.shape[1]), np.float32)
+        average_cells(self._rows, self._weight, members, begin, table)
+        labels, errors = np.zeros(len(self._rows), np.int32), np.zeros(len(self._rows), np.float32)
+        for number in range(PASSES):
+            self._progress("clustering", number, PASSES, "pass")
+            if number in FRESH:
+                near, distance = _neighbours(table)
+            else:
+                distance = np.zeros_like(distance)  # codes have moved: nothing is known
+            choose_codes(self._rows, members, begin, table, near, distance, labels, errors)
+            if number < PASSES - 1:
+                members, begin = self._cells(labels, len(table))
+                empty = np.flatnonzero(begin[1:] == begin[:-1])
+                if len(empty):
+                    self._refill(empty, labels, errors)
+                    members, begin = self._cells(labels, len(table))
+                average_cells(self._rows, self._weight, members, begin, table)
+        self._progress("clustering", PASSES, PASSES, "pass")
+        used, compact = np.unique(labels[self._first], return_inverse=True)
+        return table[used], compact.astype(np.uint32)
+
+    def _bisect(self, codes: int) -> tuple[Indices, Offsets]:
+        """Cells of the rows, fewer than `codes` only if rows are too near to be told apart.
+
+        Every cell is halved when it is made, which tells what it gains to have both halves; then those that gain most
+        are replaced by theirs.
+
+        Returns:
+            members: (M,) rows, cell after cell; neighbouring cells are near each other.
+            begin: (C + 1,) where each cell begins, and the end.
+        """
+        from .kernels.cells import halve_cells
+
+        members, places = self._first.copy(), np.empty(len(self._first))
+        begin, end = np.zeros(1, np.int64), np.array([len(members)])
+        error = np.array([np.inf])
+        cut, halves = np.empty(1, np.int64), np.empty((1, 2))
+        halve_cells(self._rows, self._weight, members, begin, end, cut, halves, places)
+        while len(begin) < codes:
+            self._progress("bisecting", len(begin), codes, "code")
+            gain = np.where(end - begin > 1, error - halves.sum(axis=1), 0)
+            chosen = np.flatnonzero((gain >= TOGETHER * gain.max()) & (gain > 0))
+            if not len(chosen):
+                break
+            if len(chosen) > codes - len(begin):
+                chosen = np.sort(chosen[np.argsort(-gain[chosen], kind="stable")[: codes - len(begin)]])
+            made = np.concatenate([begin[chosen], cut[chosen]]), np.concatenate([cut[chosen], end[chosen]])
+            cut_made, halves_made = np.empty(len(made[0]), np.int64), np.empty((len(made[0]), 2))
+            halve_cells(self._rows, self._weight, members, *made, cut_made, halves_made, places)
+            kept = np.ones(len(begin), np.bool_)
+            kept[chosen] = False
+            error = np.concatenate([error[kept], halves[chosen].T.ravel()])
+            begin, end = np.concatenate([begin[kept], made[0]]), np.concatenate([end[kept], made[1]])
+            cut, halves = np.concatenate([cut[kept], cut_made]), np.concatenate([halves[kept], halves_made])
+        return members, np.append(np.sort(begin), len(members))
+
+    def _cells(self, labels: NDArray[np.int32], codes: int) -> tuple[Indices, Offsets]:
+        """The rows of each code, ascending, code after code, and where those of each begin."""
+        of_first = labels[self._first].astype(np.uint16)  # which numpy sorts by radix
+        begin = np.concatenate([[0], np.cumsum(np.bincount(of_first, minlength=codes))])
+        return self._first[np.argsort(of_first, kind="stable")], begin
+
+    def _refill(self, empty: NDArray[np.intp], labels: NDArray[np.int32], errors: FloatArray) -> None:
+        """Gives codes that have no rows those with the largest error, one each."""
+        cost = self._weight[self._first] * errors[self._first]
+        worst = np.argsort(-cost, kind="stable")[: len(empty)]
+        worst = worst[cost[worst] > 0]
+        labels[self._first[worst]] = empty[: len(worst)]
+
+
+def _neighbours(table: FloatArray) -> tuple[NDArray[np.int32], FloatArray]:
+    """The (C, NEIGHBOURS) nearest codes of each code, nearest first, and their squared distances."""
+    from .kernels.nearest import GROUP, find_neighbours
+
+    count, width = table.shape
+    starts = np.arange(0, count, GROUP)
+    padded = np.zeros((len(starts) * GROUP, width), np.float32)
+    padded[:count] = table
+    blocks = np.ascontiguousarray(padded.reshape(len(starts), GROUP, width).transpose(0, 2, 1))
+    sums = np.add.reduceat(table, starts, axis=0, dtype=np.float64)
+    means = (sums / np.diff(np.append(starts, count))[:, None]).astype(np.float32)
+    near, distance = np.empty((count, NEIGHBOURS), np.int32), np.empty((count, NEIGHBOURS), np.float32)
+    find_neighbours(table, blocks, means, min(SEARCH, len(starts)), near, distance)
+    return near, distance
