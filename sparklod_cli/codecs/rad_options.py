@@ -8,6 +8,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from ..model.nodes import CHUNK_NODES
 from ..model.scene import Scene
 from ..model.sh import COEFFICIENTS
 from ..model.splats import FloatArray
@@ -56,9 +57,11 @@ def settled(scene: Scene, options: WriteOptions) -> WriteOptions:
 
     Raises:
         FormatError: there are more splats than the format can number.
-        ValueError: an encoding is unknown.
+        ValueError: an encoding is unknown, or the palette has no code or more than a label can name.
     """
     rad = options.rad
+    if rad.sh_codes is not None and not 1 <= rad.sh_codes <= CHUNK_NODES:
+        raise ValueError(f"sh_codes is {rad.sh_codes}, not 1 to {CHUNK_NODES:,}")
     for name in ("center", "alpha", "rgb", "scales", "orientation", "sh"):
         if getattr(rad, name) not in choices(name):
             raise ValueError(f"{name} is {getattr(rad, name)!r}, not one of {', '.join(choices(name))}")
@@ -122,9 +125,9 @@ def held(options: WriteOptions, sh_degree: int) -> list[Range]:
             found.append(Range(row.column, *ends, zero=float(SCALE_ZERO)))
         elif encoding in RANGES:
             half = (high - low) / (508 if encoding.startswith("s8") else 510)
-            found.append(Range(row.column, low - half, high + half, numbers))
+            found.append(Range(row.column, low - half, high + half, numbers, degree=row.degree))
         elif encoding in ("f16", "f16_lebytes"):
-            found.append(Range(row.column, -most, most, numbers))
+            found.append(Range(row.column, -most, most, numbers, degree=row.degree))
     return found
 
 
