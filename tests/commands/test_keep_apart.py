@@ -106,7 +106,7 @@ def test_an_output_that_is_an_input_is_refused(
 
 @pytest.mark.parametrize("command", ["inspect", "traverse"])
 def test_two_outputs_are_two_files(command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    one, two = OUTPUTS[command].values()
+    one, two, *_ = OUTPUTS[command].values()
     target = str(tmp_path / f"y{SUFFIXES[command]}")
     arguments = [target if argument == "Y" else argument for argument in (*one, *two)]
     assert run([command, str(LOD), *arguments]) == 2
