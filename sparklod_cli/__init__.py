@@ -17,11 +17,17 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from .api.cameras import orbit, read_cameras
-    from .api.files import Written, build_lod, extract_leaves, inspect, pack, read, unpack, write
+    from .api.files import build_lod, extract_leaves, inspect, pack, read, unpack
+    from .api.rad import arrange_chunks, read_rad_chunk, read_rad_header
     from .api.results import ComparisonTable, Frames, Picture, show
     from .api.views import compare, cut, psnr, render, ssim, traverse
+    from .api.writing import Written, write
     from .cameras.camera import Camera
     from .cameras.path import CameraPath
+    from .codecs.options import RadOptions
+    from .codecs.rad import Chunk
+    from .codecs.rad_header import ChunkEntry, ChunkHeader, Header
+    from .codecs.splat_encoding import SplatEncoding
     from .inspection.report import Report
     from .lod.settings import LodSettings
     from .model.foveation import Cones, Frustum
@@ -52,11 +58,17 @@ __version__ = "0.1.0"
 #: package loads neither numpy nor numba. tests/api/test_package.py holds this and the imports above together.
 _MODULES = {
     "api.cameras": ("orbit", "read_cameras"),
-    "api.files": ("Written", "build_lod", "extract_leaves", "inspect", "pack", "read", "unpack", "write"),
+    "api.files": ("build_lod", "extract_leaves", "inspect", "pack", "read", "unpack"),
+    "api.rad": ("arrange_chunks", "read_rad_chunk", "read_rad_header"),
     "api.results": ("ComparisonTable", "Frames", "Picture", "show"),
     "api.views": ("compare", "cut", "psnr", "render", "ssim", "traverse"),
+    "api.writing": ("Written", "write"),
     "cameras.camera": ("Camera",),
     "cameras.path": ("CameraPath",),
+    "codecs.options": ("RadOptions",),
+    "codecs.rad": ("Chunk",),
+    "codecs.rad_header": ("ChunkEntry", "ChunkHeader", "Header"),
+    "codecs.splat_encoding": ("SplatEncoding",),
     "inspection.report": ("Report",),
     "lod.settings": ("LodSettings",),
     "model.foveation": ("Cones", "Frustum"),
@@ -84,12 +96,16 @@ __all__ = [
     "Camera",
     "CameraPath",
     "CameraPathError",
+    "Chunk",
+    "ChunkEntry",
+    "ChunkHeader",
     "ComparisonTable",
     "Cones",
     "Cut",
     "FormatError",
     "Frames",
     "Frustum",
+    "Header",
     "Instance",
     "InstancesFileError",
     "InvalidSplatsError",
@@ -99,18 +115,21 @@ __all__ = [
     "OutOfMemoryError",
     "OutputError",
     "Picture",
+    "RadOptions",
     "RasterSettings",
     "RenderSettings",
     "Report",
     "Scene",
     "Selection",
     "SparklodError",
+    "SplatEncoding",
     "Splats",
     "StreamingSettings",
     "Transform",
     "Tree",
     "TreeError",
     "Written",
+    "arrange_chunks",
     "build_lod",
     "compare",
     "cut",
@@ -122,6 +141,8 @@ __all__ = [
     "read",
     "read_cameras",
     "read_instances",
+    "read_rad_chunk",
+    "read_rad_header",
     "render",
     "show",
     "ssim",

@@ -21,6 +21,7 @@ from ..io import check_writable, write_whole
 from ..support.errors import SparklodError, memory_errors_translated
 from ..support.progress import Progress, silent
 from ..support.threads import on_threads
+from ..tables.output import TableOutput
 
 if TYPE_CHECKING:
     from ..figures.tree_plot import Picture
@@ -45,6 +46,7 @@ class DrawSettings:
         by: what its colours show, one of `PLOT_BY`.
         html: file of a page, which `write_page` writes.
         overwrite: replace files that exist.
+        chunks: where the table of the chunks goes; None for nowhere.
     """
 
     histograms: tuple[str, ...]
@@ -53,9 +55,12 @@ class DrawSettings:
     by: str
     html: Path | None
     overwrite: bool
+    chunks: TableOutput | None = None
 
     def check(self) -> None:
-        """Raises an `OutputError` where a file cannot be written, before anything is read."""
+        """Raises a `SparklodError` where a file cannot be written, before anything is read."""
+        if self.chunks is not None:
+            self.chunks.check()
         for target in (self.plot, self.html):
             if target is not None:
                 check_writable(target, overwrite=self.overwrite)
@@ -98,6 +103,8 @@ def inspect_file(
     """
     with memory_errors_translated(), on_threads(threads):
         report, scene = checking.inspect(path, settings, threads=threads, progress=progress)
+        if drawn.chunks is not None and report.chunks is not None:
+            drawn.chunks.write(report.chunks)
         picture, problem = _picture(report, scene, drawn)
         size = None
         if picture is not None and drawn.plot is not None:

@@ -1,31 +1,27 @@
-"""Splat files and scenes: read, write, build a tree, take its leaves, inspect."""
+"""Splat files and scenes: read, build a tree, take its leaves, inspect."""
 
 from __future__ import annotations
 
 import contextlib
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..io import examine_scene, read_scene, write_whole
+from ..io import examine_scene, read_scene
 from ..lod.builders import BUILDERS, METHODS
 from ..model.scene import Scene, Tree
 from ..model.splats import COLUMNS
 from ..support.defaults import (
     DEFAULT_BASE,
-    DEFAULT_COMPRESSION,
     DEFAULT_GROWTH,
     MAX_BASE,
-    MAX_COMPRESSION,
-    MAX_FRACTIONAL_BITS,
     MAX_GROWTH,
     MAX_SH_DEGREE,
     MIN_BASE,
-    MIN_COMPRESSION,
     MIN_GROWTH,
 )
-from ..support.errors import FormatError, InvalidSplatsError, TreeError, memory_errors_translated
+from ..support.errors import FormatError, TreeError, memory_errors_translated
 from ..support.threads import on_threads, thread_count
 from .arguments import scene_like, whole_within, within
 from .progress import Told, telling
@@ -36,21 +32,6 @@ if TYPE_CHECKING:
 
     from ..inspection.report import Report
     from ..model.selection import Selection
-
-
-@dataclass(frozen=True)
-class Written:
-    """A file that was written.
-
-    Attributes:
-        path: of the file.
-        format: for display ("SPZ", "PLY"), or the name of an encoding.
-        bytes: its size.
-    """
-
-    path: Path
-    format: str
-    bytes: int
 
 
 def read(
@@ -70,7 +51,7 @@ def read(
         OutOfMemoryError: it does not fit into memory.
     """
     path = Path(path)
-    with telling(progress) as told, memory_errors_translated(), _naming(path):
+    with telling(progress) as told, memory_errors_translated(), naming(path):
         count = thread_count(threads)
         if columns is None:
             scene = read_scene(path, threads=count, progress=told)
@@ -85,7 +66,7 @@ def read(
 
 
 @contextlib.contextmanager
-def _naming(path: Path) -> Iterator[None]:
+def naming(path: Path) -> Iterator[None]:
     """Puts the file before what is wrong with it: Python, unlike a command, says nothing before it."""
     try:
         yield
@@ -98,66 +79,6 @@ def as_tree(scene: Scene) -> Scene:
     if scene.tree is None or isinstance(scene, Tree):
         return scene
     return Tree(**{each.name: getattr(scene, each.name) for each in fields(Scene)})
-
-
-def write(
-    path: Path | str,
-    scene: Scene,
-    *,
-    overwrite: bool = False,
-    spz_version: int | None = None,
-    fractional_bits: int | None = None,
-    compression_level: int = DEFAULT_COMPRESSION,
-    encoding: str | None = None,
-    threads: int | None = None,
-    progress: Told = None,
-) -> Written:
-    """Writes a scene, or a tree, whole or not at all.
-
-    Args:
-        path: of the file. A tree is written as SPZ, a scene in the format of the suffix: .spz, .ply or .splat.
-        scene: what is written.
-        overwrite: replace a file that exists.
-        spz_version: of SPZ, 2 or 3; None for 3.
-        fractional_bits: of SPZ positions, 0 to 24; None for as many as suit the scene.
-        compression_level: of SPZ, 1 (fast) to 9 (small).
-        encoding: write the arrays of "packed", "ext", "lodtree" or "texture" as .npz instead, or as the words alone
-            where the path ends in .bin or .raw.
-        threads: to encode on; None for all processors. The bytes do not depend on it.
-        progress: called with how much is done.
-
-    Raises:
-        FormatError: the format cannot hold the scene, or there is no such format.
-        InvalidSplatsError: the scene has no splats.
-        OutputError: the file exists, or cannot be written.
-        ValueError: an option is out of its range, or one of SPZ is given for another format.
-    """
-    from ..codecs.formats import WRITABLE
-    from ..codecs.gpu import dump
-    from ..codecs.gpu.table import RAW_SUFFIXES
-    from ..codecs.options import WriteOptions
-
-    path, count = Path(path), thread_count(threads)
-    suffix = path.suffix.lower()
-    whole_within("compression_level", compression_level, MIN_COMPRESSION, MAX_COMPRESSION)
-    if fractional_bits is not None:
-        whole_within("fractional_bits", fractional_bits, 0, MAX_FRACTIONAL_BITS)
-    if (spz_version is not None or fractional_bits is not None) and (encoding is not None or suffix != ".spz"):
-        raise ValueError(f"{path}: spz_version and fractional_bits are of SPZ; leave them out, or write a .spz")
-    if not len(scene_like(scene).splats):
-        raise InvalidSplatsError(f"{path}: the scene has no splats to write")
-    with telling(progress) as told, memory_errors_translated():
-        if encoding is not None:
-            arrays = pack(scene, encoding, threads=count)
-            pieces = dump.encode_raw(arrays) if suffix in RAW_SUFFIXES else dump.encode_npz(arrays)
-            return Written(path, encoding, write_whole(path, pieces, overwrite=overwrite))
-        form = WRITABLE.get(suffix)
-        if form is None or (scene.tree is not None and suffix != ".spz"):
-            what, known = ("a tree", ".spz") if scene.tree is not None else ("a scene", ", ".join(WRITABLE))
-            raise FormatError(f"{path}: {what} is written as {known}, which the name does not end in")
-        options = WriteOptions(spz_version, fractional_bits, compression_level)
-        pieces = form.codec().encode(scene, options, threads=count, progress=told)
-        return Written(path, form.name, write_whole(path, pieces, overwrite=overwrite))
 
 
 def build_lod(

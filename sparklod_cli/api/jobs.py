@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..model.instances import instances_of
-from ..scenes.finder import CutFinder
+from ..scenes.finder import CutFinder, CutSource
 from ..support.progress import silent
 from ..support.threads import on_threads
 from .viewed_files import ViewedFiles
@@ -65,6 +65,7 @@ def draw_files(
     *,
     fit_planes: bool,
     through: str | None = None,
+    loading: tuple[StreamingSettings, float] | None = None,
     reference: Path | None = None,
     overwrite: bool = False,
     ready: Callable[[CameraPath, Scenes], None] = lambda path, scenes: None,
@@ -80,6 +81,8 @@ def draw_files(
             if the cameras do not depend on one.
         fit_planes: move the near and the far plane apart where cameras are chosen for the scenes.
         through: one of `rounding.ROUND_TRIPS`, after which splats are drawn.
+        loading: how chunks get to the viewer, and how many seconds after a page was opened pictures are of, each of a
+            visitor who opened it in front of that camera; None where every chunk is there.
         reference: the file whose pictures are compared with these: the difference is written.
         overwrite: replace files that exist.
         ready: called with the cameras and the scenes before the first picture is drawn.
@@ -97,20 +100,26 @@ def draw_files(
     output, settings = place(path)
     ready(path, scenes())
     other = None
-    source = _finder(scenes(), budget, lod)
+    source = _source(scenes(), budget, lod, loading)
     if reference is not None:
         plain = dataclasses.replace(files, instances=instances_of([reference]))
-        other = _finder(plain.read(), budget, lod)
+        other = _source(plain.read(), budget, lod)
     pictures = write_pictures(
         source, path, output, render, settings, reference=other, overwrite=overwrite, progress=files.progress
     )
     return Drawn(pictures, path, output, render)
 
 
-def _finder(scenes: Scenes, budget: Budget | None, lod: LodSettings) -> CutFinder:
+def _source(
+    scenes: Scenes, budget: Budget | None, lod: LodSettings, loading: tuple[StreamingSettings, float] | None = None
+) -> CutSource:
     settings = None if budget is None else dataclasses.replace(lod, budget=budget.of(scenes.leaves))
     try:
-        return CutFinder(scenes, settings)
+        if loading is None or settings is None or not scenes.trees:
+            return CutFinder(scenes, settings)
+        from ..simulation.loading import LoadingCuts
+
+        return LoadingCuts(scenes, settings, *loading)
     except ValueError as error:
         raise UnfitError(str(error)) from None
 

@@ -82,4 +82,5 @@ def prepare(
         start = start_of(extents, settings.look_at, up, FOV if settings.fov is None else settings.fov)
     look = Look(start, up, settings.budget, path)
     site = site_of(shown, extents, look, libraries, up=settings.up, served=served)
-    return Prepared(site, shown, [*libraries.notes(), *(path.notes if path else ())])
+    notes = [file.note for file in shown if file.note is not None]
+    return Prepared(site, shown, [*libraries.notes(), *notes, *(path.notes if path else ())])

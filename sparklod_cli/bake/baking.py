@@ -101,6 +101,12 @@ def bake(
             splats, tree, leaves, dropped = _kept(scenes, settings, clock)
         else:
             splats, tree, leaves, dropped = _built(scenes, settings, output, clock, threads, progress)
+        if output.in_chunks:
+            with on_threads(threads):
+                from ..lod.chunk_order import arrange
+
+                splats, tree = arrange(splats, tree, progress=progress)
+            clock.end("arrange")
         written = output.write(Scene(splats, tree, antialiased), threads, progress)
         clock.end("write")
     return Baked(

@@ -63,6 +63,7 @@ def inspect(ctx: click.Context, /, files: tuple[Path, ...], **_: Any) -> None:
             by=output.plot_by,
             html=output.html,
             overwrite=output.overwrite,
+            chunks=output.table(),
         )
         drawn.check()
         expected = checks.expectations()
@@ -94,8 +95,10 @@ def _report_settings(checks: Checks, output: Output, expected: Expectations | No
     drawn = output.html is not None or output.plot is not None
     printed = not (as_json or field or checks.holds)
     return ReportSettings(
-        headers_only=field.partition(".")[0] in HEADER_FIELDS and not (drawn or everything or checks.holds),
+        headers_only=field.partition(".")[0] in HEADER_FIELDS
+        and not (drawn or everything or checks.holds or output.chunks_out),
         values=everything or drawn or printed,
         all_quantities=everything or output.html is not None,
         check=checks.holds or field.startswith("findings"),
+        chunks=output.chunks or output.chunks_out is not None or field.startswith("chunks"),
     )

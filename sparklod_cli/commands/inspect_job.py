@@ -71,6 +71,8 @@ class Job:
         except SparklodError as error:
             self.console.error(f"{name}: {error}")
             status = 1
+        if report.format is not None and self.settings.report.chunks:
+            status = max(status, self._print_chunks(name, report))
         for quantity, text in found.histograms.items():
             click.echo(f"\n  {quantity}\n{text}")
         if found.picture is not None:
@@ -82,6 +84,19 @@ class Job:
         elif found.problem is not None:
             self.console.say(f"{name}: no picture on the page: {found.problem}")
         return status
+
+    def _print_chunks(self, name: str, report: Report) -> int:
+        """Prints the table of the chunks, or says where it is; the exit status."""
+        from ..inspection.chunks import lines as lines_of_chunks
+
+        if report.chunks is None:
+            self.console.error(f"{name}: its chunks cannot be told, for it does not hold all of its splats")
+            return 1
+        if self.output.chunks and not self.general.as_json:
+            click.echo("\n".join(lines_of_chunks(report.chunks)))
+        if self.drawn.chunks is not None:
+            self.console.say(f"{self.drawn.chunks.path}  table of {count_of(len(report.chunks), 'chunk')}")
+        return 0
 
     def _print(self, name: str, report: Report) -> None:
         """What belongs on standard output of one file."""

@@ -15,7 +15,7 @@ import click
 
 from ..images.defaults import THUMBNAIL_SIZE, THUMBNAIL_SUPERSAMPLE
 from .command import COMMON, Command
-from .options import appearance, cameras, comparison, cut, inputs, pictures
+from .options import appearance, cameras, comparison, cut, inputs, pictures, streaming
 from .options.camera_options import camera_options
 from .options.common import General, common_options
 from .paths import claim_stdout, keep_apart
@@ -40,12 +40,14 @@ Examples:
   sparklod render scene-lod.spz --orbit 120 -o orbit.mp4             # or .webm, .gif, .webp
   sparklod render scene-lod.spz --camera-path path.json -o 'frames/out.%04d.png' --jobs 4
   sparklod render scene-lod.spz --budget 5% --color-by level -o levels.png
+  sparklod render scene-lod.rad --after 1s --bandwidth 20Mbit --latency 60ms -o after-1s.png
   sparklod render scene-lod.spz --full --through packed --diff scene-lod.spz -o rounding.png
   sparklod render scene-lod.spz --orbit 6 --compare --budget 5%,25% --assert '25%:psnr>30'   # exit status 3
 """
 
 HEADINGS = (
-    *(COMMON, inputs.HEADING, cameras.HEADING, cut.HEADING, appearance.HEADING, comparison.HEADING, pictures.HEADING),
+    *(COMMON, inputs.HEADING, cameras.HEADING, cut.HEADING, streaming.HEADING),
+    *(appearance.HEADING, comparison.HEADING, pictures.HEADING),
 )
 
 
@@ -56,6 +58,7 @@ class RenderOptions:
     inputs: inputs.Inputs
     cameras: cameras.PictureCameras
     cut: cut.PictureCut
+    streaming: streaming.PictureStreaming
     appearance: appearance.Appearance
     comparison: comparison.Comparison
     pictures: pictures.Pictures
@@ -72,6 +75,7 @@ class RenderOptions:
             options_of(ctx, inputs.Inputs),
             options_of(ctx, cameras.PictureCameras),
             options_of(ctx, cut.PictureCut),
+            options_of(ctx, streaming.PictureStreaming),
             options_of(ctx, appearance.Appearance),
             options_of(ctx, comparison.Comparison),
             options_of(ctx, pictures.Pictures),
@@ -81,6 +85,9 @@ class RenderOptions:
         asked.pictures.check(ctx)
         asked.cameras.check(ctx)
         asked.cut.check(ctx)
+        asked.streaming.check(ctx)
+        if asked.streaming.after is not None:
+            exclude(ctx, ["full", "continuous", "compare"], "--after")
         asked.appearance.check(ctx)
         claim_stdout(ctx, "output", as_json=asked.general.as_json)
         if not asked.pictures.thumbnail:
@@ -95,6 +102,7 @@ class RenderOptions:
 @inputs.input_options
 @functools.partial(camera_options, still=True)
 @functools.partial(cut.cut_options, pictures=True)
+@functools.partial(streaming.streaming_options, pictures=True)
 @appearance.appearance_options
 @comparison.comparison_options
 @functools.partial(common_options, json="Print what was drawn as one JSON object on standard output.")
@@ -137,7 +145,7 @@ def _draw(ctx: click.Context, asked: RenderOptions) -> None:
 
         def ready(path: CameraPath, scenes: Scenes) -> None:
             notes = [*path.notes, *scenes.notes, *_upside_down(asked, scenes)]
-            unused = given(ctx, cut.CUTS)
+            unused = given(ctx, (*cut.CUTS, *streaming.OF_LOADING))
             if unused and not scenes.trees:
                 unused_flags = ", ".join(unused)
                 notes.append(f"no file is a Level-of-Detail tree, so all splats are drawn; no effect: {unused_flags}")
@@ -154,6 +162,7 @@ def _draw(ctx: click.Context, asked: RenderOptions) -> None:
                 place,
                 fit_planes=fit_planes(ctx),
                 through=look.through,
+                loading=asked.streaming.loading(),
                 reference=asked.comparison.diff,
                 overwrite=asked.pictures.overwrite,
                 ready=ready,

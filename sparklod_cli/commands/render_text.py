@@ -24,7 +24,9 @@ def report(console: Console, drawn: Drawn, seconds: float, *, as_json: bool) -> 
         as_json: print one JSON object on standard output.
     """
     written, output, settings = drawn.pictures, drawn.output, drawn.render
-    if written.empty:
+    if not any(frame["splats"] for frame in written.frames):
+        console.say("warning: the picture is empty, for the first chunk has not arrived yet (--after)")
+    elif written.empty:
         console.say(
             "warning: nothing is in view; cameras and scene may not share their axes (--camera-axes,"
             " --world-transform, --up), or nothing lies between --near and --far"

@@ -15,7 +15,7 @@ from ..codecs.rad_layout import PROPERTIES, Row
 from ..codecs.spz_layout import LOD, Layout
 from ..model.scene import Scene
 from ..model.sh import COEFFICIENTS
-from ..model.splats import Splats
+from ..model.splats import FloatArray, Splats
 from .rad import PropertyFacts, RadFacts
 
 #: Largest differences of the codes of one splat: writers round, truncate or go through float16. SPZ's codes of SH keep
@@ -24,10 +24,14 @@ STEPS, SH_STEPS, F32_STEPS = 1, 16, 64
 
 #: Largest angle in degrees between two codes of one rotation: by the bytes of an SPZ code, and by RAD's encoding.
 DEGREES = {3: 14.0, 4: 0.8}
-RAD_DEGREES = {"oct88r8": 4.0, "f16": 0.2, "f32": 0.2}
+#: As f16 and f32 it has no w, which is the less exact the nearer it is to 0.
+RAD_DEGREES = {"oct88r8": 4.0, "f16": 4.0, "f32": 0.2}
 
 #: The columns of SPZ whose codes may differ by a step, in the order in which `Coded.numbers` has them.
 COLUMNS = ("center", "opacity", "rgb", "scale", "sh")
+
+#: Most bits after the binary point of centres that were rounded: those of SPZ.
+MOST_BITS = 24
 
 #: Encodings of RAD that only order the bytes of another one in a way that compresses better.
 PLAIN = {"f32_lebytes": "f32", "f16_lebytes": "f16", "r8_delta": "r8", "s8_delta": "s8"}
@@ -87,8 +91,13 @@ def of_spz(scene: Scene) -> Coding:
     return Coding(encode, steps, DEGREES[3 if version == 2 else 4])
 
 
-def of_rad(facts: RadFacts) -> Coding | str:
-    """The coding of a RAD file; or why there is none. A palette of SH, whose entries stand for many, is left out."""
+def of_rad(facts: RadFacts, leaves: Splats) -> Coding | str:
+    """The coding of a RAD file; or why there is none. A palette of SH, whose entries stand for many, is left out.
+
+    Args:
+        facts: of the file.
+        leaves: its leaves, whose centres may have been rounded to multiples of a power of two.
+    """
     mixed = [name for name, found in facts.properties.items() if "," in found.encoding]
     if mixed:
         return f"its chunks have {mixed[0]} in several encodings, in which leaves cannot be compared"
@@ -98,12 +107,18 @@ def of_rad(facts: RadFacts) -> Coding | str:
         if row.name in facts.properties and row.option and not row.codes and row.name != "orientation"
     ]
     properties = [(row, found, plain or found.encoding) for row, found, plain in compared]
+    bits = _fractional_bits(leaves.center)
     steps = [np.full(row.numbers, F32_STEPS if name == "f32" else STEPS) for row, _, name in properties]
+    if bits is not None and properties[0][0].name == "center":
+        steps[0][:] = STEPS
     rotation = facts.properties["orientation"].encoding if "orientation" in facts.properties else "oct88r8"
 
     def numbers_of(splats: Splats) -> Iterator[NDArray[Any]]:
         for row, found, name in properties:
-            yield _rad_codes(splats, row, found, name)
+            if row.name == "center" and name == "f32" and bits is not None:
+                yield np.round(splats.center.astype(np.float64) * 2.0**bits).astype(np.int32)
+            else:
+                yield _rad_codes(splats, row, found, name)
 
     def encode(splats: Splats) -> Coded:
         numbers = np.concatenate(list(numbers_of(splats)), axis=1)
@@ -112,6 +127,18 @@ def of_rad(facts: RadFacts) -> Coding | str:
         return Coded(_rows(parts), numbers, splats.quat_xyzw)
 
     return Coding(encode, np.concatenate(steps), RAD_DEGREES[rotation])
+
+
+def _fractional_bits(center: FloatArray) -> int | None:
+    """Bits after the binary point that all coordinates do with; None where they are not rounded, or need too many."""
+    most = float(np.abs(center).max(initial=0))
+    for bits in range(MOST_BITS + 1):
+        scaled = center * np.float32(2.0**bits)
+        if not most * 2.0**bits < 1 << 30:
+            return None
+        if (scaled == np.round(scaled)).all():
+            return bits
+    return None
 
 
 def _rad_codes(splats: Splats, row: Row, found: PropertyFacts, encoding: str) -> NDArray[np.int32]:

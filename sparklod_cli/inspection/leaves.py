@@ -42,7 +42,7 @@ def check(scene: Scene, original: Scene, facts: RadFacts | None = None) -> list[
         return [Finding("expect.leaves", f"{found}, but {expected} of the original can be drawn")]
     if leaves.sh_degree != splats.sh_degree:
         return [Finding("expect.leaves", f"SH degree {leaves.sh_degree}, but the original has {splats.sh_degree}")]
-    coding = of_spz(scene) if facts is None else of_rad(facts)
+    coding = of_spz(scene) if facts is None else of_rad(facts, leaves)
     if isinstance(coding, str):
         return [Finding("expect.leaves", coding)]
     missing = _unpaired(coding.encode(leaves), coding.encode(splats), coding)

@@ -17,7 +17,8 @@ from ..support.errors import FormatError, SparklodError
 from ..support.printable import printable
 from ..support.progress import Progress, silent
 from ..support.untrusted import QUOTED
-from . import arrays, rad, tree, values
+from ..tables.columns import Row
+from . import arrays, chunks, rad, tree, values
 from .findings import Finding
 
 #: Version of the report: counts up when a field changes its meaning or is removed. schema.json describes this one.
@@ -43,9 +44,11 @@ class ReportSettings:
         values: statistics of the splats.
         all_quantities: all of their quantities, instead of the main ones.
         check: findings.
+        chunks: a row for each chunk.
         headers_only: read no more than the headers of a RAD file; its tree and values are left out.
     """
 
+    chunks: bool = False
     headers_only: bool = False
     values: bool = False
     all_quantities: bool = False
@@ -69,6 +72,7 @@ class Report:
         rad: what the headers of a RAD file tell; None for other formats.
         tree: facts of the Level-of-Detail tree; None without one.
         values: statistics of the splats; None if not asked for.
+        chunks: a row for each chunk, see `chunks.COLUMNS`; None if not asked for.
         findings: None if not asked for, unless the file could not be read.
     """
 
@@ -85,6 +89,7 @@ class Report:
     rad: rad.RadFacts | None = None
     tree: tree.TreeFacts | None = None
     values: values.ValueFacts | None = None
+    chunks: list[Row] | None = None
     findings: list[Finding] | None = None
 
     def fails(self, severity: str) -> bool:
@@ -131,7 +136,7 @@ def inspect(
         threads: to read with.
         progress: called while the file is read.
     """
-    columns = COLUMNS if settings.values or settings.check else TREE_COLUMNS
+    columns = COLUMNS if settings.values or settings.check or settings.chunks else TREE_COLUMNS
     size = size_of_input(path)
     surveyed = None
     try:
@@ -200,6 +205,7 @@ def _of_scene(
         rad=None if surveyed is None else surveyed.facts,
         tree=facts,
         values=values.examine(splats, all_quantities=settings.all_quantities) if settings.values else None,
+        chunks=chunks.rows_of(scene) if settings.chunks else None,
         findings=findings if settings.check else None,
     )
 

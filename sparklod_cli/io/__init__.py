@@ -1,6 +1,7 @@
 """The only package that opens paths: tells formats, reads scenes, and writes files whole or not at all."""
 
 from .beside import companions
+from .chunks import read_rad_chunk, read_rad_header
 from .names import is_file_name
 from .reading import examine_scene, opened, read_arrays, read_scene, size_of_input
 from .scenes import SceneSink, scene_sink
@@ -20,6 +21,8 @@ __all__ = [
     "is_file_name",
     "opened",
     "read_arrays",
+    "read_rad_chunk",
+    "read_rad_header",
     "read_rgba",
     "read_scene",
     "read_text",

@@ -63,6 +63,8 @@ def draw(
     Raises:
         BackendError: the backend cannot draw here.
     """
+    if not len(splats.center):  # no chunk has arrived yet
+        return np.zeros((camera.height, camera.width, 4), np.float32)
     if style == "splats":
         return BACKENDS[backend].draw(splats, camera, settings, **(options or {}))
     seen = on_screen(splats, camera, settings)
@@ -115,7 +117,8 @@ def overdraw(splats: ShadedSplats, camera: Camera, settings: RasterSettings) -> 
     Splats are those that the backend numba draws.
     """
     counts = np.zeros((camera.height, camera.width), np.int32)
-    bands.count_fragments(
-        rasterizer.seen(splats, camera, settings), settings.profile == "shifted", np.float32(MIN_ALPHA), counts
-    )
+    if len(splats.center):
+        bands.count_fragments(
+            rasterizer.seen(splats, camera, settings), settings.profile == "shifted", np.float32(MIN_ALPHA), counts
+        )
     return counts.astype(np.float32)

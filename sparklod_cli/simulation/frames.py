@@ -33,6 +33,7 @@ class Frame:
         number: number of the frame on the path.
         camera: its camera.
         cut: the cut that is drawn.
+        resident: (chunks,) bool, of all trees, the chunks that it was found with.
         rows: the row of all instances together, then one per instance, if requested.
         in_front: share of the drawn splats in front of the camera.
     """
@@ -40,6 +41,7 @@ class Frame:
     number: int
     camera: Camera
     cut: TreeCut
+    resident: NDArray[np.bool_]
     rows: list[Row]
     in_front: float
 
@@ -100,12 +102,12 @@ class Simulation:
         found = ordered_map(self._find, path.cameras, threads)
         for at, (number, camera, ideal) in enumerate(zip(path.numbers, path.cameras, found, strict=True)):
             stream.advance(max(camera.time, stream.now))
-            drawn, chunks = self._fetched(camera, ideal, stream)
+            drawn, resident, chunks = self._fetched(camera, ideal, stream)
             rows = self._rows(number, camera, drawn, changes.next(drawn.cut))
             rows[0] |= chunks
             whole = drawn.whole
             in_front = 1 - whole.behind / whole.selected if whole.selected else 1.0
-            yield Frame(number, camera, drawn.cut, [_rounded(row) for row in rows], in_front)
+            yield Frame(number, camera, drawn.cut, resident, [_rounded(row) for row in rows], in_front)
             progress("traverse", at + 1, len(path.cameras), "frame")
 
     def _warm_up(self, camera: Camera) -> None:
@@ -129,25 +131,28 @@ class Simulation:
         )
         return _MeasuredCut(cut, whole, parts, seconds)
 
-    def _fetched(self, camera: Camera, ideal: _MeasuredCut, stream: Stream) -> tuple[_MeasuredCut, Row]:
-        """The cut with the resident chunks, and the cells of the row that describe chunks."""
+    def _fetched(
+        self, camera: Camera, ideal: _MeasuredCut, stream: Stream
+    ) -> tuple[_MeasuredCut, NDArray[np.bool_], Row]:
+        """The cut with the resident chunks, these chunks, and the cells of the row that describe chunks."""
         wanted = ideal.cut.chunks()
         instant = self._streaming.network.instant
         if instant:
             stream.want(wanted)
-        drawn = ideal
+        drawn, resident = ideal, stream.cache.resident()
         if not all(chunk in stream.cache for chunk in wanted):
-            drawn = self._find(camera, stream.cache.resident())
+            drawn = self._find(camera, resident)
         if not instant:
             stream.want(drawn.cut.chunks())  # a viewer discovers chunks through those that it has
         arrived = stream.take_arrivals()
-        return drawn, {
+        cells: Row = {
             "chunks_touched": len(stream.cache.wanted),
             "chunks_new": len(arrived),
             "bytes_new": stream.take_bytes(),
             "chunks_resident": len(stream.cache),
             "complete_in_s": None if instant else stream.complete_in(wanted),
         }
+        return drawn, resident, cells
 
     def _rows(
         self, number: int, camera: Camera, drawn: _MeasuredCut, changes: Sequence[tuple[int, int | None, int]]

@@ -12,7 +12,7 @@ from ..cameras.camera import Camera
 from ..lod.settings import LodSettings
 from ..lod.traversal import TreeCut
 from ..model.nodes import CHUNK_BITS
-from ..scenes.finder import view_of
+from ..scenes.finder import CutFinder, view_of
 from ..scenes.loaded import Cut, Scenes
 from ..tables.columns import Row
 from .chunk_cache import Chunks, header_answers
@@ -41,10 +41,10 @@ class Arrival:
 
 
 class Loader:
-    """Opens a page with scenes that are all trees, for one camera after another.
+    """Opens a page with scenes, for one camera after another.
 
     Args:
-        scenes: the scenes.
+        scenes: with trees; others are there from the beginning.
         settings: of the cuts; continuous cuts are not simulated.
         streaming: network and cache.
 
@@ -95,7 +95,7 @@ class Loader:
                 break
         return {column.name: column.rounded(figures[column.name]) for column in LOADING}
 
-    def cut_at(self, camera: Camera, seconds: float) -> Cut:
+    def cut_after(self, camera: Camera, seconds: float) -> Cut:
         """What is drawn for a camera so many seconds after the page was opened in front of it."""
         resident = np.zeros(len(self._chunks), np.bool_)
         for arrival in self.arrivals(camera):
@@ -115,6 +115,31 @@ class Loader:
             chunks, splats = np.unique(nodes >> CHUNK_BITS, return_counts=True)
             counts[int(view["chunk_base"]) + chunks.astype(np.int64)] += splats
         return counts
+
+
+class LoadingCuts:
+    """What visitors see who opened the page so many seconds ago, each in front of a camera of their own.
+
+    Args:
+        scenes: some or all of them trees; those that are none are there from the beginning.
+        settings, streaming: as of `Loader`.
+        seconds: since then.
+
+    Raises:
+        ValueError: as `Loader`.
+    """
+
+    def __init__(self, scenes: Scenes, settings: LodSettings, streaming: StreamingSettings, seconds: float) -> None:
+        self._loader = Loader(scenes, settings, streaming)
+        self._seconds = seconds
+
+    def cut(self, camera: Camera) -> Cut:
+        """What the visitor in front of a camera sees."""
+        return self._loader.cut_after(camera, self._seconds)
+
+    def candidates(self) -> Cut:
+        """All that some camera may see, sooner or later."""
+        return CutFinder(self._loader.scenes, self._loader.settings).candidates()
 
 
 def chunks_of(scenes: Scenes) -> Chunks:

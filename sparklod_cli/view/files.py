@@ -6,6 +6,7 @@ A site is a closed table of names: whatever is not in it is not served, so no na
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,16 +15,25 @@ from urllib.parse import quote
 from ..codecs.formats import FORMATS, HEAD, sniff
 from ..codecs.rad_header import MAGIC, Header, read_header
 from ..codecs.sog_files import META
-from ..io.beside import companions, in_folder
 from ..io.names import leads_away, reason_of
 from ..io.plain import open_plain
-from ..support.errors import FormatError, UnknownFormatError, UnreadableError
+from ..model.nodes import CHUNK_NODES
+from ..support.errors import FormatError, NotSplatsError, UnknownFormatError, UnreadableError
 from ..support.untrusted import quoted_value
 
-#: What Spark calls the formats that sparklod reads; a SOG is something else where it is unpacked.
-SPARK_TYPES = {"compressed PLY": "ply", "PLY": "ply", "SPZ": "spz", "KSPLAT": "ksplat", "SPLAT": "splat"}
-SPARK_TYPES |= {"SOG": "pcsogszip", "RAD": "rad"}
-UNPACKED_SOG = "pcsogs"
+#: What Spark calls the formats that sparklod reads.
+SPARK_TYPES = {
+    "compressed PLY": "ply",
+    "PLY": "ply",
+    "SPZ": "spz",
+    "KSPLAT": "ksplat",
+    "SPLAT": "splat",
+    "SOG": "pcsogszip",
+    "RAD": "rad",
+}
+
+#: How files begin that sparklod reads and Spark 2.2.0 does not, and what they are.
+UNREAD = ((rb"NGSP", "SPZ version 4"), (rb"ply\s+format (?!binary_little)", "PLY that is ascii or big-endian"))
 
 #: Media types by suffix; anything else is bytes.
 MEDIA_TYPES = {
@@ -45,13 +55,14 @@ class ShownFile:
     """A splat file that the page shows.
 
     Attributes:
-        path: as the user gave it; of an unpacked SOG, of its meta.json.
+        path: as the user gave it.
         name: for display.
         url: where the page finds it, relative to the page.
         format: for display: "RAD", "SPZ".
         spark_type: what Spark calls its format.
         header: of a RAD file.
         files: itself and what it refers to, by the names that it is served under.
+        note: why Spark will not show it; None where nothing is known against it.
     """
 
     path: Path
@@ -61,6 +72,12 @@ class ShownFile:
     spark_type: str
     header: Header | None
     files: Mapping[str, Path]
+    note: str | None = None
+
+    @property
+    def paged(self) -> bool:
+        """Whether Spark can load it chunk by chunk."""
+        return self.header is not None and self.header.lod_tree and self.header.chunk_size == CHUNK_NODES
 
     @property
     def bytes(self) -> int:
@@ -98,9 +115,8 @@ def _named(path: Path, folder: str) -> ShownFile:
 
 
 def _shown(path: Path, folder: str) -> ShownFile:
-    given = path
-    if path.is_dir():
-        path = in_folder(path)
+    if path.is_dir() or path.name == META:
+        raise NotSplatsError("Spark does not read an unpacked SOG; zip its files into a .sog")
     if path.exists() and not path.is_file():
         raise UnreadableError("it is a pipe or a device; save it to a file first")
     header = None
@@ -111,19 +127,28 @@ def _shown(path: Path, folder: str) -> ShownFile:
             header = read_header(file)
     if not head:
         raise UnreadableError("the file is empty")
-    found = sniff(head, path.suffix)
-    if found is None:
+    form = sniff(head, path.suffix)
+    if form is None:
         raise UnknownFormatError(f"not a splat file that sparklod reads ({', '.join(form.name for form in FORMATS)})")
-    form = found.name
-    files = {f"{folder}/{path.name}": path.resolve()}
+    name = f"{folder}/{path.name}"
+    files = {name: path.resolve()}
     if header is not None:
-        files |= {f"{folder}/{name}": beside for name, beside in _chunk_files(path, header)}
-    unpacked = form == "SOG" and path.name == META
-    if unpacked:
-        files |= {f"{folder}/{beside.name}": _inside(path, beside) for beside in companions(path, ())}
-    name = given.resolve().name if given.is_dir() else path.name
-    spark_type = UNPACKED_SOG if unpacked else SPARK_TYPES[form]
-    return ShownFile(path, name, url_of(f"{folder}/{path.name}"), form, spark_type, header, files)
+        files |= {f"{folder}/{chunk}": beside for chunk, beside in _chunk_files(path, header)}
+    note = _note(path.name, head, header)
+    return ShownFile(path, path.name, url_of(name), form.name, SPARK_TYPES[form.name], header, files, note)
+
+
+def _note(name: str, head: bytes, header: Header | None) -> str | None:
+    """Why Spark will not show a file, as far as its beginning tells."""
+    for beginning, what in UNREAD:
+        if re.match(beginning, head):
+            return f"{name}: Spark 2.2.0 does not read {what}; bake it first with sparklod build-lod"
+    if header is not None and header.chunked and header.lod_tree and header.chunk_size != CHUNK_NODES:
+        return (
+            f"{name}: Spark streams chunks of {CHUNK_NODES:,} nodes, not of {header.chunk_size:,}; write it anew with"
+            " sparklod build-lod"
+        )
+    return None
 
 
 def _chunk_files(path: Path, header: Header) -> Iterator[tuple[str, Path]]:

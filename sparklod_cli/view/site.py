@@ -126,6 +126,7 @@ def _file(shown: ShownFile, extent: Extent) -> dict[str, Any]:
         "splats": extent.splats,
         "leaves": extent.leaves,
         "chunks": None if shown.header is None else len(shown.header.chunks),
+        "paged": shown.paged,
         "chunked": shown.header is not None and shown.header.chunked,
     }
 

@@ -43,7 +43,7 @@ INPUTS: dict[str, dict[str, tuple[object, ...]]] = {
 #: How each command is told to write the file Y, by the parameter that says so.
 OUTPUTS: dict[str, dict[str, tuple[str, ...]]] = {
     "build-lod": {"output": ("-o", "Y")},
-    "inspect": {"plot": ("--plot", "Y"), "html": ("--html", "Y")},
+    "inspect": {"plot": ("--plot", "Y"), "html": ("--html", "Y"), "chunks_out": ("--chunks-out", "Y")},
     "traverse": {"output": ("-o", "Y"), "plot": ("--plot", "Y")},
     "render": {"output": ("-o", "Y"), "plot": ("--compare", "--plot", "Y")},
     "view": {},
@@ -106,7 +106,7 @@ def test_an_output_that_is_an_input_is_refused(
 
 @pytest.mark.parametrize("command", ["inspect", "traverse"])
 def test_two_outputs_are_two_files(command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    one, two = OUTPUTS[command].values()
+    one, two, *_ = OUTPUTS[command].values()
     target = str(tmp_path / f"y{SUFFIXES[command]}")
     arguments = [target if argument == "Y" else argument for argument in (*one, *two)]
     assert run([command, str(LOD), *arguments]) == 2

@@ -150,13 +150,15 @@ def test_hooks_name_what_there_is() -> None:
         assert shlex.split(hook["entry"])[:3] == ["sparklod", "inspect", "--check"]
 
 
-@pytest.mark.parametrize("name", ["scene.spz", "web/scene-lod.spz", "a b/c.d.spz"])
+@pytest.mark.parametrize("name", ["scene.spz", "web/scene-lod.spz", "a b/c.d.spz", "scene-lod.rad"])
 @pytest.mark.parametrize("files", [OURS["files"], LOCAL["files"]])
 def test_hooks_look_at_splat_files(files: str, name: str) -> None:
     assert re.search(files, name)
 
 
-@pytest.mark.parametrize("name", ["scene.spz.md", "spz", "scenespz", "scene.spz/readme", "splat.py", "x.plyx"])
+@pytest.mark.parametrize(
+    "name", ["scene.spz.md", "spz", "scenespz", "scene.spz/readme", "splat.py", "x.plyx", "a-0.radc"]
+)
 @pytest.mark.parametrize("files", [OURS["files"], LOCAL["files"]])
 def test_hooks_leave_other_files_alone(files: str, name: str) -> None:
     assert not re.search(files, name)
@@ -223,6 +225,16 @@ def test_the_script_stops_at_a_broken_tree(web: Path, shell: Shell) -> None:
     assert done.returncode == 3
     assert "stay here" in done.stderr
     assert shell(script).returncode == 1  # there is no number of leaves to print
+
+
+def test_the_script_for_streamed_files_bakes_and_checks(project: Path, shell: Shell) -> None:
+    script = blocks(CI, "sh")[1]
+    done = shell(script)
+    assert (done.returncode, done.stdout) == (0, "")
+    assert len((project / "web" / "demo-lod.rad.csv").read_text().splitlines()) == 2
+    done = shell(script.replace("first_bytes<2MB", "first_bytes<20kB"))
+    assert done.returncode == 3
+    assert "expect.value: first_bytes<20kB" in done.stdout
 
 
 # --- Expectations -----------------------------------------------------------------------------------------------------

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from sparklod_cli.codecs import rad_header
 from sparklod_cli.io import read_scene
 from tests.conftest import FIXTURES, ROOT
 
@@ -22,6 +23,9 @@ TREE = FIXTURES / "golden" / "tree-v3.spz"
 #: Modules in this folder replace packages that take seconds to load.
 WITHOUT = Path(__file__).parent / "without"
 ENVIRONMENT = {**os.environ, "NO_COLOR": "1", "PYTHONPATH": f"{WITHOUT}{os.pathsep}{ROOT}"}
+
+#: The arguments that write a tree as a header and a file for its chunk.
+CHUNKED = ["build-lod", DEMO, "--format", "rad-chunked", "-o"]
 
 #: The arguments of each command, and the name of its output, which is added to them.
 WRITERS: dict[str, tuple[Sequence[object], str]] = {
@@ -59,7 +63,11 @@ def said_one_error(err: str) -> str:
 
 def check_whole(path: Path) -> None:
     """Asserts that an output is complete."""
-    if path.suffix == ".spz":
+    if path.suffix == ".radc":
+        with path.open("rb") as file:
+            header = rad_header.read_chunk_header(file)
+        assert path.stat().st_size == header.bytes + header.payload_bytes
+    elif path.suffix in (".spz", ".rad"):
         scene = read_scene(path)
         assert scene.tree is not None
         scene.tree.validate()

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.faults.runs import DEMO, SMALL, TREE, WRITERS, mounted, said_one_error, shell, sparklod
+from tests.faults.runs import CHUNKED, DEMO, SMALL, TREE, WRITERS, mounted, said_one_error, shell, sparklod
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="Windows has other file systems")
 
@@ -45,6 +45,20 @@ def test_a_disk_that_fills_up_keeps_the_file_to_be_replaced(tmp_path: Path) -> N
         assert "no space left" in said_one_error(done.stderr)
         assert target.read_bytes() == TREE.read_bytes()
         assert list(disk.iterdir()) == [target]
+
+
+@pytest.mark.parametrize("existing", [False, True])
+def test_chunks_on_a_disk_that_fills_up_change_nothing(existing: bool, tmp_path: Path) -> None:
+    before = {"demo-0.radc": b"old chunk", "demo-7.radc": b"old chunk", "demo.rad": b"old header"} if existing else {}
+    with mounted(tmp_path / "disk", "size=64k") as disk:
+        for name, data in before.items():
+            (disk / name).write_bytes(data)
+        done = sparklod(*CHUNKED, disk / "demo.rad", "--overwrite")
+        assert done.returncode == 1
+        line = said_one_error(done.stderr)
+        assert "no space left" in line
+        assert str(disk / "demo.rad") in line
+        assert {path.name: path.read_bytes() for path in disk.iterdir()} == before
 
 
 def test_what_is_written_before_the_disk_is_full_is_whole(tmp_path: Path) -> None:
@@ -92,9 +106,9 @@ def test_a_full_standard_output_is_one_error(name: str) -> None:
     assert "Exception ignored" not in done.stderr
 
 
-@pytest.mark.parametrize("name", ["build-lod", "traverse"])
+@pytest.mark.parametrize("name", ["build-lod", "build-lod in chunks", "traverse"])
 def test_a_read_only_folder_is_one_error(name: str, tmp_path: Path) -> None:
-    arguments, output = WRITERS[name]
+    arguments, output = WRITERS.get(name, (CHUNKED, "demo.rad"))
     with mounted(tmp_path / "disk", "size=64k,ro") as disk:
         done = sparklod(*arguments, disk / output)
         assert done.returncode == 1

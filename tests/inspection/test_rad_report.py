@@ -211,6 +211,29 @@ def test_leaves_of_files_that_spark_wrote_are_the_splats_of_their_scenes(
     capsys.readouterr()
 
 
+ENCODINGS = [
+    "",
+    "--rad-center f16 --rad-alpha f16 --rad-rgb f16 --rad-scales ln_f16 --rad-orientation f16 --rad-sh f16",
+    "--rad-center f32 --rad-alpha f32 --rad-rgb f32 --rad-scales f32 --rad-orientation f32 --rad-sh f32",
+    "--rad-center f16_lebytes --rad-alpha r8 --rad-rgb r8_delta --rad-sh s8_delta",
+    "--cluster-sh 8",
+    "--format rad-chunked",
+]
+
+
+@pytest.mark.parametrize("options", ENCODINGS)
+@pytest.mark.parametrize("name", ["sh3.ply", "needle.ply"])
+def test_files_that_we_write_have_no_findings_and_the_leaves_of_their_scenes(
+    name: str, options: str, tmp_path: Path, capsys: Said
+) -> None:
+    source, path = str(FIXTURES / name), str(tmp_path / "a.rad")
+    assert run(["build-lod", source, "-o", path, "-q", *options.split()]) == 0
+    assert run(["inspect", path, "--check", "--leaves-of", source, "--fail-on", "warning"]) == 0
+    other = str(FIXTURES / "sh2.ply")
+    assert run(["inspect", path, "--leaves-of", other]) == 3
+    assert capsys.readouterr().out.count("expect.leaves") == 1
+
+
 def leaves_of(path: Path, change: Callable[[Scene], None]) -> list[str]:
     """Messages on a file whose original is its own leaves, changed."""
     original = read_scene(path)

@@ -19,7 +19,7 @@ from sparklod_cli.cli import run
 from sparklod_cli.codecs import spz
 from sparklod_cli.codecs.formats import FORMATS
 from sparklod_cli.codecs.options import WriteOptions
-from sparklod_cli.inspection import values
+from sparklod_cli.inspection import chunks, values
 from sparklod_cli.inspection.findings import CODES
 from sparklod_cli.inspection.report import SCHEMA_VERSION, ReportSettings, inspect, value_at
 from sparklod_cli.lod import quick
@@ -39,7 +39,7 @@ WAYS = {
     "values": ReportSettings(values=True),
     "stats": ReportSettings(values=True, all_quantities=True),
     "check": ReportSettings(check=True),
-    "all": ReportSettings(values=True, all_quantities=True, check=True),
+    "all": ReportSettings(chunks=True, values=True, all_quantities=True, check=True),
 }
 
 Report = dict[str, Any]
@@ -169,7 +169,8 @@ def holder(report: Any, way: tuple[Any, ...]) -> Any:
 @pytest.fixture
 def full(lod: Path) -> Report:
     """A report in which nothing is null that need not be."""
-    report = report_of(lod, ReportSettings(values=True, all_quantities=True, check=True))
+    report = report_of(lod, ReportSettings(chunks=True, values=True, all_quantities=True, check=True))
+    report["chunks"][0]["bytes"] = 1
     finding = {"severity": "error", "code": "tree.size", "message": "node 3", "index": 3, "count": 1}
     rad = report_of(FIXTURES / "golden" / "sh1-tree.rad", ReportSettings())["rad"]
     report = report | {"findings": [finding], "notes": ["a note"], "rad": rad}
@@ -180,13 +181,23 @@ def full(lod: Path) -> Report:
 def may_be_null(way: tuple[Any, ...]) -> bool:
     """Whether a field may be null in a report of a file that was read."""
     if len(way) == 1:
-        return way[0] in ("bytes", "bytes_per_splat", "compression_ratio", "rad", "tree", "values", "findings")
+        return way[0] in (
+            "bytes",
+            "bytes_per_splat",
+            "compression_ratio",
+            "rad",
+            "tree",
+            "values",
+            "chunks",
+            "findings",
+        )
     finding, level = way[0] == "findings", "levels" in way
     return (
         way in (("values", "box"), ("values", "box_98"), ("tree", "more_than_opaque"))
         or way in (("rad", "chunk_bytes"), ("rad", "ranges"), ("rad", "comment"))
         or (way[:2] == ("rad", "properties") and way[-1] in ("min", "max"))
         or (way[:2] == ("values", "quantities") and len(way) == 4)
+        or (way[0] == "chunks" and len(way) == 3 and way[-1] not in ("chunk", "base", "splats"))
         or (finding and way[-1] in ("index", "count"))
         or (level and way[-1] == "size")
     )
@@ -310,6 +321,7 @@ def test_the_page_has_every_field(full: Report) -> None:
     assert tops == SCHEMA["properties"].keys()
     for name in ("rad", "tree", "values"):
         assert {way.split(".")[1] for way in named if way.startswith(f"{name}.")} == full[name].keys()
+    assert {way.split(".")[2] for way in named if way.startswith("chunks.")} == {each.name for each in chunks.COLUMNS}
     assert {way.split(".")[2] for way in named if way.startswith("findings.")} == full["findings"][0].keys()
 
 

@@ -4,17 +4,29 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any
 
 import numpy as np
 import pytest
 
+from sparklod_cli.codecs.gpu import lod_tree
+from sparklod_cli.io import read_scene
+from sparklod_cli.lod.builders import BUILDERS
+from sparklod_cli.lod.settings import LodSettings
 from sparklod_cli.lod.traversal import Forest, Traversal, TreeCut, TreeInstance, View
 from sparklod_cli.model.foveation import Cones
+from sparklod_cli.model.instances import Instance
 from sparklod_cli.model.nodes import CHUNK_NODES, Nodes
+from sparklod_cli.model.scene import Scene
+from sparklod_cli.scenes.reading import read_scenes
+from sparklod_cli.simulation.frames import Simulation
+from sparklod_cli.simulation.streaming import Network, StreamingSettings
+from tests.conftest import real_scene
 from tests.interop.spark import NODE, PageUpdate, Spark
-from tests.interop.test_traversal import FOV_Y, FOVEATIONS, LOD_SCALES, Tree, baked, cameras, scene
+from tests.interop.test_traversal import FOV_Y, FOVEATIONS, LOD_SCALES, SPARKS_CONES, Tree, baked, cameras, scene
 from tests.lod.forests import links, transform
+from tests.simulation.paths import around
 
 
 def scattered(rng: np.random.Generator, count: int, chunks: int, most_children: int) -> Tree:
@@ -221,3 +233,49 @@ def test_the_cut_of_a_baked_scene_with_missing_chunks_is_that_of_spark(spark: Sp
         instance = TreeInstance(0, foveation=FOVEATIONS[number % len(FOVEATIONS)])
         reasons |= {paged.check([instance], camera, budget, 0.0).reason for budget in (3_000, 30_000, 300_000)}
     assert reasons >= {"budget", "missing"}
+
+
+@pytest.mark.parametrize("name", ["biker-spark.rad", "playbot-125k-spark/p-lod.rad"])
+def test_the_cut_of_a_file_of_spark_with_missing_chunks_is_that_of_spark(spark: Spark, name: str) -> None:
+    """Three chunks each, so that all that can be missing are tried."""
+    scene = read_scene(real_scene(f"rad/{name}"))
+    assert scene.tree is not None
+    tree = Tree.of(lod_tree.pack(scene.splats, scene.tree)["lod_tree"])
+    paged = Paged(spark, [tree], pages=4)
+    rng = np.random.default_rng(2)
+    for number in range(4):
+        paged.keep(np.array([True, bool(number & 1), bool(number & 2)]), rng)
+        for camera in cameras(tree.nodes, 5, seed=number):
+            for budget in (1_000, 20_000, 150_000):
+                paged.check([TreeInstance(0, foveation=SPARKS_CONES)], camera, budget, 0.0)
+
+
+@cache
+def robot() -> Scene:
+    """A tree of eleven chunks."""
+    return Scene(*BUILDERS["quick"].load().build(read_scene(scene("playbot.sog")).splats))
+
+
+@pytest.mark.parametrize("capacity", [None, 6])
+def test_a_simulated_flight_is_that_of_spark(spark: Spark, capacity: int | None) -> None:
+    """Frame by frame, with the chunks that are resident in the simulation in Spark's pages."""
+    whole = robot()
+    assert whole.tree is not None
+    scenes = read_scenes([Instance(whole, "playbot")], precision="float16")
+    paged = Paged(spark, [Tree.of(lod_tree.pack(whole.splats, whole.tree)["lod_tree"])], pages=12)
+    settings = LodSettings(60_000, SPARKS_CONES)
+    rng = np.random.default_rng(3)
+    counts = set()
+    chunks = scenes.trees[0].chunk_bytes()
+    network = Network(bandwidth=3.0 * float(chunks[0]), latency=0.05)  # three chunks a second
+    for frame in Simulation(scenes, settings, StreamingSettings(network, capacity)).run(around(24, 2.0, seconds=4.0)):
+        paged.keep(frame.resident, rng)
+        counts.add(int(frame.resident.sum()))
+        if not frame.resident[0]:
+            assert len(frame.cut) == 0
+            continue
+        at, limit = frame.camera, settings.limit(frame.camera.fov_y, frame.camera.height)
+        cut = paged.check([TreeInstance(0, foveation=SPARKS_CONES)], at.camera_to_world, 60_000, limit)
+        assert [nodes.tolist() for nodes in cut.indices()] == [nodes.tolist() for nodes in frame.cut.indices()]
+        assert cut.chunks() == frame.cut.chunks()
+    assert len(counts) > 3

@@ -70,12 +70,12 @@ def test_shares_are_of_the_splats_of_the_cut(rad_town: Scenes) -> None:
 def test_the_picture_after_some_seconds_is_that_of_the_resident_chunks(rad_town: Scenes) -> None:
     loader = Loader(rad_town, CUT, SLOW)
     found: Any = loader.load(AT)
-    assert len(loader.cut_at(AT, 0.0)) == 0
-    assert len(loader.cut_at(AT, found["first_picture_s"] - 1e-3)) == 0
-    sizes = [len(loader.cut_at(AT, found["first_picture_s"] + wait)) for wait in (1e-3, 1e6)]
+    assert len(loader.cut_after(AT, 0.0)) == 0
+    assert len(loader.cut_after(AT, found["first_picture_s"] - 1e-3)) == 0
+    sizes = [len(loader.cut_after(AT, found["first_picture_s"] + wait)) for wait in (1e-3, 1e6)]
     assert 0 < sizes[0] < sizes[1]
     whole = CutFinder(rad_town, CUT).cut(AT)
-    last = loader.cut_at(AT, found["resident_all_s"] + 1e-3)
+    last = loader.cut_after(AT, found["resident_all_s"] + 1e-3)
     assert [nodes.tolist() for nodes in last.nodes] == [nodes.tolist() for nodes in whole.nodes]
 
 

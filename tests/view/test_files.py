@@ -37,7 +37,6 @@ def settings_of(*paths: Path, settings: viewing.ViewSettings = PLAIN) -> dict:  
         ("sh0.splat", "splat", None),
         ("sh2-level1.ksplat", "ksplat", None),
         ("sh3-v2.sog", "pcsogszip", None),
-        ("sh1-sog", "pcsogs", None),
         ("sh1-tree.rad", "rad", True),
     ],
 )
@@ -56,11 +55,29 @@ def test_files_of_the_same_name_have_different_addresses() -> None:
     assert first["url"] != second["url"]
 
 
-def test_an_unpacked_sog_is_served_with_its_images() -> None:
-    (shown,) = shown_files([GOLDEN / "sh1-sog"])
-    names = {Path(name).name for name in shown.files}
-    assert names == {path.name for path in (GOLDEN / "sh1-sog").iterdir()}
-    assert shown.name == "sh1-sog"
+@pytest.mark.parametrize("name", ["sh1-sog", "sh1-sog/meta.json"])
+def test_an_unpacked_sog_is_refused_as_spark_does_not_read_it(name: str) -> None:
+    with pytest.raises(FormatError, match=r"zip its files into a \.sog$"):
+        shown_files([GOLDEN / name])
+
+
+@pytest.mark.parametrize(
+    ("name", "note"),
+    [
+        ("golden/hand-v4.spz", "Spark 2.2.0 does not read SPZ version 4"),
+        ("sh1-ascii.ply", "Spark 2.2.0 does not read PLY that is ascii or big-endian"),
+        ("sh1-big-endian.ply", "Spark 2.2.0 does not read PLY that is ascii or big-endian"),
+        ("golden/sh3-rad/sh3.rad", "Spark streams chunks of 65,536 nodes, not of 24"),
+        ("sh1.ply", None),
+        ("golden/sh3-compressed.ply", None),
+        ("golden/hand-v3.spz", None),
+        ("golden/sh1-tree.rad", None),
+    ],
+)
+def test_what_spark_does_not_read_is_noted(name: str, note: str | None) -> None:
+    (shown,) = shown_files([FIXTURES / name])
+    assert (shown.note or "").startswith("" if note is None else f"{shown.name}: {note}")
+    assert (shown.note is None) == (note is None)
 
 
 def test_the_size_counts_chunk_files() -> None:

@@ -15,11 +15,12 @@ from ...support.units import parse_size
 from ..command import COMMON, option, with_options
 from ..paths import InputPath, OutputPath
 from ..usage import refuse
-from .common import Command, assert_errors, assert_option, plot_option
+from .common import Command, assert_errors, assert_option, plot_option, table_form
 from .types import Quantity, Real
 
 if TYPE_CHECKING:
     from ...inspection.expectations import Expectations
+    from ...tables.output import TableOutput
 
 CHECKS, REPORT, PICTURES = "Checks", "Report", "Pictures"
 
@@ -123,6 +124,20 @@ OPTIONS: tuple[Callable[[Command], Command], ...] = (
         help="Print a histogram of a quantity that --stats lists; can be given several times.",
     ),
     option(
+        "--chunks",
+        heading=REPORT,
+        is_flag=True,
+        help="Print a table of the chunks; with --json, put it into the report. Files without chunks have those of"
+        " 65,536 splats in which a viewer would stream them.",
+    ),
+    option(
+        "--chunks-out",
+        heading=REPORT,
+        metavar="FILE",
+        type=OutputPath(),
+        help="Write the table of the chunks of a single file to FILE: .csv, .json or .parquet.",
+    ),
+    option(
         "--json-schema",
         heading=REPORT,
         is_flag=True,
@@ -221,6 +236,8 @@ class Output:
         stats: all quantities.
         field: of the report, alone.
         histogram: quantities that are drawn as text.
+        chunks: print a table of the chunks.
+        chunks_out: file of that table.
         html, plot: files of a page and of a picture.
         plot_level, plot_by: what the picture shows.
         overwrite: replace files that exist.
@@ -230,11 +247,28 @@ class Output:
     stats: bool
     field: str | None
     histogram: tuple[str, ...]
+    chunks: bool
+    chunks_out: Path | None
     html: Path | None
     plot: Path | None
     plot_level: int | None
     plot_by: str
     overwrite: bool
+
+    def table(self) -> TableOutput | None:
+        """Where the table of the chunks is written; None for nowhere.
+
+        Raises:
+            click.UsageError: no table is written by that suffix.
+        """
+        from ...inspection.chunks import COLUMNS
+        from ...tables.output import TableOutput
+
+        if self.chunks_out is None:
+            return None
+        return TableOutput(
+            self.chunks_out, table_form("--chunks-out", self.chunks_out), COLUMNS, overwrite=self.overwrite
+        )
 
 
 def check_usage(ctx: click.Context, count: int, checks: Checks, output: Output, *, as_json: bool) -> None:
@@ -248,6 +282,10 @@ def check_usage(ctx: click.Context, count: int, checks: Checks, output: Output, 
     """
     if output.plot is not None and count > 1:
         raise click.UsageError(f"--plot takes one file, not {count}")
+    if output.chunks_out is not None and count > 1:
+        raise click.UsageError(f"--chunks-out takes one file, not {count}")
+    if output.chunks and output.field:
+        raise click.UsageError("--chunks cannot be used with --field")
     if output.field and as_json:
         raise click.UsageError("--field cannot be used with --json")
     if output.histogram and (output.field or as_json):

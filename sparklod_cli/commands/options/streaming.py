@@ -23,6 +23,9 @@ HEADING = "Streaming"
 #: Options that need --bandwidth.
 OF_BANDWIDTH = ("latency", "fetchers")
 
+#: The options of `streaming_options` with `pictures`, which have no effect where no tree is drawn.
+OF_LOADING = ("after", "bandwidth", "latency", "fetchers", "chunk_cache")
+
 
 @dataclass(frozen=True)
 class Streaming:
@@ -55,11 +58,45 @@ class Streaming:
         return StreamingSettings(network, self.chunk_cache)
 
 
-def streaming_options(command: Command) -> Command:
-    """The options of `Streaming`."""
+@dataclass(frozen=True)
+class PictureStreaming(Streaming):
+    """The values of the options of `streaming_options` with `pictures`.
+
+    Attributes:
+        after: seconds since the page was opened; None draws what is there when everything has arrived.
+    """
+
+    after: float | None
+
+    def check(self, ctx: click.Context) -> None:
+        super().check(ctx)
+        if self.after is None:
+            require(ctx, OF_LOADING, "--after")
+        elif self.bandwidth is None:
+            raise click.UsageError("--after can only be used with --bandwidth")
+
+    def loading(self) -> tuple[StreamingSettings, float] | None:
+        """How chunks get to a viewer, and the seconds that it has had for them; None where all are there."""
+        return None if self.after is None else (self.settings(), self.after)
+
+
+def streaming_options(command: Command, *, pictures: bool = False) -> Command:
+    """The options of `Streaming`.
+
+    Args:
+        command: that gets them.
+        pictures: those of `PictureStreaming`.
+    """
     add = functools.partial(option, heading=HEADING)
+    after = add(
+        "--after",
+        type=Quantity("TIME", parse_latency),
+        help="Draw what a visitor sees this long after opening a page with the files, such as 500ms, who waits in front"
+        " of the camera; with --bandwidth.  [default: what is drawn once every chunk has arrived]",
+    )
     return with_options(
         command,
+        *((after,) if pictures else ()),
         add(
             "--chunk-cache",
             metavar="N",
@@ -70,7 +107,7 @@ def streaming_options(command: Command) -> Command:
             "--bandwidth",
             type=Quantity("RATE", parse_bandwidth),
             help="Simulate streaming over a network of this bandwidth, such as 20Mbit."
-            "  [default: every chunk is resident]",
+            + ("" if pictures else "  [default: every chunk is resident]"),
         ),
         add(
             "--latency",

@@ -32,13 +32,13 @@ export class ShownFile {
     this.unload(group);
     const { file } = this;
     const url = new URL(file.url, document.baseURI).href;
-    const pages = file.type === 'rad' && this.isTree && (file.chunked || (await hasRanges(url)));
+    const pages = file.paged && (file.chunked || (await hasRanges(url)));
     const progress = (event) => {
       if (event.total) this.say(`${whole((100 * event.loaded) / event.total)} % of ${size(file.bytes)}`);
     };
-    const whole_ = { fileType: file.type, extSplats: true, onProgress: progress, lod: this.builds || undefined };
+    const atOnce = { fileType: file.type, extSplats: true, onProgress: progress, lod: this.builds || undefined };
     this.say('loading');
-    const mesh = new SplatMesh({ url, objectModifier: this.modifier, ...(pages ? { paged: true, fileType: 'rad' } : whole_) });
+    const mesh = new SplatMesh({ url, objectModifier: this.modifier, ...(pages ? { paged: true, fileType: 'rad' } : atOnce) });
     this.mesh = mesh;
     mesh.visible = this.visible;
     group.add(mesh);
@@ -54,7 +54,7 @@ export class ShownFile {
   described(pages) {
     const { file } = this;
     const tree = this.isTree ? `tree of ${whole(file.splats)} nodes` : `${whole(file.splats)} splats`;
-    const how = pages ? `, ${whole(file.chunks)} chunks` : this.file.type === 'rad' && this.isTree ? ', loaded whole: this host sends no ranges' : '';
+    const how = pages ? `, ${whole(file.chunks)} chunks` : file.paged ? ', loaded whole: this host sends no ranges' : '';
     return `${file.format}, ${size(file.bytes)}, ${tree}${this.builds ? ', tree built here' : ''}${how}`;
   }
 

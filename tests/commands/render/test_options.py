@@ -28,6 +28,9 @@ from tests.scenes import random_splats
 CAMERAS = FIXTURES / "cameras"
 AT = ("--look-at", "0.5,-0.2,-2:0,0.1,0")
 
+#: More trees, each a chunk.
+MORE = ("second.spz", "third.spz")
+
 #: By option: what it takes to mean anything, and how it is given, so that it makes a difference.
 GIVEN: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "files": ((), (str(FIXTURES / "sh1.ply"),)),
@@ -63,6 +66,11 @@ GIVEN: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "outside_foveate": (("--budget", "90", "--fov", "10"), ("--outside-foveate", "0.01")),
     "behind_foveate": (("--budget", "90"), ("--cone-fov0", "0", "--cone-fov", "5", "--behind-foveate", "0.9")),
     "full": (("--budget", "50"), ("--full",)),
+    "after": (("--bandwidth", "1kbit"), ("--after", "1s")),
+    "bandwidth": (("--after", "1s"), ("--bandwidth", "1kbit")),
+    "latency": (("--after", "1s", "--bandwidth", "1Gbit"), ("--latency", "2s")),
+    "fetchers": ((*MORE, "--after", "2s", "--bandwidth", "1Gbit", "--latency", "1.5s"), ("--fetchers", "1")),
+    "chunk_cache": ((*MORE, "--after", "1s", "--bandwidth", "1Gbit"), ("--chunk-cache", "1")),
     "background": ((), ("--background", "#123456")),
     "alpha": ((), ("--alpha",)),
     "supersample": ((), ("--supersample", "2")),
@@ -152,6 +160,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     away = dataclasses.replace(splats, center=splats.center + np.float32([AWAY, 0, 0]))
     (folder / "away.ply").write_bytes(b"".join(ply.encode(Scene(away))))
     assert run(["build-lod", str(folder / "away.ply"), "-o", str(folder / "tree.spz"), "-q"]) == 0
+    for tree, file in zip(MORE, ("other.ply", "plain.ply"), strict=True):
+        assert run(["build-lod", str(folder / file), "-o", str(folder / tree), "-q"]) == 0
     there = {"file": "tree.spz", "translation": [-AWAY, 0, 0]}
     (folder / "back.json").write_text(json.dumps({"instances": [there]}))
     twice = [there, there | {"translation": [1 - AWAY, 0, 0]}]

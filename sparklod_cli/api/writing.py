@@ -1,0 +1,119 @@
+"""Writing splat files."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ..io import scene_sink, write_whole
+from ..model.scene import Scene
+from ..support.defaults import (
+    DEFAULT_COMPRESSION,
+    MAX_COMPRESSION,
+    MAX_FRACTIONAL_BITS,
+    MAX_SH_CODES,
+    MIN_COMPRESSION,
+    MIN_SH_CODES,
+)
+from ..support.errors import FormatError, InvalidSplatsError, memory_errors_translated
+from ..support.threads import thread_count
+from .arguments import scene_like, whole_within
+from .files import pack
+from .progress import Told, telling
+
+if TYPE_CHECKING:
+    from ..codecs.options import RadOptions
+
+
+@dataclass(frozen=True)
+class Written:
+    """A file that was written.
+
+    Attributes:
+        path: of the file.
+        format: for display ("SPZ", "PLY"), or the name of an encoding.
+        bytes: its size.
+    """
+
+    path: Path
+    format: str
+    bytes: int
+
+
+def write(
+    path: Path | str,
+    scene: Scene,
+    *,
+    overwrite: bool = False,
+    spz_version: int | None = None,
+    fractional_bits: int | None = None,
+    compression_level: int = DEFAULT_COMPRESSION,
+    chunked: bool = False,
+    rad: RadOptions | None = None,
+    encoding: str | None = None,
+    threads: int | None = None,
+    progress: Told = None,
+) -> Written:
+    """Writes a scene, or a tree, whole or not at all. Nodes keep their order, see `arrange_chunks`.
+
+    Args:
+        path: of the file, whose suffix tells the format: .spz or .rad; for a scene without a tree, .ply or .splat, too.
+        scene: what is written.
+        overwrite: replace a file that exists.
+        spz_version: of SPZ, 2 or 3; None for 3.
+        fractional_bits: of SPZ positions, 0 to 24; None for as many as suit the scene.
+        compression_level: of SPZ and RAD, 1 (fast) to 9 (small).
+        chunked: of RAD: write each chunk into a file of its own, NAME-0.radc and so on, beside the header; all files
+            appear, or none.
+        rad: further options of RAD.
+        encoding: write the arrays of "packed", "ext", "lodtree" or "texture" as .npz instead, or as the words alone
+            where the path ends in .bin or .raw.
+        threads: to encode on; None for all processors. The bytes do not depend on it.
+        progress: called with how much is done.
+
+    Raises:
+        FormatError: the format cannot hold the scene, or there is no such format.
+        InvalidSplatsError: the scene has no splats.
+        OutputError: the file exists, or cannot be written.
+        ValueError: an option is out of its range, or one of SPZ is given for another format.
+    """
+    from ..codecs.formats import WRITABLE
+    from ..codecs.options import RadOptions, WriteOptions
+
+    path, count = Path(path), thread_count(threads)
+    suffix = path.suffix.lower()
+    whole_within("compression_level", compression_level, MIN_COMPRESSION, MAX_COMPRESSION)
+    if fractional_bits is not None:
+        whole_within("fractional_bits", fractional_bits, 0, MAX_FRACTIONAL_BITS)
+    if (spz_version is not None or fractional_bits is not None) and (encoding is not None or suffix != ".spz"):
+        raise ValueError(f"{path}: spz_version and fractional_bits are of SPZ; leave them out, or write a .spz")
+    if (rad is not None or chunked) and (encoding is not None or suffix != ".rad"):
+        raise ValueError(f"{path}: chunked and rad are of RAD; leave them out, or write a .rad")
+    if rad is not None and rad.sh_codes is not None:
+        whole_within("sh_codes", rad.sh_codes, MIN_SH_CODES, MAX_SH_CODES)
+    if not len(scene_like(scene).splats):
+        raise InvalidSplatsError(f"{path}: the scene has no splats to write")
+    with telling(progress) as told, memory_errors_translated():
+        if encoding is not None:
+            return _write_arrays(path, scene, encoding, overwrite=overwrite, threads=count)
+        form = WRITABLE.get(suffix)
+        if form is None or (scene.tree is not None and not form.trees):
+            known = ", ".join(suffix for suffix, each in WRITABLE.items() if each.trees or scene.tree is None)
+            what = "a tree" if scene.tree is not None else "a scene"
+            raise FormatError(f"{path}: {what} is written as {known}, which the name does not end in")
+        rad = rad or RadOptions()
+        rad = dataclasses.replace(rad, chunked=rad.chunked or chunked)
+        options = WriteOptions(spz_version, fractional_bits, compression_level, rad)
+        save = scene_sink(path, form, chunked=rad.chunked, overwrite=overwrite)
+        return Written(path, form.name, save(scene, options, threads=count, progress=told))
+
+
+def _write_arrays(path: Path, scene: Scene, encoding: str, *, overwrite: bool, threads: int) -> Written:
+    from ..codecs.gpu import dump
+    from ..codecs.gpu.table import RAW_SUFFIXES
+
+    arrays = pack(scene, encoding, threads=threads)
+    pieces = dump.encode_raw(arrays) if path.suffix.lower() in RAW_SUFFIXES else dump.encode_npz(arrays)
+    return Written(path, encoding, write_whole(path, pieces, overwrite=overwrite))

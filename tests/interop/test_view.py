@@ -1,0 +1,289 @@
+"""The page of `sparklod view` in a real browser, with the real Spark."""
+
+from __future__ import annotations
+
+import base64
+import functools
+import hashlib
+import json
+import os
+import shutil
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sparklod_cli.cli import run
+from sparklod_cli.view.libraries import CDN, MODULES, VERSIONS
+from tests.conftest import FIXTURES
+from tests.interop import npm
+from tests.interop.conftest import PAGE
+from tests.interop.node import Node
+from tests.interop.pictures import psnr
+
+PROGRAM = Path(__file__).with_name("view_page.mjs")
+
+SIZE = 320, 180
+LOOK = ("--look-at", "0,-3.4,9:0,-1.1,0", "--fov", "40")
+BUDGET = 3_000
+
+#: Least PSNR in dB of a picture of the page from one of `sparklod render`: Spark rounds to 8 bits after every splat.
+LEAST = 40
+
+#: How often the page is asked whether something has come about, which takes moments.
+PATIENCE = 1_000
+
+#: A camera path that only moves.
+PATH = {
+    "format": "sparklod-camera-path",
+    "fov": 40,
+    "frames": [
+        {"time": 0, "eye": [0, -3.4, 9], "target": [0, -3.4, 0]},
+        {"time": 1000, "eye": [0, -3.4, 5], "target": [0, -3.4, 0]},
+    ],
+}
+
+
+@dataclass(frozen=True)
+class Tab:
+    """The browser's tab."""
+
+    node: Node
+
+    def ask(self, do: str, **request: Any) -> dict[str, Any]:
+        """Asks `view_page.mjs` for something."""
+        return self.node.ask({"do": do, **request})
+
+    def open(self, url: str, *, without: list[str] | None = None) -> None:
+        """Opens a page."""
+        self.ask("open", url=url, width=SIZE[0], height=SIZE[1], without=without or [])
+
+    def settled(self) -> dict[str, Any]:
+        """The state of the page, once its picture is that of its camera."""
+        self.ask("settle")
+        return self.ask("state")
+
+    def until(self, holds: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
+        """The state of the page, once something holds of it."""
+        for _ in range(PATIENCE):
+            state = self.ask("state")
+            if holds(state):
+                return state
+            time.sleep(0.05)
+        raise AssertionError(f"the page stays as it is: {state}")
+
+    def picture(self, out: Path) -> np.ndarray[Any, np.dtype[np.float64]]:
+        """(height, width, 3) what the page shows, 0..1."""
+        self.ask("picture", out=str(out))
+        return pixels(out)
+
+
+def pixels(path: Path) -> np.ndarray[Any, np.dtype[np.float64]]:
+    with Image.open(path) as image:
+        return np.asarray(image.convert("RGB"), np.float64) / 255
+
+
+@pytest.fixture(scope="module")
+def packages(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder whose node_modules has all that the page and its driver need."""
+    if shutil.which("node") is None:
+        pytest.skip("Node is not installed")
+    if given := os.environ.get("SPARK_DIR"):
+        missing = [name for name in PAGE if not (Path(given) / "node_modules" / name).is_dir()]
+        if missing:
+            pytest.skip(f"SPARK_DIR has no {' and no '.join(missing)}")
+    return npm.folder_with(PAGE, variable="SPARK_DIR", request=request, tmp_path_factory=tmp_path_factory)
+
+
+@pytest.fixture(scope="module")
+def tab(packages: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Tab]:
+    """A browser."""
+    chromium = shutil.which("chromium")
+    if chromium is None:
+        pytest.skip("Chromium is not installed (Debian's package chromium)")
+    node = Node([str(PROGRAM), str(packages), chromium], tmp_path_factory.mktemp("view") / "stderr.txt")
+    yield Tab(node)
+    node.close()
+
+
+@pytest.fixture(scope="module")
+def trees(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a tree as demo.spz and demo.rad."""
+    folder = tmp_path_factory.mktemp("trees")
+    for name in ("demo.spz", "demo.rad"):
+        assert run(["build-lod", str(FIXTURES / "demo.ply"), "-o", str(folder / name), "-q"]) == 0
+    return folder
+
+
+class Served:
+    """`sparklod view` as a process."""
+
+    def __init__(self, packages: Path, *arguments: object) -> None:
+        more = ["--spark-dir", packages, "--no-open", "-q", *arguments]
+        command = [sys.executable, "-m", "sparklod_cli", "view", *map(str, more)]
+        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+
+    def __enter__(self) -> str:
+        assert self.process.stdout is not None
+        return self.process.stdout.readline().strip()
+
+    def __exit__(self, *_: object) -> None:
+        self.process.terminate()
+        assert self.process.wait(20) == 0
+        assert self.process.stdout is not None
+        self.process.stdout.close()
+
+
+@pytest.fixture(scope="module")
+def shown(tab: Tab, packages: Path, trees: Path) -> Iterator[Tab]:
+    """The browser with the tree as SPZ."""
+    with Served(packages, trees / "demo.spz", *LOOK, "--budget", BUDGET) as url:
+        tab.open(url)
+        yield tab
+
+
+def rendered(file: Path, camera: list[str], out: Path, budget: int = BUDGET) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """The picture of `sparklod render`."""
+    size = f"{SIZE[0]}x{SIZE[1]}"
+    command = ["render", str(file), *camera, "--budget", str(budget), "--size", size, "--background", "black", "-q"]
+    assert run([*command, "-o", str(out), "--overwrite"]) == 0
+    return pixels(out)
+
+
+def eye_of(camera: str) -> list[float]:
+    return [float(value) for value in camera.partition("=")[2].partition(":")[0].split(",")]
+
+
+def test_the_digests_are_those_of_the_packages(packages: Path) -> None:
+    assert {name: PAGE[name] for name in VERSIONS} == VERSIONS
+    for (package, path), digest in MODULES.items():
+        data = (packages / "node_modules" / package / path).read_bytes()
+        assert base64.b64encode(hashlib.sha384(data).digest()).decode() == digest, path
+
+
+def test_the_page_shows_what_render_draws(shown: Tab, trees: Path, tmp_path: Path) -> None:
+    """From the camera that the page copies out."""
+    state = shown.settled()
+    assert state["faults"] == []
+    assert state["camera"] == "--look-at=0,-3.4,9:0,-1.1,0 --fov=40"
+    assert 0.9 * BUDGET < state["drawn"] <= BUDGET
+    assert state["said"] == f"{state['drawn']:,}"
+    assert state["budget"] == f"{BUDGET:,}"
+    theirs, ours = (
+        shown.picture(tmp_path / "page.png"),
+        rendered(trees / "demo.spz", state["camera"].split(), tmp_path / "r.png"),
+    )
+    assert theirs.max(axis=2).mean() > 0.1, "the picture is empty"
+    assert psnr(theirs - ours) >= LEAST
+
+
+def test_the_slider_changes_how_much_is_drawn(shown: Tab) -> None:
+    shown.ask("fill", id="budget", value="0")
+    few = shown.settled()
+    assert few["budget"] == "1,000"
+    assert 0 < few["drawn"] <= 1_000
+    shown.ask("fill", id="budget", value="500")
+    assert shown.settled()["drawn"] > 2 * few["drawn"]
+
+
+def test_colours_by_level_are_those_of_the_legend(shown: Tab, tmp_path: Path) -> None:
+    shown.settled()
+    plain = shown.picture(tmp_path / "plain.png")
+    shown.ask("press", key="l")
+    state = shown.settled()
+    colored = shown.picture(tmp_path / "colored.png")
+    shown.ask("press", key="l")
+    assert state["legend"]
+    assert psnr(plain - colored) < 20
+    # Viridis has no reds: of what is bright, green is the strongest.
+    bright = colored[colored.max(axis=2) > 0.5]
+    assert (bright.argmax(axis=1) == 1).mean() > 0.9
+    shown.settled()
+    assert psnr(plain - shown.picture(tmp_path / "again.png")) >= LEAST
+
+
+def test_dragging_turns_around_the_target(shown: Tab) -> None:
+    before = shown.ask("state")["camera"]
+    shown.ask("drag", dx=60, dy=10)
+    after = shown.settled()["camera"]
+    target = np.array([0, -1.1, 0])
+    assert before != after
+    assert after.partition(":")[2].startswith("0,-1.1,0 ")
+    distances = [np.linalg.norm(np.subtract(eye_of(camera), target)) for camera in (before, after)]
+    assert distances[0] == pytest.approx(distances[1], rel=1e-3)
+    shown.ask("press", key="0")
+    assert shown.settled()["camera"] == "--look-at=0,-3.4,9:0,-1.1,0 --fov=40"
+
+
+def test_a_dropped_path_plays(shown: Tab) -> None:
+    shown.ask(
+        "drop", name="path.csv", text="x,y,z,target_x,target_y,target_z,time\n0,-3.4,9,0,0,0,0\n0,-3.4,5,0,0,0,1000\n"
+    )
+    state = shown.until(lambda state: state["path"] is not None)
+    assert state["path"] == "path.csv: sparklod's CSV, 2 cameras, 1000.0 s"
+    shown.until(lambda later: later["time"] > state["time"])
+    shown.ask("fill", id="scrub", value="500")
+    middle = shown.settled()
+    assert not middle["playing"]
+    assert eye_of(middle["camera"]) == pytest.approx([0, -3.4, 7], abs=1e-3)
+    shown.ask("drag", dx=5, dy=0)  # who takes the camera leaves the path
+    assert shown.ask("state")["path"] is None
+    shown.ask("drop", name="scene.ply", text="ply\n")
+    assert shown.ask("message")["text"].startswith("scene.ply cannot be played: scene.ply: its content is of no known")
+
+
+def test_a_rad_tree_is_paged(tab: Tab, packages: Path, trees: Path, tmp_path: Path) -> None:
+    with Served(packages, trees / "demo.rad", trees / "demo.spz", *LOOK, "--budget", BUDGET) as url:
+        tab.open(url)
+        state = tab.settled()
+        assert (state["paged"], state["chunks"], state["meshes"], state["faults"]) == ([True, False], "1 of 1", 2, [])
+        tab.ask("fill", id="budget", value="0")  # of both together
+        assert 0 < tab.settled()["drawn"] <= 1_000
+
+
+def test_an_exported_site_works_without_sparklod_and_without_ranges(
+    tab: Tab, packages: Path, trees: Path, tmp_path: Path
+) -> None:
+    command = ["view", str(trees / "demo.rad"), *LOOK, "--budget", str(BUDGET), "--spark-dir", str(packages), "-q"]
+    assert run([*command, "--export", str(tmp_path / "public" / "site")]) == 0
+
+    class Quiet(SimpleHTTPRequestHandler):
+        def log_message(self, format: str, *args: object) -> None:
+            """Says nothing."""
+
+    handler = functools.partial(Quiet, directory=str(tmp_path / "public"))
+    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        tab.open(f"http://127.0.0.1:{server.server_port}/site/")
+        state = tab.settled()
+        assert state["faults"] == []
+        assert state["files"][0].endswith("loaded whole: this host sends no ranges")
+        theirs = tab.picture(tmp_path / "page.png")
+        ours = rendered(trees / "demo.rad", state["camera"].split(), tmp_path / "r.png")
+        assert psnr(theirs - ours) >= LEAST
+        tab.ask("drop", name="path.json", text=json.dumps(PATH))
+        tab.until(lambda state: state["path"] is not None)
+        tab.ask("fill", id="scrub", value="500")
+        assert eye_of(tab.settled()["camera"]) == pytest.approx([0, -3.4, 7], abs=1e-3)
+        server.shutdown()
+
+
+def test_a_page_without_its_libraries_says_what_to_do(tab: Tab, trees: Path) -> None:
+    command = [sys.executable, "-m", "sparklod_cli", "view", str(trees / "demo.spz"), "--no-open", "-q"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        tab.open(process.stdout.readline().strip(), without=[urlsplit(CDN).netloc])
+        text = tab.ask("message")["text"]
+        process.terminate()
+    assert f"cannot be loaded from {CDN}" in text
+    assert text.endswith("Without a network, start sparklod view with --spark-dir.")
