@@ -21,6 +21,7 @@ class Range:
         low, high: smallest and largest value that is rounded to a code.
         numbers: the first, and the one after the last, of the numbers of a splat that are meant; all by default.
         zero: values below this are held as 0.
+        degree: of the SH that they are; 0 for other columns, or for SH of all degrees.
     """
 
     column: str
@@ -28,6 +29,7 @@ class Range:
     high: float
     numbers: tuple[int, int | None] = (0, None)
     zero: float = 0.0
+    degree: int = 0
 
 
 #: What SPZ holds.
@@ -36,14 +38,16 @@ SPZ = tuple(Range(column, low, high) for column, (low, high) in quantize.CLAMPS.
 
 @dataclass(frozen=True)
 class Clamp:
-    """Values of a column that lie beyond one end of the range of their code.
+    """Values of a column that lie beyond one end of the range of their code, or both of a range around 0.
 
     Attributes:
-        column: of `Splats`: scale, rgb or sh.
+        column: of `Splats`: center, scale, rgb or sh.
         above: whether they lie above the upper end; otherwise below the lower one.
         splats: number of splats with such a value.
         end: the end of the range.
         farthest: the value farthest beyond the end.
+        degree: as in `Range`.
+        both: the range is -end to end; the values lie beyond either, and `farthest` is a magnitude.
     """
 
     column: str
@@ -51,6 +55,8 @@ class Clamp:
     splats: int
     end: float
     farthest: float
+    degree: int = 0
+    both: bool = False
 
 
 @dataclass(frozen=True)
@@ -85,7 +91,7 @@ def find(splats: Splats, threads: int = 1, ranges: Sequence[Range] = SPZ) -> Cla
                 least, most = values.min(axis=1), values.max(axis=1)
                 below, above = least < each.low, most > each.high
                 either |= below | above
-                counted = int(np.count_nonzero(below)), int(np.count_nonzero(above))
+                counted = (int(np.count_nonzero(mask)) for mask in (below, above, below | above))
                 found.append((*counted, float(least.min()), float(most.max())))
             return [(int(np.count_nonzero(either)),), *found]
 
@@ -93,9 +99,14 @@ def find(splats: Splats, threads: int = 1, ranges: Sequence[Range] = SPZ) -> Cla
         if total := sum(int(part[0][0]) for part in parts):
             counts[name] = total
         for index, each in enumerate(rows, 1):
-            below, above, least, most = zip(*(part[index] for part in parts), strict=True)
+            below, above, beyond, least, most = zip(*(part[index] for part in parts), strict=True)
+            if each.low == -each.high:
+                if sum(beyond):
+                    farthest = max(-min(least), max(most))
+                    ends.append(Clamp(name, True, int(sum(beyond)), each.high, farthest, each.degree, both=True))
+                continue
             if sum(below):
-                ends.append(Clamp(name, False, int(sum(below)), each.low, min(least)))
+                ends.append(Clamp(name, False, int(sum(below)), each.low, min(least), each.degree))
             if sum(above):
-                ends.append(Clamp(name, True, int(sum(above)), each.high, max(most)))
+                ends.append(Clamp(name, True, int(sum(above)), each.high, max(most), each.degree))
     return Clamps(counts, tuple(ends))

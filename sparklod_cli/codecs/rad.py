@@ -25,10 +25,10 @@ from ..model.splats import COLUMNS, FloatArray, Splats
 from ..support.errors import FormatError, NotSplatsError, TreeError, TruncatedError
 from ..support.parallel import blocks_of, ordered_map
 from ..support.progress import Progress, silent
-from . import compression, rad_promises
+from . import compression, rad_promises, sh_palette
 from .options import DEFAULTS, WriteOptions
 from .rad_decode import Packed, fill
-from .rad_encode import Writing
+from .rad_encode import Palette, Writing
 from .rad_header import CHUNK_MAGIC, ChunkEntry, ChunkHeader, Header, pack_header, read_header
 from .rad_names import SUFFIX, chunk_name
 from .rad_options import settled as settled
@@ -131,7 +131,7 @@ def encode(
     Raises:
         FormatError, ValueError: see `rad_options.settled`.
     """
-    writing = _writing(scene, options, threads)
+    writing = _writing(scene, options, threads, progress)
     sizes = []
     with tempfile.SpooledTemporaryFile(SPOOLED) as spool:
         for chunk in _encoded(writing, threads, progress):
@@ -156,7 +156,7 @@ def encode_chunked(
     Raises:
         FormatError, ValueError: see `rad_options.settled`.
     """
-    writing = _writing(scene, options, threads)
+    writing = _writing(scene, options, threads, progress)
     entries = []
     for number, chunk in enumerate(_encoded(writing, threads, progress)):
         name = chunk_name(stem, number)
@@ -165,10 +165,23 @@ def encode_chunked(
     yield stem + SUFFIX, [pack_header(_header(writing, tuple(entries)))]
 
 
-def _writing(scene: Scene, options: WriteOptions, threads: int) -> Writing:
+def _writing(scene: Scene, options: WriteOptions, threads: int, progress: Progress) -> Writing:
     options = settled(scene, options)
-    assert options.rad.ranges is not None
-    return Writing(scene, options.rad, options.rad.ranges, None, options.compression_level)
+    ranges, codes, palette = options.rad.ranges, options.rad.sh_codes, None
+    assert ranges is not None
+    if codes is not None and scene.splats.sh_degree and len(scene):
+        palette = _palette(scene.splats, codes, threads, progress)
+    return Writing(scene, options.rad, ranges, palette, options.compression_level)
+
+
+def _palette(splats: Splats, codes: int, threads: int, progress: Progress) -> Palette:
+    """A palette of SH, and zeros behind it up to as many codes as Spark reads."""
+    room = min(len(splats), CHUNK_NODES)
+    weight = sh_palette.visible_weight(splats)
+    found = sh_palette.cluster(splats.sh, min(codes, room), weight=weight, threads=threads, progress=progress)
+    padded = np.zeros((room, *found.codes.shape[1:]), np.float32)
+    padded[: len(found.codes)] = found.codes
+    return Palette(padded, found.labels)
 
 
 def _encoded(writing: Writing, threads: int, progress: Progress) -> Iterator[bytes]:

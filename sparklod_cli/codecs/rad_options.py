@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..model.nodes import CHUNK_NODES
 from ..model.scene import Scene
 from ..model.sh import COEFFICIENTS
 from ..model.splats import FloatArray
 from ..support.errors import FormatError
 from .clamps import Range
+from .magnitudes import LOWER, UPPER, Magnitudes, tops
 from .options import RadOptions, WriteOptions
 from .rad_encodings import LARGEST_F16
 from .rad_layout import AUTO, PROPERTIES, RANGES, Row, choices
@@ -29,8 +32,8 @@ LOG_RANGE = 12.0
 #: Range from which float16 is used: as Spark does, which is also where its error of 2 ** -11 becomes the smaller one.
 WIDE_LOG_RANGE = 25.0
 
-#: Range of colours from which float16 is used: a code would be 3 steps of 8-bit colour and more.
-WIDE_RGB_RANGE = 3.0
+#: Range of colours from which float16 is used: a code would be 4 steps of 8-bit colour and more.
+WIDE_RGB_RANGE = 4.0
 
 #: Ranges end at multiples of this, so that their numbers are short and exact.
 GRID = 1 / 64
@@ -40,15 +43,12 @@ GRID = 1 / 64
 #: 6 to 8 bits takes that.
 LEAST_SH_MAX = 1.0
 
-#: Numbers that ranges are fitted to, about: more would not change them, but take longer.
-SAMPLE = 1 << 16
-
 #: An error of a colour or a coefficient from which more is no worse: a colour is then a wrong one. Otherwise a single
 #: splat far from all others would decide the steps of all.
 WORST = 0.5
 
-#: Ends of ranges that are tried, as shares of the values that lie inside.
-SHARES = 1 - np.array([0.0, 1e-4, 3e-4, 1e-3, 3e-3, 1e-2])
+#: Ends of ranges that are tried, as shares of the values that lie beyond.
+BEYOND = np.array([0.0, 1e-4, 3e-4, 1e-3, 3e-3, 1e-2])
 
 
 def settled(scene: Scene, options: WriteOptions) -> WriteOptions:
@@ -56,9 +56,11 @@ def settled(scene: Scene, options: WriteOptions) -> WriteOptions:
 
     Raises:
         FormatError: there are more splats than the format can number.
-        ValueError: an encoding is unknown.
+        ValueError: an encoding is unknown, or the palette has no code or more than a label can name.
     """
     rad = options.rad
+    if rad.sh_codes is not None and not 1 <= rad.sh_codes <= CHUNK_NODES:
+        raise ValueError(f"sh_codes is {rad.sh_codes}, not 1 to {CHUNK_NODES:,}")
     for name in ("center", "alpha", "rgb", "scales", "orientation", "sh"):
         if getattr(rad, name) not in choices(name):
             raise ValueError(f"{name} is {getattr(rad, name)!r}, not one of {', '.join(choices(name))}")
@@ -122,66 +124,64 @@ def held(options: WriteOptions, sh_degree: int) -> list[Range]:
             found.append(Range(row.column, *ends, zero=float(SCALE_ZERO)))
         elif encoding in RANGES:
             half = (high - low) / (508 if encoding.startswith("s8") else 510)
-            found.append(Range(row.column, low - half, high + half, numbers))
+            found.append(Range(row.column, low - half, high + half, numbers, degree=row.degree))
         elif encoding in ("f16", "f16_lebytes"):
-            found.append(Range(row.column, -most, most, numbers))
+            found.append(Range(row.column, -most, most, numbers, degree=row.degree))
     return found
-
-
-def _sampled(values: FloatArray) -> NDArray[np.float64]:
-    """Numbers of every so many splats."""
-    step = max(1, values.size // SAMPLE)
-    return values[::step].reshape(-1).astype(np.float64)
-
-
-def _quantiles(ordered: NDArray[np.float64], shares: NDArray[np.float64]) -> NDArray[np.float64]:
-    return ordered[np.rint(shares * (len(ordered) - 1)).astype(np.intp)]
-
-
-def _squared(beyond: NDArray[np.float64], step: float) -> float:
-    """The mean squared error of values that lie so far beyond a range, where others are rounded to steps."""
-    return float(np.mean(np.minimum(beyond, WORST) ** 2)) + step**2 / 12
 
 
 def _outward(value: float, up: bool) -> float:
     return (math.ceil if up else math.floor)(value / GRID) * GRID
 
 
+def _clamping(counts: NDArray[np.int64], top: float) -> float:
+    """The summed squared error of magnitudes that are clamped to `top`."""
+    bins = np.flatnonzero(counts[:-1])
+    beyond = np.clip(UPPER[bins] - top, 0, WORST)
+    return float(np.sum(counts[bins] * beyond**2))
+
+
 def _linear_range(values: FloatArray) -> tuple[float, float]:
     """The range of 255 steps with the least squared error, of rounding and of clamping together."""
-    sample = np.sort(_sampled(values))
-    if not sample.size:
-        return 0.0, 1.0
-    lows = np.unique(np.minimum(_quantiles(sample, 1 - SHARES), 0))
-    highs = np.unique(np.maximum(_quantiles(sample, SHARES), 1))
+    found = Magnitudes.of(values)
+    total = max(found.count, 1)
+    below = tops(found.negative, total, -found.lowest, BEYOND)
+    above = np.maximum(tops(found.positive, total, found.highest, BEYOND), 1)
+    lows = {-low: _clamping(found.negative, low) for low in below}
+    highs = {high: _clamping(found.positive, high) for high in above}
 
-    def error(low: float, high: float) -> float:
-        beyond = np.maximum(low - sample, 0) + np.maximum(sample - high, 0)
-        return _squared(beyond, (high - low) / 255)
+    def error(ends: tuple[float, float]) -> float:
+        low, high = ends
+        return (lows[low] + highs[high]) / total + ((high - low) / 255) ** 2 / 12
 
-    best = min((error(low, high), low, high) for low in lows for high in highs)
-    return _outward(best[1], False), _outward(best[2], True)
+    low, high = min(itertools.product(sorted(lows), sorted(highs)), key=error)
+    return _outward(low, False), _outward(high, True)
 
 
 def _largest(values: FloatArray) -> float:
     """The largest coefficient for 254 steps with the least squared error, of rounding and of clamping together."""
-    sample = np.sort(np.abs(_sampled(values)))
-    if not sample.size:
+    found = Magnitudes.of(values)
+    total, counts = found.count, found.positive + found.negative
+    most = max(found.highest, -found.lowest)
+    if not total:
         return 1.0
 
     def error(top: float) -> float:
-        return _squared(np.maximum(sample - top, 0), top / 127)
+        return _clamping(counts, top) / total + (top / 127) ** 2 / 12
 
-    return max(GRID, _outward(min(_quantiles(sample, SHARES), key=error), True))
+    return max(GRID, _outward(min(tops(counts, total, most, BEYOND), key=error), True))
 
 
 def _log_range(scale: FloatArray) -> tuple[float, float]:
     """From the logarithm of a small scale to that of the largest: the sizes of coarse splats must not be clamped."""
-    visible = scale[scale > SCALE_ZERO]
-    if not visible.size:
+    counts = Magnitudes.of(scale).positive.copy()
+    counts[UPPER <= SCALE_ZERO] = 0
+    counts[-1] = 0
+    bins = np.flatnonzero(counts)
+    if not bins.size:
         return SplatEncoding.ln_scale_min, SplatEncoding.ln_scale_max
-    least, most = (float(np.log(np.float64(end))) for end in (visible.min(), visible.max()))
-    small = float(np.log(_quantiles(np.sort(_sampled(visible)), np.array(SMALL_QUANTILE))))
-    low = max(least, min(small, most - LOG_RANGE))
+    small = bins[np.searchsorted(np.cumsum(counts[bins]), SMALL_QUANTILE * counts.sum())]
+    least, small_log, most = np.log([LOWER[bins[0]], LOWER[small], UPPER[bins[-1]]])
+    low = max(least, math.log(SCALE_ZERO), min(small_log, most - LOG_RANGE))
     low, high = _outward(low, False), _outward(most, True)
     return low, high if high > low else low + GRID

@@ -31,13 +31,11 @@ CLAMPED_BY_SPZ = {
 _THIN, _WIDE = "mostly how thick flat splats are; --rad-scales ln_f16 keeps them", "--rad-scales ln_f16 keeps them"
 _FAR, _COLORS = "--rad-center f32_lebytes keeps them", "the loss is hardly visible; --rad-rgb f16 keeps them"
 CLAMPED_BY_RAD = {
-    ("center", False): ("coordinates", _FAR),
     ("center", True): ("coordinates", _FAR),
     ("scale", False): ("scales", _THIN),
     ("scale", True): ("scales", _WIDE),
     ("rgb", False): ("colours", _COLORS),
     ("rgb", True): ("colours", _COLORS),
-    ("sh", False): ("SH", "reflections get weaker; --rad-sh f16 keeps them"),
     ("sh", True): ("SH", "reflections get weaker; --rad-sh f16 keeps them"),
 }
 
@@ -78,10 +76,12 @@ def _clamped(clamp: Clamp, baked: Baked) -> str:
     form, table = ("SPZ", CLAMPED_BY_SPZ) if baked.chunks is None else ("RAD", CLAMPED_BY_RAD)
     name, advice = table[clamp.column, clamp.above]
     share = f"{count_of(clamp.splats, 'node')} ({100 * clamp.splats / baked.nodes:.3g} %)"
+    name += f" of degree {clamp.degree}" if clamp.degree else ""
     where, way = ("above", "up") if clamp.above else ("below", "down")
+    where = "beyond ±" if clamp.both else f"{where} "
     farthest = clamp.farthest or 0.0  # no -0
     return (
-        f"{name} of {share} are {where} {clamp.end:.3g}, {way} to {farthest:.3g}, and are clamped to what {form} holds:"
+        f"{name} of {share} are {where}{clamp.end:.3g}, {way} to {farthest:.3g}, and are clamped to what {form} holds:"
         f" {advice}"
     )
 

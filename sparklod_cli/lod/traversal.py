@@ -132,7 +132,10 @@ class TreeCut:
         return [np.sort(self.node[self.instance == number]) for number in range(len(self.views))]
 
     def chunks(self) -> list[int]:
-        """The chunks of all trees that finding the cut reads, or would read if they were resident, by priority."""
+        """The chunks of all trees that finding the cut reads, or would read if they were resident, by priority.
+
+        Those of equal priority are in the order of their numbers; Spark has them in the order that its queue finds.
+        """
         wanted = np.flatnonzero(self.wanted > 0)
         order: list[int] = wanted[np.argsort(-self.wanted[wanted], kind="stable")].tolist()
         return order

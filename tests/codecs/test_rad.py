@@ -239,6 +239,62 @@ def test_a_scene_without_splats_is_a_file_without_chunks() -> None:
     assert (len(back), back.tree, back.splats.sh_degree, back.chunk_bytes) == (0, None, 2, ())
 
 
+# --- Palettes ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def shared() -> Scene:
+    """A tree whose 500 nodes have 40 different SH of degree 3."""
+    splats = random_splats(500, sh_degree=3)
+    splats.sh[:] = splats.sh[np.random.default_rng(2).permutation(500) % 40]
+    return Scene(splats, broad_tree(500))
+
+
+def test_few_different_sh_are_all_in_the_palette(shared: Scene) -> None:
+    data = written(shared, sh_codes=64, sh="f32")
+    back = read(data)
+    np.testing.assert_array_equal(back.splats.sh, shared.splats.sh)
+    plain = read(written(shared, sh="f32")).splats
+    assert_same(back.splats, plain)
+    assert len(data) < 0.7 * len(written(shared, sh="f32"))
+
+
+def test_a_palette_has_as_many_codes_as_the_first_chunk_has_splats_with_zeros_at_its_end(shared: Scene) -> None:
+    """Spark reads no other number, see docs/formats.md."""
+    file = io.BytesIO(written(shared, sh_codes=64))
+    header = read_header(file)
+    palette = rad.read_chunk(file, header.chunks[0], header).palette
+    assert palette is not None
+    assert header.sh_code_count == len(palette) == 500
+    assert palette[:40].any(axis=(1, 2)).all() and not palette[40:].any()
+
+
+def test_fewer_codes_than_different_sh_come_near(shared: Scene) -> None:
+    exact, near = (read(written(shared, sh_codes=codes, sh="f32")).splats.sh for codes in (64, 20))
+    assert len(np.unique(near, axis=0)) <= 20 < len(np.unique(exact, axis=0)) == 40
+    middle = shared.splats.sh.mean(axis=0)
+    assert np.mean((near - exact) ** 2) < 0.7 * np.mean((exact - middle) ** 2)
+
+
+def test_threads_do_not_change_a_palette_and_chunk_files_have_it_in_the_first(shared: Scene) -> None:
+    assert written(shared, 1, sh_codes=20) == written(shared, 2, sh_codes=20)
+    options = WriteOptions(rad=RadOptions(sh_codes=20))
+    files = {name: b"".join(pieces) for name, pieces in rad.encode_chunked(shared, options, "scene")}
+    back = rad.decode(io.BytesIO(files["scene.rad"]), beside=lambda name: io.BytesIO(files[name]))
+    assert_same(back.splats, read(written(shared, sh_codes=20)).splats)
+
+
+def test_without_sh_there_is_no_palette() -> None:
+    header = read_header(io.BytesIO(written(Scene(random_splats(9)), sh_codes=4)))
+    assert (header.sh_code_count, header.max_sh) == (None, 0)
+
+
+@pytest.mark.parametrize("codes", [0, -1, 65537])
+def test_a_palette_of_an_impossible_size_is_refused(codes: int) -> None:
+    with pytest.raises(ValueError, match=f"sh_codes is {codes}, not 1 to 65,536"):
+        chosen(random_splats(1), sh_codes=codes)
+
+
 # --- What "auto" chooses ----------------------------------------------------------------------------------------------
 
 
@@ -276,14 +332,22 @@ def test_ranges_hold_all_scales_and_most_of_the_rest() -> None:
     ranges = options.rad.ranges
     assert ranges is not None
     logs = np.log(splats.scale)
-    assert ranges.ln_scale_min <= logs.min() < ranges.ln_scale_min + 0.02
-    assert ranges.ln_scale_max - 0.02 < logs.max() <= ranges.ln_scale_max
+    assert ranges.ln_scale_min <= logs.min() < ranges.ln_scale_min + 0.03
+    assert ranges.ln_scale_max - 0.03 < logs.max() <= ranges.ln_scale_max
     assert (ranges.rgb_min, ranges.rgb_max) == (0, 2.25)
     assert 0.3 < ranges.sh1_max < 4 and not ranges.lod_opacity
     found = clamps.find(splats, ranges=rad_options.held(options, 3))
     assert found.splats == {"sh": 1}
-    assert {(each.column, each.above) for each in found.ends} == {("sh", True)}
-    assert len(found.ends) == 3
+    assert [(each.column, each.degree, each.both, each.splats) for each in found.ends] == [
+        ("sh", degree, True, 1) for degree in (1, 2, 3)
+    ]
+
+
+def test_the_order_of_splats_does_not_change_a_range(large: Scene) -> None:
+    splats = large.splats.take(slice(None))
+    splats.rgb[::64] *= 3
+    shuffled = splats.take(np.random.default_rng(1).permutation(len(splats)))
+    assert rad_options.fitted(Scene(shuffled)) == rad_options.fitted(Scene(splats))
 
 
 def test_colours_and_scales_of_a_wide_range_are_float16() -> None:

@@ -262,3 +262,12 @@ def test_spark_reads_each_of_several_chunks(spark: Spark, tmp_path: Path) -> Non
     for name, pieces in rad.encode_chunked(scene, WriteOptions(), "tree", threads=2):
         (tmp_path / name).write_bytes(b"".join(pieces))
     assert check_chunks(spark, tmp_path / "tree.rad", tmp_path) == 2
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_both_read_the_same_palette(spark: Spark, tmp_path: Path, degree: int) -> None:
+    """It has as many codes as the first chunk has splats, since Spark takes so many whatever the header says."""
+    path = written(tmp_path / "scene.rad", tree(degree), RadOptions(sh_codes=300))
+    assert header_of(path).sh_code_count == len(tree(degree)) > 300
+    check_whole(spark, path)
+    assert check_chunks(spark, path, tmp_path) == 1

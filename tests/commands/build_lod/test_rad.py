@@ -204,7 +204,7 @@ def test_what_is_clamped_is_said_with_the_range_of_the_file(tmp_path: Path, caps
     record = json.loads(out)
     assert record["clamped"]["center"] > 0
     assert ("center", True, 65504.0) in {(each["column"], each["above"], each["end"]) for each in record["clamps"]}
-    assert "are above 6.55e+04, up to 1e+06, and are clamped to what RAD holds: --rad-center f32_lebytes keeps" in err
+    assert "are beyond ±6.55e+04, up to 1e+06, and are clamped to what RAD holds: --rad-center f32_lebytes keeps" in err
 
 
 @pytest.mark.parametrize(
