@@ -72,6 +72,13 @@ JOBS = {
         ),
         ("build-lod scene.ply --method quality -o quality.spz",),
     ),
+    "rad": Job(
+        (
+            *("chunk_demand.fill_demand", "chunk_inside.sort_within_chunks", "chunk_sets.split_sets", "sort.sort_pass"),
+            *("tree_links.find_depths", "tree_links.find_parents"),
+        ),
+        ("build-lod tree.spz --format rad -o tree.rad",),
+    ),
     "render": Job(
         (
             *("bands.count_fragments", "bands.draw_discs", "cut.find_cut", "pixel_scale.pixel_scales"),

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sparklod_cli.cli import run
 from sparklod_cli.codecs import rad
 from sparklod_cli.codecs.gpu import packed_splats
 from sparklod_cli.codecs.octahedral import encode_lod_alpha
@@ -262,6 +263,17 @@ def test_spark_reads_each_of_several_chunks(spark: Spark, tmp_path: Path) -> Non
     for name, pieces in rad.encode_chunked(scene, WriteOptions(), "tree", threads=2):
         (tmp_path / name).write_bytes(b"".join(pieces))
     assert check_chunks(spark, tmp_path / "tree.rad", tmp_path) == 2
+
+
+@pytest.mark.parametrize("name", ["biker.ply", "meadow.sog", "playbot-125k.ply"])
+def test_spark_reads_real_scenes_as_build_lod_writes_them(spark: Spark, tmp_path: Path, name: str) -> None:
+    """In one file, and in chunk files, whose chunks are the same."""
+    whole, header = tmp_path / "whole.rad", tmp_path / "scene-lod.rad"
+    for output, form in ((whole, "rad"), (header, "rad-chunked")):
+        assert run(["build-lod", str(real_scene(name)), "--format", form, "-o", str(output)]) == 0
+    check_whole(spark, whole)
+    assert check_chunks(spark, header, tmp_path) == len(header_of(header).chunks) > 2
+    assert [data for data, _, _ in chunks_of(whole)] == [data for data, _, _ in chunks_of(header)]
 
 
 @pytest.mark.parametrize("degree", [1, 2, 3])
