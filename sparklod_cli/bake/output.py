@@ -144,7 +144,7 @@ class _File:
             bytes=size,
             chunks=-(-len(scene) // CHUNK_NODES),
             encodings={name: getattr(options.rad, name) for name in OPTIONS if degree or name != "sh"},
-            sh_codes=options.rad.sh_codes if degree else None,
+            sh_codes=min(options.rad.sh_codes, len(scene)) if options.rad.sh_codes and degree else None,
             clamped=beyond.splats,
             clamps=beyond.ends,
         )
