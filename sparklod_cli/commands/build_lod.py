@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..codecs.rad_names import SUFFIX as RAD
+from ..codecs.rad.names import SUFFIX as RAD
 from ..support.errors import SparklodError
 from ..support.printable import MOST, shortened
 from ..support.stdin import DASH, name_of
@@ -24,7 +24,7 @@ from .reports import report_baked, report_extracted
 from .usage import options_of
 
 if TYPE_CHECKING:
-    from ..api.file_jobs import Baked, Extracted
+    from ..api.bake_jobs import Baked, Extracted
     from .console import Console
 
 EXAMPLES = """
@@ -129,11 +129,12 @@ def _job(
     ctx: click.Context, outputs: Outputs, console: Console
 ) -> tuple[Callable[..., Baked | Extracted], Callable[..., None]]:
     """What makes an output of an input, and what reports it; the point where numpy and numba are loaded."""
-    from ..api.file_jobs import bake, extract_leaves
+    from ..api.bake_jobs import bake, extract_leaves
 
     if outputs.unlod:
         leaves = functools.partial(extract_leaves, suffix=outputs.suffix, options=write_options(ctx))
         return leaves, report_extracted
     settings = bake_settings(ctx, suffix=outputs.suffix, raw=outputs.is_raw, converts=outputs.format_is_asked_for)
-    console.announce_compiling(settings.method, *(["rad"] if outputs.suffix == RAD else []))
+    more = [] if outputs.suffix != RAD else ["rad"] if settings.options.rad.sh_codes is None else ["rad", "palette"]
+    console.announce_compiling(settings.method, *more)
     return functools.partial(bake, settings=settings), report_baked

@@ -52,7 +52,7 @@ def inspect(ctx: click.Context, /, files: tuple[Path, ...], **_: Any) -> None:
     keep_apart(ctx)
     check_usage(ctx, len(files), checks, output, as_json=general.as_json)
     with general.console() as console:
-        from ..api.file_jobs import CheckSettings, DrawSettings
+        from ..api.inspect_jobs import CheckSettings, DrawSettings
         from ..inspection.checking import read_original
 
         console.announce_compiling(*(["inspect"] if output.html is None else ["inspect", "render"]))

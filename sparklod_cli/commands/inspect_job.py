@@ -17,7 +17,7 @@ from .console import Console, count_of, size_of
 from .inspect_text import finding_line, lines
 
 if TYPE_CHECKING:
-    from ..api.file_jobs import DrawSettings, Inspected
+    from ..api.inspect_jobs import DrawSettings, Inspected
     from ..inspection.checking import CheckSettings
     from ..inspection.html import Section
     from ..inspection.report import Report
@@ -39,7 +39,7 @@ class Job:
 
     def inspect(self, file: Path) -> int:
         """Prints what is asked for of a file; its exit status. One too large for memory does not stop the others."""
-        from ..api.file_jobs import inspect_file
+        from ..api.inspect_jobs import inspect_file
 
         start, name = time.perf_counter(), name_of(file)
         try:
@@ -120,7 +120,7 @@ class Job:
         """Writes the page, if one is wanted."""
         if self.drawn.html is None:
             return
-        from ..api.file_jobs import write_page
+        from ..api.inspect_jobs import write_page
 
         size = write_page(self.drawn.html, self.sections, overwrite=self.drawn.overwrite)
         self.console.say(f"{self.drawn.html}  page of {count_of(len(self.sections), 'file')}, {size_of(size)}")

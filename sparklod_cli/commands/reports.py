@@ -9,7 +9,7 @@ from ..support.stdin import DASH, name_of
 from .console import Console, count_of, size_of
 
 if TYPE_CHECKING:
-    from ..api.file_jobs import Baked, Extracted
+    from ..api.bake_jobs import Baked, Extracted
     from ..codecs.clamps import Clamp
 
 #: What clamping does to a scene and what to do about it, by column of `Splats` and whether the upper end clamps.

@@ -19,7 +19,7 @@ from .common import Command
 from .types import AutoOr, Ball, Codes, Numbers, Real
 
 if TYPE_CHECKING:
-    from ...api.file_jobs import BakeSettings
+    from ...api.bake_jobs import BakeSettings
     from ...codecs.options import WriteOptions
 
 TREE, SELECTION, PLACE, FORMAT = "Tree", "Selection", "Rotation, scale and position", "File format"
@@ -235,7 +235,7 @@ def bake_settings(ctx: click.Context, *, suffix: str, raw: bool, converts: bool)
         raw: write the words of --encoding alone.
         converts: somebody chose the format of the output, so that the tree of an input is kept.
     """
-    from ...api.file_jobs import BakeSettings
+    from ...api.bake_jobs import BakeSettings
     from ...model.selection import Selection
     from ...model.transforms import Transform
 

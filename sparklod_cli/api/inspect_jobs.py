@@ -1,7 +1,4 @@
-"""Whole-file jobs of `build-lod` and `inspect`, from reading to writing.
-
-Those of `build-lod` are `bake` and `extract_leaves`, as the library has them.
-"""
+"""The whole-file jobs of `inspect`, from reading to writing."""
 
 from __future__ import annotations
 
@@ -10,11 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..bake import Baked as Baked
-from ..bake import BakeSettings as BakeSettings
-from ..bake import bake as bake
-from ..extract_leaves import Extracted as Extracted
-from ..extract_leaves import extract_leaves as extract_leaves
 from ..inspection import checking
 from ..inspection.checking import CheckSettings as CheckSettings
 from ..io import check_writable, write_whole

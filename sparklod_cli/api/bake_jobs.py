@@ -1,0 +1,7 @@
+"""The whole-file jobs of `build-lod`, as the library has them; apart from those of `inspect`, which load more."""
+
+from ..bake import Baked as Baked
+from ..bake import BakeSettings as BakeSettings
+from ..bake import bake as bake
+from ..extract_leaves import Extracted as Extracted
+from ..extract_leaves import extract_leaves as extract_leaves
