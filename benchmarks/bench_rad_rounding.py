@@ -19,9 +19,10 @@ from scenes import load
 
 import sparklod_cli as sparklod
 from sparklod_cli import Splats
-from sparklod_cli.codecs import rad, spz
+from sparklod_cli.codecs import spz
 from sparklod_cli.codecs.gpu import packed_splats
 from sparklod_cli.codecs.options import DEFAULTS, RadOptions, WriteOptions
+from sparklod_cli.codecs.rad import codec as rad
 from sparklod_cli.codecs.splat_encoding import SplatEncoding
 from sparklod_cli.model.sh import COEFFICIENTS
 

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from .cameras.camera import Camera
     from .cameras.path import CameraPath
     from .codecs.options import RadOptions
-    from .codecs.rad import Chunk
-    from .codecs.rad_header import ChunkEntry, ChunkHeader, Header
+    from .codecs.rad.codec import RadChunk
+    from .codecs.rad.header import RadChunkEntry, RadChunkHeader, RadHeader
     from .codecs.splat_encoding import SplatEncoding
     from .inspection.report import Report
     from .lod.settings import LodSettings
@@ -66,8 +66,8 @@ _MODULES = {
     "cameras.camera": ("Camera",),
     "cameras.path": ("CameraPath",),
     "codecs.options": ("RadOptions",),
-    "codecs.rad": ("Chunk",),
-    "codecs.rad_header": ("ChunkEntry", "ChunkHeader", "Header"),
+    "codecs.rad.codec": ("RadChunk",),
+    "codecs.rad.header": ("RadChunkEntry", "RadChunkHeader", "RadHeader"),
     "codecs.splat_encoding": ("SplatEncoding",),
     "inspection.report": ("Report",),
     "lod.settings": ("LodSettings",),
@@ -96,16 +96,12 @@ __all__ = [
     "Camera",
     "CameraPath",
     "CameraPathError",
-    "Chunk",
-    "ChunkEntry",
-    "ChunkHeader",
     "ComparisonTable",
     "Cones",
     "Cut",
     "FormatError",
     "Frames",
     "Frustum",
-    "Header",
     "Instance",
     "InstancesFileError",
     "InvalidSplatsError",
@@ -115,6 +111,10 @@ __all__ = [
     "OutOfMemoryError",
     "OutputError",
     "Picture",
+    "RadChunk",
+    "RadChunkEntry",
+    "RadChunkHeader",
+    "RadHeader",
     "RadOptions",
     "RasterSettings",
     "RenderSettings",

@@ -10,7 +10,7 @@ import threading
 import time
 from collections.abc import Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -90,6 +90,14 @@ JOBS = {
             "render scene.ply --size 64x64 --style billboards -o billboards.png",
             "render scene.ply --size 64x64 --color-by overdraw -o overdraw.png",
         ),
+    ),
+    "palette": Job(
+        (
+            *("chunk_demand.fill_demand", "chunk_inside.sort_within_chunks", "chunk_sets.split_sets", "sort.sort_pass"),
+            *("tree_links.find_depths", "tree_links.find_parents", "row_hash.hash_rows", "cells.halve_cells"),
+            *("cells.average_cells", "nearest.find_neighbours", "nearest.choose_codes"),
+        ),
+        ("build-lod shiny.spz --format rad --cluster-sh 4 -o palette.rad",),
     ),
 }
 
@@ -181,7 +189,7 @@ def _do(job: str, folder: Path, children: _Children) -> None:
 
 
 def _write_inputs(folder: Path) -> None:
-    """Writes a scene of a few splats and a tree of them, without a builder, which would need kernels."""
+    """Writes a scene of a few splats, and trees of them with and without SH, without a builder, which needs kernels."""
     rng = np.random.default_rng(0)
     count = 64
     leaves = Splats(
@@ -200,3 +208,5 @@ def _write_inputs(folder: Path) -> None:
     tree = Scene(root, LodTree(children, starts))
     write_whole(folder / "scene.ply", ply.encode(Scene(leaves)), overwrite=True)
     write_whole(folder / "tree.spz", spz.encode(tree), overwrite=True)
+    sh = rng.uniform(-0.5, 0.5, (count + 1, 3, 3)).astype(np.float32)
+    write_whole(folder / "shiny.spz", spz.encode(replace(tree, splats=replace(root, sh=sh))), overwrite=True)

@@ -9,8 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from sparklod_cli.codecs import rad_header, rad_names
-from sparklod_cli.codecs.rad_header import ChunkEntry, Header
+from sparklod_cli.codecs.rad import header as rad_header
+from sparklod_cli.codecs.rad import names as rad_names
+from sparklod_cli.codecs.rad.header import RadChunkEntry, RadHeader
 from sparklod_cli.io import chunk_files, companions, sink_together, write_together
 from sparklod_cli.support.errors import OutputError
 from tests.conftest import IS_ROOT
@@ -129,8 +130,8 @@ def test_a_folder_that_may_not_be_written_to(tmp_path: Path) -> None:
 
 
 def test_chunks_that_a_header_names_are_its_companions(tmp_path: Path) -> None:
-    entries = tuple(ChunkEntry(0, 8, name) for name in ("y-0.radc", "../away.radc", "missing.radc", "y-1.radc"))
-    data = rad_header.pack_header(Header(100, 0, True, 65536, 32, entries))
+    entries = tuple(RadChunkEntry(0, 8, name) for name in ("y-0.radc", "../away.radc", "missing.radc", "y-1.radc"))
+    data = rad_header.pack_header(RadHeader(100, 0, True, 65536, 32, entries))
     header = tmp_path / "sub" / "x.rad"
     header.parent.mkdir()
     for path in (header.with_name("y-0.radc"), header.with_name("y-1.radc"), tmp_path / "away.radc"):

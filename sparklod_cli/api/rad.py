@@ -15,11 +15,11 @@ from .files import naming
 from .progress import Told, telling
 
 if TYPE_CHECKING:
-    from ..codecs.rad import Chunk
-    from ..codecs.rad_header import Header
+    from ..codecs.rad.codec import RadChunk
+    from ..codecs.rad.header import RadHeader
 
 
-def read_rad_header(path: Path | str) -> Header:
+def read_rad_header(path: Path | str) -> RadHeader:
     """Reads the header of a RAD file and nothing else; the chunks need not be there.
 
     Args:
@@ -33,7 +33,7 @@ def read_rad_header(path: Path | str) -> Header:
         return io.read_rad_header(path)
 
 
-def read_rad_chunk(path: Path | str, number: int, *, palette: FloatArray | None = None) -> Chunk:
+def read_rad_chunk(path: Path | str, number: int, *, palette: FloatArray | None = None) -> RadChunk:
     """Reads the header of a RAD file and the bytes of one chunk, as a viewer does that streams it.
 
     Args:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ..codecs.formats import WRITABLE
-from ..codecs.rad_names import SUFFIX as RAD
+from ..codecs.rad.names import SUFFIX as RAD
 from ..model.scene import Scene
 from ..support.errors import FormatError
 from .settings import SPZ, BakeSettings

@@ -6,13 +6,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
-from ..codecs import clamps, rad_options
+from ..codecs import clamps
 from ..codecs.clamps import Clamp
 from ..codecs.formats import WRITABLE, Format
 from ..codecs.gpu import dump
 from ..codecs.options import WriteOptions
-from ..codecs.rad_layout import OPTIONS
-from ..codecs.rad_names import SUFFIX as RAD
+from ..codecs.rad import options as rad_options
+from ..codecs.rad.layout import OPTIONS
+from ..codecs.rad.names import SUFFIX as RAD
 from ..io import SceneSink, Sink, scene_sink, sink
 from ..model.nodes import CHUNK_NODES
 from ..model.scene import Scene
@@ -143,7 +144,7 @@ class _File:
             bytes=size,
             chunks=-(-len(scene) // CHUNK_NODES),
             encodings={name: getattr(options.rad, name) for name in OPTIONS if degree or name != "sh"},
-            sh_codes=options.rad.sh_codes if degree else None,
+            sh_codes=min(options.rad.sh_codes, len(scene)) if options.rad.sh_codes and degree else None,
             clamped=beyond.splats,
             clamps=beyond.ends,
         )

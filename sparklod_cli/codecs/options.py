@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class RadOptions:
-    """How to write RAD. Encodings are those of `rad_layout.choices`; "auto" suits the scene, see `rad_options`.
+    """How to write RAD. Encodings are those of `rad.layout.choices`; "auto" suits the scene, see `rad.options`.
 
     Attributes:
         center, alpha, rgb, scales, orientation, sh: the encoding of each property.

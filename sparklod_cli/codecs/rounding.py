@@ -42,7 +42,7 @@ def _spz(scene: Scene, threads: int) -> Splats:
 
 
 def _rad(scene: Scene, threads: int) -> Splats:
-    from . import rad
+    from .rad import codec as rad
 
     options = WriteOptions(compression_level=1)  # as for SPZ
     data = b"".join(rad.encode(scene, options, threads=threads))

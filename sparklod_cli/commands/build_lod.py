@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from ..codecs.rad_names import SUFFIX as RAD
 from ..support.errors import SparklodError
 from ..support.printable import MOST, shortened
 from ..support.stdin import DASH, name_of
@@ -134,5 +135,5 @@ def _job(
         leaves = functools.partial(extract_leaves, suffix=outputs.suffix, options=write_options(ctx))
         return leaves, report_extracted
     settings = bake_settings(ctx, suffix=outputs.suffix, raw=outputs.is_raw, converts=outputs.format_is_asked_for)
-    console.announce_compiling(settings.method)
+    console.announce_compiling(settings.method, *(["rad"] if outputs.suffix == RAD else []))
     return functools.partial(bake, settings=settings), report_baked

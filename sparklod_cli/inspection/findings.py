@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ..codecs.rad_promises import ERRORS as RAD_ERRORS
-from ..codecs.rad_promises import WARNINGS as RAD_WARNINGS
+from ..codecs.rad.promises import ERRORS as RAD_ERRORS
+from ..codecs.rad.promises import WARNINGS as RAD_WARNINGS
 
 ERROR, WARNING, NOTE = "error", "warning", "note"
 

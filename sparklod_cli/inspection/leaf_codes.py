@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..codecs.octahedral import STEPS_8_8_8, encode_axis_angle, encode_lod_alpha
-from ..codecs.rad_encodings import CODINGS
-from ..codecs.rad_layout import PROPERTIES, Row
+from ..codecs.rad.encodings import CODINGS
+from ..codecs.rad.layout import PROPERTIES, Row
 from ..codecs.spz_layout import LOD, Layout
 from ..model.scene import Scene
 from ..model.sh import COEFFICIENTS

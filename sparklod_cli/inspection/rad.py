@@ -8,10 +8,10 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from ..codecs.rad_encodings import LARGEST_F16
-from ..codecs.rad_header import ENCODING_KEYS, ChunkHeader, Header, Violation
-from ..codecs.rad_layout import BY_NAME, PROPERTIES, SIZES
-from ..codecs.rad_survey import survey_chunks, survey_file
+from ..codecs.rad.encodings import LARGEST_F16
+from ..codecs.rad.header import ENCODING_KEYS, RadChunkHeader, RadHeader, Violation
+from ..codecs.rad.layout import BY_NAME, PROPERTIES, SIZES
+from ..codecs.rad.survey import survey_chunks, survey_file
 from ..codecs.splat_encoding import log_scale_table
 from ..io import opened
 from ..support.printable import MOST, printable
@@ -89,7 +89,7 @@ class Survey:
         fatal: findings because of which the file cannot be read.
     """
 
-    header: Header
+    header: RadHeader
     facts: RadFacts | None
     findings: list[Finding]
     fatal: list[Finding]
@@ -129,7 +129,7 @@ class _Gathered:
     low: dict[str, float] = field(default_factory=dict)
     high: dict[str, float] = field(default_factory=dict)
 
-    def add(self, chunk: ChunkHeader) -> None:
+    def add(self, chunk: RadChunkHeader) -> None:
         for each in chunk.properties:
             if each.name not in BY_NAME or each.encoding not in SIZES:
                 continue  # a finding says so
@@ -141,7 +141,7 @@ class _Gathered:
                 self.high[each.name] = max(each.max, self.high.get(each.name, each.max))
 
 
-def _facts(header: Header, gathered: _Gathered) -> RadFacts:
+def _facts(header: RadHeader, gathered: _Gathered) -> RadFacts:
     sizes = [entry.bytes for entry in header.chunks]
     total = header.bytes + sum(sizes)
     chunk_bytes = ChunkBytes(min(sizes), round(statistics.median(sizes)), max(sizes)) if sizes else None

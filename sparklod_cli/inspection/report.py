@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..codecs.rad import name_of
+from ..codecs.rad.codec import name_of
 from ..codecs.spz_layout import KNOWN_FLAGS
 from ..io import examine_scene, read_arrays, size_of_input
 from ..model.scene import Scene

@@ -7,8 +7,8 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import BinaryIO
 
-from ..codecs import rad_header
 from ..codecs.formats import HEAD
+from ..codecs.rad import header as rad_header
 from ..codecs.sog_files import MAX_META, META, names_beside
 from ..support.errors import FormatError, UnreadableError
 from ..support.stdin import DASH

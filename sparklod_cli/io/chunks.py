@@ -7,9 +7,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
-from ..codecs import rad, rad_promises
-from ..codecs.rad import Chunk
-from ..codecs.rad_header import ChunkEntry, Header, read_header
+from ..codecs.rad import codec as rad
+from ..codecs.rad import promises as rad_promises
+from ..codecs.rad.codec import RadChunk
+from ..codecs.rad.header import RadChunkEntry, RadHeader, read_header
 from ..codecs.stream import size_of
 from ..model.splats import FloatArray
 from ..support.errors import TruncatedError, UnreadableError
@@ -17,7 +18,7 @@ from .beside import open_beside
 from .names import reason_of
 
 
-def read_rad_header(path: Path) -> Header:
+def read_rad_header(path: Path) -> RadHeader:
     """Reads the header of a RAD file; its chunks need not be there.
 
     Raises:
@@ -27,7 +28,7 @@ def read_rad_header(path: Path) -> Header:
         return _header(file)
 
 
-def read_rad_chunk(path: Path, number: int, *, palette: FloatArray | None = None) -> Chunk:
+def read_rad_chunk(path: Path, number: int, *, palette: FloatArray | None = None) -> RadChunk:
     """Reads the header of a RAD file, and one chunk of it.
 
     Args:
@@ -61,13 +62,13 @@ def _opened(path: Path) -> Iterator[BinaryIO]:
         raise UnreadableError(f"cannot be read: {reason_of(error)}") from None
 
 
-def _header(file: BinaryIO) -> Header:
+def _header(file: BinaryIO) -> RadHeader:
     header = read_header(file)
     rad_promises.check(rad_promises.violations(header))
     return header
 
 
-def _chunk(file: BinaryIO, entry: ChunkEntry, header: Header, palette: FloatArray | None) -> Chunk:
+def _chunk(file: BinaryIO, entry: RadChunkEntry, header: RadHeader, palette: FloatArray | None) -> RadChunk:
     """A chunk, after a look at whether its file has as many bytes as memory would be asked for."""
     begin = entry.offset + (header.bytes if entry.filename is None else 0)
     if begin + entry.bytes > size_of(file):

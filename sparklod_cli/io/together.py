@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from ..codecs.rad_names import CHUNK_SUFFIX, number_of
+from ..codecs.rad.names import CHUNK_SUFFIX, number_of
 from ..support import atomic_set
 from ..support.errors import OutputError
 from ..support.stdin import DASH

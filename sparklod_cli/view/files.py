@@ -13,7 +13,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 from ..codecs.formats import FORMATS, HEAD, sniff
-from ..codecs.rad_header import MAGIC, Header, read_header
+from ..codecs.rad.header import MAGIC, RadHeader, read_header
 from ..codecs.sog_files import META
 from ..io.names import leads_away, reason_of
 from ..io.plain import open_plain
@@ -70,7 +70,7 @@ class ShownFile:
     url: str
     format: str
     spark_type: str
-    header: Header | None
+    header: RadHeader | None
     files: Mapping[str, Path]
     note: str | None = None
 
@@ -138,7 +138,7 @@ def _shown(path: Path, folder: str) -> ShownFile:
     return ShownFile(path, path.name, url_of(name), form.name, SPARK_TYPES[form.name], header, files, note)
 
 
-def _note(name: str, head: bytes, header: Header | None) -> str | None:
+def _note(name: str, head: bytes, header: RadHeader | None) -> str | None:
     """Why Spark will not show a file, as far as its beginning tells."""
     for beginning, what in UNREAD:
         if re.match(beginning, head):
@@ -151,7 +151,7 @@ def _note(name: str, head: bytes, header: Header | None) -> str | None:
     return None
 
 
-def _chunk_files(path: Path, header: Header) -> Iterator[tuple[str, Path]]:
+def _chunk_files(path: Path, header: RadHeader) -> Iterator[tuple[str, Path]]:
     """The chunk files that the header of a RAD file names."""
     for entry in header.chunks:
         name = entry.filename

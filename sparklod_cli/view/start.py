@@ -14,8 +14,8 @@ from ..cameras.camera import Camera, Matrix
 from ..cameras.defaults import ELEVATION
 from ..cameras.frame import DEFAULT_FOV_Y, Settings
 from ..cameras.sources import Views, WholeScene
-from ..codecs.rad import read_chunk
-from ..codecs.rad_header import Header
+from ..codecs.rad.codec import read_chunk
+from ..codecs.rad.header import RadHeader
 from ..io import examine_scene
 from ..io.names import reason_of
 from ..io.plain import open_plain
@@ -101,7 +101,7 @@ def extent_of(shown: ShownFile, *, threads: int = 1, progress: Progress = silent
     return Extent(len(scene.splats), None if leaves is None else len(leaves), balls, _sizes(scene.splats))
 
 
-def _coarse_extent(shown: ShownFile, header: Header) -> Extent:
+def _coarse_extent(shown: ShownFile, header: RadHeader) -> Extent:
     """That of a RAD tree by its first chunk alone, as a viewer first has it: a file may have gigabytes.
 
     A cut through the chunk, its nodes that have no children in it, covers the whole scene.

@@ -12,10 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fixtures import by_hand, by_hand_compressed_ply, by_hand_ksplat, by_hand_rad, by_hand_sog, by_hand_splat
-from sparklod_cli.codecs import octahedral, ply, quantize, rad, splat, spz
+from sparklod_cli.codecs import octahedral, ply, quantize, splat, spz
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
-from sparklod_cli.codecs.rad_header import ENCODING_KEYS
-from sparklod_cli.codecs.rad_layout import choices
+from sparklod_cli.codecs.rad import codec as rad
+from sparklod_cli.codecs.rad.header import ENCODING_KEYS
+from sparklod_cli.codecs.rad.layout import choices
 from sparklod_cli.codecs.splat_encoding import SplatEncoding
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.sh import SH_C0

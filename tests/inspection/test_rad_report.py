@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from sparklod_cli.cli import run
-from sparklod_cli.codecs import rad as codec
-from sparklod_cli.codecs import rad_survey
+from sparklod_cli.codecs.rad import codec as codec
+from sparklod_cli.codecs.rad import survey as rad_survey
 from sparklod_cli.inspection import leaves, rad
 from sparklod_cli.inspection.html import Section, page
 from sparklod_cli.inspection.rad import PropertyFacts

@@ -15,12 +15,12 @@ import numpy as np
 import pytest
 
 from sparklod_cli.cli import run
-from sparklod_cli.codecs import rad
 from sparklod_cli.codecs.gpu import packed_splats
 from sparklod_cli.codecs.octahedral import encode_lod_alpha
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
-from sparklod_cli.codecs.rad_header import Header, read_chunk_header, read_header
-from sparklod_cli.codecs.rad_layout import choices
+from sparklod_cli.codecs.rad import codec as rad
+from sparklod_cli.codecs.rad.header import RadHeader, read_chunk_header, read_header
+from sparklod_cli.codecs.rad.layout import choices
 from sparklod_cli.codecs.splat_encoding import SplatEncoding
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod import quick
@@ -51,7 +51,7 @@ DEGREES = {"oct88r8": 1.94} | {
 }
 
 
-def header_of(path: Path) -> Header:
+def header_of(path: Path) -> RadHeader:
     with path.open("rb") as file:
         return read_header(file)
 

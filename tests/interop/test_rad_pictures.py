@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.cameras.pose import look_at
-from sparklod_cli.codecs import rad, spz
+from sparklod_cli.codecs import spz
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
-from sparklod_cli.codecs.rad_header import Header, read_header
+from sparklod_cli.codecs.rad import codec as rad
+from sparklod_cli.codecs.rad.header import RadHeader, read_header
 from sparklod_cli.codecs.splat_encoding import SplatEncoding
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod import quick
@@ -60,12 +61,12 @@ class Files:
     spz: Path
     whole: Path
     chunked: Path
-    header: Header
+    header: RadHeader
 
     @classmethod
     def of(cls, scene: Scene, folder: Path, ranges: SplatEncoding | None = None) -> Files:
         options = WriteOptions(rad=RadOptions(ranges=ranges))
-        files = cls(folder / "tree.spz", folder / "tree.rad", folder / "parts-lod.rad", Header(0, 0, True, 0, 0, ()))
+        files = cls(folder / "tree.spz", folder / "tree.rad", folder / "parts-lod.rad", RadHeader(0, 0, True, 0, 0, ()))
         files.spz.write_bytes(b"".join(spz.encode(scene, threads=2)))
         files.whole.write_bytes(b"".join(rad.encode(scene, options, threads=2)))
         for name, pieces in rad.encode_chunked(scene, options, "parts-lod", threads=2):

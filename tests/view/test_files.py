@@ -12,7 +12,7 @@ import pytest
 
 import sparklod_cli as sparklod
 from sparklod_cli.api import viewing
-from sparklod_cli.codecs.rad_header import ChunkEntry, Header, pack_header
+from sparklod_cli.codecs.rad.header import RadChunkEntry, RadHeader, pack_header
 from sparklod_cli.support.errors import CameraPathError, FormatError, SparklodError
 from sparklod_cli.view.files import shown_files
 from tests.conftest import FIXTURES
@@ -121,7 +121,7 @@ def test_a_chunk_file_outside_of_the_folder_is_refused(tmp_path: Path, name: str
     (tmp_path / "secret").write_text("not yours")
     folder = tmp_path / "rad"
     folder.mkdir()
-    header = Header(10, 0, True, 65_536, 5, (ChunkEntry(0, 5, name),))
+    header = RadHeader(10, 0, True, 65_536, 5, (RadChunkEntry(0, 5, name),))
     (folder / "scene.rad").write_bytes(pack_header(header))
     with pytest.raises(FormatError, match="which is not a file beside it"):
         shown_files([folder / "scene.rad"])

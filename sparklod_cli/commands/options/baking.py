@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import click
 
 from ...codecs.gpu.table import ENCODINGS, NPZ, RAW_SUFFIXES
-from ...codecs.rad_layout import OPTIONS as PROPERTIES
-from ...codecs.rad_layout import choices
+from ...codecs.rad.layout import OPTIONS as PROPERTIES
+from ...codecs.rad.layout import choices
 from ...lod.builders import BUILDERS, METHODS
 from ...support import defaults
 from ..command import COMMON, option, with_options

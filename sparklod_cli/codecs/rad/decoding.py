@@ -11,15 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 from zlib_ng import zlib_ng
 
-from ..model.lod_tree import LodTree
-from ..model.sh import COEFFICIENTS
-from ..model.splats import FloatArray, Splats
-from ..support.errors import FormatError, TooLongError, TruncatedError
-from . import octahedral, rad_promises
-from .quantize import Bytes, quat_of_xyz
-from .rad_encodings import CODINGS
-from .rad_header import ChunkHeader, Header, Property, read_chunk_header
-from .rad_layout import BY_NAME, SIZES, Row
+from ...model.lod_tree import LodTree
+from ...model.sh import COEFFICIENTS
+from ...model.splats import FloatArray, Splats
+from ...support.errors import FormatError, TooLongError, TruncatedError
+from .. import octahedral
+from ..quantize import Bytes, quat_of_xyz
+from . import promises
+from .encodings import CODINGS
+from .header import Property, RadChunkHeader, RadHeader, read_chunk_header
+from .layout import BY_NAME, SIZES, Row
 
 _ZlibError: Any = zlib_ng.error  # the stubs take the class for an instance
 _RAW = -zlib_ng.MAX_WBITS
@@ -36,25 +37,25 @@ class Packed:
     """
 
     number: int
-    header: ChunkHeader
+    header: RadChunkHeader
     payload: memoryview
 
     @classmethod
-    def of(cls, data: bytes, number: int, header: Header) -> Packed:
+    def of(cls, data: bytes, number: int, header: RadHeader) -> Packed:
         """A chunk of its bytes.
 
         Raises:
-            FormatError: its header is broken, or breaks a promise of `rad_promises` that is fatal.
+            FormatError: its header is broken, or breaks a promise of `promises` that is fatal.
         """
         chunk = read_chunk_header(io.BytesIO(data))
-        rad_promises.check(rad_promises.chunk_violations(header, number, chunk, len(data)))
+        promises.check(promises.chunk_violations(header, number, chunk, len(data)))
         return cls(number, chunk, memoryview(data)[chunk.bytes :])
 
     def property(self, name: str) -> Property | None:
         """A property by its name; None where the chunk has none."""
         return next((each for each in self.header.properties if each.name == name), None)
 
-    def palette(self, header: Header) -> FloatArray | None:
+    def palette(self, header: RadHeader) -> FloatArray | None:
         """(codes, K, 3) SH coefficients that labels point to; None where the chunk has no palette.
 
         Raises:
@@ -111,7 +112,7 @@ def fill_sh(out: FloatArray, degree: int, values: FloatArray) -> None:
 @np.errstate(invalid="ignore", over="ignore")  # any bits may be a float
 def fill(
     packed: Packed,
-    header: Header,
+    header: RadHeader,
     splats: Splats,
     tree: LodTree | None,
     palette: FloatArray | None,
@@ -152,7 +153,7 @@ def fill(
     if labels is not None and palette is not None:
         if labels.max(initial=0) >= len(palette):
             where = f"SH label {labels.max():,} of chunk {packed.number:,}"
-            raise rad_promises.error_of("rad.palette", f"{where} is beyond the {len(palette):,} codes of the palette")
+            raise promises.error_of("rad.palette", f"{where} is beyond the {len(palette):,} codes of the palette")
         if "sh" in columns:
             np.take(palette, labels, axis=0, out=splats.sh)
         return None

@@ -7,15 +7,14 @@ has a header of its own, so that it can be decoded by itself. `docs/formats.md` 
 from __future__ import annotations
 
 import json
-import math
 import struct
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, BinaryIO
 
-from ..support.errors import FormatError, NotSplatsError, PromiseError, TruncatedError, VersionError
-from ..support.untrusted import parse_json, quoted_value
-from .splat_encoding import SplatEncoding
+from ...support.errors import FormatError, NotSplatsError, PromiseError, TruncatedError, VersionError
+from ...support.untrusted import parse_json, quoted_value
+from ..splat_encoding import SplatEncoding
+from .fields import Fields
 
 #: The first bytes of a file, and of a chunk.
 MAGIC, CHUNK_MAGIC = b"RAD0", b"RADC"
@@ -44,7 +43,7 @@ ENCODING_KEYS = {
 
 
 @dataclass(frozen=True)
-class ChunkEntry:
+class RadChunkEntry:
     """Where a chunk is.
 
     Attributes:
@@ -59,7 +58,7 @@ class ChunkEntry:
 
 
 @dataclass(frozen=True)
-class Header:
+class RadHeader:
     """The header of a file.
 
     Attributes:
@@ -81,7 +80,7 @@ class Header:
     lod_tree: bool
     chunk_size: int
     all_chunk_bytes: int
-    chunks: tuple[ChunkEntry, ...]
+    chunks: tuple[RadChunkEntry, ...]
     encoding: SplatEncoding | None = None
     sh_code_count: int | None = None
     comment: str | None = None
@@ -101,8 +100,8 @@ class Property:
     Attributes:
         offset: from the beginning of the payload.
         bytes: as stored.
-        name: one of `rad_layout.PROPERTIES`, as far as it is known.
-        encoding: one of `rad_layout.ENCODINGS`, as far as it is known.
+        name: one of `layout.PROPERTIES`, as far as it is known.
+        encoding: one of `layout.ENCODINGS`, as far as it is known.
         compression: "gz" for a raw deflate stream, None for none.
         min, max: ends of the range of the codes; None where there is none.
     """
@@ -117,14 +116,14 @@ class Property:
 
 
 @dataclass(frozen=True)
-class ChunkHeader:
+class RadChunkHeader:
     """The header of a chunk.
 
     Attributes:
         base: index of its first splat in the file.
         count: its splats.
         payload_bytes: of its properties with their padding, as the JSON has it.
-        max_sh, lod_tree: as in `Header`.
+        max_sh, lod_tree: as in `RadHeader`.
         properties: in the order of the file.
         encoding: ranges of the codes; None where the header has none.
         stored_payload_bytes: the same number again, as it stands before the payload.
@@ -164,7 +163,7 @@ def padding(size: int) -> int:
     return -size % ALIGNMENT
 
 
-def read_header(file: BinaryIO) -> Header:
+def read_header(file: BinaryIO) -> RadHeader:
     """Reads the header of a file, and nothing behind it; the file is left where its first chunk would begin.
 
     Raises:
@@ -175,10 +174,10 @@ def read_header(file: BinaryIO) -> Header:
         raise NotSplatsError(f"a RAD file of {quoted_value(fields.text('type'))}, not of {TYPE}")
     count = fields.whole("count")
     chunks = tuple(
-        ChunkEntry(entry.whole("offset"), entry.whole("bytes"), entry.text_or_none("filename"))
+        RadChunkEntry(entry.whole("offset"), entry.whole("bytes"), entry.text_or_none("filename"))
         for entry in fields.items("chunks")
     )
-    return Header(
+    return RadHeader(
         count,
         fields.whole("maxSh", 0),
         fields.flag("lodTree"),
@@ -193,7 +192,7 @@ def read_header(file: BinaryIO) -> Header:
     )
 
 
-def read_chunk_header(file: BinaryIO) -> ChunkHeader:
+def read_chunk_header(file: BinaryIO) -> RadChunkHeader:
     """Reads the header of a chunk; the file is left at its payload.
 
     Raises:
@@ -215,7 +214,7 @@ def read_chunk_header(file: BinaryIO) -> ChunkHeader:
         )
         for entry in fields.items("properties")
     )
-    return ChunkHeader(
+    return RadChunkHeader(
         fields.whole("base"),
         fields.whole("count"),
         fields.whole("payloadBytes"),
@@ -229,7 +228,7 @@ def read_chunk_header(file: BinaryIO) -> ChunkHeader:
     )
 
 
-def pack_header(header: Header) -> bytes:
+def pack_header(header: RadHeader) -> bytes:
     """The bytes of a file's header, padding included; `bytes` and `padded_with_zeros` of the argument are ignored."""
     chunks = [
         {"offset": entry.offset, "bytes": entry.bytes} | ({"filename": entry.filename} if entry.filename else {})
@@ -251,7 +250,7 @@ def pack_header(header: Header) -> bytes:
     return _pack_json(MAGIC, fields)
 
 
-def pack_chunk_header(header: ChunkHeader) -> bytes:
+def pack_chunk_header(header: RadChunkHeader) -> bytes:
     """The bytes of a chunk's header up to its payload; the fields about what was read are ignored."""
     properties = [
         {
@@ -292,7 +291,7 @@ def _encoding_fields(encoding: SplatEncoding | None) -> dict[str, float | bool] 
     return None if encoding is None else {key: getattr(encoding, name) for key, name in ENCODING_KEYS.items()}
 
 
-def _read_json(file: BinaryIO, magic: bytes, limit: int, what: str) -> tuple[_Fields, int, bool]:
+def _read_json(file: BinaryIO, magic: bytes, limit: int, what: str) -> tuple[Fields, int, bool]:
     """The JSON after a magic word, how many bytes it takes with its padding, and whether that is zeros."""
     prefix = file.read(PREFIX.size)
     if len(prefix) < PREFIX.size:
@@ -310,13 +309,13 @@ def _read_json(file: BinaryIO, magic: bytes, limit: int, what: str) -> tuple[_Fi
         value = parse_json(data)
     except ValueError as error:
         raise FormatError(f"its {what} is not JSON: {error}") from None
-    fields = _Fields(value, what)
+    fields = Fields(value, what)
     if fields.whole("version") != VERSION:
         raise VersionError(f"RAD version {fields.whole('version')} is unknown, only {VERSION} is read")
     return fields, PREFIX.size + length + len(pad), not any(pad)
 
 
-def _encoding(fields: _Fields) -> SplatEncoding | None:
+def _encoding(fields: Fields) -> SplatEncoding | None:
     """The ranges of the codes, where the header has them; what it leaves out is Spark's default."""
     if not fields.has("splatEncoding"):
         return None
@@ -329,74 +328,3 @@ def _encoding(fields: _Fields) -> SplatEncoding | None:
         return SplatEncoding(**given)
     except ValueError as error:
         raise FormatError(f"its splatEncoding is not possible: {error}") from None
-
-
-@dataclass(frozen=True)
-class _Fields:
-    """An object of a strangers' JSON, whose values are checked when they are read."""
-
-    values: Any
-    what: str = field(default="header")
-
-    def __post_init__(self) -> None:
-        if not isinstance(self.values, dict):
-            raise FormatError(f"its {self.what} is not a JSON object")
-
-    def has(self, key: str) -> bool:
-        """Whether there is such a key, with a value other than null."""
-        return self.values.get(key) is not None
-
-    def whole(self, key: str, default: int | None = None) -> int:
-        """A whole number that is not negative."""
-        value = self.values.get(key)
-        if value is None and default is not None:
-            return default
-        if type(value) is not int or value < 0:
-            raise self._wrong(key, "a whole number of 0 or more")
-        return value
-
-    def number_or_none(self, key: str) -> float | None:
-        """A finite number."""
-        value = self.values.get(key)
-        if value is None:
-            return None
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-            raise self._wrong(key, "a finite number")
-        return float(value)
-
-    def flag(self, key: str) -> bool:
-        """True or false; false without the key."""
-        value = self.values.get(key)
-        if value is not None and not isinstance(value, bool):
-            raise self._wrong(key, "true or false")
-        return bool(value)
-
-    def text(self, key: str) -> str:
-        """A text."""
-        value = self.text_or_none(key)
-        if value is None:
-            raise self._wrong(key, "a text")
-        return value
-
-    def text_or_none(self, key: str) -> str | None:
-        """A text, or None without the key."""
-        value = self.values.get(key)
-        if value is not None and not isinstance(value, str):
-            raise self._wrong(key, "a text")
-        return value
-
-    def inner(self, key: str) -> _Fields:
-        """An object."""
-        return _Fields(self.values.get(key), f"{self.what}'s {key}")
-
-    def items(self, key: str) -> Iterator[_Fields]:
-        """The objects of a list."""
-        values = self.values.get(key)
-        if not isinstance(values, list):
-            raise self._wrong(key, "a list")
-        return (_Fields(value, f"{self.what}'s {key}[{number}]") for number, value in enumerate(values))
-
-    def _wrong(self, key: str, kind: str) -> FormatError:
-        if key not in self.values:
-            return FormatError(f"its {self.what} has no {key}")
-        return FormatError(f"its {self.what} has {key} = {quoted_value(self.values[key])}, which is not {kind}")

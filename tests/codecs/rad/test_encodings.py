@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from fixtures import by_hand_rad
 from sparklod_cli.codecs.options import RadOptions
-from sparklod_cli.codecs.rad_encodings import CODINGS, LARGEST_F16
-from sparklod_cli.codecs.rad_layout import PROPERTIES, RANGES, SIZES, choices
+from sparklod_cli.codecs.rad.encodings import CODINGS, LARGEST_F16
+from sparklod_cli.codecs.rad.layout import PROPERTIES, RANGES, SIZES, choices
 from tests.codecs.test_quantize import rotation_degrees
 from tests.scenes import random_splats
 

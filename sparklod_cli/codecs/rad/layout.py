@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-#: Leaves the choice to `rad_options`.
+#: Leaves the choice to `options`.
 AUTO = "auto"
 
 #: Bytes of a number in each encoding of a file.

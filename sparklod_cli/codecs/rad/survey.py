@@ -7,11 +7,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import BinaryIO
 
-from ..support.errors import FormatError
-from .rad import Beside, refuse_chunk
-from .rad_header import ChunkHeader, Header, Violation, padding, read_chunk_header, read_header
-from .rad_promises import chunk_violations, violations
-from .stream import size_of
+from ...support.errors import FormatError
+from ..stream import size_of
+from .codec import Beside, refuse_chunk
+from .header import RadChunkHeader, RadHeader, Violation, padding, read_chunk_header, read_header
+from .promises import chunk_violations, violations
 
 
 @dataclass(frozen=True)
@@ -25,11 +25,11 @@ class ChunkSurvey:
     """
 
     number: int
-    header: ChunkHeader | None
+    header: RadChunkHeader | None
     violations: tuple[Violation, ...]
 
 
-def survey_file(file: BinaryIO, beside: Beside) -> tuple[Header, tuple[Violation, ...]]:
+def survey_file(file: BinaryIO, beside: Beside) -> tuple[RadHeader, tuple[Violation, ...]]:
     """The header of a file and the promises that it breaks, those about the files of its chunks among them.
 
     Raises:
@@ -51,7 +51,7 @@ def _size_beside(name: str, beside: Beside) -> int | str:
         return str(error)
 
 
-def survey_chunks(file: BinaryIO, beside: Beside, header: Header, *, paddings: bool) -> Iterator[ChunkSurvey]:
+def survey_chunks(file: BinaryIO, beside: Beside, header: RadHeader, *, paddings: bool) -> Iterator[ChunkSurvey]:
     """The headers of the chunks, one after the other.
 
     Args:
@@ -78,7 +78,7 @@ def survey_chunks(file: BinaryIO, beside: Beside, header: Header, *, paddings: b
             yield ChunkSurvey(number, chunk, tuple(found))
 
 
-def _paddings(file: BinaryIO, payload: int, chunk: ChunkHeader, number: int) -> Iterator[Violation]:
+def _paddings(file: BinaryIO, payload: int, chunk: RadChunkHeader, number: int) -> Iterator[Violation]:
     for each in chunk.properties:
         file.seek(payload + each.offset + each.bytes)
         if any(file.read(padding(each.bytes))):

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from fixtures import by_hand_rad
-from sparklod_cli.codecs import rad
-from sparklod_cli.codecs.rad_header import read_header
+from sparklod_cli.codecs.rad import codec as rad
+from sparklod_cli.codecs.rad.header import read_header
 from sparklod_cli.support.errors import FormatError, PromiseError
 from tests.codecs.test_damaged import attempt, content
 from tests.codecs.test_damaged_sog import VALUES, places_of, replaced

@@ -16,23 +16,24 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from .. import __version__
-from ..model.lod_tree import LodTree
-from ..model.nodes import CHUNK_NODES
-from ..model.scene import Scene
-from ..model.sh import COEFFICIENTS
-from ..model.splats import COLUMNS, FloatArray, Splats
-from ..support.errors import FormatError, NotSplatsError, TreeError, TruncatedError
-from ..support.parallel import blocks_of, ordered_map
-from ..support.progress import Progress, silent
-from . import compression, rad_promises, sh_palette
-from .options import DEFAULTS, WriteOptions
-from .rad_decode import Packed, fill
-from .rad_encode import Palette, Writing
-from .rad_header import CHUNK_MAGIC, ChunkEntry, ChunkHeader, Header, pack_header, read_header
-from .rad_names import SUFFIX, chunk_name
-from .rad_options import settled as settled
-from .stream import size_of
+from ... import __version__
+from ...model.lod_tree import LodTree
+from ...model.nodes import CHUNK_NODES
+from ...model.scene import Scene
+from ...model.sh import COEFFICIENTS
+from ...model.splats import COLUMNS, FloatArray, Splats
+from ...support.errors import FormatError, NotSplatsError, TreeError, TruncatedError
+from ...support.parallel import blocks_of, ordered_map
+from ...support.progress import Progress, silent
+from .. import compression, sh_palette
+from ..options import DEFAULTS, WriteOptions
+from ..stream import size_of
+from . import promises
+from .decoding import Packed, fill
+from .encoding import Palette, Writing
+from .header import CHUNK_MAGIC, RadChunkEntry, RadChunkHeader, RadHeader, pack_header, read_header
+from .names import SUFFIX, chunk_name
+from .options import settled as settled
 
 #: Bytes of chunks that wait in memory for their header; beyond, they wait on disk.
 SPOOLED = 1 << 26
@@ -51,7 +52,7 @@ def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent, bes
         beside: opens the files that the header names; None if there are none to open.
 
     Raises:
-        FormatError: the file is not RAD, cut short or corrupt, breaks a promise of `rad_promises` that is fatal, or has
+        FormatError: the file is not RAD, cut short or corrupt, breaks a promise of `promises` that is fatal, or has
             a broken tree; a file that it names is missing or damaged.
     """
     scene = examine(file, threads=threads, progress=progress, beside=beside)
@@ -83,7 +84,7 @@ def examine(
     refuse_chunk(file)
     header = read_header(file)
     files = _sizes_beside(header, beside)
-    rad_promises.check(rad_promises.violations(header, size, files))
+    promises.check(promises.violations(header, size, files))
     _check_promise(header.count, header, size + sum(files.values()))
     make = Splats.empty if set(COLUMNS) <= set(columns) else Splats.zeros
     splats, tree = make(header.count, header.max_sh), None
@@ -98,7 +99,7 @@ def examine(
         part = _rows(splats, tree, slice(start, stop))
         if fill(packed, header, *part, palette, columns) is not None:
             text = f"chunk {packed.number:,} has labels of SH, but there is no palette"
-            raise rad_promises.error_of("rad.palette", text)
+            raise promises.error_of("rad.palette", text)
         return stop
 
     def all_chunks() -> Iterator[Packed]:
@@ -115,7 +116,7 @@ def examine(
     return Scene(splats, tree, format=name_of(header), header=facts, chunk_bytes=sizes)
 
 
-def name_of(header: Header) -> str:
+def name_of(header: RadHeader) -> str:
     """The format of a file for people, as `Scene.format` has it."""
     return "RAD" + " LoD" * header.lod_tree
 
@@ -129,7 +130,7 @@ def encode(
     `lod.chunk_order` is for streaming.
 
     Raises:
-        FormatError, ValueError: see `rad_options.settled`.
+        FormatError, ValueError: see `options.settled`.
     """
     writing = _writing(scene, options, threads, progress)
     sizes = []
@@ -139,7 +140,7 @@ def encode(
             sizes.append(len(chunk))
         spool.seek(0)
         offsets = itertools.accumulate(sizes, initial=0)
-        yield pack_header(_header(writing, tuple(map(ChunkEntry, offsets, sizes))))
+        yield pack_header(_header(writing, tuple(map(RadChunkEntry, offsets, sizes))))
         while piece := spool.read(compression.PIECE):
             yield piece
 
@@ -154,13 +155,13 @@ def encode_chunked(
         stem: of the names: the header's is "stem.rad", and those of the chunks are "stem-0.radc" and so on.
 
     Raises:
-        FormatError, ValueError: see `rad_options.settled`.
+        FormatError, ValueError: see `options.settled`.
     """
     writing = _writing(scene, options, threads, progress)
     entries = []
     for number, chunk in enumerate(_encoded(writing, threads, progress)):
         name = chunk_name(stem, number)
-        entries.append(ChunkEntry(0, len(chunk), name))
+        entries.append(RadChunkEntry(0, len(chunk), name))
         yield name, [chunk]
     yield stem + SUFFIX, [pack_header(_header(writing, tuple(entries)))]
 
@@ -192,9 +193,9 @@ def _encoded(writing: Writing, threads: int, progress: Progress) -> Iterator[byt
         yield chunk
 
 
-def _header(writing: Writing, entries: tuple[ChunkEntry, ...]) -> Header:
+def _header(writing: Writing, entries: tuple[RadChunkEntry, ...]) -> RadHeader:
     scene = writing.scene
-    return Header(
+    return RadHeader(
         len(scene),
         scene.splats.sh_degree,
         scene.tree is not None,
@@ -208,7 +209,7 @@ def _header(writing: Writing, entries: tuple[ChunkEntry, ...]) -> Header:
 
 
 @dataclass(frozen=True, eq=False)
-class Chunk:
+class RadChunk:
     """One chunk of a file.
 
     Attributes:
@@ -219,26 +220,26 @@ class Chunk:
         labels: (N,) into the palette, where that is not known.
     """
 
-    header: ChunkHeader
+    header: RadChunkHeader
     splats: Splats
     tree: LodTree | None
     palette: FloatArray | None
     labels: NDArray[np.uint32] | None
 
 
-def read_chunk(file: BinaryIO, entry: ChunkEntry, header: Header, palette: FloatArray | None = None) -> Chunk:
+def read_chunk(file: BinaryIO, entry: RadChunkEntry, header: RadHeader, palette: FloatArray | None = None) -> RadChunk:
     """Reads one chunk, and nothing but its bytes.
 
     Args:
         file: that of the header, or the chunk's own where the entry names one.
         entry: one of the header's.
-        header: of the file, see `rad_header.read_header`.
+        header: of the file, see `header.read_header`.
         palette: that of the file's first chunk; labels stay labels without.
 
     Raises:
         FormatError: the chunk is cut short, corrupt, or not the one that the header means.
     """
-    rad_promises.check(rad_promises.violations(header))
+    promises.check(promises.violations(header))
     packed = Packed.of(_bytes_of(file, entry, header), header.chunks.index(entry), header)
     count = packed.header.count
     _check_promise(count, header, entry.bytes)
@@ -250,7 +251,7 @@ def read_chunk(file: BinaryIO, entry: ChunkEntry, header: Header, palette: Float
     labels = fill(packed, header, splats, tree, palette, COLUMNS)
     if labels is not None:
         splats.sh[:] = 0
-    return Chunk(packed.header, splats, tree, own, labels)
+    return RadChunk(packed.header, splats, tree, own, labels)
 
 
 def refuse_chunk(file: BinaryIO) -> None:
@@ -260,7 +261,7 @@ def refuse_chunk(file: BinaryIO) -> None:
     file.seek(0)
 
 
-def _sizes_beside(header: Header, beside: Beside | None) -> dict[str, int]:
+def _sizes_beside(header: RadHeader, beside: Beside | None) -> dict[str, int]:
     """Sizes of the files that a header names.
 
     Raises:
@@ -280,7 +281,7 @@ def _open(name: str, beside: Beside | None) -> BinaryIO:
     return beside(name)
 
 
-def _chunks(file: BinaryIO, header: Header, beside: Beside | None) -> Iterator[Packed]:
+def _chunks(file: BinaryIO, header: RadHeader, beside: Beside | None) -> Iterator[Packed]:
     """The chunks in order, read when they are asked for."""
     for number, entry in enumerate(header.chunks):
         with contextlib.ExitStack() as stack:
@@ -289,7 +290,7 @@ def _chunks(file: BinaryIO, header: Header, beside: Beside | None) -> Iterator[P
         yield Packed.of(data, number, header)
 
 
-def _bytes_of(file: BinaryIO, entry: ChunkEntry, header: Header) -> bytes:
+def _bytes_of(file: BinaryIO, entry: RadChunkEntry, header: RadHeader) -> bytes:
     start = entry.offset + (header.bytes if entry.filename is None else 0)
     lacking = start + entry.bytes - size_of(file)
     if lacking > 0:  # before so much memory is asked for
@@ -298,7 +299,7 @@ def _bytes_of(file: BinaryIO, entry: ChunkEntry, header: Header) -> bytes:
     return file.read(entry.bytes)
 
 
-def _check_promise(count: int, header: Header, size: int) -> None:
+def _check_promise(count: int, header: RadHeader, size: int) -> None:
     """Raises `PromiseError` if a file or a chunk of this size can hardly have so many splats."""
     compression.check_promise(count * 4 * (14 + 3 * COEFFICIENTS[header.max_sh]), size)
 

@@ -9,18 +9,18 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ..model.nodes import CHUNK_NODES
-from ..model.scene import Scene
-from ..model.sh import COEFFICIENTS
-from ..model.splats import FloatArray
-from ..support.errors import FormatError
-from .clamps import Range
-from .magnitudes import LOWER, UPPER, Magnitudes, tops
-from .options import RadOptions, WriteOptions
-from .rad_encodings import LARGEST_F16
-from .rad_layout import AUTO, PROPERTIES, RANGES, Row, choices
-from .splat_encoding import SCALE_ZERO, SplatEncoding
-from .steps import SMALL_QUANTILE, fine_bits
+from ...model.nodes import CHUNK_NODES
+from ...model.scene import Scene
+from ...model.sh import COEFFICIENTS
+from ...model.splats import FloatArray
+from ...support.errors import FormatError
+from ..clamps import Range
+from ..magnitudes import LOWER, UPPER, Magnitudes, tops
+from ..options import RadOptions, WriteOptions
+from ..splat_encoding import SCALE_ZERO, SplatEncoding
+from ..steps import SMALL_QUANTILE, fine_bits
+from .encodings import LARGEST_F16
+from .layout import AUTO, PROPERTIES, RANGES, Row, choices
 
 #: What "auto" stands for, where the scene does not decide.
 AUTOMATIC = RadOptions("f32_lebytes", "r8", "r8", "ln_0r8", "oct88r8", "s8")

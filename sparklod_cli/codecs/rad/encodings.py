@@ -12,10 +12,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..model.splats import FloatArray
-from . import octahedral, splat_encoding
-from .octahedral import STEPS_8_8_8
-from .quantize import Bytes
+from ...model.splats import FloatArray
+from .. import octahedral, splat_encoding
+from ..octahedral import STEPS_8_8_8
+from ..quantize import Bytes
 
 #: Largest finite float16. Larger values are clamped to it: rounded they would be infinite.
 LARGEST_F16 = np.float32(65504)

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
 
-from ..model.nodes import CHUNK_NODES
-from ..support.defaults import MAX_SH_DEGREE
-from ..support.errors import FormatError
-from ..support.untrusted import quoted_value
-from .quantize import LARGEST
-from .rad_header import ALIGNMENT, GZ, ChunkEntry, ChunkHeader, Header, Property, Violation, padding
-from .rad_layout import BY_NAME, PROPERTIES, RANGES, Row
+from ...model.nodes import CHUNK_NODES
+from ...support.defaults import MAX_SH_DEGREE
+from ...support.errors import FormatError
+from ...support.untrusted import quoted_value
+from ..quantize import LARGEST
+from .header import ALIGNMENT, GZ, Property, RadChunkEntry, RadChunkHeader, RadHeader, Violation, padding
+from .layout import BY_NAME, PROPERTIES, RANGES, Row
 
 #: What is wrong with each promise, by its code; the text of a violation has the values. Other formats break some of
 #: these promises, too: their codes are "container.cut-short", "container.trailing" and "container.version".
@@ -56,18 +56,18 @@ def error_of(code: str, text: str) -> FormatError:
     return error
 
 
-def expected_chunks(header: Header) -> int:
+def expected_chunks(header: RadHeader) -> int:
     """How many chunks the splats of a file take."""
     return -(-header.count // max(header.chunk_size, 1))
 
 
-def expected_count(header: Header, number: int) -> int:
+def expected_count(header: RadHeader, number: int) -> int:
     """Splats of a chunk."""
     return max(0, min(header.chunk_size, header.count - number * header.chunk_size))
 
 
 def violations(
-    header: Header, file_size: int | None = None, files: Mapping[str, int | str] | None = None
+    header: RadHeader, file_size: int | None = None, files: Mapping[str, int | str] | None = None
 ) -> Iterator[Violation]:
     """The broken promises of a file's header.
 
@@ -112,9 +112,9 @@ def violations(
         yield Violation("rad.opacity", "it has a tree, but its splatEncoding has no lodOpacity", fatal=False)
 
 
-def _places(header: Header, file_size: int, files: Mapping[str, int | str] | None) -> Iterator[Violation]:
+def _places(header: RadHeader, file_size: int, files: Mapping[str, int | str] | None) -> Iterator[Violation]:
     """Of chunks in their files."""
-    by_file: dict[str | None, list[tuple[int, ChunkEntry]]] = defaultdict(list)
+    by_file: dict[str | None, list[tuple[int, RadChunkEntry]]] = defaultdict(list)
     for number, entry in enumerate(header.chunks):
         by_file[entry.filename].append((number, entry))
     for name, entries in by_file.items():
@@ -156,7 +156,7 @@ def _end_of_file(name: str, size: int | str, end: int, last: int) -> Iterator[Vi
         yield Violation("container.trailing", text, fatal=False)
 
 
-def chunk_violations(header: Header, number: int, chunk: ChunkHeader, size: int) -> Iterator[Violation]:
+def chunk_violations(header: RadHeader, number: int, chunk: RadChunkHeader, size: int) -> Iterator[Violation]:
     """The broken promises of a chunk's header.
 
     Args:
@@ -193,11 +193,11 @@ def chunk_violations(header: Header, number: int, chunk: ChunkHeader, size: int)
         yield from _encodings(each, f"property {quoted_value(each.name)} of {name}")
 
 
-def _kind_of(header: Header | ChunkHeader) -> str:
+def _kind_of(header: RadHeader | RadChunkHeader) -> str:
     return f"SH degree {header.max_sh} and {'a tree' if header.lod_tree else 'no tree'}"
 
 
-def _payload(number: int, chunk: ChunkHeader, payload: int) -> Iterator[Violation]:
+def _payload(number: int, chunk: RadChunkHeader, payload: int) -> Iterator[Violation]:
     at = 0
     for each in chunk.properties:
         what = f"property {quoted_value(each.name)} of chunk {number:,}"
@@ -212,7 +212,7 @@ def _payload(number: int, chunk: ChunkHeader, payload: int) -> Iterator[Violatio
         yield Violation("rad.sizes", text, fatal=False)
 
 
-def _names(header: Header, number: int, names: list[str]) -> Iterator[Violation]:
+def _names(header: RadHeader, number: int, names: list[str]) -> Iterator[Violation]:
     where = f"chunk {number:,}"
     twice = {name for name in names if names.count(name) > 1} if len(names) <= len(BY_NAME) else set(names)
     if twice:
@@ -237,7 +237,7 @@ def _names(header: Header, number: int, names: list[str]) -> Iterator[Violation]
         yield Violation("rad.order", f"the properties of {where} are in the order {', '.join(known)}", fatal=False)
 
 
-def _belongs(row: Row, header: Header, number: int | None, *, labels: bool) -> bool:
+def _belongs(row: Row, header: RadHeader, number: int | None, *, labels: bool) -> bool:
     """Whether a property belongs into a chunk of this number, or into any."""
     if row.column in ("child_count", "child_start"):
         return header.lod_tree

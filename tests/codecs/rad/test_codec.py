@@ -14,9 +14,11 @@ import pytest
 
 from fixtures import by_hand_rad
 from sparklod_cli import __version__
-from sparklod_cli.codecs import clamps, rad, rad_options
+from sparklod_cli.codecs import clamps
 from sparklod_cli.codecs.options import DEFAULTS, RadOptions, WriteOptions
-from sparklod_cli.codecs.rad_header import Header, read_header
+from sparklod_cli.codecs.rad import codec as rad
+from sparklod_cli.codecs.rad import options as rad_options
+from sparklod_cli.codecs.rad.header import RadHeader, read_header
 from sparklod_cli.codecs.splat_encoding import SplatEncoding
 from sparklod_cli.codecs.steps import SMALL_QUANTILE, STEPS_A_SPLAT
 from sparklod_cli.io import examine_scene, read_scene
@@ -204,7 +206,7 @@ def test_chunks_in_files_are_those_of_one_file(large: Scene) -> None:
     assert offsets_are_sums(header) and len(whole) == header.bytes + header.all_chunk_bytes
 
 
-def offsets_are_sums(header: Header) -> bool:
+def offsets_are_sums(header: RadHeader) -> bool:
     sizes = [entry.bytes for entry in header.chunks]
     return [entry.offset for entry in header.chunks] == list(itertools.accumulate(sizes, initial=0))[:-1]
 

@@ -10,16 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 from zlib_ng import zlib_ng
 
-from ..model.scene import Scene
-from ..model.sh import COEFFICIENTS
-from ..model.splats import FloatArray
-from . import octahedral
-from .options import RadOptions
-from .rad_encodings import CODINGS
-from .rad_header import GZ, ChunkHeader, Property, pack_chunk_header, padding
-from .rad_layout import PROPERTIES, RANGES, SIZES, Row
-from .rad_options import code_range
-from .splat_encoding import SplatEncoding
+from ...model.scene import Scene
+from ...model.sh import COEFFICIENTS
+from ...model.splats import FloatArray
+from .. import octahedral
+from ..options import RadOptions
+from ..splat_encoding import SplatEncoding
+from .encodings import CODINGS
+from .header import GZ, Property, RadChunkHeader, pack_chunk_header, padding
+from .layout import PROPERTIES, RANGES, SIZES, Row
+from .options import code_range
 
 _RAW = -zlib_ng.MAX_WBITS
 
@@ -70,7 +70,7 @@ class Writing:
             payload += [data, bytes(padding(len(data)))]
             at += len(data) + padding(len(data))
         splats, tree = self.scene.splats, self.scene.tree
-        header = ChunkHeader(
+        header = RadChunkHeader(
             part.start, part.stop - part.start, at, splats.sh_degree, tree is not None, tuple(properties), self.ranges
         )
         return b"".join([pack_chunk_header(header), *payload])
