@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..codecs.rad_names import SUFFIX as RAD
+from ..codecs.rad.names import SUFFIX as RAD
 from ..support.errors import SparklodError
 from ..support.printable import MOST, shortened
 from ..support.stdin import DASH, name_of
