@@ -205,10 +205,13 @@ def main() -> None:
     parser.add_argument("--methods", nargs="+", choices=("quick", "quality"), default=["quick"])
     parser.add_argument("--tables", nargs="+", choices=("sizes", "times", "reading"), default=["sizes", "times"])
     parser.add_argument("--runs", type=int, default=5, help="number of runs, in turns; medians are printed")
-    parser.add_argument("--no-palette", action="store_true", help="leave out palettes of spherical harmonics")
+    parser.add_argument("--no-palette", action="store_true", help="leave out our palettes of spherical harmonics")
+    parser.add_argument("--peer-palette", action="store_true", help="Spark's palettes, too, which take half an hour")
     arguments = parser.parse_args()
     ways = [way for way in WAYS if arguments.peer or not way.peer]
-    ways = [way for way in ways if not (arguments.no_palette and way in (PALETTE, SPARK_PALETTE))]
+    left_out = {PALETTE} if arguments.no_palette else set()
+    left_out |= set() if arguments.peer_palette else {SPARK_PALETTE}
+    ways = [way for way in ways if way not in left_out]
     print(f"Machine: {machine()}. Medians of {arguments.runs} runs.")
     with tempfile.TemporaryDirectory() as top:
         bakeries = {}
