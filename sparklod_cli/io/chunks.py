@@ -63,6 +63,7 @@ def _opened(path: Path) -> Iterator[BinaryIO]:
 
 
 def _header(file: BinaryIO) -> RadHeader:
+    rad.refuse_chunk(file)
     header = read_header(file)
     rad_promises.check(rad_promises.violations(header))
     return header

@@ -15,6 +15,7 @@ from urllib.parse import quote
 from ..codecs.formats import FORMATS, HEAD, sniff
 from ..codecs.rad.header import MAGIC, RadHeader, read_header
 from ..codecs.sog_files import META
+from ..io.beside import in_folder
 from ..io.names import leads_away, reason_of
 from ..io.plain import open_plain
 from ..model.nodes import CHUNK_NODES
@@ -115,6 +116,8 @@ def _named(path: Path, folder: str) -> ShownFile:
 
 
 def _shown(path: Path, folder: str) -> ShownFile:
+    if path.is_dir():
+        in_folder(path)
     if path.is_dir() or path.name == META:
         raise NotSplatsError("Spark does not read an unpacked SOG; zip its files into a .sog")
     if path.exists() and not path.is_file():

@@ -61,6 +61,11 @@ def test_an_unpacked_sog_is_refused_as_spark_does_not_read_it(name: str) -> None
         shown_files([GOLDEN / name])
 
 
+def test_a_folder_that_is_no_splat_file_is_not_called_a_sog(tmp_path: Path) -> None:
+    with pytest.raises(FormatError, match=r"is a directory, without the meta\.json of an unpacked SOG$"):
+        shown_files([tmp_path])
+
+
 @pytest.mark.parametrize(
     ("name", "note"),
     [

@@ -22,6 +22,7 @@ from ...model.nodes import CHUNK_NODES
 from ...model.scene import Scene
 from ...model.sh import COEFFICIENTS
 from ...model.splats import COLUMNS, FloatArray, Splats
+from ...support.defaults import MAX_SH_DEGREE
 from ...support.errors import FormatError, NotSplatsError, TreeError, TruncatedError
 from ...support.parallel import blocks_of, ordered_map
 from ...support.progress import Progress, silent
@@ -238,13 +239,17 @@ def read_chunk(file: BinaryIO, entry: RadChunkEntry, header: RadHeader, palette:
 
     Raises:
         FormatError: the chunk is cut short, corrupt, or not the one that the header means.
+        ValueError: the palette is of another SH degree than the file.
     """
+    room = COEFFICIENTS[min(header.max_sh, MAX_SH_DEGREE)], 3
+    if palette is not None and np.shape(palette)[1:] != room:
+        raise ValueError(f"the palette has the shape {np.shape(palette)}; that of this file has (codes, {room[0]}, 3)")
     promises.check(promises.violations(header))
     packed = Packed.of(_bytes_of(file, entry, header), header.chunks.index(entry), header)
     count = packed.header.count
     _check_promise(count, header, entry.bytes)
     own = packed.palette(header)
-    palette = own if own is not None else palette
+    palette = own if own is not None or palette is None else np.asarray(palette, np.float32)
     splats, tree = Splats.empty(count, header.max_sh), None
     if header.lod_tree:
         tree = LodTree(np.empty(count, np.uint16), np.empty(count, np.uint32))

@@ -263,7 +263,7 @@ def _encodings(each: Property, what: str) -> Iterator[Violation]:
     ends = {"min": each.min, "max": each.max}
     for key in RANGES.get(each.encoding, ()):
         value = ends[key]
-        if value is None or abs(value) > LARGEST:
+        if value is None or abs(value) > float(LARGEST):
             yield Violation("rad.encoding", f"{what} is in {each.encoding}, but its {key} is {quoted_value(value)}")
             return
     low = each.min if "min" in RANGES.get(each.encoding, ()) else 0.0
