@@ -16,7 +16,7 @@ from .progress import Told, telling
 
 if TYPE_CHECKING:
     from ..codecs.rad.codec import RadChunk
-    from ..codecs.rad.header import RadHeader
+    from ..codecs.rad.records import RadHeader
 
 
 def read_rad_header(path: Path | str) -> RadHeader:

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 
 from ...model.nodes import CHUNK_NODES
 from ...support.defaults import MAX_SH_DEGREE
 from ...support.errors import FormatError
 from ...support.untrusted import quoted_value
 from ..quantize import LARGEST
-from .header import ALIGNMENT, GZ, Property, RadChunkEntry, RadChunkHeader, RadHeader, Violation, padding
+from .header import ALIGNMENT, padding
 from .layout import BY_NAME, PROPERTIES, RANGES, Row
+from .records import GZ, Property, RadChunkEntry, RadChunkHeader, RadHeader
 
 #: What is wrong with each promise, by its code; the text of a violation has the values. Other formats break some of
 #: these promises, too: their codes are "container.cut-short", "container.trailing" and "container.version".
@@ -40,6 +42,21 @@ WARNINGS = {
 
 #: Bytes of a file in which Spark looks for the header at first, and at most.
 FIRST_LOOK, LAST_LOOK = 1 << 16, 1 << 20
+
+
+@dataclass(frozen=True)
+class Violation:
+    """A promise of the container that a file breaks.
+
+    Attributes:
+        code: for `inspect`, "rad...".
+        text: what is wrong, with the values.
+        fatal: Spark, or this reader, cannot read the file, or would read something else than was written.
+    """
+
+    code: str
+    text: str
+    fatal: bool = True
 
 
 def check(broken: Iterator[Violation]) -> None:
