@@ -18,12 +18,12 @@ from .records import GZ, Property, RadChunkEntry, RadChunkHeader, RadHeader
 #: What is wrong with each promise, by its code; the text of a violation has the values. Other formats break some of
 #: these promises, too: their codes are "container.cut-short", "container.trailing" and "container.version".
 ERRORS = {
-    "rad.chunks": "the number of chunks or their size is not that of the splats",
+    "rad.chunks": "the number of chunks, or their size, does not fit the number of splats",
     "rad.offsets": "chunks or properties do not lie one after the other",
     "rad.sizes": "sizes disagree",
     "rad.chunk-files": "the file of a chunk is missing, cut short, or not in the folder",
     "rad.chunk-header": "the header of a chunk cannot be read",
-    "rad.bases": "a chunk is not of the splats that its place in the file tells",
+    "rad.bases": "a chunk does not hold the splats that belong at its place in the file",
     "rad.kind": "maxSh or lodTree of a chunk is not that of the file",
     "rad.properties": "a property is unknown, missing, there twice, or does not belong there",
     "rad.encoding": "the encoding or the range of a property is unknown or impossible",
