@@ -13,19 +13,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from fixtures import by_hand, by_hand_ksplat, by_hand_splat
 from sparklod_cli.bake import BakeSettings, bake
 from sparklod_cli.codecs import ply, spz_options
 from sparklod_cli.codecs.gpu.table import ENCODINGS
-from sparklod_cli.codecs.options import WriteOptions
+from sparklod_cli.codecs.options import RadOptions, WriteOptions
+from sparklod_cli.codecs.rad import options as rad_options
+from sparklod_cli.codecs.splat_encoding import log_scale_table
 from sparklod_cli.inspection import leaves, values
 from sparklod_cli.inspection.findings import ERROR, NOTE, Finding
 from sparklod_cli.inspection.report import ReportSettings, inspect
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod.builders import METHODS
+from sparklod_cli.lod.chunk_order import viewpoints
 from sparklod_cli.model.gaussian import normalized_quat
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.selection import Selection
@@ -148,6 +151,35 @@ def test_baked_files_pass_inspect_check(splats: Splats, method: str, version: in
             assert refused(error)
         else:
             assert [each for each in found if each.severity == ERROR] == []
+
+
+@given(scenes(), st.sampled_from(METHODS), st.booleans(), st.sampled_from([None, None, 2, 65_536]))
+@settings(max_examples=80, deadline=None)
+def test_baked_rad_passes_inspect_check(splats: Splats, method: str, chunked: bool, codes: int | None) -> None:
+    assume(np.abs(splats.center).max() < 1e38)  # beyond, what is merged of two splats may be infinitely large
+    with tempfile.TemporaryDirectory() as folder:
+        options = WriteOptions(rad=RadOptions(chunked=chunked, sh_codes=codes))
+        source, output = file_of(folder, splats), Path(folder, "out.rad")
+        try:
+            bake(source, output, BakeSettings(method=method, suffix=".rad", options=options))
+        except SparklodError as error:
+            assert refused(error)
+        else:
+            report, _ = inspect(output, ReportSettings(check=True))
+            assert [each for each in report.findings or [] if each.severity == ERROR] == []
+            reported(output)
+
+
+def test_the_largest_scales_and_coordinates_of_float32_stay_finite_in_rad() -> None:
+    splats = random_splats(4)
+    splats.scale[0] = np.finfo(np.float32).max
+    ranges = rad_options.settled(Scene(splats), WriteOptions()).rad.ranges
+    assert ranges is not None
+    table = log_scale_table(ranges.ln_scale_min, ranges.ln_scale_max)
+    assert np.isfinite(table).all()
+    assert table[-1] > 3e38
+    eyes = viewpoints(np.array([[-3e38, 0, 0], [3e38, 0, 0]], np.float32))
+    assert all(np.isfinite(eyes[f"origin_{axis}"]).all() for axis in "xyz")
 
 
 @pytest.mark.parametrize("method", METHODS)

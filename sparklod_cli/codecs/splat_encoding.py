@@ -85,6 +85,7 @@ def encode_log_scale(scale: FloatArray, low: float, high: float) -> Words:
     return codes
 
 
+@np.errstate(over="ignore")  # a stranger's range may be any
 def log_scale_table(low: float, high: float) -> FloatArray:
     """(256,) linear scales of the codes. Largest error: a factor of e ** ((high - low) / 508); exact for 0."""
     first = np.float32(low)

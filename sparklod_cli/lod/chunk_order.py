@@ -39,6 +39,9 @@ OUTSIDE, NEAR = (0.5, 4.0), (0.02, 0.2)
 #: Share of the centres, at either end of each axis, that the box of the scene leaves out. Chosen.
 OUTLIERS = 0.02
 
+#: Coordinates of viewpoints end where float32 does: scenes may reach that far themselves.
+LARGEST = float(np.finfo(np.float32).max)
+
 #: The least budget of viewers, as a share of the nodes, but no more than one chunk. Chosen.
 LEAST_BUDGET = 1 / 16
 
@@ -173,6 +176,7 @@ def viewpoints(centers: FloatArray) -> NDArray[np.void]:
     ahead = np.where(kind < 2, middle + gaze * (u[6][:, None] * radius / 2) - outside, gaze)
     length = np.linalg.norm(ahead, axis=1, keepdims=True)
     ahead = np.where(length > 0, ahead / np.where(length > 0, length, 1), gaze)
+    eye = np.clip(eye, -LARGEST, LARGEST)
     views = np.zeros(VIEWPOINTS, VIEW)
     for axis, name in enumerate("xyz"):
         views[f"origin_{name}"], views[f"forward_{name}"] = eye[:, axis], ahead[:, axis]

@@ -86,13 +86,14 @@ def _largest(values: FloatArray) -> float:
 def _log_range(scale: FloatArray) -> tuple[float, float]:
     """From the logarithm of a small scale to that of the largest: the sizes of coarse splats must not be clamped."""
     counts = Magnitudes.of(scale).positive.copy()
-    counts[UPPER <= SCALE_ZERO] = 0
-    counts[-1] = 0
+    counts[(UPPER <= SCALE_ZERO) | ~np.isfinite(LOWER)] = 0
     bins = np.flatnonzero(counts)
     if not bins.size:
         return SplatEncoding.ln_scale_min, SplatEncoding.ln_scale_max
     small = bins[np.searchsorted(np.cumsum(counts[bins]), SMALL_QUANTILE * counts.sum())]
-    least, small_log, most = np.log([LOWER[bins[0]], LOWER[small], UPPER[bins[-1]]])
+    largest = min(UPPER[bins[-1]], float(np.finfo(np.float32).max))
+    least, small_log, most = np.log([LOWER[bins[0]], LOWER[small], largest])
+    end = _outward(math.log(np.finfo(np.float32).max), False)  # the last code must not become infinite
     low = max(least, math.log(SCALE_ZERO), min(small_log, most - LOG_RANGE))
-    low, high = _outward(low, False), _outward(most, True)
+    low, high = _outward(min(low, end - GRID), False), min(_outward(most, True), end)
     return low, high if high > low else low + GRID
