@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from .cameras.path import CameraPath
     from .codecs.options import RadOptions
     from .codecs.rad.codec import RadChunk
-    from .codecs.rad.header import RadChunkEntry, RadChunkHeader, RadHeader
+    from .codecs.rad.records import RadChunkEntry, RadChunkHeader, RadHeader
     from .codecs.splat_encoding import SplatEncoding
     from .inspection.report import Report
     from .lod.settings import LodSettings
@@ -67,7 +67,7 @@ _MODULES = {
     "cameras.path": ("CameraPath",),
     "codecs.options": ("RadOptions",),
     "codecs.rad.codec": ("RadChunk",),
-    "codecs.rad.header": ("RadChunkEntry", "RadChunkHeader", "RadHeader"),
+    "codecs.rad.records": ("RadChunkEntry", "RadChunkHeader", "RadHeader"),
     "codecs.splat_encoding": ("SplatEncoding",),
     "inspection.report": ("Report",),
     "lod.settings": ("LodSettings",),

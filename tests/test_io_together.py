@@ -11,7 +11,7 @@ import pytest
 
 from sparklod_cli.codecs.rad import header as rad_header
 from sparklod_cli.codecs.rad import names as rad_names
-from sparklod_cli.codecs.rad.header import RadChunkEntry, RadHeader
+from sparklod_cli.codecs.rad.records import RadChunkEntry, RadHeader
 from sparklod_cli.io import chunk_files, companions, sink_together, write_together
 from sparklod_cli.support.errors import OutputError
 from tests.conftest import IS_ROOT

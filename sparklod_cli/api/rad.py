@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from .. import io
 from ..model.scene import Scene, Tree
 from ..model.splats import FloatArray
@@ -16,7 +18,7 @@ from .progress import Told, telling
 
 if TYPE_CHECKING:
     from ..codecs.rad.codec import RadChunk
-    from ..codecs.rad.header import RadHeader
+    from ..codecs.rad.records import RadHeader
 
 
 def read_rad_header(path: Path | str) -> RadHeader:
@@ -44,9 +46,12 @@ def read_rad_chunk(path: Path | str, number: int, *, palette: FloatArray | None 
 
     Raises:
         FormatError: the header or the chunk cannot be read, or is broken.
-        ValueError: there is no such chunk.
+        TypeError: the number is not a whole one.
+        ValueError: there is no such chunk, or the palette is of another SH degree than the file.
     """
     path = Path(path)
+    if isinstance(number, bool) or not isinstance(number, (int, np.integer)):
+        raise TypeError(f"number is {number!r}; give a whole number, which counts chunks from 0")
     with naming(path), memory_errors_translated():
         return io.read_rad_chunk(path, number, palette=palette)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
+from types import NoneType
 from typing import TYPE_CHECKING
 
 from ..io import scene_sink, write_whole
@@ -25,6 +26,9 @@ from .progress import Told, telling
 
 if TYPE_CHECKING:
     from ..codecs.options import RadOptions
+
+#: Binary digits after the point of the smallest number of float32.
+MAX_CENTER_BITS = 149
 
 
 @dataclass(frozen=True)
@@ -77,10 +81,12 @@ def write(
         FormatError: the format cannot hold the scene, or there is no such format.
         InvalidSplatsError: the scene has no splats.
         OutputError: the file exists, or cannot be written.
+        TypeError: an option is of another type.
         ValueError: an option is out of its range, or one of SPZ is given for another format.
     """
     from ..codecs.formats import WRITABLE
     from ..codecs.options import RadOptions, WriteOptions
+    from ..codecs.splat_encoding import SplatEncoding
 
     path, count = Path(path), thread_count(threads)
     suffix = path.suffix.lower()
@@ -91,6 +97,12 @@ def write(
         raise ValueError(f"{path}: spz_version and fractional_bits are of SPZ; leave them out, or write a .spz")
     if (rad is not None or chunked) and (encoding is not None or suffix != ".rad"):
         raise ValueError(f"{path}: chunked and rad are of RAD; leave them out, or write a .rad")
+    if not isinstance(rad, (RadOptions, NoneType)):
+        raise TypeError(f"rad is {rad!r}; give RadOptions")
+    if rad is not None and not isinstance(rad.ranges, (SplatEncoding, NoneType)):
+        raise TypeError(f"ranges is {rad.ranges!r}; give a SplatEncoding")
+    if rad is not None and rad.center_bits is not None:
+        whole_within("center_bits", rad.center_bits, -MAX_CENTER_BITS, MAX_CENTER_BITS)
     if rad is not None and rad.sh_codes is not None:
         whole_within("sh_codes", rad.sh_codes, MIN_SH_CODES, MAX_SH_CODES)
     if not len(scene_like(scene).splats):

@@ -36,10 +36,18 @@ class SplatEncoding:
     lod_opacity: bool = False
 
     def __post_init__(self) -> None:
-        if not (self.rgb_min < self.rgb_max and self.ln_scale_min < self.ln_scale_max):
-            raise ValueError(f"a range is empty: {self}")
-        if not min(self.sh1_max, self.sh2_max, self.sh3_max) > 0:
-            raise ValueError(f"the largest SH coefficients must be positive: {self}")
+        for name, value in vars(self).items():
+            if name != "lod_opacity" and not isinstance(value, (int, float, np.integer, np.floating)):
+                raise TypeError(f"{name} is {value!r}; give a number")
+            if not abs(value) <= float(quantize.LARGEST):
+                raise ValueError(f"{name} is {value}; give a finite number that float32 can hold")
+        for least, most in (("rgb_min", "rgb_max"), ("ln_scale_min", "ln_scale_max")):
+            low, high = getattr(self, least), getattr(self, most)
+            if not low < high:
+                raise ValueError(f"{least} is {low:g}, which is not below {most}, {high:g}")
+        for name in ("sh1_max", "sh2_max", "sh3_max"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} is {getattr(self, name):g}; give a number above 0")
 
     @property
     def alpha_max(self) -> int:

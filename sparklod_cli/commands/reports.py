@@ -29,14 +29,15 @@ CLAMPED_BY_SPZ = {
     ("sh", True): ("SH", "reflections get weaker; render --diff shows whether it matters"),
 }
 _THIN, _WIDE = "mostly how thick flat splats are; --rad-scales ln_f16 keeps them", "--rad-scales ln_f16 keeps them"
-_FAR, _COLORS = "--rad-center f32_lebytes keeps them", "the loss is hardly visible; --rad-rgb f16 keeps them"
+_FAR, _COLORS = "--rad-center f32_lebytes keeps them", "the loss is hardly visible; --rad-rgb {wide} keeps them"
+#: "{wide}" is the encoding that holds the values.
 CLAMPED_BY_RAD = {
     ("center", True): ("coordinates", _FAR),
     ("scale", False): ("scales", _THIN),
     ("scale", True): ("scales", _WIDE),
     ("rgb", False): ("colours", _COLORS),
     ("rgb", True): ("colours", _COLORS),
-    ("sh", True): ("SH", "reflections get weaker; --rad-sh f16 keeps them"),
+    ("sh", True): ("SH", "reflections get weaker; --rad-sh {wide} keeps them"),
 }
 
 
@@ -73,6 +74,8 @@ def _written(baked: Baked) -> str:
 
 def _clamped(clamp: Clamp, baked: Baked) -> str:
     """How many nodes have values that were clamped, how far these were off, and what that means."""
+    from ..codecs.rad.encodings import LARGEST_F16
+
     form, table = ("SPZ", CLAMPED_BY_SPZ) if baked.chunks is None else ("RAD", CLAMPED_BY_RAD)
     name, advice = table[clamp.column, clamp.above]
     share = f"{count_of(clamp.splats, 'node')} ({100 * clamp.splats / baked.nodes:.3g} %)"
@@ -80,6 +83,7 @@ def _clamped(clamp: Clamp, baked: Baked) -> str:
     where, way = ("above", "up") if clamp.above else ("below", "down")
     where = "beyond ±" if clamp.both else f"{where} "
     farthest = clamp.farthest or 0.0  # no -0
+    advice = advice.format(wide="f16" if abs(farthest) <= LARGEST_F16 else "f32")
     return (
         f"{name} of {share} are {where}{clamp.end:.3g}, {way} to {farthest:.3g}, and are clamped to what {form} holds:"
         f" {advice}"

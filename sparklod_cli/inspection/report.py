@@ -166,7 +166,7 @@ def _of_headers(path: Path, surveyed: rad.Survey) -> Report:
         name_of(header),
         header.count,
         header.max_sh,
-        False,
+        header.antialiased,
         bytes_per_splat=_bytes_per_splat(facts.bytes, header.count),
         compression_ratio=_compression_ratio(facts.bytes, header.count, header.max_sh),
         rad=facts,

@@ -44,8 +44,7 @@ def _named_in(path: Path) -> list[str]:
         head = file.read(HEAD)
         file.seek(0)
         if head.startswith(rad_header.MAGIC):
-            names = (entry.filename for entry in rad_header.read_header(file).chunks)
-            return [name for name in dict.fromkeys(names) if name is not None]
+            return list(rad_header.read_header(file).filenames)
         if head.lstrip().startswith(b"{") and path.stat().st_size <= MAX_META:
             return names_beside(file.read())
     return []
@@ -59,13 +58,18 @@ def in_folder(folder: Path) -> Path:
     return path
 
 
+def path_beside(first: Path, name: str) -> Path:
+    """Where a file would be that another one names; `FormatError` where the name could lead out of their folder."""
+    if leads_away(name):
+        raise FormatError(f"it names {quoted_value(name)}, which is not a file beside it")
+    return first.parent / name
+
+
 def open_beside(first: Path, name: str) -> BinaryIO:
     """Opens a file that another one names; `FormatError` where the name could lead out of their folder."""
     if first == DASH:
         raise FormatError(f"it names {quoted_value(name)}, but standard input has no folder; give the path instead")
-    if leads_away(name):
-        raise FormatError(f"it names {quoted_value(name)}, which is not a file beside it")
-    path = first.parent / name
+    path = path_beside(first, name)
     try:
         if path.exists() and not path.is_file():
             raise FormatError(f"{quoted_value(name)}, which it names, is not a file")

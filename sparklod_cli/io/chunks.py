@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
-from ..codecs.rad import codec as rad
-from ..codecs.rad import promises as rad_promises
-from ..codecs.rad.codec import RadChunk
-from ..codecs.rad.header import RadChunkEntry, RadHeader, read_header
-from ..codecs.stream import size_of
+from ..codecs.rad import promises
+from ..codecs.rad.codec import RadChunk, read_chunk
+from ..codecs.rad.header import read_header
+from ..codecs.rad.places import file_of
+from ..codecs.rad.records import RadHeader
 from ..model.splats import FloatArray
-from ..support.errors import TruncatedError, UnreadableError
+from ..support.errors import UnreadableError
 from .beside import open_beside
 from .names import reason_of
 
@@ -34,7 +35,7 @@ def read_rad_chunk(path: Path, number: int, *, palette: FloatArray | None = None
     Args:
         path: of the file, or of the header whose chunks are files beside it.
         number: of the chunk, from 0.
-        palette: that of the first chunk, see `rad.read_chunk`.
+        palette: that of the first chunk, see `codecs.rad.codec.read_chunk`.
 
     Raises:
         FormatError: the header or the chunk cannot be read, or is broken.
@@ -45,10 +46,8 @@ def read_rad_chunk(path: Path, number: int, *, palette: FloatArray | None = None
         if not 0 <= number < len(header.chunks):
             raise ValueError(f"number is {number}; its chunks are 0 to {len(header.chunks) - 1}")
         entry = header.chunks[number]
-        if entry.filename is None:
-            return _chunk(file, entry, header, palette)
-        with open_beside(path, entry.filename) as beside:
-            return _chunk(beside, entry, header, palette)
+        with file_of(entry, file, functools.partial(open_beside, path)) as source:
+            return read_chunk(source, entry, header, palette)
 
 
 @contextlib.contextmanager
@@ -64,13 +63,5 @@ def _opened(path: Path) -> Iterator[BinaryIO]:
 
 def _header(file: BinaryIO) -> RadHeader:
     header = read_header(file)
-    rad_promises.check(rad_promises.violations(header))
+    promises.check(promises.violations(header))
     return header
-
-
-def _chunk(file: BinaryIO, entry: RadChunkEntry, header: RadHeader, palette: FloatArray | None) -> RadChunk:
-    """A chunk, after a look at whether its file has as many bytes as memory would be asked for."""
-    begin = entry.offset + (header.bytes if entry.filename is None else 0)
-    if begin + entry.bytes > size_of(file):
-        raise TruncatedError(f"cut short: a chunk of {entry.bytes:,} bytes begins at {begin:,}")
-    return rad.read_chunk(file, entry, header, palette)

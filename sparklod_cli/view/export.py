@@ -22,12 +22,15 @@ PARTS = ".sparklod-{}.part"
 #: Bytes that are copied at a time.
 PIECE = 1 << 20
 
+#: What the folder of a site has: folders, and suffixes of files. Names of files may change from version to version.
+FOLDERS, SUFFIXES = ("data", "lib"), (".html", ".css", ".js", ".json")
+
 
 def check_folder(folder: Path, site: Site | None = None, *, overwrite: bool) -> None:
     """Raises an `OutputError` where a site cannot be written into a folder.
 
     A folder that exists is replaced only if it is empty or a site that was exported before: what else somebody keeps
-    in a folder is not ours to remove.
+    in a folder, such as the .git of the pages that it is published from, is not ours to remove.
 
     Args:
         folder: of the site.
@@ -42,6 +45,8 @@ def check_folder(folder: Path, site: Site | None = None, *, overwrite: bool) -> 
                 raise OutputError(f"{folder} exists, add --overwrite to replace the site in it")
             if not _is_site(folder):
                 raise OutputError(f"{folder} holds something else than a site of sparklod view; name another folder")
+            for other in filter(_is_foreign, folder.iterdir()):
+                raise OutputError(f"{folder} holds {other.name}, which is not of the site; move it away first")
         real = folder.resolve()
     except OSError as error:
         raise OutputError(f"cannot write {folder}: {reason_of(error)}") from None
@@ -56,6 +61,11 @@ def _is_site(folder: Path) -> bool:
     except (SparklodError, ValueError):
         return False
     return isinstance(settings, dict) and settings.get("generator") == GENERATOR
+
+
+def _is_foreign(path: Path) -> bool:
+    """Whether an entry of the folder of a site was put there by somebody else."""
+    return path.name not in FOLDERS if path.is_dir() else path.suffix not in SUFFIXES
 
 
 def export(site: Site, folder: Path, *, overwrite: bool, progress: Progress = silent) -> int:

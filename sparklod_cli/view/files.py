@@ -13,9 +13,11 @@ from pathlib import Path
 from urllib.parse import quote
 
 from ..codecs.formats import FORMATS, HEAD, sniff
-from ..codecs.rad.header import MAGIC, RadHeader, read_header
+from ..codecs.rad.header import MAGIC, read_header
+from ..codecs.rad.records import RadHeader
 from ..codecs.sog_files import META
-from ..io.names import leads_away, reason_of
+from ..io.beside import in_folder, path_beside
+from ..io.names import reason_of
 from ..io.plain import open_plain
 from ..model.nodes import CHUNK_NODES
 from ..support.errors import FormatError, NotSplatsError, UnknownFormatError, UnreadableError
@@ -115,6 +117,8 @@ def _named(path: Path, folder: str) -> ShownFile:
 
 
 def _shown(path: Path, folder: str) -> ShownFile:
+    if path.is_dir():
+        in_folder(path)
     if path.is_dir() or path.name == META:
         raise NotSplatsError("Spark does not read an unpacked SOG; zip its files into a .sog")
     if path.exists() and not path.is_file():
@@ -153,13 +157,8 @@ def _note(name: str, head: bytes, header: RadHeader | None) -> str | None:
 
 def _chunk_files(path: Path, header: RadHeader) -> Iterator[tuple[str, Path]]:
     """The chunk files that the header of a RAD file names."""
-    for entry in header.chunks:
-        name = entry.filename
-        if name is None:
-            continue
-        if leads_away(name):
-            raise FormatError(f"it names {quoted_value(name)}, which is not a file beside it")
-        beside = path.parent / name
+    for name in header.filenames:
+        beside = path_beside(path, name)
         if not beside.is_file():
             raise FormatError(f"its chunk file {quoted_value(name)} is missing")
         yield name, _inside(path, beside)

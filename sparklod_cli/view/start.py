@@ -15,7 +15,7 @@ from ..cameras.defaults import ELEVATION
 from ..cameras.frame import DEFAULT_FOV_Y, Settings
 from ..cameras.sources import Views, WholeScene
 from ..codecs.rad.codec import read_chunk
-from ..codecs.rad.header import RadHeader
+from ..codecs.rad.records import RadHeader
 from ..io import examine_scene
 from ..io.names import reason_of
 from ..io.plain import open_plain

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -163,3 +165,55 @@ def test_the_order_for_streaming_keeps_the_tree(large: sparklod.Tree, scene: spa
     np.testing.assert_array_equal(one.splats.center, streamed.splats.center)
     with pytest.raises(sparklod.FormatError, match="no Level-of-Detail tree; build_lod makes one"):
         sparklod.arrange_chunks(scene)
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"rad": {"center": "f32"}}, TypeError, "rad is {'center': 'f32'}; give RadOptions"),
+        ({"rad": sparklod.RadOptions(ranges=3)}, TypeError, "ranges is 3; give a SplatEncoding"),  # type: ignore[arg-type]
+        ({"rad": sparklod.RadOptions(center_bits=150)}, ValueError, "center_bits is 150; give -149 to 149"),
+        ({"rad": sparklod.RadOptions(center_bits=1.5)}, TypeError, "center_bits is 1.5"),  # type: ignore[arg-type]
+    ],
+)
+def test_wrong_options_are_refused_before_anything_is_written(
+    scene: sparklod.Scene, tmp_path: Path, options: dict[str, Any], error: type[Exception], message: str
+) -> None:
+    with pytest.raises(error, match=f"^{re.escape(message)}"):
+        sparklod.write(tmp_path / "new.rad", scene, **options)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("ranges", "error", "message"),
+    [
+        ({"rgb_min": 1, "rgb_max": 0}, ValueError, "rgb_min is 1, which is not below rgb_max, 0"),
+        ({"ln_scale_min": 9}, ValueError, "ln_scale_min is 9, which is not below ln_scale_max, 9"),
+        ({"sh2_max": 0}, ValueError, "sh2_max is 0; give a number above 0"),
+        ({"rgb_max": float("nan")}, ValueError, "rgb_max is nan; give a finite number"),
+        ({"ln_scale_max": 1e39}, ValueError, "ln_scale_max is 1e+39; give a finite number"),
+        ({"rgb_min": "a"}, TypeError, "rgb_min is 'a'; give a number"),
+    ],
+)
+def test_impossible_ranges_are_refused(ranges: dict[str, Any], error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=f"^{re.escape(message)}"):
+        sparklod.SplatEncoding(**ranges)
+
+
+@pytest.mark.parametrize("number", [1.0, "1", None, True])
+def test_the_number_of_a_chunk_is_a_whole_one(rad: Path, number: Any) -> None:
+    with pytest.raises(TypeError, match="give a whole number, which counts chunks from 0"):
+        sparklod.read_rad_chunk(rad, number)
+    assert sparklod.read_rad_chunk(rad, np.int64(1)).header.base == CHUNK_NODES  # type: ignore[arg-type]
+
+
+def test_a_palette_of_another_degree_is_refused(rad: Path) -> None:
+    with pytest.raises(ValueError, match=r"shape \(7, 8, 3\); that of this file has \(codes, 3, 3\)$"):
+        sparklod.read_rad_chunk(rad, 1, palette=np.zeros((7, 8, 3), np.float32))
+
+
+def test_the_header_of_a_chunk_file_is_not_that_of_the_rad(rad: Path) -> None:
+    name = sparklod.read_rad_header(rad).chunks[0].filename
+    if name is not None:
+        with pytest.raises(sparklod.FormatError, match=r"it is one chunk of a RAD file; give the \.rad file"):
+            sparklod.read_rad_header(rad.with_name(name))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import io
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ import pytest
 from sparklod_cli.codecs import spz
 from sparklod_cli.codecs.formats import FORMATS
 from sparklod_cli.codecs.options import WriteOptions
+from sparklod_cli.codecs.rad import codec as rad
 from sparklod_cli.io import read_scene
 from sparklod_cli.model.gaussian import linear_opacity, lod_opacity
 from sparklod_cli.model.lod_tree import LodTree
@@ -94,9 +96,10 @@ def test_writing_a_decoded_scene_again_changes_nothing(name: str, version: int, 
 
 
 @pytest.mark.parametrize("antialiased", [False, True])
-def test_spz_keeps_whether_a_scene_is_antialiased(antialiased: bool) -> None:
-    data = b"".join(spz.encode(Scene(scene("sh0").splats, antialiased=antialiased)))
-    assert spz.decode(io.BytesIO(data)).antialiased is antialiased
+@pytest.mark.parametrize("codec", [spz, rad])
+def test_whether_a_scene_is_antialiased_is_kept(codec: ModuleType, antialiased: bool) -> None:
+    data = b"".join(codec.encode(Scene(scene("sh0").splats, antialiased=antialiased)))
+    assert codec.decode(io.BytesIO(data)).antialiased is antialiased
 
 
 @pytest.mark.parametrize(("form", "way"), CASES)

@@ -16,19 +16,12 @@ from typing import Any
 
 import numpy as np
 
+from fixtures import by_hand_rad
+
 CHUNK = 65_536
 
-#: What a viewer assumes of the codes; every header repeats it.
-RANGES = {
-    "rgbMin": 0.0,
-    "rgbMax": 1.0,
-    "lnScaleMin": -12.0,
-    "lnScaleMax": 9.0,
-    "sh1Max": 1.0,
-    "sh2Max": 1.0,
-    "sh3Max": 1.0,
-    "lodOpacity": True,
-}
+#: What a viewer assumes of the codes of a tree; every header repeats it.
+RANGES = by_hand_rad.RANGES | {"lodOpacity": True}
 
 #: Coefficients of each SH degree, with three colours each.
 COEFFICIENTS = {1: 9, 2: 15, 3: 21}

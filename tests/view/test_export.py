@@ -45,13 +45,26 @@ def test_the_libraries_are_copied_too(packages: Path, tmp_path: Path) -> None:
 def test_an_existing_folder_is_refused_and_replaced_only_if_it_is_a_site(static: Site, tmp_path: Path) -> None:
     folder = tmp_path / "site"
     export(static, folder, overwrite=False)
-    (folder / "old").write_text("of the site before")
+    (folder / "old.js").write_text("of the site before")
     with pytest.raises(OutputError, match=f"^{folder} exists, add --overwrite"):
         export(static, folder, overwrite=False)
-    assert (folder / "old").exists()
+    assert (folder / "old.js").exists()
     export(static, folder, overwrite=True)
     assert everything(folder).keys() == static.resources.keys()
     assert [path.name for path in tmp_path.iterdir()] == ["site"]
+
+
+@pytest.mark.parametrize("name", [".git/HEAD", "CNAME", "notes.txt"])
+def test_what_somebody_put_into_the_folder_of_a_site_is_never_removed(static: Site, tmp_path: Path, name: str) -> None:
+    folder = tmp_path / "site"
+    export(static, folder, overwrite=False)
+    (folder / name).parent.mkdir(exist_ok=True)
+    (folder / name).write_text("mine")
+    with pytest.raises(
+        OutputError, match=r"holds (\.git|CNAME|notes\.txt), which is not of the site; move it away first$"
+    ):
+        export(static, folder, overwrite=True)
+    assert (folder / name).read_text() == "mine"
 
 
 @pytest.mark.parametrize("content", [{"notes.txt": "mine"}, {"view.json": "{}"}, {"view.json": "no json"}])

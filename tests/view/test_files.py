@@ -12,7 +12,8 @@ import pytest
 
 import sparklod_cli as sparklod
 from sparklod_cli.api import viewing
-from sparklod_cli.codecs.rad.header import RadChunkEntry, RadHeader, pack_header
+from sparklod_cli.codecs.rad.header import pack_header
+from sparklod_cli.codecs.rad.records import RadChunkEntry, RadHeader
 from sparklod_cli.support.errors import CameraPathError, FormatError, SparklodError
 from sparklod_cli.view.files import shown_files
 from tests.conftest import FIXTURES
@@ -59,6 +60,11 @@ def test_files_of_the_same_name_have_different_addresses() -> None:
 def test_an_unpacked_sog_is_refused_as_spark_does_not_read_it(name: str) -> None:
     with pytest.raises(FormatError, match=r"zip its files into a \.sog$"):
         shown_files([GOLDEN / name])
+
+
+def test_a_folder_that_is_no_splat_file_is_not_called_a_sog(tmp_path: Path) -> None:
+    with pytest.raises(FormatError, match=r"is a directory, without the meta\.json of an unpacked SOG$"):
+        shown_files([tmp_path])
 
 
 @pytest.mark.parametrize(

@@ -19,8 +19,9 @@ from .. import octahedral
 from ..quantize import Bytes, quat_of_xyz
 from . import promises
 from .encodings import CODINGS
-from .header import Property, RadChunkHeader, RadHeader, read_chunk_header
+from .header import read_chunk_header
 from .layout import BY_NAME, SIZES, Row
+from .records import Property, RadChunkHeader, RadHeader
 
 _ZlibError: Any = zlib_ng.error  # the stubs take the class for an instance
 _RAW = -zlib_ng.MAX_WBITS

@@ -1,8 +1,8 @@
-"""Encodes the chunks of a RAD file."""
+"""Encodes the chunks of a RAD file, and makes the header that tells of them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,16 +10,21 @@ import numpy as np
 from numpy.typing import NDArray
 from zlib_ng import zlib_ng
 
+from ...model.nodes import CHUNK_NODES
 from ...model.scene import Scene
 from ...model.sh import COEFFICIENTS
-from ...model.splats import FloatArray
-from .. import octahedral
-from ..options import RadOptions
+from ...model.splats import FloatArray, Splats
+from ...support.parallel import blocks_of, ordered_map
+from ...support.progress import Progress
+from .. import octahedral, sh_palette
+from ..options import RadOptions, WriteOptions
 from ..splat_encoding import SplatEncoding
+from .comment import comment_of
 from .encodings import CODINGS
-from .header import GZ, Property, RadChunkHeader, pack_chunk_header, padding
+from .header import pack_chunk_header, padding
 from .layout import PROPERTIES, RANGES, SIZES, Row
 from .options import code_range
+from .records import GZ, Property, RadChunkEntry, RadChunkHeader, RadHeader
 
 _RAW = -zlib_ng.MAX_WBITS
 
@@ -39,6 +44,16 @@ class Palette:
     codes: FloatArray
     labels: NDArray[np.uint32]
 
+    @classmethod
+    def of(cls, splats: Splats, most: int, threads: int, progress: Progress) -> Palette:
+        """A palette of at most so many codes, with zeros behind them up to as many as Spark reads."""
+        room = min(len(splats), CHUNK_NODES)
+        weight = sh_palette.visible_weight(splats)
+        found = sh_palette.cluster(splats.sh, min(most, room), weight=weight, threads=threads, progress=progress)
+        padded = np.zeros((room, *found.codes.shape[1:]), np.float32)
+        padded[: len(found.codes)] = found.codes
+        return cls(padded, found.labels)
+
 
 @dataclass(frozen=True)
 class Writing:
@@ -57,6 +72,37 @@ class Writing:
     ranges: SplatEncoding
     palette: Palette | None
     level: int
+
+    @classmethod
+    def of(cls, scene: Scene, options: WriteOptions, threads: int, progress: Progress) -> Writing:
+        """That of a scene with settled options; finds the palette, if there is to be one."""
+        rad, palette = options.rad, None
+        assert rad.ranges is not None
+        if rad.sh_codes is not None and scene.splats.sh_degree and len(scene):
+            palette = Palette.of(scene.splats, rad.sh_codes, threads, progress)
+        return cls(scene, rad, rad.ranges, palette, options.compression_level)
+
+    def header(self, entries: Iterable[RadChunkEntry]) -> RadHeader:
+        """The header of the file whose chunks are there."""
+        scene, chunks = self.scene, tuple(entries)
+        return RadHeader(
+            len(scene),
+            scene.splats.sh_degree,
+            scene.tree is not None,
+            CHUNK_NODES,
+            sum(entry.bytes for entry in chunks),
+            chunks,
+            self.ranges,
+            None if self.palette is None else len(self.palette.codes),
+            comment_of(antialiased=scene.antialiased),
+        )
+
+    def chunks(self, threads: int, progress: Progress) -> Iterator[bytes]:
+        """The bytes of each chunk in order, a few encoded ahead."""
+        parts = blocks_of(len(self.scene), CHUNK_NODES)
+        for part, chunk in zip(parts, ordered_map(self.chunk, parts, threads), strict=True):
+            progress("writing", part.stop, len(self.scene), "splat")
+            yield chunk
 
     def chunk(self, part: slice) -> bytes:
         """The bytes of the chunk of these splats."""

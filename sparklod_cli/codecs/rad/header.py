@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import json
 import struct
-from dataclasses import dataclass
 from typing import Any, BinaryIO
 
 from ...support.errors import FormatError, NotSplatsError, PromiseError, TruncatedError, VersionError
 from ...support.untrusted import parse_json, quoted_value
 from ..splat_encoding import SplatEncoding
 from .fields import Fields
+from .records import Property, RadChunkEntry, RadChunkHeader, RadHeader
 
 #: The first bytes of a file, and of a chunk.
 MAGIC, CHUNK_MAGIC = b"RAD0", b"RADC"
@@ -23,7 +23,7 @@ MAGIC, CHUNK_MAGIC = b"RAD0", b"RADC"
 PREFIX, PAYLOAD = struct.Struct("<4sI"), struct.Struct("<Q")
 ALIGNMENT = 8
 
-VERSION, TYPE, GZ = 1, "gsplat", "gz"
+VERSION, TYPE = 1, "gsplat"
 
 #: Largest JSON of a file, and of a chunk, in bytes. An entry of a chunk takes 50 to 100 bytes, so that a file of
 #: 10,000 chunks, 655 million nodes, has a JSON of 1 MB; a chunk's has about 1,500 bytes.
@@ -40,122 +40,6 @@ ENCODING_KEYS = {
     "sh3Max": "sh3_max",
     "lodOpacity": "lod_opacity",
 }
-
-
-@dataclass(frozen=True)
-class RadChunkEntry:
-    """Where a chunk is.
-
-    Attributes:
-        offset: from the first byte after the header, or of the chunk's own file.
-        bytes: its size, header included.
-        filename: of its own file, beside the header's; None where it is in the same file.
-    """
-
-    offset: int
-    bytes: int
-    filename: str | None = None
-
-
-@dataclass(frozen=True)
-class RadHeader:
-    """The header of a file.
-
-    Attributes:
-        count: splats, which are the nodes where there is a tree.
-        max_sh: SH degree.
-        lod_tree: whether the splats are the nodes of a Level-of-Detail tree.
-        chunk_size: splats of each chunk but the last.
-        all_chunk_bytes: sum of the chunks' sizes.
-        chunks: where they are, in order.
-        encoding: ranges of the codes; None where the header has none.
-        sh_code_count: entries of the SH palette; None without one.
-        comment: free text; None without one.
-        bytes: of the header with its padding: where the first chunk begins.
-        padded_with_zeros: whether the padding is zeros.
-    """
-
-    count: int
-    max_sh: int
-    lod_tree: bool
-    chunk_size: int
-    all_chunk_bytes: int
-    chunks: tuple[RadChunkEntry, ...]
-    encoding: SplatEncoding | None = None
-    sh_code_count: int | None = None
-    comment: str | None = None
-    bytes: int = 0
-    padded_with_zeros: bool = True
-
-    @property
-    def chunked(self) -> bool:
-        """Whether the chunks are files of their own."""
-        return any(entry.filename is not None for entry in self.chunks)
-
-
-@dataclass(frozen=True)
-class Property:
-    """A column of a chunk.
-
-    Attributes:
-        offset: from the beginning of the payload.
-        bytes: as stored.
-        name: one of `layout.PROPERTIES`, as far as it is known.
-        encoding: one of `layout.ENCODINGS`, as far as it is known.
-        compression: "gz" for a raw deflate stream, None for none.
-        min, max: ends of the range of the codes; None where there is none.
-    """
-
-    offset: int
-    bytes: int
-    name: str
-    encoding: str
-    compression: str | None = GZ
-    min: float | None = None
-    max: float | None = None
-
-
-@dataclass(frozen=True)
-class RadChunkHeader:
-    """The header of a chunk.
-
-    Attributes:
-        base: index of its first splat in the file.
-        count: its splats.
-        payload_bytes: of its properties with their padding, as the JSON has it.
-        max_sh, lod_tree: as in `RadHeader`.
-        properties: in the order of the file.
-        encoding: ranges of the codes; None where the header has none.
-        stored_payload_bytes: the same number again, as it stands before the payload.
-        bytes: of the header with its padding and the size of the payload: where the payload begins.
-        padded_with_zeros: whether the padding is zeros.
-    """
-
-    base: int
-    count: int
-    payload_bytes: int
-    max_sh: int
-    lod_tree: bool
-    properties: tuple[Property, ...]
-    encoding: SplatEncoding | None = None
-    stored_payload_bytes: int = 0
-    bytes: int = 0
-    padded_with_zeros: bool = True
-
-
-@dataclass(frozen=True)
-class Violation:
-    """A promise of the container that a file breaks.
-
-    Attributes:
-        code: for `inspect`, "rad...".
-        text: what is wrong, with the values.
-        fatal: Spark, or this reader, cannot read the file, or would read something else than was written.
-    """
-
-    code: str
-    text: str
-    fatal: bool = True
 
 
 def padding(size: int) -> int:
@@ -297,6 +181,8 @@ def _read_json(file: BinaryIO, magic: bytes, limit: int, what: str) -> tuple[Fie
     if len(prefix) < PREFIX.size:
         raise TruncatedError(f"cut short inside the {what}")
     found, length = PREFIX.unpack(prefix)
+    if found == CHUNK_MAGIC != magic:
+        raise NotSplatsError("it is one chunk of a RAD file; give the .rad file beside it, which names all chunks")
     if found != magic:
         raise NotSplatsError(f"no {what}: it begins with {quoted_value(found)}, not {quoted_value(magic)}")
     if length > limit:

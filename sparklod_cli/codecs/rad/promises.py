@@ -4,24 +4,26 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 
 from ...model.nodes import CHUNK_NODES
 from ...support.defaults import MAX_SH_DEGREE
 from ...support.errors import FormatError
 from ...support.untrusted import quoted_value
 from ..quantize import LARGEST
-from .header import ALIGNMENT, GZ, Property, RadChunkEntry, RadChunkHeader, RadHeader, Violation, padding
+from .header import ALIGNMENT, padding
 from .layout import BY_NAME, PROPERTIES, RANGES, Row
+from .records import GZ, Property, RadChunkEntry, RadChunkHeader, RadHeader
 
 #: What is wrong with each promise, by its code; the text of a violation has the values. Other formats break some of
 #: these promises, too: their codes are "container.cut-short", "container.trailing" and "container.version".
 ERRORS = {
-    "rad.chunks": "the number of chunks or their size is not that of the splats",
+    "rad.chunks": "the number of chunks, or their size, does not fit the number of splats",
     "rad.offsets": "chunks or properties do not lie one after the other",
     "rad.sizes": "sizes disagree",
     "rad.chunk-files": "the file of a chunk is missing, cut short, or not in the folder",
     "rad.chunk-header": "the header of a chunk cannot be read",
-    "rad.bases": "a chunk is not of the splats that its place in the file tells",
+    "rad.bases": "a chunk does not hold the splats that belong at its place in the file",
     "rad.kind": "maxSh or lodTree of a chunk is not that of the file",
     "rad.properties": "a property is unknown, missing, there twice, or does not belong there",
     "rad.encoding": "the encoding or the range of a property is unknown or impossible",
@@ -40,6 +42,21 @@ WARNINGS = {
 
 #: Bytes of a file in which Spark looks for the header at first, and at most.
 FIRST_LOOK, LAST_LOOK = 1 << 16, 1 << 20
+
+
+@dataclass(frozen=True)
+class Violation:
+    """A promise of the container that a file breaks.
+
+    Attributes:
+        code: for `inspect`, "rad...".
+        text: what is wrong, with the values.
+        fatal: Spark, or this reader, cannot read the file, or would read something else than was written.
+    """
+
+    code: str
+    text: str
+    fatal: bool = True
 
 
 def check(broken: Iterator[Violation]) -> None:
@@ -263,7 +280,7 @@ def _encodings(each: Property, what: str) -> Iterator[Violation]:
     ends = {"min": each.min, "max": each.max}
     for key in RANGES.get(each.encoding, ()):
         value = ends[key]
-        if value is None or abs(value) > LARGEST:
+        if value is None or abs(value) > float(LARGEST):
             yield Violation("rad.encoding", f"{what} is in {each.encoding}, but its {key} is {quoted_value(value)}")
             return
     low = each.min if "min" in RANGES.get(each.encoding, ()) else 0.0

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import BinaryIO
 
 from ...support.errors import FormatError
 from ..stream import size_of
-from .codec import Beside, refuse_chunk
-from .header import RadChunkHeader, RadHeader, Violation, padding, read_chunk_header, read_header
-from .promises import chunk_violations, violations
+from .header import padding, read_chunk_header, read_header
+from .places import Beside, file_of, size_beside, start_of
+from .promises import Violation, chunk_violations, violations
+from .records import RadChunkHeader, RadHeader
 
 
 @dataclass(frozen=True)
@@ -35,18 +35,16 @@ def survey_file(file: BinaryIO, beside: Beside) -> tuple[RadHeader, tuple[Violat
     Raises:
         FormatError: the header cannot be read.
     """
-    refuse_chunk(file)
     size = size_of(file)
     header = read_header(file)
-    names = dict.fromkeys(entry.filename for entry in header.chunks if entry.filename is not None)
-    return header, tuple(violations(header, size, {name: _size_beside(name, beside) for name in names}))
+    files = {name: _size_or_reason(name, beside) for name in header.filenames}
+    return header, tuple(violations(header, size, files))
 
 
-def _size_beside(name: str, beside: Beside) -> int | str:
+def _size_or_reason(name: str, beside: Beside) -> int | str:
     """Bytes of a file that the header names, or why it cannot be opened."""
     try:
-        with contextlib.closing(beside(name)) as file:
-            return size_of(file)
+        return size_beside(name, beside)
     except FormatError as error:
         return str(error)
 
@@ -61,11 +59,8 @@ def survey_chunks(file: BinaryIO, beside: Beside, header: RadHeader, *, paddings
         paddings: look at the padding of properties, too.
     """
     for number, entry in enumerate(header.chunks):
-        with contextlib.ExitStack() as stack:
-            if entry.filename is None:
-                source, at = file, header.bytes + entry.offset
-            else:
-                source, at = stack.enter_context(contextlib.closing(beside(entry.filename))), entry.offset
+        with file_of(entry, file, beside) as source:
+            at = start_of(entry, header)
             source.seek(at)
             try:
                 chunk = read_chunk_header(source)

@@ -16,6 +16,7 @@ import pytest
 from fixtures import by_hand_rad
 from sparklod_cli.codecs.rad import codec as rad
 from sparklod_cli.codecs.rad.header import read_header
+from sparklod_cli.codecs.rad.layout import RANGES
 from sparklod_cli.support.errors import FormatError, PromiseError
 from tests.codecs.test_damaged import attempt, content
 from tests.codecs.test_damaged_sog import VALUES, places_of, replaced
@@ -160,3 +161,11 @@ def test_a_label_beyond_the_palette_is_named() -> None:
     files = FILES | {"sh3-1.radc": data, "sh3.rad": by_hand_rad.headed(b"RAD0", header)}
     result = attempt(CHUNKED, files["sh3.rad"], files=files)
     assert result == "SH label 24 of chunk 1 is beyond the 24 codes of the palette"
+
+
+def test_a_range_that_float32_cannot_hold_is_refused_without_a_warning() -> None:
+    fields = json.loads(PARTS["0.json"])
+    ranged = next(number for number, each in enumerate(fields["properties"]) if each["encoding"] in RANGES)
+    text = json.dumps(replaced(fields, ("properties", ranged, "max"), 1e39)).encode()
+    with pytest.raises(FormatError, match=r"its max is 1e\+39$"):
+        rad.decode(io.BytesIO(by_hand_rad.joined(PARTS | {"0.json": text}, PARTS)))

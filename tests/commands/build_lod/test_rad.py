@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from sparklod_cli.codecs import spz
-from sparklod_cli.codecs.options import WriteOptions
+from sparklod_cli.codecs.options import RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import codec as rad
 from sparklod_cli.codecs.rad import layout as rad_layout
 from sparklod_cli.codecs.rad.header import read_chunk_header, read_header
@@ -207,6 +207,22 @@ def test_what_is_clamped_is_said_with_the_range_of_the_file(tmp_path: Path, caps
     assert record["clamped"]["center"] > 0
     assert ("center", True, 65504.0) in {(each["column"], each["above"], each["end"]) for each in record["clamps"]}
     assert "are beyond ±6.55e+04, up to 1e+06, and are clamped to what RAD holds: --rad-center f32_lebytes keeps" in err
+
+
+@pytest.mark.parametrize(("value", "encoding"), [(5e4, "f16"), (1e6, "f32")])
+@pytest.mark.parametrize("column", ["rgb", "sh"])
+def test_the_encoding_that_is_advised_holds_the_values(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], column: str, value: float, encoding: str
+) -> None:
+    splats = random_splats(400, sh_degree=1)
+    getattr(splats, column)[3] = value
+    source = tmp_path / "bright.rad"
+    source.write_bytes(b"".join(rad.encode(Scene(splats), WriteOptions(rad=RadOptions(rgb="f32", sh="f32")))))
+    assert build(source, "-o", tmp_path / "out.rad", "--rad-rgb", "r8", "--rad-sh", "s8") == 0
+    assert f"--rad-{column} {encoding} keeps them" in capsys.readouterr().err
+    advised = ("--rad-rgb", encoding, "--rad-sh", encoding)
+    assert build(source, "-o", tmp_path / "out.rad", "-f", *advised) == 0
+    assert "keeps them" not in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..model.splats import FloatArray
+from ...model.splats import FloatArray
 
 #: A bin has the float32 of the same upper bits: sign, exponent and 7 bits of the mantissa, so its ends are at most
 #: 0.8 % apart.

@@ -1,0 +1,98 @@
+"""The ranges of codes that suit a scene: what clamping and rounding cost together is least."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...model.scene import Scene
+from ...model.sh import COEFFICIENTS
+from ...model.splats import FloatArray
+from ..splat_encoding import SCALE_ZERO, SplatEncoding
+from ..steps import SMALL_QUANTILE
+from .magnitudes import LOWER, UPPER, Magnitudes, tops
+
+#: Range of the logarithms of scales up to which none is clamped: 254 steps of 4.7 % at most. Beyond, the smallest
+#: `SMALL_QUANTILE` of the scales may be; those are flat splats' thicknesses.
+LOG_RANGE = 12.0
+
+#: Ranges end at multiples of this, so that their numbers are short and exact.
+GRID = 1 / 64
+
+#: An error of a colour or a coefficient from which more is no worse: a colour is then a wrong one. Otherwise a single
+#: splat far from all others would decide the steps of all.
+WORST = 0.5
+
+#: Ends of ranges that are tried, as shares of the values that lie beyond.
+BEYOND = np.array([0.0, 1e-4, 3e-4, 1e-3, 3e-3, 1e-2])
+
+
+def fitted(scene: Scene) -> SplatEncoding:
+    """The ranges that suit a scene; they do not depend on the order of its splats."""
+    splats = scene.splats
+    rgb_min, rgb_max = _linear_range(splats.rgb)
+    low, high = _log_range(splats.scale)
+    sh_max = dict.fromkeys(("sh1_max", "sh2_max", "sh3_max"), 1.0)
+    for degree in range(1, splats.sh_degree + 1):
+        sh_max[f"sh{degree}_max"] = _largest(splats.sh[:, COEFFICIENTS[degree - 1] : COEFFICIENTS[degree]])
+    return SplatEncoding(rgb_min, rgb_max, low, high, **sh_max, lod_opacity=scene.tree is not None)
+
+
+def _outward(value: float, up: bool) -> float:
+    return (math.ceil if up else math.floor)(value / GRID) * GRID
+
+
+def _clamping(counts: NDArray[np.int64], top: float) -> float:
+    """The summed squared error of magnitudes that are clamped to `top`."""
+    bins = np.flatnonzero(counts[:-1])
+    beyond = np.clip(UPPER[bins] - top, 0, WORST)
+    return float(np.sum(counts[bins] * beyond**2))
+
+
+def _linear_range(values: FloatArray) -> tuple[float, float]:
+    """The range of 255 steps with the least squared error, of rounding and of clamping together."""
+    found = Magnitudes.of(values)
+    total = max(found.count, 1)
+    below = tops(found.negative, total, -found.lowest, BEYOND)
+    above = np.maximum(tops(found.positive, total, found.highest, BEYOND), 1)
+    lows = {-low: _clamping(found.negative, low) for low in below}
+    highs = {high: _clamping(found.positive, high) for high in above}
+
+    def error(ends: tuple[float, float]) -> float:
+        low, high = ends
+        return (lows[low] + highs[high]) / total + ((high - low) / 255) ** 2 / 12
+
+    low, high = min(itertools.product(sorted(lows), sorted(highs)), key=error)
+    return _outward(low, False), _outward(high, True)
+
+
+def _largest(values: FloatArray) -> float:
+    """The largest coefficient for 254 steps with the least squared error, of rounding and of clamping together."""
+    found = Magnitudes.of(values)
+    total, counts = found.count, found.positive + found.negative
+    most = max(found.highest, -found.lowest)
+    if not total:
+        return 1.0
+
+    def error(top: float) -> float:
+        return _clamping(counts, top) / total + (top / 127) ** 2 / 12
+
+    return max(GRID, _outward(min(tops(counts, total, most, BEYOND), key=error), True))
+
+
+def _log_range(scale: FloatArray) -> tuple[float, float]:
+    """From the logarithm of a small scale to that of the largest: the sizes of coarse splats must not be clamped."""
+    counts = Magnitudes.of(scale).positive.copy()
+    counts[UPPER <= SCALE_ZERO] = 0
+    counts[-1] = 0
+    bins = np.flatnonzero(counts)
+    if not bins.size:
+        return SplatEncoding.ln_scale_min, SplatEncoding.ln_scale_max
+    small = bins[np.searchsorted(np.cumsum(counts[bins]), SMALL_QUANTILE * counts.sum())]
+    least, small_log, most = np.log([LOWER[bins[0]], LOWER[small], UPPER[bins[-1]]])
+    low = max(least, math.log(SCALE_ZERO), min(small_log, most - LOG_RANGE))
+    low, high = _outward(low, False), _outward(most, True)
+    return low, high if high > low else low + GRID
