@@ -30,6 +30,7 @@ from tests.interop import npm
 from tests.interop.conftest import PAGE
 from tests.interop.node import Node
 from tests.interop.pictures import psnr
+from tests.view.signals import heed_signals
 
 PROGRAM = Path(__file__).with_name("view_page.mjs")
 
@@ -131,7 +132,7 @@ class Served:
     def __init__(self, packages: Path, *arguments: object) -> None:
         more = ["--spark-dir", packages, "--no-open", "-q", *arguments]
         command = [sys.executable, "-m", "sparklod_cli", "view", *map(str, more)]
-        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, preexec_fn=heed_signals)
 
     def __enter__(self) -> str:
         assert self.process.stdout is not None

@@ -17,6 +17,7 @@ import pytest
 
 from sparklod_cli.cli import run
 from tests.view.conftest import CHUNKED, TREE
+from tests.view.signals import heed_signals
 
 
 @contextlib.contextmanager
@@ -27,7 +28,7 @@ def started(*arguments: object) -> Iterator[subprocess.Popen[str]]:
         name: value for name, value in os.environ.items() if name not in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER")
     }
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    with subprocess.Popen(command, env=environment, **pipes) as process:  # type: ignore[call-overload]
+    with subprocess.Popen(command, env=environment, preexec_fn=heed_signals, **pipes) as process:  # type: ignore[call-overload]
         try:
             yield process
         finally:
