@@ -299,5 +299,5 @@ def test_sh_of_a_degree_that_is_missing_are_refused() -> None:
 
 @pytest.mark.parametrize("options", [{"rgb_min": 1}, {"ln_scale_max": -12}, {"sh2_max": 0}, {"rgb_max": float("nan")}])
 def test_an_encoding_with_an_empty_range_is_refused(options: dict[str, float]) -> None:
-    with pytest.raises(ValueError, match="rgb_min is 1, |ln_scale_min is -12, |sh2_max is 0|rgb_max is nan"):
+    with pytest.raises(ValueError, match=r"rgb_min is 1, |ln_scale_min is -12, |sh2_max is 0|rgb_max is nan"):
         SplatEncoding(**options)
