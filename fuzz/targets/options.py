@@ -106,6 +106,8 @@ def make(rng: Rng) -> Case:
         line += ["--size", "16x12"]
     if name in ("render", "traverse") and rng.integers(2):
         line += ["--orbit", "2"]
+    if name == "view":
+        line += ["--export", "site"]  # it would serve until it is interrupted
     inputs = [pick(rng, FILES[: 3 if rng.integers(3) else None]) for _ in range(int(pick(rng, (1, 1, 1, 2, 0))))]
     line[1:1] = inputs
     files = {file: seeds()[seed] for file, seed in INPUTS.items()}
