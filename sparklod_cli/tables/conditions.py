@@ -69,7 +69,8 @@ class Condition:
 
 def is_number(value: Any) -> bool:
     """Whether a value can be compared by its size."""
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and not math.isnan(value)
+    # Only NaN differs from itself; math.isnan fails on whole numbers beyond the range of floats.
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and value == value
 
 
 def parse(text: str, *, example: str) -> Condition:
