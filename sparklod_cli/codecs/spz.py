@@ -18,11 +18,12 @@ from ..model.scene import Scene
 from ..model.sh import notes_on_degree
 from ..model.splats import COLUMNS, Splats
 from ..support.defaults import MAX_SH_DEGREE
-from ..support.errors import FormatError, MembersError, NotSplatsError, TreeError, TruncatedError, VersionError
+from ..support.errors import FormatError, MembersError, NotSplatsError, TruncatedError, VersionError
 from ..support.parallel import for_blocks, ordered_map
 from ..support.progress import Progress, silent
 from . import compression
 from .options import DEFAULTS, WriteOptions
+from .sound import with_sound_tree
 from .spz_layout import ANTIALIASED, EXTENSIONS, LOD, Layout, Stream, StreamRows
 from .spz_options import settled as settled
 from .stream import Read, rows_of, size_of
@@ -43,13 +44,7 @@ def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> 
         FormatError: the file is not SPZ, of an unknown version or SH degree, cut short or corrupt, announces far more
             splats than its size can hold, or has a broken tree.
     """
-    scene = examine(file, threads=threads, progress=progress)
-    if scene.tree is not None:
-        try:
-            scene.tree.validate()
-        except TreeError as error:
-            raise FormatError(f"its Level-of-Detail tree is broken: {error}") from error
-    return scene
+    return with_sound_tree(examine(file, threads=threads, progress=progress))
 
 
 def examine(

@@ -19,11 +19,11 @@ from ...model.scene import Scene
 from ...model.sh import COEFFICIENTS
 from ...model.splats import COLUMNS, FloatArray, Splats
 from ...support.defaults import MAX_SH_DEGREE
-from ...support.errors import FormatError, TreeError
 from ...support.parallel import ordered_map
 from ...support.progress import Progress, silent
 from .. import compression
 from ..options import DEFAULTS, WriteOptions
+from ..sound import with_sound_tree
 from ..stream import size_of
 from . import promises
 from .decoding import Packed, fill
@@ -51,13 +51,7 @@ def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent, bes
         FormatError: the file is not RAD, cut short or corrupt, breaks a promise of `promises` that is fatal, or has
             a broken tree; a file that it names is missing or damaged.
     """
-    scene = examine(file, threads=threads, progress=progress, beside=beside)
-    if scene.tree is not None:
-        try:
-            scene.tree.validate()
-        except TreeError as error:
-            raise FormatError(f"its Level-of-Detail tree is broken: {error}") from error
-    return scene
+    return with_sound_tree(examine(file, threads=threads, progress=progress, beside=beside))
 
 
 def examine(
