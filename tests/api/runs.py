@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import sys
 from typing import Any
 
-import pytest
-
 import sparklod_cli as sparklod
-from sparklod_cli.cli import main
+from sparklod_cli.cli import run
 from tests.conftest import FIXTURES
 
 DEMO = FIXTURES / "demo.ply"
@@ -23,11 +20,7 @@ def camera(size: tuple[int, int] = SIZE) -> sparklod.Camera:
 
 def command(*arguments: object) -> None:
     """Runs a command, which must succeed."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "argv", ["sparklod", *map(str, arguments)])
-        with pytest.raises(SystemExit) as caught:
-            main()
-    assert not caught.value.code
+    assert run([str(argument) for argument in arguments]) == 0
 
 
 def without_time(rows: Any) -> list[dict[str, Any]]:

@@ -281,7 +281,7 @@ def test_an_exported_site_works_without_sparklod_and_without_ranges(
 
 def test_a_page_without_its_libraries_says_what_to_do(tab: Tab, trees: Path) -> None:
     command = [sys.executable, "-m", "sparklod_cli", "view", str(trees / "demo.spz"), "--no-open", "-q"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, preexec_fn=heed_signals) as process:
         assert process.stdout is not None
         tab.open(process.stdout.readline().strip(), without=[urlsplit(CDN).netloc])
         text = tab.ask("message")["text"]
