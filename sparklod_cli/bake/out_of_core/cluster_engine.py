@@ -23,7 +23,7 @@ _INSTALL = f"pip install 'sparklod[cluster]=={__version__}' there, and start it 
 class ClusterEngine:
     """Runs tasks on a Dask cluster.
 
-    The client holds the graph: a task is submitted when all that it needs is done. Workers return nothing, so that one
+    The client holds the graph: a task is submitted when all that it needs is done. Workers return a few numbers, so that one
     which is lost takes no result with it: what it had put is in the store.
     """
 
@@ -56,8 +56,11 @@ class ClusterEngine:
             for name in [name for name, wanted in needs.items() if not wanted]:
                 submit(name)
             while pool:
-                name, _, error = pool.next()
-                if error is not None and not store.has(name):
+                name, future, error = pool.next()
+                if error is None:
+                    written, read = future.result()
+                    store.traffic.add(written=written, read=read)
+                elif not store.has(name):
                     raise error
                 done += left[name][1].weight
                 progress(stage, done, total, "splat")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import os
 import pickle
 import signal
@@ -65,29 +64,27 @@ def probe(store: Store, name: str, files: Sequence[Path]) -> Probed:
     return Probed(__version__, socket.gethostname(), reads, writes, missing)
 
 
-def run_task(job: bytes, task: Task, threads: int) -> None:
+def run_task(packed: bytes, task: Task, threads: int) -> tuple[int, int]:
     """Runs a task, unless its result is there: a worker may have been lost after it had put that.
 
     Args:
-        job: pickled.
+        packed: the job, pickled; a copy for each task, so that each counts its own bytes.
         task: to be run.
         threads: to work on.
+
+    Returns:
+        bytes that it wrote to the store, and read there.
     """
-    whole = _job_of(job)
-    if whole.store.has(task.name):
-        return
-    with memory_errors_translated():
-        task.run(whole, *task.arguments, threads=threads, progress=silent)
+    job = pickle.loads(packed)
+    if not job.store.has(task.name):
+        with memory_errors_translated():
+            task.run(job, *task.arguments, threads=threads, progress=silent)
+    return job.store.traffic.written, job.store.traffic.read
 
 
 def run_call(call: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
     """Calls a function that returns something small."""
     return call(*arguments)
-
-
-@functools.lru_cache(maxsize=2)
-def _job_of(job: bytes) -> Any:
-    return pickle.loads(job)
 
 
 def dask_setup(worker: Any) -> None:
