@@ -120,7 +120,8 @@ def _connected(address: str) -> Iterator[Any]:
             ) from None
         yield client
     finally:
-        client.close(timeout=1)
+        with contextlib.suppress(TimeoutError):  # a scheduler that is gone
+            client.close(timeout=1)
 
 
 @contextlib.contextmanager

@@ -112,12 +112,8 @@ class ClusterEngine:
 
 def _check_answer(worker: str, answer: Any, store: Store) -> None:
     """Raises a `SparklodError` for what a worker said of itself."""
-    if isinstance(answer, ImportError):
-        raise SparklodError(f"worker {worker} does not have sparklod {__version__} ({answer}): {_INSTALL}")
-    if not isinstance(answer, Probed):
-        raise SparklodError(
-            f"worker {worker} cannot work with this sparklod ({type(answer).__name__}: {answer}): {_INSTALL}"
-        )
+    if not isinstance(answer, Probed):  # an error: it has no sparklod, or one that knows no such question
+        raise SparklodError(f"worker {worker} does not run sparklod {__version__} ({answer}): {_INSTALL}")
     place = f"worker {worker} on {answer.host}"
     if answer.version != __version__:
         raise SparklodError(f"{place} has sparklod {answer.version}, not {__version__} as here: {_INSTALL}")

@@ -136,7 +136,7 @@ def test_a_worker_without_sparklod_is_told_what_to_do(engine: ClusterEngine, job
     client = engine._connection.client
     client.run(_hide, cluster_worker.__name__)
     try:
-        with pytest.raises(SparklodError, match=r"does not have sparklod .*: pip install 'sparklod\[cluster\]=="):
+        with pytest.raises(SparklodError, match=r"does not run sparklod .*: pip install 'sparklod\[cluster\]=="):
             engine.check(job.store)
     finally:
         client.run(_show, cluster_worker.__name__)
