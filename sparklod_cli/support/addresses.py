@@ -15,7 +15,7 @@ import tempfile
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, Literal
 from urllib.parse import unquote, urlsplit
 
 from .errors import SparklodError
@@ -105,16 +105,17 @@ class Address:
             raise OSError(f"{self} does not tell its size; download it first")
         return int(size)
 
-    def open(self, mode: str = "rb", buffering: int = READ_AHEAD) -> BinaryIO:
+    def open(
+        self, mode: Literal["rb"] = "rb", buffering: int = READ_AHEAD, *, size: int | None = None
+    ) -> io.BufferedReader:
         """Opens the file for reading, wherever in it.
 
         Args:
-            mode: "rb".
-            buffering: bytes that are read at once by those who want less.
+            mode: as of a path.
+            buffering: bytes that are read at once where less is wanted.
+            size: bytes of the file, where that is known.
         """
-        assert mode == "rb"
-        raw = _Ranged(self)
-        return io.BufferedReader(raw, buffering) if buffering else raw  # type: ignore[return-value]
+        return io.BufferedReader(_Ranged(self, self.size() if size is None else size), buffering)
 
     def read(self, start: int, stop: int) -> bytes:
         """Some bytes of the file."""
@@ -180,8 +181,8 @@ class Address:
 class _Ranged(io.RawIOBase):
     """A file at an address, whose bytes are asked for when they are read."""
 
-    def __init__(self, address: Address) -> None:
-        self._address, self._size, self._at = address, address.size(), 0
+    def __init__(self, address: Address, size: int) -> None:
+        self._address, self._size, self._at = address, size, 0
 
     def readable(self) -> bool:
         return True

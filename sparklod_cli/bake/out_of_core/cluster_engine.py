@@ -23,8 +23,8 @@ _INSTALL = f"pip install 'sparklod[cluster]=={__version__}' there, and start it 
 class ClusterEngine:
     """Runs tasks on a Dask cluster.
 
-    The client holds the graph: a task is submitted when all that it needs is done. Workers return a few numbers, so that one
-    which is lost takes no result with it: what it had put is in the store.
+    The client holds the graph: a task is submitted when all that it needs is done. Workers return two numbers, so that
+    one which is lost takes no result with it: what it had put is in the store.
     """
 
     def __init__(self, connection: Connection, *, threads: int) -> None:
@@ -56,9 +56,9 @@ class ClusterEngine:
             for name in [name for name, wanted in needs.items() if not wanted]:
                 submit(name)
             while pool:
-                name, future, error = pool.next()
+                name, result, error = pool.next()
                 if error is None:
-                    written, read = future.result()
+                    written, read = result
                     store.traffic.add(written=written, read=read)
                 elif not store.has(name):
                     raise error
@@ -86,10 +86,10 @@ class ClusterEngine:
                 count += 1
             for wanted in map(str, range(count)):
                 while wanted not in outcomes:
-                    name, future, error = pool.next()
+                    name, result, error = pool.next()
                     if error is not None and not isinstance(error, SparklodError):
                         raise error
-                    outcomes[name] = future.result() if error is None else error
+                    outcomes[name] = result if error is None else error
                 yield outcomes.pop(wanted)
 
     def check(self, store: Store, files: Sequence[Path] = ()) -> None:

@@ -181,7 +181,7 @@ class Pool:
         future.add_done_callback(lambda _: self._ended.put(name))
 
     def next(self) -> tuple[str, Any, Exception | None]:
-        """Waits for a call that ends: its name, its future, and the error that it failed with, if it did."""
+        """Waits for a call that ends: its name, its result, and the error that it failed with, if it did."""
         while True:
             self._go_on()
             try:
@@ -190,10 +190,15 @@ class Pool:
                 self._connection.look()
                 continue
             future = self._futures.pop(name)
-            error = None if future.status == "finished" else self._connection.failure(name, future)
-            if error is None or not self._is_worth_another(name, error):
+            if future.status == "finished":
+                with self._connection.guarded():
+                    result = future.result()
                 del self._calls[name]
-                return name, future, error
+                return name, result, None
+            error = self._connection.failure(name, future)
+            if not self._is_worth_another(name, error):
+                del self._calls[name]
+                return name, None, error
 
     def _is_worth_another(self, name: str, error: Exception) -> bool:
         """Whether a call is tried again, after a pause."""

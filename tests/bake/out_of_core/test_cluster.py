@@ -81,7 +81,7 @@ def test_a_connection_that_breaks_is_tried_again(engine: ClusterEngine, job: Job
 
 def test_an_error_for_people_comes_through_and_is_not_tried_again(engine: ClusterEngine, job: Job) -> None:
     tasks = [Task("full", made_up.fill_disk, ("full",)), *tree_of(16, seconds=0.5)]
-    with pytest.raises(ScratchError, match="^there is no room left in the scratch folder /scratch$"):
+    with pytest.raises(ScratchError, match=r"^there is no room left in the scratch folder /scratch$"):
         engine.run("building", tasks, job, silent)
     assert job.store.has("tried/full/0") and not job.store.has("tried/full/1")
     assert not job.store.has(tasks[-1].name)
@@ -92,7 +92,7 @@ def test_a_task_that_fails_although_its_result_is_there_is_done(engine: ClusterE
 
 
 def test_other_errors_come_through_for_those_who_mend_them(engine: ClusterEngine, job: Job) -> None:
-    with pytest.raises(TypeError, match="add_up"):
+    with pytest.raises(TypeError, match=r"add_up"):
         engine.run("building", [Task("wrong", made_up.add_up)], job, silent)
 
 
@@ -120,7 +120,7 @@ def test_workers_that_do_not_fit_are_refused(
         patch.setattr(cluster_engine, "__version__", "9.9")
         with pytest.raises(SparklodError, match=r"has sparklod .*, not 9\.9 as here: pip install"):
             engine.check(job.store)
-    with pytest.raises(SparklodError, match="does not see what was written to .*--scratch-dir a folder that all"):
+    with pytest.raises(SparklodError, match=r"does not see what was written to .*--scratch-dir a folder that all"):
         engine.check(_Elsewhere(tmp_path / "here"))
     assert not list(tmp_path.rglob("*.result"))
 
@@ -160,9 +160,11 @@ def test_a_block_that_does_not_fit_into_memory_is_named(tmp_path: Path, monkeypa
     monkeypatch.setattr("sparklod_cli.bake.out_of_core.cluster._memory_limit", lambda workers, memory: 400_000_000)
     job = Job(FolderStore(tmp_path / "store"))
     with cluster(ClusterSettings(workers=1)) as started:
-        with pytest.raises(OutOfMemoryError, match="^stage/7 does not fit into the memory of a worker; give a smaller"):
+        with pytest.raises(
+            OutOfMemoryError, match=r"^stage/7 does not fit into the memory of a worker; give a smaller"
+        ):
             started.run("building", [Task("stage/7", made_up.devour, ("stage/7",))], job, silent)
-        with pytest.raises(SparklodError, match="^each worker that did stage/8 was lost, the last one tcp://"):
+        with pytest.raises(SparklodError, match=r"^each worker that did stage/8 was lost, the last one tcp://"):
             started.run("building", [Task("stage/8", made_up.die, ("stage/8",))], job, silent)
 
 

@@ -9,7 +9,9 @@ from typing import Any
 
 import pytest
 
-distributed = pytest.importorskip("distributed")
+pytest.importorskip("distributed")
+
+import distributed
 
 from sparklod_cli.bake.out_of_core import cluster as module
 from sparklod_cli.bake.out_of_core.cluster import ClusterSettings, cluster
@@ -54,7 +56,7 @@ def test_a_scheduler_that_goes_away_keeps_what_is_done(scheduler: Any, tmp_path:
     job, tasks = Job(FolderStore(tmp_path)), tree_of(64, seconds=0.05)
     with cluster(ClusterSettings(scheduler=scheduler.scheduler_address)) as engine:
         threading.Timer(0.5, lambda: scheduler.loop.add_callback(scheduler.scheduler.close)).start()
-        with pytest.raises(SparklodError, match="scheduler of the cluster does not answer any more.*add --resume"):
+        with pytest.raises(SparklodError, match=r"scheduler of the cluster does not answer any more.*add --resume"):
             engine.run("building", tasks, job, silent)
     assert job.store.has(tasks[0].name) and not job.store.has(tasks[-1].name)
 
@@ -62,7 +64,7 @@ def test_a_scheduler_that_goes_away_keeps_what_is_done(scheduler: Any, tmp_path:
 def test_a_cluster_without_workers_is_refused(scheduler: Any) -> None:
     scheduler.scale(0)
     with (
-        pytest.raises(SparklodError, match="has no workers; start some with dask worker tcp://"),
+        pytest.raises(SparklodError, match=r"has no workers; start some with dask worker tcp://"),
         cluster(ClusterSettings(scheduler=scheduler.scheduler_address)),
     ):
         pass
@@ -72,7 +74,7 @@ def test_a_cluster_without_workers_is_refused(scheduler: Any) -> None:
 def test_an_address_without_a_scheduler_is_refused(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "PATIENCE", 0.2)
     with (
-        pytest.raises(SparklodError, match="no scheduler answers at .*; start one with dask scheduler"),
+        pytest.raises(SparklodError, match=r"no scheduler answers at .*; start one with dask scheduler"),
         cluster(ClusterSettings(scheduler=address)),
     ):
         pass
