@@ -1,4 +1,4 @@
-"""Where the nodes can be that a stage of the quick builder does not know: outside of its region, and a margin within."""
+"""Where nodes can be that a stage of the quick builder does not know: outside of its region, and in a margin of it."""
 
 from __future__ import annotations
 
@@ -41,13 +41,13 @@ class Margins:
     def are_closed(self) -> bool:
         """Whether no centre in the box of the scene is off the margins."""
         sides = zip(self._below, self._above, self._grid.low, self._grid.high, strict=True)
-        return any(below >= min(above, high) or above <= low for below, above, low, high in sides)
+        return any(float(below) >= min(float(above), high) or float(above) <= low for below, above, low, high in sides)
 
     def are_inside(self, geometry: FloatArray, nodes: Nodes) -> NDArray[np.bool_]:
         """(n,) whether the centre of each node is off the margins, so that no unknown node can be in its cell."""
         center = geometry[nodes, CENTER : CENTER + 3]
-        inside: NDArray[np.bool_] = ((center > self._below) & (center < self._above)).all(axis=1)
-        return inside
+        below, above = np.array(self._below), np.array(self._above)
+        return np.asarray(((center > below) & (center < above)).all(axis=1))
 
 
 def _first_from(value: float) -> np.float32:

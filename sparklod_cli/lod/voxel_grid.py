@@ -76,7 +76,7 @@ class VoxelGrid:
         return max(1, -(-self.cells(level)[2] // AXIS_BITS))
 
     def leaf_keys(self, center: FloatArray, scale: FloatArray) -> tuple[Keys, NDArray[np.int32], int]:
-        """Keys that order splats by level and then along a curve, (n,) their levels, and the number of bits of a key."""
+        """Keys that order splats by level and along a curve, (n,) their levels, and the number of bits of a key."""
         steps = self.steps
         low, high = np.array(self.low), np.array(self.high)
         edge = max(float((high - low).max()) / (2**CURVE_BITS - 2), float(steps[0]))  # one cell to spare at either end

@@ -16,7 +16,7 @@ from ..kernels.geometry import CENTER, OPACITY, QUAT, SCALE, WIDTH, SplatColumns
 from ..kernels.sort import Keys, Nodes, cell_words, sort_by_key
 from ..margins import Margins
 from ..voxel_grid import VoxelGrid
-from ..voxel_growth import Arrivals, Left, grow
+from ..voxel_growth import Arrivals, grow
 from ..voxel_tree import SHRINK, Batch, VoxelTree, final_order, in_order
 from .records import NO_FAMILY, STAGE_BITS, Families, Pending, Region, Survey
 
@@ -147,7 +147,7 @@ def _places(tree: VoxelTree, grid: VoxelGrid) -> tuple[NDArray[np.int32], Keys, 
 
 
 def _number(batch: Batch) -> int:
-    """The number of a batch in the order of the tree: coarse levels first, and folds after what they are merged into."""
+    """The number of a batch in the tree: coarse levels first, folds after the batches that they are merged in."""
     return (LEVELS - batch.level) * FOLDS + (FOLDS - batch.fold if batch.fold else 0)
 
 

@@ -7,15 +7,14 @@ import pytest
 
 from sparklod_cli.lod import quick
 from sparklod_cli.lod.stages import quick as staged_quick
-from tests.lod.stages.assembly import EVERYWHERE, Division, assembled, build_in_stages, halves
+from tests.lod.stages.assembled import build_in_stages
 from tests.scenes import random_splats
 
 
 @pytest.mark.parametrize("base", [1.1, 1.5, 2.0])
 def test_the_tree_in_stages_is_the_tree_in_memory(base: float) -> None:
     splats = random_splats(3000, sh_degree=1)
-    division = Division(EVERYWHERE, tuple(map(Division, halves(EVERYWHERE, splats.center, 3))))
-    nodes, tree = assembled(build_in_stages(staged_quick, splats, base, division))
+    nodes, tree = build_in_stages(staged_quick, splats, base, [(2, 2, 2), (1, 2, 1)])
     expected, expected_tree = quick.build(splats, base)
     assert np.array_equal(tree.child_count, expected_tree.child_count)
     assert np.array_equal(tree.child_start, expected_tree.child_start)
