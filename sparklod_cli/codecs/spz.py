@@ -16,6 +16,7 @@ from ..support.progress import Progress, silent
 from . import compression
 from .options import DEFAULTS, WriteOptions
 from .spz_layout import ANTIALIASED, HEADER, LOD, MAGIC, Layout
+from .spz_options import needed as needed
 from .spz_options import settled as settled
 from .spz_reading import column_of
 from .spz_reading import decode as decode

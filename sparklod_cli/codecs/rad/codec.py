@@ -16,6 +16,7 @@ from ..options import DEFAULTS, WriteOptions
 from .encoding import Writing
 from .header import pack_header
 from .names import SUFFIX, chunk_name
+from .options import needed as needed
 from .options import settled as settled
 from .reading import RadChunk as RadChunk
 from .reading import decode as decode
