@@ -83,7 +83,8 @@ def sink_together(path: Place, *, overwrite: bool) -> SinkTogether:
 
 def _check(path: Place, *, overwrite: bool) -> None:
     if isinstance(path, Address):
-        return check_together(path, overwrite=overwrite)
+        check_together(path, overwrite=overwrite)
+        return
     if path == DASH:
         raise OutputError("standard output cannot take several files; name a file")
     check_writable(path, overwrite=overwrite)

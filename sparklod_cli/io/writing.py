@@ -30,7 +30,8 @@ def check_writable(path: Place, *, overwrite: bool) -> None:
         overwrite: an existing file may be replaced.
     """
     if isinstance(path, Address):
-        return check_address(path, overwrite=overwrite)
+        check_address(path, overwrite=overwrite)
+        return
     try:
         if path.is_dir():
             raise OutputError(f"{path} is a directory")
