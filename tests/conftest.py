@@ -41,7 +41,7 @@ def pytest_sessionstart(session: pytest.Session) -> None:
 
 @pytest.fixture(autouse=True)
 def signals_as_before() -> Iterator[None]:
-    """Puts signal handlers back: a signal left ignored would be ignored by every `sparklod` that a later test starts."""
+    """Puts signal handlers back: every `sparklod` that a later test starts would inherit a signal left ignored."""
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     yield
     for number, handler in before.items():
