@@ -3,5 +3,9 @@
 from ..bake import Baked as Baked
 from ..bake import BakeSettings as BakeSettings
 from ..bake import bake as bake
+from ..bake.out_of_core.cluster import ClusterSettings as ClusterSettings
+from ..bake.out_of_core.cluster import cluster as cluster
+from ..bake.out_of_core.cluster_engine import ClusterEngine as ClusterEngine
+from ..bake.side_by_side import bake_side_by_side as bake_side_by_side
 from ..extract_leaves import Extracted as Extracted
 from ..extract_leaves import extract_leaves as extract_leaves

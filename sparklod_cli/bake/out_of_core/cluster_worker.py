@@ -9,12 +9,12 @@ import socket
 import uuid
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ... import __version__
+from ...support.addresses import Place
 from ...support.errors import memory_errors_translated
 from ...support.progress import silent
 from .contracts import Store, Task
@@ -42,7 +42,7 @@ class Probed:
     missing: tuple[str, ...]
 
 
-def probe(store: Store, name: str, files: Sequence[Path]) -> Probed:
+def probe(store: Store, name: str, files: Sequence[Place]) -> Probed:
     """Tries whether this worker can do its share: read what others wrote, and write what they read.
 
     Args:
@@ -82,9 +82,9 @@ def run_task(packed: bytes, task: Task, threads: int) -> tuple[int, int]:
     return job.store.traffic.written, job.store.traffic.read
 
 
-def run_call(call: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
+def run_call(call: Callable[..., Any], arguments: tuple[Any, ...], threads: int) -> Any:
     """Calls a function that returns something small."""
-    return call(*arguments)
+    return call(*arguments, threads=threads)
 
 
 def dask_setup(worker: Any) -> None:
