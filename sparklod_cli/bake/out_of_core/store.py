@@ -50,6 +50,9 @@ class FolderStore:
     def __reduce__(self) -> tuple[type[FolderStore], tuple[Path]]:
         return FolderStore, (self.folder,)
 
+    def __str__(self) -> str:
+        return str(self.folder)
+
     def has(self, name: str) -> bool:
         """Whether there is a result of the length that it was written with."""
         try:
