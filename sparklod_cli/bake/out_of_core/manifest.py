@@ -20,7 +20,7 @@ from ...support.units import count_of
 from ..recipe import Recipe
 from .contracts import Store
 from .lock import LOCK, locked
-from .store import FolderStore
+from .store import FileStore
 
 #: How the names of scratch folders end.
 SUFFIX = ".sparklod-scratch"
@@ -115,7 +115,8 @@ def at_work(
         ScratchError: a run is at work there; there are results and neither `resume` nor `overwrite` is set, or they are
             of another recipe; or the store cannot be written.
     """
-    with locked(store.folder) if isinstance(store, FolderStore) else contextlib.nullcontext():
+    folder = _folder_of(store)
+    with contextlib.nullcontext() if folder is None else locked(folder):  # an address cannot be locked
         former = _Manifest.get(store)
         names = [name for name in store.names() if name != RECIPE]
         if names and not resume and not overwrite:
@@ -140,8 +141,9 @@ def at_work(
 
 def _clear(store: Store) -> None:
     """Removes all that is there but the lock."""
-    if isinstance(store, FolderStore):
-        for path in store.folder.iterdir():
+    folder = _folder_of(store)
+    if folder is not None:
+        for path in folder.iterdir():
             if path.is_dir():
                 shutil.rmtree(path, ignore_errors=True)
             elif path.name != LOCK:
@@ -178,6 +180,12 @@ def _resumed(
     lost = f"; {count_of(len(damaged), 'other')} that a failure damaged will be made again" if damaged else ""
     say(f"goes on with {count_of(len(names) - len(damaged), 'result')} in {store}{lost}")
     return former.block_splats
+
+
+def _folder_of(store: Store) -> Path | None:
+    """The folder of a store on this machine."""
+    place = store.folder if isinstance(store, FileStore) else None
+    return place if isinstance(place, Path) else None
 
 
 def _is_hopeless(error: BaseException) -> bool:

@@ -76,9 +76,6 @@ class FileStore(ABC):
     def _unlink(self, name: str) -> None:
         """Removes the file of a result, if it is there."""
 
-    def __str__(self) -> str:
-        return str(self.folder)
-
     def has(self, name: str) -> bool:
         """Whether there is a result of the length that it was written with."""
         try:
