@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
-from ..support.addresses import Place
+from ..support.addresses import Place, absolute
 from ..support.errors import SparklodError
 from ..support.progress import Progress, silent
 from .baking import Baked, bake
@@ -19,35 +21,41 @@ def bake_side_by_side(
     engine: ClusterEngine,
     *,
     fits: Callable[[Place], bool],
-    bake_large: Callable[[Place, Place], Baked],
+    bake_large: Callable[[Place, Place], Any],
     overwrite: bool = False,
     progress: Progress = silent,
-) -> Iterator[Baked | SparklodError]:
-    """Bakes scenes, and yields what came of each in their order, as soon as it is known.
+) -> Iterator[Any]:
+    """Bakes scenes; yields what came of each, a `Baked` or a `SparklodError`, in their order as soon as it is known.
 
     Args:
         pairs: inputs and outputs, which all workers see.
         settings: how.
         engine: of the cluster.
         fits: whether a worker can hold an input.
-        bake_large: bakes one that none can.
+        bake_large: bakes one that none can, and returns what came of it.
         overwrite: replace files that exist.
         progress: told how many scenes are done.
     """
     small = [fits(source) for source, _ in pairs]
-    calls = [(*pair, settings, overwrite) for pair, is_small in zip(pairs, small, strict=True) if is_small]
+    settings = dataclasses.replace(settings, rgba=settings.rgba and settings.rgba.absolute())
+    whole = [(absolute(source), absolute(target)) for source, target in pairs]  # workers have folders of their own
+    calls = [(*pair, settings, overwrite) for pair, is_small in zip(whole, small, strict=True) if is_small]
+    engine.check(None, [source for source, _ in whole])
     with engine.each("baking", _bake_small, calls, progress, "scene") as outcomes:
         for pair, is_small in zip(pairs, small, strict=True):
-            yield next(outcomes) if is_small else _outcome(bake_large, pair)
+            yield _found(next(outcomes), pair[1]) if is_small else bake_large(*pair)
+
+
+def _found(outcome: Any, target: Place) -> Any:
+    """What came of a scene; a `SparklodError` where its output is on a machine that this one does not see."""
+    if isinstance(outcome, Baked) and isinstance(target, Path) and not target.exists():
+        return SparklodError(
+            f"a worker wrote {target} into a folder that is not seen here: give --output-dir a folder that all machines"
+            " share, or a URL"
+        )
+    return outcome
 
 
 def _bake_small(source: Place, target: Place, settings: BakeSettings, overwrite: bool, *, threads: int) -> Baked:
     """What a worker does."""
     return bake(source, target, settings, overwrite=overwrite, threads=threads)
-
-
-def _outcome(bake_large: Callable[[Place, Place], Baked], pair: tuple[Place, Place]) -> Any:
-    try:
-        return bake_large(*pair)
-    except SparklodError as error:
-        return error

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -18,14 +18,18 @@ from ..support.stdin import DASH, name_of
 from .build_lod_outputs import Outputs, check_formats
 from .command import COMMON, Command, option
 from .options.baking import bake_settings, baking_options, check_method, write_options
+from .options.cluster import OF_CLUSTERS, check_cluster, cluster_of, cluster_options
 from .options.common import General, common_options, output_option, overwrite_option
 from .paths import InputPath, OutputPath, claim_stdout, keep_apart, with_chunks
 from .reports import report_baked, report_extracted
-from .usage import options_of
+from .usage import exclude, options_of
 
 if TYPE_CHECKING:
-    from ..api.bake_jobs import Baked, Extracted
+    from ..api.bake_jobs import Baked, ClusterEngine, Extracted
     from .console import Console
+
+    Pairs = Sequence[tuple[Place, Place]]
+    Make = Callable[[Pairs], Iterator[Baked | Extracted | SparklodError]]
 
 EXAMPLES = """
 \b
@@ -34,6 +38,8 @@ Examples:
   sparklod build-lod scene.ply --up -y                  # y up, as viewers want it
   sparklod build-lod scene.ply --method quality         # for publishing
   sparklod build-lod scans/*.ply --output-dir web -f
+  sparklod build-lod scans/*.ply --output-dir web --workers 4
+  sparklod build-lod s3://bucket/scan.ply --scheduler tcp://host:8786
   cat scene.ply | sparklod build-lod - -o - | aws s3 cp - s3://bucket/scene-lod.spz
   sparklod build-lod scene.ply --within 0,1,0,25 --min-opacity 0.02
   sparklod build-lod scene.ply --json | jq .nodes
@@ -69,6 +75,7 @@ Examples:
     " .splat.",
 )
 @baking_options
+@cluster_options
 @common_options
 @click.pass_context
 def build_lod(ctx: click.Context, /, inputs: tuple[Place, ...], **_: Any) -> None:
@@ -80,25 +87,25 @@ def build_lod(ctx: click.Context, /, inputs: tuple[Place, ...], **_: Any) -> Non
 
     The axes of the input are kept unless --up or --rotate turns them. Selection goes by the coordinates of the input.
 
-    An input that fails does not stop the others; the exit status is 1 if any did.
+    INPUT, FILE and DIR may be addresses such as s3://bucket/scan.ply (pip install 'sparklod[cloud]').
+
+    An input that fails does not stop the others; the exit status is 1 if any did. With --workers or --scheduler,
+    several inputs are baked side by side (pip install 'sparklod[cluster]').
     """
     general, outputs = options_of(ctx, General), options_of(ctx, Outputs)
     _check(ctx, inputs, outputs, general)
     failed = False
-    with general.console() as console:
-        make, report = _job(ctx, outputs, console)
-        shared = {"overwrite": outputs.overwrite, "threads": general.threads, "progress": console.progress}
-        for source in inputs:
-            target = outputs.target(source)
-            try:
-                result = make(source, target, **shared)
-                report(console, source, target, result)
-            except SparklodError as error:
+    with general.console() as console, cluster_of(ctx, general, console) as engine:
+        pairs = [(source, outputs.target(source)) for source in inputs]
+        make, report = _job(ctx, outputs, general, console, engine)
+        for (source, target), outcome in zip(pairs, make(pairs), strict=True):
+            if isinstance(outcome, SparklodError):
                 failed = True
-                console.error(f"{name_of(source)}: {error}")
-                record: dict[str, Any] = {"input": str(source), "error": shortened(str(error), MOST)}
+                console.error(f"{name_of(source)}: {outcome}")
+                record: dict[str, Any] = {"input": str(source), "error": shortened(str(outcome), MOST)}
             else:
-                record = {"input": str(source), "output": str(target), **dataclasses.asdict(result)}
+                report(console, source, target, outcome)
+                record = {"input": str(source), "output": str(target), **dataclasses.asdict(outcome)}
             if general.as_json:
                 click.echo(json.dumps(record))
     if failed:
@@ -122,20 +129,44 @@ def _check(ctx: click.Context, inputs: tuple[Place, ...], outputs: Outputs, gene
     if ctx.params["rgba"] is not None and len(inputs) > 1:
         raise click.UsageError(f"--rgba takes one input, not {len(inputs)}")
     check_formats(ctx, outputs)
-    if not outputs.unlod:
+    check_cluster(ctx)
+    if outputs.unlod:
+        exclude(ctx, OF_CLUSTERS, "--unlod")
+    else:
         check_method(ctx)
+    if DASH in inputs:
+        exclude(ctx, OF_CLUSTERS, "standard input, which workers cannot read; save it to a file first")
 
 
 def _job(
-    ctx: click.Context, outputs: Outputs, console: Console
-) -> tuple[Callable[..., Baked | Extracted], Callable[..., None]]:
-    """What makes an output of an input, and what reports it; the point where numpy and numba are loaded."""
-    from ..api.bake_jobs import bake, extract_leaves
+    ctx: click.Context, outputs: Outputs, general: General, console: Console, engine: ClusterEngine | None
+) -> tuple[Make, Callable[..., None]]:
+    """What makes outputs of inputs, and what reports one; the point where numpy and numba are loaded."""
+    from ..api.bake_jobs import bake, bake_side_by_side, extract_leaves
 
+    shared: dict[str, Any] = {"overwrite": outputs.overwrite, "progress": console.progress}
+    make: Callable[..., Baked | Extracted]
     if outputs.unlod:
-        leaves = functools.partial(extract_leaves, suffix=outputs.suffix, options=write_options(ctx))
-        return leaves, report_extracted
+        make = functools.partial(extract_leaves, suffix=outputs.suffix, options=write_options(ctx), **shared)
+        return _one_by_one(functools.partial(make, threads=general.threads)), report_extracted
     settings = bake_settings(ctx, suffix=outputs.suffix, raw=outputs.is_raw, converts=outputs.format_is_asked_for)
     more = [] if outputs.suffix != RAD else ["rad"] if settings.options.rad.sh_codes is None else ["rad", "palette"]
     console.announce_compiling(settings.method, *more)
-    return functools.partial(bake, settings=settings), report_baked
+    make = functools.partial(bake, settings=settings, threads=general.threads, **shared)
+    if engine is None:
+        return _one_by_one(make), report_baked
+    beside = functools.partial(bake_side_by_side, settings=settings, engine=engine, fits=lambda _: True, **shared)
+    return functools.partial(beside, bake_large=functools.partial(_outcome, make)), report_baked
+
+
+def _one_by_one(make: Callable[..., Baked | Extracted]) -> Make:
+    """Makes outputs of inputs one after the other."""
+    return lambda pairs: (_outcome(make, *pair) for pair in pairs)
+
+
+def _outcome(make: Callable[..., Baked | Extracted], source: Place, target: Place) -> Baked | Extracted | SparklodError:
+    """What came of an input, so that one which fails does not stop the others."""
+    try:
+        return make(source, target)
+    except SparklodError as error:
+        return error

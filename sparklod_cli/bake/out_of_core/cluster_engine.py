@@ -6,6 +6,7 @@ import contextlib
 import pickle
 import uuid
 from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -106,25 +107,28 @@ class ClusterEngine:
                 outcomes[name] = result if error is None else error
             yield outcomes.pop(str(place))
 
-    def check(self, store: Store, files: Sequence[Place] = ()) -> None:
+    def check(self, store: Store | None, files: Sequence[Place] = ()) -> None:
         """Raises a `SparklodError` where a worker cannot do its share: another sparklod, or a folder it does not see.
 
         Args:
-            store: of the bake.
-            files: that tasks read.
+            store: of the bake, if it has one.
+            files: that tasks read; those that are not here are left to the tasks.
         """
+        here = [file for file in files if isinstance(file, Path) and file.exists()]
         name = f"{PROBE}/{uuid.uuid4().hex}"
-        store.put(name, {PROBE: np.arange(2)})
+        if store is not None:
+            store.put(name, {PROBE: np.arange(2)})
         try:
             with self._connection.guarded():
-                found = self._connection.client.run(probe, store, name, files, on_error="return")
+                found = self._connection.client.run(probe, store, name, here, on_error="return")
         finally:
-            store.remove(name)
+            if store is not None:
+                store.remove(name)
         for worker, answer in found.items():
             _check_answer(worker, answer, store)
 
 
-def _check_answer(worker: str, answer: Any, store: Store) -> None:
+def _check_answer(worker: str, answer: Any, store: Store | None) -> None:
     """Raises a `SparklodError` for what a worker said of itself."""
     if not isinstance(answer, Probed):  # an error: it has no sparklod, or one that knows no such question
         raise SparklodError(f"worker {worker} does not run sparklod {__version__} ({answer}): {_INSTALL}")

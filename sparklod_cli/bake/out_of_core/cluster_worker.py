@@ -9,12 +9,12 @@ import socket
 import uuid
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ... import __version__
-from ...support.addresses import Place
 from ...support.errors import memory_errors_translated
 from ...support.progress import silent
 from .contracts import Store, Task
@@ -42,24 +42,26 @@ class Probed:
     missing: tuple[str, ...]
 
 
-def probe(store: Store, name: str, files: Sequence[Place]) -> Probed:
+def probe(store: Store | None, name: str, files: Sequence[Path]) -> Probed:
     """Tries whether this worker can do its share: read what others wrote, and write what they read.
 
     Args:
-        store: of the bake.
+        store: of the bake, if it has one.
         name: of a result that the client wrote.
         files: that tasks read.
     """
-    writes, mine = "", f"{name}-{uuid.uuid4().hex}"
-    try:
-        store.put(mine, {PROBE: np.arange(2)})
-        store.remove(mine)
-    except Exception as error:
-        writes = f"{type(error).__name__}: {error}"
-    try:
-        reads = store.has(name) and len(store.get(name)[PROBE]) > 0
-    except Exception:
-        reads = False
+    reads, writes = True, ""
+    if store is not None:
+        mine = f"{name}-{uuid.uuid4().hex}"
+        try:
+            store.put(mine, {PROBE: np.arange(2)})
+            store.remove(mine)
+        except Exception as error:
+            writes = f"{type(error).__name__}: {error}"
+        try:
+            reads = store.has(name) and len(store.get(name)[PROBE]) > 0
+        except Exception:
+            reads = False
     missing = tuple(str(path) for path in files if not path.exists())
     return Probed(__version__, socket.gethostname(), reads, writes, missing)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import pickle
 from collections.abc import Iterator
 from pathlib import Path
@@ -116,8 +117,11 @@ def test_calls_that_nobody_waits_for_are_cancelled(engine: ClusterEngine) -> Non
 def test_workers_that_do_not_fit_are_refused(
     engine: ClusterEngine, job: Job, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    with pytest.raises(SparklodError, match=r"does not see .*missing.ply: put inputs into a folder that all"):
-        engine.check(job.store, [tmp_path / "missing.ply"])
+    engine.check(None, [tmp_path, tmp_path / "missing.ply"])  # which is nowhere, as its task will say
+    here_alone = Path(f"/proc/self/task/{os.getpid()}")
+    if here_alone.exists():
+        with pytest.raises(SparklodError, match=r"does not see /proc/self/task/.*: put inputs into a folder that all"):
+            engine.check(None, [here_alone])
     with monkeypatch.context() as patch:
         patch.setattr(cluster_engine, "__version__", "9.9")
         with pytest.raises(SparklodError, match=r"has sparklod .*, not 9\.9 as here: pip install"):
