@@ -4,20 +4,23 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import hashlib
 import tempfile
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO, Protocol
 
+from ..model.instances import Instance
+from ..model.merged import Placed, merged
 from ..model.splats import Splats
-from ..model.streams import SceneStream
+from ..model.streams import SceneStream, stream_of
 from ..support import atomic
-from ..support.errors import FormatError, OutputError
+from ..support.errors import FormatError, OutputError, SparklodError
 from ..support.progress import Progress, silent
-from ..support.stdin import DASH
+from ..support.stdin import DASH, name_of
 from .names import reason_of
 from .reading import opened, readable
 
@@ -64,6 +67,51 @@ def open_stream(
         yield dataclasses.replace(found, read=_Read(source, found.count, found.sh_degree))
     finally:
         store.close()
+
+
+@contextlib.contextmanager
+def open_streams(
+    instances: Sequence[Instance],
+    *,
+    scratch: Path | None = None,
+    keep: bool = False,
+    threads: int = 1,
+    progress: Progress = silent,
+) -> Iterator[SceneStream]:
+    """The splats of several files, each where its instance stands, as those of one scene; see `model.merged`.
+
+    A file that several instances have is read for each of them, and nothing of it is kept open in between.
+
+    Args:
+        instances: at least one; their `lod_scale` and `foveation` mean nothing here.
+        scratch, keep, threads, progress: as for `open_stream`. Unless `keep` is set, a file is unpacked for each read.
+
+    Raises:
+        HasTreeError, FormatError, ValueError: as `open_stream`; names the file.
+    """
+    streams: dict[Path, SceneStream] = {}
+    for file in (each.file for each in instances if each.file is not None):
+        if file not in streams:
+            try:
+                with open_stream(file, scratch=scratch, keep=keep, threads=threads, progress=progress) as stream:
+                    again = functools.partial(_read_once, file, scratch, threads, progress)
+                    streams[file] = stream if keep else dataclasses.replace(stream, read=again)
+            except SparklodError as error:
+                raise type(error)(f"{name_of(file)}: {error}") from None
+    yield merged([_placed(each, streams) for each in instances])
+
+
+def _placed(instance: Instance, streams: Mapping[Path, SceneStream]) -> Placed:
+    if isinstance(instance.source, Path):
+        return Placed(streams[instance.source], name_of(instance.source), instance.transform)
+    return Placed(stream_of(instance.source), instance.name, instance.transform)
+
+
+def _read_once(
+    path: Path, scratch: Path | None, threads: int, progress: Progress, start: int, stop: int
+) -> Iterator[Splats]:
+    with open_stream(path, scratch=scratch, threads=threads, progress=progress) as stream:
+        yield from stream.read(start, stop)
 
 
 class _Store(Protocol):
