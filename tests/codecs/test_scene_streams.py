@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sparklod_cli.io import open_stream, open_streams, read_scene
+from sparklod_cli.io import PlacedFile, open_stream, open_streams, read_scene
 from sparklod_cli.model import streams
-from sparklod_cli.model.instances import Instance, instances_of
 from sparklod_cli.model.merged import Placed, merged
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
@@ -106,13 +105,12 @@ def test_several_files_are_one_scene_and_one_that_is_named_twice_is_read_twice(t
         paths[form] = put(WRITERS[form][way].write(source), tmp_path / form, form)
         scenes[form] = read_scene(paths[form])
     order = ("PLY", "SPZ", "PLY")
-    instances = [Instance(paths[form]) for form in order[:2]] + [Instance(paths["PLY"], "", turned.matrix)]
-    instances += [Instance(scenes["SPZ"], "in memory")]
+    files = [PlacedFile(paths[form]) for form in order[:2]] + [PlacedFile(paths["PLY"], turned)]
     parts = [Placed(stream_of(scenes[form]), form) for form in order[:2]]
-    parts += [Placed(stream_of(scenes["PLY"]), "", turned), Placed(stream_of(scenes["SPZ"]), "")]
+    parts += [Placed(stream_of(scenes["PLY"]), "", turned)]
     expected = collected(merged(parts)).splats
     for keep in (False, True):
-        with open_streams(instances, scratch=tmp_path, keep=keep) as stream:
+        with open_streams(files, scratch=tmp_path, keep=keep) as stream:
             assert_rows([collected(stream).splats], expected)
             assert_rows(list(stream.read(150, 250)), expected.take(slice(150, 250)))
         assert len(list(tmp_path.glob("*.unpacked"))) == keep
@@ -126,9 +124,9 @@ def test_errors_on_one_of_several_files_name_it(tmp_path: Path) -> None:
         (tree, HasTreeError, "it is a Level-of-Detail file"),
         (bad / "x", UnreadableError, "cannot"),
     ):
-        with pytest.raises(kind, match=rf"{file.name}: {text}"), open_streams(instances_of([good, file])):
+        with pytest.raises(kind, match=rf"{file.name}: {text}"), open_streams([PlacedFile(good), PlacedFile(file)]):
             pass
-    with open_streams(instances_of([good, bad])) as stream, pytest.raises(FormatError, match=r"bad\.ply: "):
+    with open_streams([PlacedFile(good), PlacedFile(bad)]) as stream, pytest.raises(FormatError, match=r"bad\.ply: "):
         list(stream.blocks())
 
 
