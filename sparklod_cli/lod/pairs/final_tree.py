@@ -26,8 +26,9 @@ class Wanted:
     Attributes:
         most: number of merged nodes.
         splats: number of splats of the scene under the tree's leaves.
-        is_whole: whether its last node is the root of the scene. Otherwise the nodes without a parent get one later;
-            they are dropped last of all, and then their children are left without a parent.
+        is_whole: whether its last node is the root of the scene. Otherwise the nodes without a parent get one later.
+            They are dropped last of all, unless others then had more than MOST_CHILDREN; their children are left
+            without a parent.
         highest: ln(size) of rank 0, in units; None for the root's.
         latest: (N,) ranks that the parents of leaves must be below; empty for any.
     """
