@@ -14,9 +14,10 @@ from ..model.lod_tree import LodTree
 from ..model.scene import Scene
 from ..model.splats import Splats
 from ..model.transforms import Transform
-from ..support.errors import InvalidSplatsError, memory_errors_translated
+from ..support.errors import memory_errors_translated
 from ..support.progress import Progress, silent
 from ..support.threads import on_threads
+from .checks import check_transformed
 from .kept_tree import check_kept
 from .output import Output, WrittenTree, output_of
 from .settings import BakeSettings
@@ -159,10 +160,7 @@ def _transformed(splats: Splats, transform: Transform) -> Splats:
         InvalidSplatsError: one leaves the range of float32.
     """
     turned = transform.apply(splats)
-    if turned is not splats and turned.invalid():
-        raise InvalidSplatsError(
-            "scaled and moved like this, it leaves the range of float32; give a smaller --scale or --translate"
-        )
+    check_transformed(0 if turned is splats else len(turned.invalid()))
     return turned
 
 

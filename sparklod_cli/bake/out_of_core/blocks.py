@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from dataclasses import dataclass
 import numpy as np
@@ -55,12 +54,12 @@ class Blocks:
         return self.stages[-1].blocks
 
     @property
-    def groups(self) -> tuple[tuple[Stage, ...], ...]:
-        """The stages that begin with blocks, in runs that one stage joins; the blocks of a run are consecutive."""
+    def groups(self) -> tuple[range, ...]:
+        """Runs of blocks whose stages are joined by the same one."""
         parents = {child: stage.number for stage in self.stages for child in stage.children}
-        first = [stage for stage in self.stages if stage.block is not None]
-        runs = itertools.groupby(first, key=lambda stage: parents.get(stage.number))
-        return tuple(tuple(run) for _, run in runs)
+        joined = [parents.get(stage.number) for stage in self.stages if stage.block is not None]
+        ends = [*(k for k in range(1, self.count) if joined[k] != joined[k - 1]), self.count]
+        return tuple(range(start, stop) for start, stop in zip([0, *ends], ends, strict=False))
 
     def sort(self, center: FloatArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Sorts splats by their blocks, stably.
