@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,6 +16,7 @@ CHILDREN = 8
 
 #: Share of the centres at either end of an axis that do not count for its extent: a few splats of a scan lie far away.
 OUTLIERS = 0.02
+
 
 @dataclass(frozen=True)
 class Stage:

@@ -12,9 +12,13 @@ import numpy as np
 
 from ...codecs.statistics import Statistics
 from ...lod.builders import BUILDERS
+from ...model.scene import Scene
 from ...model.selection import Tally
 from ...model.streams import NodeStream, SceneStream
 from ...support.progress import Progress, silent
+from ...support.threads import on_threads
+from ..clock import Clock
+from ..output import Output, WrittenTree
 from ..settings import BakeSettings
 from .blocks import cut_into_blocks
 from .contracts import Engine, Store, Task
@@ -62,8 +66,9 @@ def build_in_store(
     store: Store,
     engine: Engine,
     block_splats: int,
-    check: Callable[[Statistics], None] = lambda statistics: None,
-    progress: Progress = silent,
+    check: Callable[[Statistics], None],
+    clock: Clock,
+    progress: Progress,
 ) -> Staged:
     """Builds the tree of a scene that need not fit into memory.
 
@@ -74,6 +79,7 @@ def build_in_store(
         engine: runs the tasks.
         block_splats: of a block, about.
         check: called with the statistics of the splats that are kept; raises where a tree of them cannot be written.
+        clock: is told when a stage ends.
         progress: told of the stages.
 
     Raises:
@@ -81,14 +87,17 @@ def build_in_store(
         SparklodError: a task failed for good.
     """
     job, findings = _scattered(stream, settings, store, engine, block_splats, progress)
+    clock.end("read")
     check(findings.statistics)
     setting = getattr(settings, BUILDERS[settings.method].setting)
     job = dataclasses.replace(job, plan=job.builder().plan(findings.survey(), setting))
     engine.run("building", list(_stages(job)), job, progress)
+    clock.end("build")
     stages = [store.get(stage_of(stage.number)) for stage in job.blocks.stages]
     job = dataclasses.replace(job, families=tuple(int(stage["counts"][0]) for stage in stages))
     engine.run("ordering", [Task(ORDER, put_order, weight=sum(job.families))], job, progress)
     order = Order.from_arrays(store.get(ORDER))
+    clock.end("order")
     return Staged(
         node_stream(job, order, findings.tally.kept, antialiased=stream.antialiased),
         order,
@@ -119,7 +128,7 @@ def _scattered(
         check_findings(findings, settings)
         kept = tuple(itertools.accumulate((part.tally.kept for part in parts), initial=0))
         job = dataclasses.replace(job, kept=kept)
-        largest = int(sum(np.diff(each["first"]) for each in found).max())
+        largest = int(np.sum([np.diff(each["first"]) for each in found], axis=0).max())
         again = cut_into_blocks(findings.sample[:, :3], findings.tally.kept, block_splats)
         if largest <= SLACK * block_splats or job.round + 1 == ROUNDS or again == blocks:
             return job, findings
@@ -141,3 +150,68 @@ def _stages(job: Job) -> Iterator[Task]:
         if stage.block in ends:
             group = ends[stage.block]
             yield Task(clean_of(group), clean, (group,), tuple(begun[block] for block in blocks.groups[group]))
+
+
+@dataclass(frozen=True)
+class BakedOutOfCore:
+    """What was baked out of core.
+
+    Attributes:
+        written: about the output.
+        findings: of the splats of the input.
+        nodes, levels: of the tree; levels is its depth and 1.
+        blocks: that it was built of.
+        seconds: by stage.
+    """
+
+    written: WrittenTree
+    findings: Findings
+    nodes: int
+    levels: int
+    blocks: int
+    seconds: dict[str, float]
+
+
+def bake_out_of_core(
+    stream: SceneStream,
+    output: Output,
+    settings: BakeSettings,
+    *,
+    store: Store,
+    engine: Engine,
+    block_splats: int,
+    threads: int = 1,
+    progress: Progress = silent,
+) -> BakedOutOfCore:
+    """Builds a tree in a store and writes it.
+
+    Args:
+        stream, settings, store, engine, block_splats, progress: as for `build_in_store`.
+        output: writes the tree.
+        threads: of this process, to write with.
+
+    Raises:
+        FormatError, InvalidSplatsError, OutputError: as `bake`.
+        SparklodError: a task failed for good.
+    """
+    clock = Clock()
+    tree = build_in_store(
+        stream,
+        settings,
+        store=store,
+        engine=engine,
+        block_splats=block_splats,
+        check=output.check_statistics,
+        clock=clock,
+        progress=progress,
+    )
+    nodes, links = tree.nodes.read(0, tree.nodes.count)
+    if output.in_chunks:
+        with on_threads(threads):
+            from ...lod.chunk_order import arrange
+
+            nodes, links = arrange(nodes, links, progress=progress)
+        clock.end("arrange")
+    written = output.write(Scene(nodes, links, stream.antialiased), threads, progress)
+    clock.end("write")
+    return BakedOutOfCore(written, tree.findings, tree.nodes.count, tree.order.levels, tree.blocks, clock.seconds)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any
 
@@ -57,7 +58,7 @@ class Job:
         return f"{self.part(part)}/{group}"
 
 
-def stage_of(number: int) -> str:
+def stage_of(number: int | str) -> str:
     """The name of what is known of a stage, all of whose results are there then."""
     return f"stage/{number}"
 
@@ -79,3 +80,17 @@ def clean_of(group: int) -> str:
 
 #: Names of the root, and of the order of all nodes.
 ROOT, ORDER = "root", "order"
+
+
+def forget(store: Store, damaged: Collection[str]) -> None:
+    """Removes results that are damaged, and whatever has to be made again for them; stages that are whole are kept."""
+    names = set(damaged)
+    if names - {ORDER}:
+        names |= {ORDER}
+        names |= {name for name in store.names() if name.startswith(("scatter-", "clean/"))}
+        names |= {stage_of(name.partition("/")[2]) for name in damaged if name.startswith(("families/", "pending/"))}
+    if ROOT in damaged:  # the last stage makes it
+        numbers = [int(name.partition("/")[2]) for name in store.names() if name.startswith("stage/")]
+        names |= {stage_of(max(numbers, default=0))}
+    for name in sorted(names):
+        store.remove(name)

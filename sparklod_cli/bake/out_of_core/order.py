@@ -125,7 +125,10 @@ def _ranges(store: Store, runs: list[Run]) -> Iterator[list[Run]]:
     pivots = np.unique(probes[[len(probes) * piece // pieces for piece in range(1, pieces)]])
     cuts = [[0, *np.searchsorted(each, pivots).tolist(), len(each)] for each in first]
     for piece in range(len(pivots) + 1):
-        parts = [(stage, start + cut[piece], start + cut[piece + 1]) for (stage, start, _), cut in zip(runs, cuts, strict=True)]
+        parts = [
+            (stage, start + cut[piece], start + cut[piece + 1])
+            for (stage, start, _), cut in zip(runs, cuts, strict=True)
+        ]
         yield [part for part in parts if part[1] < part[2]]
 
 

@@ -67,9 +67,7 @@ class Findings:
         """Of splats that are kept; every so many of them are the sample."""
         low, high, smallest, largest = find_bounds(splats.center, splats.scale, threads)
         sample = rows_of(splats.take(slice(None, None, stride)))
-        return cls(
-            tally, beyond, np.stack([low, high]), np.array([smallest, largest]), sample, Statistics.of(splats)
-        )
+        return cls(tally, beyond, np.stack([low, high]), np.array([smallest, largest]), sample, Statistics.of(splats))
 
     @classmethod
     def merged(cls, parts: Sequence[Findings]) -> Findings:
@@ -117,7 +115,8 @@ class Findings:
         """What the builder has to know."""
         sample = splats_of(self.sample)
         low, high = (tuple(corner) for corner in self.box.tolist())
-        return Survey(self.tally.kept, sample.sh_degree, low, high, *self.sizes.tolist(), sample)
+        smallest, largest = self.sizes.tolist()
+        return Survey(self.tally.kept, sample.sh_degree, low, high, smallest, largest, sample)
 
 
 def check_findings(findings: Findings, settings: BakeSettings) -> None:

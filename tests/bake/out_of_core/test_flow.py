@@ -6,25 +6,35 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-import pytest
-from hypothesis import given, settings
+from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 from sparklod_cli.bake import BakeSettings
+from sparklod_cli.bake.clock import Clock
 from sparklod_cli.bake.out_of_core.flow import Staged, build_in_store
 from sparklod_cli.lod import quick
-from sparklod_cli.lod.builders import METHODS
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
+from sparklod_cli.support.progress import silent
 from tests.bake.out_of_core.plain import Loop, PlainStore, stream_of
 from tests.scenes import random_splats
+
+#: Without shrinking, which takes minutes, as any scene will do.
+LAW = settings(max_examples=40, deadline=None, phases=[Phase.explicit, Phase.reuse, Phase.generate])
 
 
 def staged(folder: str | Path, scene: Scene, how: BakeSettings, block: int, engine: Loop | None = None) -> Staged:
     """A tree in a store, of blocks of about so many splats."""
     return build_in_store(
-        stream_of(scene), how, store=PlainStore(Path(folder)), engine=engine or Loop(), block_splats=block
+        stream_of(scene),
+        how,
+        store=PlainStore(Path(folder)),
+        engine=engine or Loop(),
+        block_splats=block,
+        check=lambda statistics: None,
+        clock=Clock(),
+        progress=silent,
     )
 
 
@@ -43,7 +53,7 @@ def same(found: tuple[Splats, LodTree], expected: tuple[Splats, LodTree]) -> Non
     st.sampled_from([0, 0, 1, 2]),
     st.sampled_from([1.1, 1.5, 2.0]),
 )
-@settings(max_examples=60, deadline=None)
+@LAW
 def test_quick_makes_the_tree_of_a_bake_in_memory(count: int, seed: int, block: int, degree: int, base: float) -> None:
     splats = random_splats(count, seed=seed, sh_degree=degree)
     with tempfile.TemporaryDirectory() as folder:
