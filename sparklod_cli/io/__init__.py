@@ -3,6 +3,7 @@
 from .beside import companions
 from .chunks import read_rad_chunk, read_rad_header
 from .names import is_file_name
+from .rad_file import RadFile
 from .reading import examine_scene, opened, read_arrays, read_scene, size_of_input
 from .scenes import SceneSink, scene_sink
 from .texts import MAX_TEXT, read_rgba, read_text, read_together
@@ -11,6 +12,7 @@ from .writing import Sink, check_writable, sink, write_stdout, write_whole
 
 __all__ = [
     "MAX_TEXT",
+    "RadFile",
     "SceneSink",
     "Sink",
     "SinkTogether",
