@@ -270,7 +270,7 @@ def test_any_numbers_are_baked_refused_and_reported_without_a_warning(
 #: Scenes that SPZ does not hold, or hardly: how large or how far the splats themselves are is said, of their trees too.
 ODD = {"huge.ply": {"values.center-far", "values.scale-clamped"}}
 SCENES = ("sh0.ply", "sh3.ply", "flat.ply", "needle.ply", "coincident.ply", "one.ply", "demo.ply", *ODD)
-REAL = ("biker.ply", "biker.spz", "playbot-125k.ply", "meadow.sog", "playbot.sog")
+REAL = ("biker.ply", "biker.spz", "playbot-125k.ply", "meadow.sog")
 
 
 def passes(source: Path, method: str) -> None:

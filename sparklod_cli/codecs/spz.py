@@ -25,6 +25,7 @@ from . import compression
 from .options import DEFAULTS, WriteOptions
 from .sound import with_sound_tree
 from .spz_layout import ANTIALIASED, EXTENSIONS, LOD, Layout, Stream, StreamRows
+from .spz_options import needed as needed
 from .spz_options import settled as settled
 from .stream import Read, rows_of, size_of
 

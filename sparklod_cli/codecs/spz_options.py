@@ -5,13 +5,13 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..model.scene import Scene
 from ..support.defaults import DEFAULT_SPZ_VERSION, MAX_FRACTIONAL_BITS, SPZ_VERSIONS
 from ..support.errors import FormatError
 from . import quantize
 from .options import WriteOptions
+from .statistics import Statistics
 from .steps import fine_bits
 
 #: The largest code that a coordinate is given, 2 ** 23 - 2. Writers clamp what does not fit to the code after it, of
@@ -19,13 +19,15 @@ from .steps import fine_bits
 LAST_CODE = quantize.FIXED24_MAX - 1
 
 
-def largest_fractional_bits(center: NDArray[np.float32]) -> int:
+def largest_fractional_bits(largest: float) -> int:
     """The most fractional bits, 0 to 24, with which every coordinate fits 24-bit fixed point.
+
+    Args:
+        largest: magnitude of a coordinate.
 
     Raises:
         FormatError: not even whole units fit.
     """
-    largest = float(np.abs(center).max(initial=0))
     if np.rint(largest) > LAST_CODE:
         reach = f"{largest:.0f}" if largest < 1e7 else f"{largest:.3g}"
         raise FormatError(f"coordinates reach {reach}, SPZ holds at most {LAST_CODE}: scale the scene down")
@@ -35,11 +37,20 @@ def largest_fractional_bits(center: NDArray[np.float32]) -> int:
     return bits
 
 
-def settled(scene: Scene, options: WriteOptions) -> WriteOptions:
+def needed(options: WriteOptions) -> frozenset[str]:
+    """The statistics by which `settled` settles these options."""
+    return frozenset(("reach",) if options.fractional_bits is not None else ("reach", "leaf_scale"))
+
+
+def settled(scene: Scene | Statistics, options: WriteOptions) -> WriteOptions:
     """These options with nothing left open: `encode` writes the scene with them.
 
     Positions get as many fractional bits as all nodes allow, up to where a step is far below the smallest splats of
     full detail (`steps.STEPS_A_SPLAT`): merged splats are larger.
+
+    Args:
+        scene: or the statistics of one that are `needed`.
+        options: that may leave choices open.
 
     Raises:
         FormatError: a coordinate does not fit the fractional bits; the text names the most that would.
@@ -48,9 +59,12 @@ def settled(scene: Scene, options: WriteOptions) -> WriteOptions:
     version = DEFAULT_SPZ_VERSION if options.spz_version is None else options.spz_version
     if version not in SPZ_VERSIONS:
         raise ValueError(f"SPZ version {version} is not one of {SPZ_VERSIONS}")
-    bits, most = options.fractional_bits, largest_fractional_bits(scene.splats.center)
+    found = scene if isinstance(scene, Statistics) else Statistics.of_scene(scene, needed(options))
+    assert found.reach is not None
+    bits, most = options.fractional_bits, largest_fractional_bits(found.reach)
     if bits is None:
-        bits = max(0, min(most, fine_bits(scene)))
+        assert found.leaf_scale is not None
+        bits = max(0, min(most, fine_bits(found.leaf_scale)))
     if bits > most:
         raise FormatError(f"a coordinate does not fit {bits} fractional bits; use at most {most}")
     return dataclasses.replace(options, spz_version=version, fractional_bits=bits)

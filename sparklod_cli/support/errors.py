@@ -85,6 +85,10 @@ class OutputError(SparklodError):
     """An output file already exists, or the file system refused to write it."""
 
 
+class ScratchError(OutputError):
+    """The scratch folder of a bake cannot be used: it is full, damaged, in use, or has the results of another bake."""
+
+
 class StdoutError(OutputError):
     """Standard output is closed or cannot be written, which has nothing to do with the file being processed."""
 

@@ -67,8 +67,8 @@ def test_a_changed_meta_json_gives_a_scene_or_a_format_error(name: str) -> None:
     files = FILES if unpacked else members(name)
     meta = json.loads(files["meta.json"])
     refused, tried = 0, 0
-    for path in places_of(meta)[1:]:
-        for value in (..., *VALUES):
+    for number, path in enumerate(places_of(meta)[1:]):
+        for value in (..., *VALUES)[number % 3 :: 3]:  # all of them at neighbouring places
             text = json.dumps(replaced(meta, path, value)).encode()
             data = text if unpacked else by_hand_sog.zipped(files | {"meta.json": text})
             refused += attempt(name, data, files=files, threads=1 + tried % 2) != "scene"

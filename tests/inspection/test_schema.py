@@ -205,9 +205,9 @@ def may_be_null(way: tuple[Any, ...]) -> bool:
 
 def test_a_wrong_type_is_noticed(full: Report) -> None:
     examples: dict[type | None, Any] = {str: "1", int: 1, float: 0.5, list: [], dict: {}, bool: True, None: None}
-    for way in places(full):
+    for number, way in enumerate(places(full)):
         right = type(holder(full, way)[way[-1]])
-        for kind, other in examples.items():
+        for kind, other in list(examples.items())[number % 2 :: 2]:
             if kind is right or (kind is int and right is float):
                 continue
             if right is type(None) and kind in (int, float):  # a range that this property does not have

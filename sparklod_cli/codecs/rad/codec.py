@@ -30,6 +30,7 @@ from .decoding import Packed, fill
 from .encoding import Writing
 from .header import pack_header, read_header
 from .names import SUFFIX, chunk_name
+from .options import needed as needed
 from .options import settled as settled
 from .places import Beside, bytes_of, file_of, size_beside
 from .records import RadChunkEntry, RadChunkHeader, RadHeader

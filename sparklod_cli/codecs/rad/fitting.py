@@ -8,12 +8,13 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ...model.scene import Scene
-from ...model.sh import COEFFICIENTS
-from ...model.splats import FloatArray
+from ..magnitudes import LOWER, UPPER, Magnitudes, tops
 from ..splat_encoding import SCALE_ZERO, SplatEncoding
+from ..statistics import Statistics
 from ..steps import SMALL_QUANTILE
-from .magnitudes import LOWER, UPPER, Magnitudes, tops
+
+#: The statistics that ranges are fitted to.
+NEEDED = frozenset(("rgb", "scale", "sh"))
 
 #: Range of the logarithms of scales up to which none is clamped: 254 steps of 4.7 % at most. Beyond, the smallest
 #: `SMALL_QUANTILE` of the scales may be; those are flat splats' thicknesses.
@@ -30,15 +31,18 @@ WORST = 0.5
 BEYOND = np.array([0.0, 1e-4, 3e-4, 1e-3, 3e-3, 1e-2])
 
 
-def fitted(scene: Scene) -> SplatEncoding:
-    """The ranges that suit a scene; they do not depend on the order of its splats."""
-    splats = scene.splats
-    rgb_min, rgb_max = _linear_range(splats.rgb)
-    low, high = _log_range(splats.scale)
+def fitted(found: Statistics) -> SplatEncoding:
+    """The ranges that suit splats; they do not depend on their order.
+
+    Args:
+        found: of `NEEDED`.
+    """
+    rgb_min, rgb_max = _linear_range(found.magnitudes["rgb"])
+    low, high = _log_range(found.magnitudes["scale"])
     sh_max = dict.fromkeys(("sh1_max", "sh2_max", "sh3_max"), 1.0)
-    for degree in range(1, splats.sh_degree + 1):
-        sh_max[f"sh{degree}_max"] = _largest(splats.sh[:, COEFFICIENTS[degree - 1] : COEFFICIENTS[degree]])
-    return SplatEncoding(rgb_min, rgb_max, low, high, **sh_max, lod_opacity=scene.tree is not None)
+    for degree in range(1, found.sh_degree + 1):
+        sh_max[f"sh{degree}_max"] = _largest(found.magnitudes[f"sh{degree}"])
+    return SplatEncoding(rgb_min, rgb_max, low, high, **sh_max, lod_opacity=found.tree)
 
 
 def _outward(value: float, up: bool) -> float:
@@ -52,9 +56,8 @@ def _clamping(counts: NDArray[np.int64], top: float) -> float:
     return float(np.sum(counts[bins] * beyond**2))
 
 
-def _linear_range(values: FloatArray) -> tuple[float, float]:
+def _linear_range(found: Magnitudes) -> tuple[float, float]:
     """The range of 255 steps with the least squared error, of rounding and of clamping together."""
-    found = Magnitudes.of(values)
     total = max(found.count, 1)
     below = tops(found.negative, total, -found.lowest, BEYOND)
     above = np.maximum(tops(found.positive, total, found.highest, BEYOND), 1)
@@ -69,9 +72,8 @@ def _linear_range(values: FloatArray) -> tuple[float, float]:
     return _outward(low, False), _outward(high, True)
 
 
-def _largest(values: FloatArray) -> float:
+def _largest(found: Magnitudes) -> float:
     """The largest coefficient for 254 steps with the least squared error, of rounding and of clamping together."""
-    found = Magnitudes.of(values)
     total, counts = found.count, found.positive + found.negative
     most = max(found.highest, -found.lowest)
     if not total:
@@ -83,9 +85,9 @@ def _largest(values: FloatArray) -> float:
     return max(GRID, _outward(min(tops(counts, total, most, BEYOND), key=error), True))
 
 
-def _log_range(scale: FloatArray) -> tuple[float, float]:
+def _log_range(scale: Magnitudes) -> tuple[float, float]:
     """From the logarithm of a small scale to that of the largest: the sizes of coarse splats must not be clamped."""
-    counts = Magnitudes.of(scale).positive.copy()
+    counts = scale.positive.copy()
     counts[(UPPER <= SCALE_ZERO) | ~np.isfinite(LOWER)] = 0
     bins = np.flatnonzero(counts)
     if not bins.size:

@@ -12,9 +12,10 @@ from ...support.errors import FormatError
 from ..clamps import Range
 from ..options import RadOptions, WriteOptions
 from ..splat_encoding import SCALE_ZERO, SplatEncoding
+from ..statistics import Statistics
 from ..steps import fine_bits
 from .encodings import LARGEST_F16
-from .fitting import fitted
+from .fitting import NEEDED, fitted
 from .layout import AUTO, OPTIONS, PROPERTIES, RANGES, Row, choices
 
 #: What "auto" stands for, where the scene does not decide.
@@ -32,8 +33,24 @@ WIDE_RGB_RANGE = 4.0
 LEAST_SH_MAX = 1.0
 
 
-def settled(scene: Scene, options: WriteOptions) -> WriteOptions:
+def needed(options: WriteOptions) -> frozenset[str]:
+    """The statistics by which `settled` settles these options."""
+    rad = options.rad
+    ranges = NEEDED if rad.ranges is None else frozenset[str]()
+    return ranges | {"leaf_scale"} if _rounds(rad) else ranges
+
+
+def _rounds(rad: RadOptions) -> bool:
+    """Whether it is left open how centres are rounded."""
+    return rad.center == AUTO and rad.center_bits is None
+
+
+def settled(scene: Scene | Statistics, options: WriteOptions) -> WriteOptions:
     """These options with nothing left open: `encode` writes the scene with them.
+
+    Args:
+        scene: or the statistics of one that are `needed`.
+        options: that may leave choices open.
 
     Raises:
         FormatError: there are more splats than the format can number.
@@ -46,18 +63,20 @@ def settled(scene: Scene, options: WriteOptions) -> WriteOptions:
     for name, value in given.items():
         if value not in choices(name):
             raise ValueError(f"{name} is {value!r}, not one of {', '.join(choices(name))}")
-    if len(scene.splats) >= 1 << 32:
-        raise FormatError(f"{len(scene.splats):,} splats; RAD numbers at most {(1 << 32) - 1:,}")
-    ranges = rad.ranges or fitted(scene)
+    found = scene if isinstance(scene, Statistics) else Statistics.of_scene(scene, needed(options))
+    if found.count >= 1 << 32:
+        raise FormatError(f"{found.count:,} splats; RAD numbers at most {(1 << 32) - 1:,}")
+    ranges = rad.ranges or fitted(found)
     chosen = {name: getattr(AUTOMATIC, name) if value == AUTO else value for name, value in given.items()}
     if rad.scales == AUTO and ranges.ln_scale_max - ranges.ln_scale_min > WIDE_LOG_RANGE:
         chosen["scales"] = "ln_f16"
     if rad.rgb == AUTO and ranges.rgb_max - ranges.rgb_min > WIDE_RGB_RANGE:
         chosen["rgb"] = "f16"
     bits = rad.center_bits
-    if rad.center == AUTO and bits is None:
+    if _rounds(rad):
         # The lowest bytes of rounded float32 are mostly zeros, which take no room.
-        bits = fine_bits(scene)
+        assert found.leaf_scale is not None
+        bits = fine_bits(found.leaf_scale)
     return dataclasses.replace(options, rad=dataclasses.replace(rad, **chosen, center_bits=bits, ranges=ranges))
 
 

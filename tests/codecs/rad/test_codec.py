@@ -22,6 +22,7 @@ from sparklod_cli.codecs.rad import options as rad_options
 from sparklod_cli.codecs.rad.header import read_header
 from sparklod_cli.codecs.rad.records import RadHeader
 from sparklod_cli.codecs.splat_encoding import SplatEncoding
+from sparklod_cli.codecs.statistics import Statistics
 from sparklod_cli.codecs.steps import SMALL_QUANTILE, STEPS_A_SPLAT
 from sparklod_cli.io import examine_scene, read_scene
 from sparklod_cli.model.gaussian import linear_opacity, lod_opacity
@@ -351,7 +352,7 @@ def test_the_order_of_splats_does_not_change_a_range(large: Scene) -> None:
     splats = large.splats.take(slice(None))
     splats.rgb[::64] *= 3
     shuffled = splats.take(np.random.default_rng(1).permutation(len(splats)))
-    assert fitting.fitted(Scene(shuffled)) == fitting.fitted(Scene(splats))
+    assert fitting.fitted(Statistics.of_scene(Scene(shuffled))) == fitting.fitted(Statistics.of_scene(Scene(splats)))
 
 
 def test_colours_and_scales_of_a_wide_range_are_float16() -> None:
@@ -395,10 +396,10 @@ def test_an_unknown_encoding_is_named_with_those_there_are() -> None:
 
 @pytest.mark.parametrize("scene", [Scene(random_splats(1)), Scene(random_splats(0))])
 def test_ranges_of_hardly_any_splats_are_not_empty(scene: Scene) -> None:
-    assert isinstance(fitting.fitted(scene), SplatEncoding)
+    assert isinstance(fitting.fitted(Statistics.of_scene(scene)), SplatEncoding)
     flat = scene.splats.take(slice(None))
     flat.scale[:] = 0.5
-    assert isinstance(fitting.fitted(Scene(flat)), SplatEncoding)
+    assert isinstance(fitting.fitted(Statistics.of_scene(Scene(flat))), SplatEncoding)
 
 
 # --- Spark's own files ------------------------------------------------------------------------------------------------

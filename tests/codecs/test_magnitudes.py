@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sparklod_cli.codecs.rad.magnitudes import LOWER, UPPER, Magnitudes, tops
+from sparklod_cli.codecs.magnitudes import LOWER, UPPER, Magnitudes, tops
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...model.splats import FloatArray
+from ..model.splats import FloatArray
 
 #: A bin has the float32 of the same upper bits: sign, exponent and 7 bits of the mantissa, so its ends are at most
 #: 0.8 % apart.
@@ -51,6 +52,13 @@ class Magnitudes:
             lowest, highest = min(lowest, float(flat.min(initial=0))), max(highest, float(flat.max(initial=0)))
             counts += np.bincount(flat.view(np.uint32) >> np.uint32(_SHIFT), minlength=2 * _BINS)
         return cls(counts[:_BINS], counts[_BINS:], lowest, highest)
+
+    @classmethod
+    def merged(cls, parts: Sequence[Magnitudes]) -> Magnitudes:
+        """Those of all values of one part or more, in any order."""
+        positive = np.sum([part.positive for part in parts], axis=0)
+        negative = np.sum([part.negative for part in parts], axis=0)
+        return cls(positive, negative, min(part.lowest for part in parts), max(part.highest for part in parts))
 
     @property
     def count(self) -> int:

@@ -1,0 +1,124 @@
+"""`Statistics`: what has to be known of all splats of a file before the first of them can be written.
+
+They are counted in any pieces, merged in any order with the same outcome, and small: a file that does not fit into
+memory is settled by those of its pieces.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..model.scene import Scene
+from ..model.sh import COEFFICIENTS
+from ..model.splats import Splats
+from .binades import Binades
+from .magnitudes import Magnitudes
+
+#: What can be counted: the largest coordinate, the largest scale of each leaf, and the magnitudes of columns.
+ALL = frozenset(("reach", "leaf_scale", "rgb", "scale", "sh"))
+
+
+@dataclass(frozen=True, eq=False)
+class Statistics:
+    """Statistics of splats.
+
+    Attributes:
+        count: N splats, which are nodes where there is a tree.
+        sh_degree: of them.
+        tree: whether they are nodes of a tree.
+        reach: the largest magnitude of a coordinate; None where it was not asked for.
+        leaf_scale: the largest scale of each leaf, or splat where there is no tree; None where not asked for.
+        magnitudes: of the values of "rgb", "scale", "sh1", "sh2" and "sh3", as far as they were asked for.
+    """
+
+    count: int
+    sh_degree: int
+    tree: bool
+    reach: float | None = None
+    leaf_scale: Binades | None = None
+    magnitudes: Mapping[str, Magnitudes] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, splats: Splats, leaf: NDArray[np.bool_] | None = None, needed: Collection[str] = ALL) -> Statistics:
+        """Counts splats.
+
+        Args:
+            splats: N splats or nodes.
+            leaf: (N,) which nodes are leaves; None for splats that are no nodes.
+            needed: what to count, of `ALL`.
+        """
+        reach, leaf_scale = None, None
+        if "reach" in needed:
+            center = splats.center
+            reach = float(np.maximum(center.max(initial=0), -center.min(initial=0)))  # NaN stays
+        if "leaf_scale" in needed:
+            scale = splats.scale if leaf is None else splats.scale[leaf]
+            leaf_scale = Binades.of(np.maximum.reduce(scale.T))
+        columns = {name: getattr(splats, name) for name in ("rgb", "scale") if name in needed}
+        if "sh" in needed:
+            for degree in range(1, splats.sh_degree + 1):
+                columns[f"sh{degree}"] = splats.sh[:, COEFFICIENTS[degree - 1] : COEFFICIENTS[degree]]
+        magnitudes = {name: Magnitudes.of(values) for name, values in columns.items()}
+        return cls(len(splats), splats.sh_degree, leaf is not None, reach, leaf_scale, magnitudes)
+
+    @classmethod
+    def of_scene(cls, scene: Scene, needed: Collection[str] = ALL) -> Statistics:
+        """Counts the splats of a scene."""
+        return cls.of(scene.splats, None if scene.tree is None else scene.tree.is_leaf, needed)
+
+    @classmethod
+    def merged(cls, parts: Sequence[Statistics]) -> Statistics:
+        """Those of all splats of one part or more, which were asked for the same.
+
+        Raises:
+            ValueError: the parts are not of one scene: they differ in SH degree, or in whether they have a tree.
+        """
+        first = parts[0]
+        if {(part.sh_degree, part.tree) for part in parts} != {(first.sh_degree, first.tree)}:
+            raise ValueError("statistics of splats of several SH degrees, or of splats and nodes, cannot be merged")
+        return cls(
+            sum(part.count for part in parts),
+            first.sh_degree,
+            first.tree,
+            None if first.reach is None else float(np.max([part.reach for part in parts])),
+            None if first.leaf_scale is None else Binades.merged([_known(part.leaf_scale) for part in parts]),
+            {name: Magnitudes.merged([part.magnitudes[name] for part in parts]) for name in first.magnitudes},
+        )
+
+    def array(self) -> NDArray[np.uint8]:
+        """The bytes of these statistics, tens of KB, from which `from_array` makes them again."""
+        columns: dict[str, Any] = {"facts": [self.count, self.sh_degree, self.tree]}
+        if self.reach is not None:
+            columns["reach"] = self.reach
+        parts = {"leaf_scale": self.leaf_scale} if self.leaf_scale is not None else {}
+        for name, part in {**parts, **self.magnitudes}.items():
+            columns |= {f"{name}.{key}": value for key, value in vars(part).items()}
+        file = io.BytesIO()
+        np.savez_compressed(file, **columns)
+        return np.frombuffer(file.getvalue(), np.uint8)
+
+    @classmethod
+    def from_array(cls, array: NDArray[np.uint8]) -> Statistics:
+        """The statistics of `array`."""
+        with np.load(io.BytesIO(array.tobytes()), allow_pickle=False) as file:
+            columns = {name: values.item() if values.ndim == 0 else values for name, values in file.items()}
+        count, sh_degree, tree = columns.pop("facts").tolist()
+        reach = columns.pop("reach", None)
+        parts: dict[str, dict[str, Any]] = {}
+        for name, value in columns.items():
+            column, key = name.split(".")
+            parts.setdefault(column, {})[key] = value
+        scale = parts.pop("leaf_scale", None)
+        leaf_scale = None if scale is None else Binades(**scale)
+        return cls(count, sh_degree, bool(tree), reach, leaf_scale, {k: Magnitudes(**v) for k, v in parts.items()})
+
+
+def _known(found: Binades | None) -> Binades:
+    assert found is not None, "the parts were asked for different statistics"
+    return found

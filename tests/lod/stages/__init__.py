@@ -1,0 +1,1 @@
+"""Laws of builders in stages."""
