@@ -13,12 +13,16 @@ from ..model.splats import FloatArray
 #: Bits of a number that a pass settles, from the highest on.
 DIGIT_BITS = 16
 
+#: As many numbers are kept and sorted, which takes less time. Chosen.
+KEPT = 1 << 18
+
 
 class Percentiles:
     """Exact percentiles, as numpy's are (linear between two numbers), and the mean.
 
-    All numbers pass once for each 16 of their bits, 2 times as float32 and 4 times as float64: a pass counts the next
-    digit of those numbers whose digits before are those of a number that is looked for (radix selection).
+    More than `KEPT` numbers pass once for each 16 of their bits, 2 times as float32 and 4 times as float64: a pass
+    counts the next digit of those numbers whose digits before are those of a number that is looked for (radix
+    selection). Fewer pass once.
 
     Args:
         levels: percentiles, 0 to 100.
@@ -36,6 +40,7 @@ class Percentiles:
         self.count, self._sum = 0, 0.0
         self.passes = 8 * self._float.itemsize // DIGIT_BITS
         self._first = True
+        self._kept: list[FloatArray] | None = []  # in the first pass, as long as they are few
         self._prefixes = np.zeros(1, self._key)  # what begins the keys of numbers that are looked for
         self._counts = np.zeros((1, 1 << DIGIT_BITS), np.int64)
         self._ranks = np.zeros(0, np.int64)  # places of these numbers among all in order
@@ -49,6 +54,16 @@ class Percentiles:
         if self._first:
             self.count += len(values)
             self._sum += float(values.sum(dtype=np.float64))
+        if self._kept is None:
+            self._tally(values)
+            return
+        self._kept.append(values)
+        if self.count > KEPT:
+            for each in self._kept:
+                self._tally(each)
+            self._kept = None
+
+    def _tally(self, values: FloatArray) -> None:
         keys = _keys(values, self._key)
         shift = self._key.type(DIGIT_BITS * (self.passes - 1))
         for row, prefix in enumerate(self._prefixes):
@@ -68,6 +83,10 @@ class Percentiles:
             low = np.floor((self.count - 1) * self._shares).astype(np.int64)
             self._ranks = np.unique(np.concatenate([low, np.minimum(low + 1, self.count - 1)]))
             self._places, self._found = self._ranks.copy(), np.zeros(len(self._ranks), self._key)
+        if self._kept is not None:
+            self._found = np.sort(_keys(np.concatenate(self._kept), self._key))[self._ranks]
+            self._kept, self.passes = None, 0
+            return
         sums = np.cumsum(self._counts, axis=1)
         for at, row in enumerate(np.searchsorted(self._prefixes, self._found)):
             digit = int(np.searchsorted(sums[row], self._places[at], side="right"))

@@ -49,7 +49,7 @@ class ReportSettings:
         chunks: a row for each chunk.
         headers_only: read no more than the headers of a RAD file; its tree and values are left out.
         at_once: have the whole scene in memory, as those need who look at it besides; False reads RAD files chunk by
-            chunk; None does so with those that are large in relation to memory.
+            chunk; None does so with large ones, see `RadFile.fits`.
     """
 
     chunks: bool = False
@@ -133,8 +133,8 @@ def inspect(
 ) -> tuple[Report, Scene | None]:
     """The report on a file, and its scene as far as it was read.
 
-    A file that cannot be read gives a finding, not an error, and None for the scene. A RAD file that is large in
-    relation to memory is read chunk by chunk, which gives the same report, but no scene.
+    A file that cannot be read gives a finding, not an error, and None for the scene. A large RAD file is
+    read chunk by chunk, which gives the same report, but no scene.
 
     Args:
         path: of the file, or of the folder of an unpacked SOG.

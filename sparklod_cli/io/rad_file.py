@@ -19,9 +19,9 @@ from .reading import opened
 #: Name of the format in `codecs.formats`.
 FORMAT = "RAD"
 
-#: Files whose decoded columns take more than this share of the free memory are read chunk by chunk, for what is
-#: computed of them takes two or three times as much again. Chosen.
-SHARE = 0.25
+#: Files whose decoded columns take more bytes than this, or than this share of the free memory, are read chunk by chunk:
+#: what is computed of them takes as much again, and it is no slower (docs/decisions/2026-11-22-files-larger-than-memory.md).
+AT_ONCE, SHARE = 1 << 28, 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,9 +68,9 @@ class RadFile:
 
     @property
     def fits(self) -> bool:
-        """Whether there is room in memory for the whole file and what is computed of it."""
+        """Whether it is small enough to be read at once."""
         free = available_memory()
-        return free is None or bytes_decoded(self.header) <= SHARE * free
+        return bytes_decoded(self.header) <= (AT_ONCE if free is None else min(AT_ONCE, SHARE * free))
 
     def chunks(
         self, columns: Collection[str], *, thorough: bool, threads: int

@@ -45,7 +45,7 @@ def read_scenes(
         trees_only: refuse scenes without trees.
         through: one of `rounding.ROUND_TRIPS`, a coding after which splats are drawn; cuts are those of the scene.
         precision: one of `PRECISIONS`, of the nodes that cuts are found with.
-        paged: only cuts are looked at, so that of RAD trees that are large in relation to memory those chunks suffice
+        paged: only cuts are looked at, so that of large RAD trees those chunks suffice
             that cuts need. Chunks that no cut needs are not looked at; all the rest is the same.
         threads: to decode on.
         progress: called with how much is done.
