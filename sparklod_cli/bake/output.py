@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Protocol
 
 from ..codecs import clamps
@@ -17,6 +16,7 @@ from ..codecs.rad.names import SUFFIX as RAD
 from ..io import SceneSink, Sink, scene_sink, sink
 from ..model.nodes import CHUNK_NODES
 from ..model.scene import Scene
+from ..support.addresses import Place
 from ..support.progress import Progress
 from .settings import BakeSettings
 
@@ -63,7 +63,7 @@ class Output(Protocol):
         """Writes a tree."""
 
 
-def output_of(target: Path, settings: BakeSettings, *, overwrite: bool) -> Output:
+def output_of(target: Place, settings: BakeSettings, *, overwrite: bool) -> Output:
     """The output that settings ask for; fails now if it cannot be written later.
 
     Raises:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -13,6 +14,9 @@ from ..model.gaussian import linear_opacity, lod_opacity
 from ..model.sh import COEFFICIENTS
 from ..support.defaults import MAX_SH_DEGREE
 from . import quantize
+
+MAGIC = 0x5053474E  # "NGSP"
+HEADER = struct.Struct("<IIIBBBB")  # magic, version, splats, SH degree, fractional bits, flags, reserved
 
 #: Flags of the header.
 ANTIALIASED, EXTENSIONS, LOD = 0x01, 0x02, 0x80
@@ -35,6 +39,11 @@ class Stream(NamedTuple):
     column: str
     decode: Callable[[quantize.Bytes], NDArray[Any]]
     encode: Callable[[NDArray[Any]], NDArray[Any]]
+
+    @property
+    def row_type(self) -> np.dtype[Any]:
+        """(size,) bytes."""
+        return np.dtype((np.uint8, (self.size,)))
 
 
 #: Some rows of a stream: the stream, which rows, and (n, size) bytes.

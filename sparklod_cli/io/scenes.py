@@ -9,6 +9,7 @@ from typing import Protocol
 from ..codecs.formats import Format
 from ..codecs.options import WriteOptions
 from ..model.scene import Scene
+from ..support.addresses import Address, Place
 from ..support.progress import Progress, silent
 from .together import sink_together
 from .writing import sink
@@ -22,7 +23,7 @@ class SceneSink(Protocol):
     ) -> int: ...
 
 
-def scene_sink(path: Path, form: Format, *, chunked: bool = False, overwrite: bool) -> SceneSink:
+def scene_sink(path: Place, form: Format, *, chunked: bool = False, overwrite: bool) -> SceneSink:
     """The function that writes a scene in a format. Fails now if the output cannot be written later.
 
     Args:
@@ -40,7 +41,7 @@ def scene_sink(path: Path, form: Format, *, chunked: bool = False, overwrite: bo
             form.codec().encode(scene, options, threads=threads, progress=progress)
         )
     together = sink_together(path, overwrite=overwrite)
-    stem = Path(os.path.realpath(path)).stem
+    stem = path.stem if isinstance(path, Address) else Path(os.path.realpath(path)).stem
     return lambda scene, options, *, threads=1, progress=silent: together(
         form.codec().encode_chunked(scene, options, stem, threads=threads, progress=progress)
     )

@@ -67,6 +67,10 @@ class MembersError(FormatError):
     code = "container.members"
 
 
+class HasTreeError(FormatError):
+    """A file is a Level-of-Detail tree where splats without one are needed."""
+
+
 class TooLongError(FormatError):
     """A stream is longer than the header declares."""
 

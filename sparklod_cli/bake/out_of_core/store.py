@@ -1,4 +1,4 @@
-"""A store of results in a folder of this machine, or one that several machines mount."""
+"""Stores of results: in a folder, which several machines may mount, or at an address."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ import contextlib
 import errno
 import os
 import threading
-from collections.abc import Collection, Iterator
-from io import FileIO
+from abc import ABC, abstractmethod
+from collections.abc import Collection, Iterable, Iterator
+from io import BufferedReader, FileIO
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -15,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...support import atomic
+from ...support.addresses import Address, Place
 from ...support.errors import ScratchError
 from .contracts import Arrays, Traffic
 from .results import HEAD, DamagedError, Entry, Table, check, decode_table, encode, table_bytes
@@ -25,35 +27,59 @@ SUFFIX = ".result"
 #: Bytes that are read at once of a result that is only checked.
 CHECK_BYTES = 1 << 24
 
+#: Bytes that are read at once at an address: the head and the table of most results.
+READ_AHEAD = 1 << 16
+
 #: What the system says of a disk, or a share of one, that is full.
 FULL = {errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC)}
 
+#: The file of a result, open.
+_File = FileIO | BufferedReader
 
-class FolderStore:
-    """A folder with a file for each result.
 
-    Files are not synced, which would take half of the time of writing: what a process has written is there when the
-    process is killed, and a checksum of each array, in its file, tells what a power failure damaged. `get` compares it,
-    `rows` does not; `is_sound` reads all of a result for that, as a bake does that resumes.
+class FileStore(ABC):
+    """A file for each result.
+
+    A checksum of each array, in its file, tells what was damaged. `get` compares it, `rows` does not; `is_sound` reads
+    all of a result for that, as a bake does that resumes.
 
     Attributes:
         folder: of the files; made when the first result is put.
         traffic: what was written and read by this process.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Place) -> None:
         self.folder = folder
         self.traffic = Traffic()
         self._tables: dict[str, Table] = {}
         self._lock = threading.Lock()
 
-    def __reduce__(self) -> tuple[type[FolderStore], tuple[Path]]:
-        return FolderStore, (self.folder,)
+    def __reduce__(self) -> tuple[type[FileStore], tuple[Place]]:
+        return type(self), (self.folder,)
+
+    def __str__(self) -> str:
+        return str(self.folder)
+
+    @abstractmethod
+    def names(self) -> list[str]:
+        """The names of all results, in order."""
+
+    @abstractmethod
+    def _open(self, name: str) -> _File:
+        """Opens the file of a result."""
+
+    @abstractmethod
+    def _write(self, name: str, pieces: Iterable[bytes | memoryview]) -> int:
+        """Writes the file of a result, which appears when it is whole; returns its size."""
+
+    @abstractmethod
+    def _unlink(self, name: str) -> None:
+        """Removes the file of a result, if it is there."""
 
     def has(self, name: str) -> bool:
         """Whether there is a result of the length that it was written with."""
         try:
-            with self._path(name).open("rb", buffering=0) as file:
+            with self._open(name) as file:
                 self._table(name, file)
         except (FileNotFoundError, NotADirectoryError, DamagedError):
             return False
@@ -63,11 +89,9 @@ class FolderStore:
 
     def put(self, name: str, arrays: Arrays) -> None:
         """Writes a result; replaces one of this name."""
-        path = self._path(name)
         self._forget(name)
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            self.traffic.add(written=atomic.write(path, encode(arrays), overwrite=True, sync=False))
+            self.traffic.add(written=self._write(name, encode(arrays)))
         except OSError as error:
             self._refused("write", error)
 
@@ -101,14 +125,9 @@ class FolderStore:
         """Removes a result, if it is there."""
         self._forget(name)
         try:
-            self._path(name).unlink(missing_ok=True)
+            self._unlink(name)
         except OSError as error:
             self._refused("write", error)
-
-    def names(self) -> list[str]:
-        """The names of all results, in order."""
-        files = self.folder.rglob(f"*{SUFFIX}")
-        return sorted(path.relative_to(self.folder).as_posix().removesuffix(SUFFIX) for path in files)
 
     def is_sound(self, name: str) -> bool:
         """Whether a result is there, and has the bytes that were put; reads all of it."""
@@ -116,7 +135,7 @@ class FolderStore:
         if not self.has(name):
             return False
         try:
-            with self._path(name).open("rb", buffering=0) as file:
+            with self._open(name) as file:
                 for entry in self._table(name, file).entries.values():
                     check(entry, _pieces(file, entry))
                     self.traffic.add(read=entry.bytes)
@@ -126,19 +145,17 @@ class FolderStore:
             self._refused("read", error)
         return True
 
-    def _path(self, name: str) -> Path:
-        return self.folder / f"{name}{SUFFIX}"
-
     def _forget(self, name: str) -> None:
         with self._lock:
             self._tables.pop(name, None)
 
-    def _table(self, name: str, file: FileIO) -> Table:
+    def _table(self, name: str, file: _File) -> Table:
         """The table of a file that is open, which is read once."""
-        size = os.fstat(file.fileno()).st_size
+        size = file.seek(0, os.SEEK_END)
         with self._lock:
             table = self._tables.get(name)
         if table is None or table.bytes != size:
+            file.seek(0)
             head = file.read(HEAD.size)
             table = decode_table(head, file.read(table_bytes(head)), size)
             with self._lock:
@@ -146,10 +163,10 @@ class FolderStore:
         return table
 
     @contextlib.contextmanager
-    def _reading(self, name: str) -> Iterator[tuple[FileIO, Table]]:
+    def _reading(self, name: str) -> Iterator[tuple[_File, Table]]:
         """The file of a result, and its table."""
         try:
-            with self._path(name).open("rb", buffering=0) as file:
+            with self._open(name) as file:
                 yield file, self._table(name, file)
         except DamagedError as error:
             raise ScratchError(
@@ -171,7 +188,75 @@ class FolderStore:
         ) from None
 
 
-def _filled(file: FileIO, offset: int, array: NDArray[Any]) -> NDArray[Any]:
+class FolderStore(FileStore):
+    """A folder of this machine, or one that several machines mount.
+
+    Files are not synced, which would take half of the time of writing: what a process has written is there when the
+    process is killed, and checksums tell what a power failure damaged.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
+        self._folder = folder
+
+    def names(self) -> list[str]:
+        files = self._folder.rglob(f"*{SUFFIX}")
+        return sorted(path.relative_to(self._folder).as_posix().removesuffix(SUFFIX) for path in files)
+
+    def _open(self, name: str) -> FileIO:
+        return self._path(name).open("rb", buffering=0)
+
+    def _write(self, name: str, pieces: Iterable[bytes | memoryview]) -> int:
+        path = self._path(name)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return atomic.write(path, pieces, overwrite=True, sync=False)
+
+    def _unlink(self, name: str) -> None:
+        self._path(name).unlink(missing_ok=True)
+
+    def _path(self, name: str) -> Path:
+        return self._folder / f"{name}{SUFFIX}"
+
+
+class AddressStore(FileStore):
+    """An object for each result, which appears when all of it was sent."""
+
+    def __init__(self, folder: Address) -> None:
+        super().__init__(folder)
+        self._folder = folder
+
+    def has(self, name: str) -> bool:
+        try:
+            return self._path(name).is_file()
+        except OSError as error:
+            self._refused("read", error)
+
+    def names(self) -> list[str]:
+        try:
+            return [name.removesuffix(SUFFIX) for name in self._folder.files() if name.endswith(SUFFIX)]
+        except OSError as error:
+            self._refused("read", error)
+
+    def _open(self, name: str) -> BufferedReader:
+        table = self._tables.get(name)
+        return self._path(name).open(buffering=READ_AHEAD, size=None if table is None else table.bytes)
+
+    def _write(self, name: str, pieces: Iterable[bytes | memoryview]) -> int:
+        return self._path(name).write(pieces)
+
+    def _unlink(self, name: str) -> None:
+        self._path(name).unlink(missing_ok=True)
+
+    def _path(self, name: str) -> Address:
+        return self._folder / f"{name}{SUFFIX}"
+
+
+def store_of(folder: Place) -> FileStore:
+    """The store in a folder, wherever it is."""
+    return AddressStore(folder) if isinstance(folder, Address) else FolderStore(folder)
+
+
+def _filled(file: _File, offset: int, array: NDArray[Any]) -> NDArray[Any]:
     """An array with the bytes of a file."""
     view = array.reshape(-1).view(np.uint8).data
     file.seek(offset)
@@ -183,7 +268,7 @@ def _filled(file: FileIO, offset: int, array: NDArray[Any]) -> NDArray[Any]:
     return array
 
 
-def _pieces(file: FileIO, entry: Entry) -> Iterator[NDArray[Any]]:
+def _pieces(file: _File, entry: Entry) -> Iterator[NDArray[Any]]:
     """The bytes of an array, some at a time."""
     for start in range(0, entry.bytes, CHECK_BYTES):
         piece = np.empty(min(CHECK_BYTES, entry.bytes - start), np.uint8)
