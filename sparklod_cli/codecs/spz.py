@@ -8,29 +8,30 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Collection, Iterator
-from typing import Any, BinaryIO
+from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..model.lod_tree import LodTree
 from ..model.scene import Scene
 from ..model.sh import notes_on_degree
 from ..model.splats import COLUMNS, Splats
+from ..model.streams import NodeStream
 from ..support.defaults import MAX_SH_DEGREE
 from ..support.errors import FormatError, MembersError, NotSplatsError, TruncatedError, VersionError
-from ..support.parallel import for_blocks, ordered_map
+from ..support.parallel import ordered_map
 from ..support.progress import Progress, silent
 from . import compression
+from .encoder import Kept, results
 from .options import DEFAULTS, WriteOptions
 from .sound import with_sound_tree
-from .spz_layout import ANTIALIASED, EXTENSIONS, LOD, Layout, Stream, StreamRows
+from .spz_encoder import encoder
+from .spz_layout import ANTIALIASED, EXTENSIONS, HEADER, LOD, MAGIC, Layout, Stream, StreamRows, column_of
 from .spz_options import needed as needed
 from .spz_options import settled as settled
 from .stream import Read, rows_of, size_of
 
-MAGIC = 0x5053474E  # "NGSP"
-HEADER = struct.Struct("<IIIBBBB")  # magic, version, splats, SH degree, fractional bits, flags, reserved
 HEADER_V4 = struct.Struct("<IIIBBBBI12s")  # ..., streams, offset of the table of streams, reserved
 STREAM_SIZES = struct.Struct("<QQ")  # of a version 4 stream: compressed, uncompressed
 
@@ -73,7 +74,7 @@ def examine(
     def fill(item: StreamRows) -> int:
         stream, part, codes = item
         if stream.column in wanted:
-            out = _column(splats, tree, stream)[part]
+            out = column_of(splats, tree, stream)[part]
             out[...] = stream.decode(codes).reshape(out.shape)
         return codes.size
 
@@ -90,43 +91,33 @@ def examine(
     return Scene(splats, tree, antialiased, name, notes, facts)
 
 
-def _column(splats: Splats, tree: LodTree | None, stream: Stream) -> NDArray[Any]:
-    column: NDArray[Any] = getattr(splats if hasattr(splats, stream.column) else tree, stream.column)
-    return column
-
-
 def encode(
-    scene: Scene, options: WriteOptions = DEFAULTS, *, threads: int = 1, progress: Progress = silent
+    scene: Scene | NodeStream,
+    options: WriteOptions = DEFAULTS,
+    *,
+    threads: int = 1,
+    progress: Progress = silent,
+    scratch: Path | None = None,
 ) -> Iterator[bytes]:
     """The bytes of a file, piece by piece: an LoD file if the scene has a tree, otherwise a plain one.
 
-    The same scene and options give the same bytes for any number of threads.
+    The same scene and options give the same bytes for any number of threads, and for a stream of the same nodes.
+
+    Args:
+        scene: what is written.
+        options: settled where the scene is a stream; otherwise they may leave choices open.
+        threads: to encode on.
+        progress: told of the splats, and then of the bytes.
+        scratch: folder for a temporary file of the bytes before they are compressed; None to keep them in memory.
 
     Raises:
         FormatError: a coordinate does not fit the fractional bits; the text names the most that would.
     """
-    splats, tree = scene.splats, scene.tree
-    options = settled(scene, options)
-    assert options.spz_version is not None and options.fractional_bits is not None
-    bits = options.fractional_bits
-    flags = (ANTIALIASED if scene.antialiased else 0) | (LOD if tree is not None else 0)
-    layout = Layout(options.spz_version, len(splats), splats.sh_degree, bits, flags)
-    data = np.empty(HEADER.size + layout.total, np.uint8)
-    data[: HEADER.size] = np.frombuffer(
-        HEADER.pack(MAGIC, layout.version, layout.count, layout.sh_degree, bits, flags, 0), np.uint8
-    )
-    codes, at = {}, HEADER.size
-    for stream in layout.streams():
-        codes[stream] = data[at : at + stream.size * layout.count].reshape(layout.count, stream.size)
-        at += codes[stream].size
-
-    def fill(part: slice) -> None:
-        for stream, out in codes.items():
-            values = np.ascontiguousarray(stream.encode(_column(splats, tree, stream)[part]))
-            out[part] = values.view(np.uint8).reshape(-1, stream.size)
-
-    for_blocks(fill, layout.count, threads, lambda done: progress("encoding", done, layout.count, "splat"))
-    yield from compression.gzip_member(data, options.compression_level, threads, progress)
+    made = encoder(scene, settled(scene, options) if isinstance(scene, Scene) else options)
+    with Kept(scratch, None if scratch is None else 0) as kept:
+        for result in results(made, scene, threads, progress, "encoding"):
+            kept.put(result)
+        yield from made.pieces(kept.get, threads=threads, progress=progress)
 
 
 def _checked(layout: Layout, file_size: int) -> Layout:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -10,9 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..model.gaussian import linear_opacity, lod_opacity
+from ..model.lod_tree import LodTree
 from ..model.sh import COEFFICIENTS
+from ..model.splats import Splats
 from ..support.defaults import MAX_SH_DEGREE
 from . import quantize
+
+MAGIC = 0x5053474E  # "NGSP"
+HEADER = struct.Struct("<IIIBBBB")  # magic, version, splats, SH degree, fractional bits, flags, reserved
 
 #: Flags of the header.
 ANTIALIASED, EXTENSIONS, LOD = 0x01, 0x02, 0x80
@@ -39,6 +45,12 @@ class Stream(NamedTuple):
 
 #: Some rows of a stream: the stream, which rows, and (n, size) bytes.
 StreamRows = tuple[Stream, slice, quantize.Bytes]
+
+
+def column_of(splats: Splats, tree: LodTree | None, stream: Stream) -> NDArray[Any]:
+    """The column that a stream holds."""
+    column: NDArray[Any] = getattr(splats if hasattr(splats, stream.column) else tree, stream.column)
+    return column
 
 
 @dataclass(frozen=True)

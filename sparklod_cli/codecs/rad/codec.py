@@ -5,10 +5,9 @@ A file is a header and its chunks, or a header that names a file for each chunk;
 
 from __future__ import annotations
 
-import itertools
-import tempfile
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
@@ -18,18 +17,19 @@ from ...model.lod_tree import LodTree
 from ...model.scene import Scene
 from ...model.sh import COEFFICIENTS
 from ...model.splats import COLUMNS, FloatArray, Splats
+from ...model.streams import NodeStream
 from ...support.defaults import MAX_SH_DEGREE
 from ...support.parallel import ordered_map
 from ...support.progress import Progress, silent
 from .. import compression
+from ..encoder import Kept, results, rows_of
 from ..options import DEFAULTS, WriteOptions
 from ..sound import with_sound_tree
 from ..stream import size_of
 from . import promises
 from .decoding import Packed, fill
-from .encoding import Writing
-from .header import pack_header, read_header
-from .names import SUFFIX, chunk_name
+from .encoding import CHUNK, RadEncoder, encoder
+from .header import read_header
 from .options import needed as needed
 from .options import settled as settled
 from .places import Beside, bytes_of, file_of, size_beside
@@ -86,7 +86,7 @@ def examine(
 
     def run(packed: Packed) -> int:
         start, stop = packed.header.base, packed.header.base + packed.header.count
-        part = _rows(splats, tree, slice(start, stop))
+        part = rows_of(splats, tree, slice(start, stop))
         if fill(packed, header, *part, palette, columns) is not None:
             text = f"chunk {packed.number:,} has labels of SH, but there is no palette"
             raise promises.error_of("rad.palette", text)
@@ -112,31 +112,37 @@ def name_of(header: RadHeader) -> str:
 
 
 def encode(
-    scene: Scene, options: WriteOptions = DEFAULTS, *, threads: int = 1, progress: Progress = silent
+    scene: Scene | NodeStream,
+    options: WriteOptions = DEFAULTS,
+    *,
+    threads: int = 1,
+    progress: Progress = silent,
+    scratch: Path | None = None,
 ) -> Iterator[bytes]:
     """The bytes of one file, piece by piece; the chunks wait in a temporary file for the header, which has their sizes.
 
-    The same scene and options give the same bytes for any number of threads. Nodes keep their order; that of
-    `lod.chunk_order` is for streaming.
+    The same scene and options give the same bytes for any number of threads, and for a stream of the same nodes. Nodes
+    keep their order; that of `lod.chunk_order` is for streaming.
+
+    Args:
+        scene: what is written.
+        options: settled where the scene is a stream; otherwise they may leave choices open.
+        threads: to encode on.
+        progress: told of the splats.
+        scratch: folder for the temporary file; None for that of the system.
 
     Raises:
         FormatError, ValueError: see `options.settled`.
     """
-    writing = Writing.of(scene, settled(scene, options), threads, progress)
-    sizes = []
-    with tempfile.SpooledTemporaryFile(SPOOLED) as spool:
-        for chunk in writing.chunks(threads, progress):
-            spool.write(chunk)
-            sizes.append(len(chunk))
-        spool.seek(0)
-        offsets = itertools.accumulate(sizes, initial=0)
-        yield pack_header(writing.header(map(RadChunkEntry, offsets, sizes)))
-        while piece := spool.read(compression.PIECE):
-            yield piece
+    made = _encoder(scene, options, threads, progress)
+    with Kept(scratch, SPOOLED) as kept:
+        for result in results(made, scene, threads, progress, "encoding"):
+            kept.put(result)
+        yield from made.pieces(kept.get, threads=threads, progress=progress)
 
 
 def encode_chunked(
-    scene: Scene, options: WriteOptions, stem: str, *, threads: int = 1, progress: Progress = silent
+    scene: Scene | NodeStream, options: WriteOptions, stem: str, *, threads: int = 1, progress: Progress = silent
 ) -> Iterator[tuple[str, Iterable[bytes]]]:
     """The files of a scene whose chunks are files of their own: the name of each, and its bytes; the header is last.
 
@@ -147,13 +153,14 @@ def encode_chunked(
     Raises:
         FormatError, ValueError: see `options.settled`.
     """
-    writing = Writing.of(scene, settled(scene, options), threads, progress)
-    entries = []
-    for number, chunk in enumerate(writing.chunks(threads, progress)):
-        name = chunk_name(stem, number)
-        entries.append(RadChunkEntry(0, len(chunk), name))
-        yield name, [chunk]
-    yield stem + SUFFIX, [pack_header(writing.header(entries))]
+    made = _encoder(scene, options, threads, progress)
+    found = results(made, scene, threads, progress, "writing")
+    yield from made.files((result[CHUNK] for result in found), stem)
+
+
+def _encoder(scene: Scene | NodeStream, options: WriteOptions, threads: int, progress: Progress) -> RadEncoder:
+    options = settled(scene, options) if isinstance(scene, Scene) else options
+    return encoder(scene, options, threads=threads, progress=progress)
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,9 +224,3 @@ def _chunks(file: BinaryIO, header: RadHeader, beside: Beside | None) -> Iterato
 def _check_promise(count: int, header: RadHeader, size: int) -> None:
     """Raises `PromiseError` if a file or a chunk of this size can hardly have so many splats."""
     compression.check_promise(count * 4 * (14 + 3 * COEFFICIENTS[header.max_sh]), size)
-
-
-def _rows(splats: Splats, tree: LodTree | None, part: slice) -> tuple[Splats, LodTree | None]:
-    """Views of some rows."""
-    views = Splats(**{name: getattr(splats, name)[part] for name in COLUMNS})
-    return views, None if tree is None else LodTree(tree.child_count[part], tree.child_start[part])
