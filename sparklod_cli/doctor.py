@@ -34,6 +34,8 @@ INTERNAL_EXTRAS = ("dev", "docs", "test")
 
 #: What the other extras bring, for display.
 PURPOSES = {
+    "cloud": "files at addresses such as s3://bucket/scan.ply",
+    "cluster": "build-lod on several processes or machines",
     "parquet": "Parquet tables",
     "render": "figures, charts, and the backends osmesa and open3d of render",
     "video": ".mp4 animations",

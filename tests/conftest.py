@@ -40,9 +40,9 @@ def pytest_sessionstart(session: pytest.Session) -> None:
 
 
 @pytest.fixture(autouse=True)
-def signals_stay() -> Iterator[None]:
-    """A test that leaves signals ignored would have every later `sparklod` that a test starts ignore them, too."""
-    numbers = signal.SIGINT, signal.SIGTERM
-    before = [signal.getsignal(number) for number in numbers]
+def signals_as_before() -> Iterator[None]:
+    """Puts signal handlers back: every `sparklod` that a later test starts would inherit a signal left ignored."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     yield
-    assert [signal.getsignal(number) for number in numbers] == before
+    for number, handler in before.items():
+        signal.signal(number, handler)

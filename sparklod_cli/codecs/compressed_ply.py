@@ -11,13 +11,15 @@ from numpy.typing import NDArray
 from ..model.scene import Scene
 from ..model.sh import degree_of, notes_on_degree
 from ..model.splats import FloatArray, Splats
+from ..model.streams import SceneStream
 from ..support.defaults import MAX_SH_DEGREE
 from ..support.errors import FormatError
 from ..support.progress import Progress, silent
 from ..support.units import count_of
 from . import quantize
+from .content import Content, Scratch, rows_in
 from .ply_header import Header, read_header
-from .stream import decode_rows, rows_of, size_of
+from .stream import Positioned, Rows, decode_rows, rows_between, size_of
 
 #: Splats of a chunk, which share bounds.
 CHUNK_SPLATS = 256
@@ -39,60 +41,70 @@ def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> 
     Raises:
         FormatError: the file is not compressed PLY, or cut short.
     """
+    return _content(file).scene(threads, progress)
+
+
+def stream(file: BinaryIO, *, scratch: Scratch, threads: int = 1, progress: Progress = silent) -> SceneStream:
+    """The same splats, block by block; raises as `decode`."""
+    return _content(file).stream(threads)
+
+
+def _content(file: BinaryIO) -> Content:
     size = size_of(file)
     header = read_header(file)
     count, coefficients = _checked(header)
     trailing = header.check_size(size)
-    degree = degree_of(coefficients)
-    splats = Splats.empty(count, min(degree, MAX_SH_DEGREE))
-    bounds = _read_bounds(file, header, -(-count // CHUNK_SPLATS))
+    degree, source = degree_of(coefficients), Positioned(file)
+    bounds = _read_bounds(source, header, -(-count // CHUNK_SPLATS))
 
-    @np.errstate(invalid="ignore", over="ignore")  # absurd bounds overflow
-    def unpack(part: slice, rows: NDArray[Any]) -> None:
-        words = {name: rows[name].astype(np.uint32) for name in VERTEX}
-        splats.center[part] = _within(
-            bounds["position"], part, quantize.decode_unorm_11_10_11(words["packed_position"])
-        )
-        splats.scale[part] = quantize.decode_log(
-            _within(bounds["scale"], part, quantize.decode_unorm_11_10_11(words["packed_scale"]))
-        )
-        splats.quat_xyzw[part] = quantize.decode_quat_2_10_10_10(words["packed_rotation"])[:, [1, 2, 3, 0]]
-        rgba = quantize.decode_unorm_8888(words["packed_color"])
-        splats.rgb[part] = _within(bounds["color"], part, rgba[:, :3])
-        splats.opacity[part] = rgba[:, 3]
+    def fill(out: Splats, start: int, threads: int, progress: Progress) -> None:
+        @np.errstate(invalid="ignore", over="ignore")  # absurd bounds overflow
+        def unpack(part: slice, rows: NDArray[Any]) -> None:
+            splats, words = rows_in(out, part, start), {name: rows[name].astype(np.uint32) for name in VERTEX}
+            center = quantize.decode_unorm_11_10_11(words["packed_position"])
+            splats.center[:] = _within(bounds["position"], part, center)
+            log_scale = quantize.decode_unorm_11_10_11(words["packed_scale"])
+            splats.scale[:] = quantize.decode_log(_within(bounds["scale"], part, log_scale))
+            splats.quat_xyzw[:] = quantize.decode_quat_2_10_10_10(words["packed_rotation"])[:, [1, 2, 3, 0]]
+            rgba = quantize.decode_unorm_8888(words["packed_color"])
+            splats.rgb[:] = _within(bounds["color"], part, rgba[:, :3])
+            splats.opacity[:] = rgba[:, 3]
 
-    def unpack_sh(part: slice, rows: NDArray[Any]) -> None:
-        codes = rows.view(np.uint8).reshape(len(rows), 3, coefficients)  # all of red come first
-        splats.sh[part] = quantize.decode_centred_8(codes[:, :, : splats.sh.shape[1]].transpose(0, 2, 1))
+        def unpack_sh(part: slice, rows: NDArray[Any]) -> None:
+            codes = rows.view(np.uint8).reshape(len(rows), 3, coefficients)  # all of red come first
+            sh = rows_in(out, part, start).sh
+            sh[:] = quantize.decode_centred_8(codes[:, :, : sh.shape[1]].transpose(0, 2, 1))
 
-    decode_rows(_rows(file, header, "vertex"), unpack, count, threads, progress)
-    if coefficients:
-        decode_rows(_rows(file, header, "sh"), unpack_sh, count, threads, progress)
+        stop = start + len(out)
+        decode_rows(_rows(source, header, "vertex", start, stop), unpack, count, threads, progress)
+        if coefficients:
+            decode_rows(_rows(source, header, "sh", start, stop), unpack_sh, count, threads, progress)
+
     facts = {"chunks": header.count("chunk"), "color_bounds": int(bounds["color"] is not None)}
     facts["trailing_bytes"] = trailing
-    return Scene(splats, format="compressed PLY", notes=notes_on_degree(degree), header=facts)
+    kept = min(degree, MAX_SH_DEGREE)
+    return Content(count, kept, fill, "compressed PLY", notes=notes_on_degree(degree), header=facts)
 
 
 def _within(bounds: FloatArray | None, part: slice, unit: FloatArray) -> FloatArray:
     """(n, 3) values 0..1 of the splats in `part`, scaled to their chunks' bounds, (chunks, 6): low and high xyz."""
     if bounds is None:
         return unit
-    # Blocks have 16,384 rows, as the four words of a splat alone are 16 bytes; so a block begins with a chunk.
     of_chunks = bounds[part.start // CHUNK_SPLATS : -(-part.stop // CHUNK_SPLATS)]
-    low, high = np.split(np.repeat(of_chunks, CHUNK_SPLATS, axis=0)[: len(unit)], 2, axis=1)
+    first = part.start % CHUNK_SPLATS
+    low, high = np.split(np.repeat(of_chunks, CHUNK_SPLATS, axis=0)[first : first + len(unit)], 2, axis=1)
     return quantize.between(unit, low, high)
 
 
-def _rows(file: BinaryIO, header: Header, name: str) -> Iterator[tuple[slice, NDArray[Any]]]:
+def _rows(file: Positioned, header: Header, name: str, start: int, stop: int) -> Iterator[Rows]:
     offset, row_type = header.offset(name), header.row_type(name)
     if offset is None or row_type is None:
         raise FormatError("compressed PLY cannot have list properties")
-    file.seek(offset)
-    return rows_of(file.read, row_type, header.count(name))
+    return rows_between(file, offset, row_type, start, stop, header.count(name))
 
 
-def _read_bounds(file: BinaryIO, header: Header, chunks: int) -> dict[str, FloatArray | None]:
-    rows = np.concatenate([rows for _, rows in _rows(file, header, "chunk")] or [np.empty(0)])[:chunks]
+def _read_bounds(file: Positioned, header: Header, chunks: int) -> dict[str, FloatArray | None]:
+    rows = np.concatenate([rows for _, rows in _rows(file, header, "chunk", 0, chunks)] or [np.empty(0)])
     have = rows.dtype.names or ()
     return {
         what: np.stack([rows[name] for name in names], axis=1).astype(np.float32) if names[0] in have else None

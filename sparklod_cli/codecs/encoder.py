@@ -6,12 +6,13 @@ machines share; then the pieces of the file are made of the results.
 
 from __future__ import annotations
 
+import math
 import os
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,10 @@ from ..model.splats import COLUMNS, Splats
 from ..model.streams import NodeStream
 from ..support.parallel import blocks_of, ordered_map
 from ..support.progress import Progress
+from .options import WriteOptions
+
+if TYPE_CHECKING:
+    from .clamps import Range
 
 #: The result of a window: arrays by name.
 Encoded = dict[str, NDArray[Any]]
@@ -40,6 +45,18 @@ class Encoder(Protocol):
     @property
     def count(self) -> int:
         """Splats of the file."""
+
+    @property
+    def sh_degree(self) -> int:
+        """Of all splats."""
+
+    @property
+    def options(self) -> WriteOptions:
+        """With nothing left open."""
+
+    @property
+    def ranges(self) -> tuple[Range, ...]:
+        """Beyond which values are counted, see `clamps.tally`; none unless somebody wants to know."""
 
     def encode(self, splats: Splats, tree: LodTree | None, start: int) -> Encoded:
         """The result of a window.
@@ -90,19 +107,18 @@ def results(
 
 
 class Kept:
-    """Results of windows, in the order in which they are put, in memory or in a temporary file. A context manager.
+    """Results of windows, in the order in which they are put, in a temporary file. A context manager.
 
     Args:
-        folder: of the file, which has no name.
-        in_memory: bytes that are kept in memory; None for all.
+        folder: of the file, which has no name; None for that of the system.
+        in_memory: bytes up to which they are kept in memory.
     """
 
-    def __init__(self, folder: Path | None = None, in_memory: int | None = None) -> None:
-        self._arrays: list[Encoded] = []
+    def __init__(self, folder: Path | None = None, in_memory: int = 0) -> None:
         self._places: list[dict[str, tuple[int, np.dtype[Any], tuple[int, ...]]]] = []
-        self._file = None
-        if in_memory is not None:  # of 0, the file would hold everything in memory
-            self._file = tempfile.SpooledTemporaryFile(max(in_memory, 1), dir=None if folder is None else str(folder))  # noqa: SIM115
+        name = None if folder is None else str(folder)
+        # A limit of 0 would mean none.
+        self._file = tempfile.SpooledTemporaryFile(max(in_memory, 1), dir=name)  # noqa: SIM115
 
     def __enter__(self) -> Kept:
         return self
@@ -110,14 +126,10 @@ class Kept:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if self._file is not None:
-            self._file.close()
+        self._file.close()
 
     def put(self, arrays: Encoded) -> None:
         """Keeps the result of the next window."""
-        if self._file is None:
-            self._arrays.append(arrays)
-            return
         places = {}
         self._file.seek(0, os.SEEK_END)
         for name, array in arrays.items():
@@ -127,9 +139,7 @@ class Kept:
 
     def get(self, number: int, name: str) -> NDArray[Any]:
         """An array of a result."""
-        if self._file is None:
-            return self._arrays[number][name]
         at, dtype, shape = self._places[number][name]
         self._file.seek(at)
-        size = int(np.prod(shape)) * dtype.itemsize
+        size = math.prod(shape) * dtype.itemsize
         return np.frombuffer(self._file.read(size), dtype).reshape(shape)

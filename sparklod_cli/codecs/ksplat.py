@@ -17,11 +17,13 @@ from ..model.gaussian import normalized_quat
 from ..model.scene import Scene
 from ..model.sh import COEFFICIENTS
 from ..model.splats import FloatArray, Splats
+from ..model.streams import SceneStream
 from ..support.errors import FormatError, TruncatedError, VersionError
 from ..support.progress import Progress, silent
 from ..support.units import count_of
 from . import quantize
-from .stream import Rows, decode_rows, rows_of, size_of
+from .content import Content, Scratch, rows_in
+from .stream import Positioned, Rows, decode_rows, rows_between, size_of
 
 HEADER = np.dtype(
     {
@@ -106,6 +108,15 @@ def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> 
     Raises:
         FormatError: the file is not KSPLAT, of an unknown version, level or SH degree, or cut short.
     """
+    return _content(file).scene(threads, progress)
+
+
+def stream(file: BinaryIO, *, scratch: Scratch, threads: int = 1, progress: Progress = silent) -> SceneStream:
+    """The same splats, block by block; raises as `decode`."""
+    return _content(file).stream(threads)
+
+
+def _content(file: BinaryIO) -> Content:
     size = size_of(file)
     header = _read(file, HEADER, 1, "the header")[0]
     level, count = int(header["level"]), int(header["splats"])
@@ -121,34 +132,37 @@ def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> 
     if found != count:
         raise FormatError(f"its header announces {count_of(count, 'splat')}, its sections have {found:,}")
     degrees = [COEFFICIENTS.index(section.row_type["sh"].shape[0] // 3) for section in sections]
-    splats = Splats.empty(count, max(degrees, default=0))
     low, high = header["least_sh"] or np.float32(-DEFAULT_SH), header["most_sh"] or np.float32(DEFAULT_SH)
 
-    def rows() -> Iterator[Rows]:
+    source = Positioned(file)
+
+    def rows(start: int, stop: int) -> Iterator[Rows]:
         for section in sections:
-            file.seek(section.offset)
-            for part, some in rows_of(file.read, section.row_type, section.count):
+            first, last = max(start - section.first, 0), min(stop - section.first, section.count)
+            for part, some in rows_between(source, section.offset, section.row_type, first, last, section.count):
                 yield slice(section.first + part.start, section.first + part.stop), some
 
     @np.errstate(invalid="ignore", over="ignore")  # absurd numbers overflow
-    def fill(part: slice, some: NDArray[Any]) -> None:
+    def unpack(part: slice, some: NDArray[Any], splats: Splats) -> None:
         section = sections[bisect(firsts, part.start) - 1]
-        splats.center[part] = _centers(section, part, some["center"]) if level else some["center"]
-        splats.scale[part] = some["scale"]
-        splats.quat_xyzw[part] = normalized_quat(some["quat_wxyz"].astype(np.float32))[:, [1, 2, 3, 0]]
-        splats.rgb[part] = quantize.decode_unorm8(some["rgb"])
-        splats.opacity[part] = quantize.decode_unorm8(some["opacity"])
+        splats.center[:] = _centers(section, part, some["center"]) if level else some["center"]
+        splats.scale[:] = some["scale"]
+        splats.quat_xyzw[:] = normalized_quat(some["quat_wxyz"].astype(np.float32))[:, [1, 2, 3, 0]]
+        splats.rgb[:] = quantize.decode_unorm8(some["rgb"])
+        splats.opacity[:] = quantize.decode_unorm8(some["opacity"])
         values = some["sh"][:, SH_PLACES[: some["sh"].shape[1]]].astype(np.float32)
         if level == 2:
             values = quantize.of_range(values / np.float32(255), low, high)
         coefficients = values.shape[1] // 3
-        splats.sh[part, :coefficients] = values.reshape(len(some), coefficients, 3)
-        splats.sh[part, coefficients:] = 0  # the degree of other sections may be higher
+        splats.sh[:, :coefficients] = values.reshape(len(some), coefficients, 3)
+        splats.sh[:, coefficients:] = 0  # the degree of other sections may be higher
 
-    decode_rows(rows(), fill, count, threads, progress)
-    return Scene(
-        splats, format="KSPLAT", header={"level": level, "sections": len(sections), "trailing_bytes": size - end}
-    )
+    def fill(out: Splats, start: int, threads: int, progress: Progress) -> None:
+        some = rows(start, start + len(out))
+        decode_rows(some, lambda part, rows: unpack(part, rows, rows_in(out, part, start)), count, threads, progress)
+
+    facts = {"level": level, "sections": len(sections), "trailing_bytes": size - end}
+    return Content(count, max(degrees, default=0), fill, "KSPLAT", header=facts)
 
 
 def _centers(section: Section, part: slice, codes: NDArray[np.uint16]) -> FloatArray:

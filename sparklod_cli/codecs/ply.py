@@ -5,6 +5,7 @@ A vertex is a splat, with scalar properties in any order; properties that are no
 
 from __future__ import annotations
 
+import functools
 import re
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -13,21 +14,22 @@ from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
-from plyfile import PlyData, PlyParseError
 
 from ..model.gaussian import normalized_quat
 from ..model.scene import Scene
 from ..model.sh import degree_of, notes_on_degree
 from ..model.splats import FloatArray, Splats
+from ..model.streams import SceneStream
 from ..support.defaults import MAX_SH_DEGREE
 from ..support.errors import FormatError, NotSplatsError, TruncatedError
 from ..support.parallel import blocks_of
 from ..support.progress import Progress, silent
 from ..support.untrusted import quoted
 from . import quantize
+from .content import Content, Scratch, rows_in
 from .options import DEFAULTS, WriteOptions
-from .ply_header import Header, read_header
-from .stream import Rows, decode_rows, encode_rows, rows_of, size_of
+from .ply_header import Header, offset_of, read_header
+from .stream import Positioned, Rows, decode_rows, encode_rows, rows_between, size_of
 
 Coding = Callable[[FloatArray], FloatArray]
 
@@ -48,31 +50,49 @@ def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> 
     Raises:
         FormatError: the file is not PLY, cut short, or does not hold splats.
     """
+    return _content(file, None).scene(threads, progress)
+
+
+def stream(file: BinaryIO, *, scratch: Scratch, threads: int = 1, progress: Progress = silent) -> SceneStream:
+    """The same splats, block by block; raises as `decode`. An ascii file is unpacked to `scratch`, as binary rows."""
+    return _content(file, scratch).stream(threads)
+
+
+def _content(file: BinaryIO, scratch: Scratch | None) -> Content:
+    """The content of a file; without `scratch`, that of an ascii file can only be read as a whole."""
     size = size_of(file)
     header = read_header(file)
     coefficients = _checked_coefficients(header)
-    trailing = header.check_size(size)
+    facts = {"properties": len(_row_type(header).names or ()), "ascii": int(header.text)}
+    facts |= {"big_endian": int(header.byte_order == ">"), "trailing_bytes": header.check_size(size)}
     degree, count = degree_of(coefficients), header.count("vertex")
-    splats = Splats.empty(count, min(degree, MAX_SH_DEGREE))
-    rows = _text_rows(file, header) if header.text else _binary_rows(file, header)
-    names = list(_row_type(header).names or ())
+    unpack = _unpacking(_row_type(header), coefficients)
+    rows = _rows(file, header, scratch)
+
+    def fill(out: Splats, start: int, threads: int, progress: Progress) -> None:
+        some = rows(start, start + len(out))
+        decode_rows(some, lambda part, rows: unpack(rows, rows_in(out, part, start)), count, threads, progress)
+
+    return Content(count, min(degree, MAX_SH_DEGREE), fill, "PLY", notes=notes_on_degree(degree), header=facts)
+
+
+def _unpacking(row_type: np.dtype[Any], coefficients: int) -> Callable[[NDArray[Any], Splats], None]:
+    """What fills the columns of splats from rows."""
+    names = list(row_type.names or ())
     places = {column: _run([names.index(name) for name in parts]) for column, parts, _, _ in COLUMNS}
     rest = _run([names.index(f"f_rest_{index}") for index in range(3 * coefficients)])  # all of red's come first
-    kept = splats.sh.shape[1]
 
     # Converters write infinite logits and logarithms for an opacity of 0 or 1 and a scale of 0.
     @np.errstate(over="ignore", invalid="ignore")
-    def fill(part: slice, some: NDArray[Any]) -> None:
-        matrix = _matrix(some)
+    def unpack(rows: NDArray[Any], splats: Splats) -> None:
+        matrix = _matrix(rows)
         for column, _, decoder, _ in COLUMNS:
-            out = getattr(splats, column)[part]
+            out = getattr(splats, column)
             out[...] = decoder(matrix[:, places[column]]).reshape(out.shape)
-        splats.sh[part] = matrix[:, rest].reshape(len(some), 3, coefficients)[:, :, :kept].transpose(0, 2, 1)
+        sh = matrix[:, rest].reshape(len(rows), 3, coefficients)
+        splats.sh[:] = sh[:, :, : splats.sh.shape[1]].transpose(0, 2, 1)
 
-    decode_rows(rows, fill, count, threads, progress)
-    facts = {"properties": len(names), "ascii": int(header.text), "big_endian": int(header.byte_order == ">")}
-    facts["trailing_bytes"] = trailing
-    return Scene(splats, format="PLY", notes=notes_on_degree(degree), header=facts)
+    return unpack
 
 
 def _matrix(rows: NDArray[Any]) -> FloatArray:
@@ -116,19 +136,25 @@ def _row_type(header: Header) -> np.dtype[Any]:
     return row_type
 
 
-def _binary_rows(file: BinaryIO, header: Header) -> Iterator[Rows]:
-    offset = header.offset("vertex")
-    if offset is not None:
-        file.seek(offset)
-        yield from rows_of(file.read, _row_type(header), header.count("vertex"), "vertices")
-        return
-    file.seek(0)  # rows of unknown size come before the vertices
-    try:
-        data = PlyData.read(file)["vertex"].data
-    except (PlyParseError, ValueError) as error:
-        raise FormatError(f"bad PLY data: {quoted(error)}") from None
-    for part in blocks_of(len(data)):
-        yield part, data[part]
+def _rows(file: BinaryIO, header: Header, scratch: Scratch | None) -> Callable[[int, int], Iterator[Rows]]:
+    """What gives the vertices from a number to another."""
+    row_type, count = _row_type(header), header.count("vertex")
+
+    def opened() -> tuple[Positioned, int]:
+        """A file of binary rows, and where they begin."""
+        if not header.text:
+            return Positioned(file), offset_of(file, header, "vertex")
+        assert scratch is not None
+        return Positioned(scratch(lambda: (rows.tobytes() for _, rows in _text_rows(file, header)))), 0
+
+    def between(start: int, stop: int) -> Iterator[Rows]:
+        if header.text and scratch is None:
+            return _text_rows(file, header)
+        source, offset = once()
+        return rows_between(source, offset, row_type, start, stop, count, "vertices")
+
+    once = functools.lru_cache(1)(opened)
+    return between
 
 
 def _text_rows(file: BinaryIO, header: Header) -> Iterator[Rows]:

@@ -112,3 +112,41 @@ def read_header(file: BinaryIO) -> Header:
         raise FormatError(f"bad PLY header: {quoted(error)}") from None
     elements = {element.name: (element, count) for element, count in zip(parsed, counts, strict=True)}
     return Header(elements, parsed.text, parsed.byte_order, len(text))
+
+
+def offset_of(file: BinaryIO, header: Header, name: str) -> int:
+    """Where the rows of an element begin in a binary file; rows with lists before them are read for their sizes.
+
+    Raises:
+        FormatError: those rows are cut short, or a list has a size that none can have.
+    """
+    at = header.size
+    for other, (element, count) in header.elements.items():
+        if other == name:
+            break
+        row_type = header.row_type(other)
+        if row_type is not None:
+            at += count * row_type.itemsize
+            continue
+        file.seek(at)
+        for _ in range(count):
+            _skip_row(file, element, header.byte_order)
+        at = file.tell()
+    return at
+
+
+def _skip_row(file: BinaryIO, element: PlyElement, byte_order: str) -> None:
+    for each in element.properties:
+        if not isinstance(each, PlyListProperty):
+            file.seek(np.dtype(each.dtype(byte_order)).itemsize, io.SEEK_CUR)
+            continue
+        length, values = (np.dtype(kind) for kind in each.list_dtype(byte_order))
+        if length.kind not in "iu":
+            raise FormatError(f"bad PLY header: lists of its element {element.name} are counted in {length}")
+        data = file.read(length.itemsize)
+        if len(data) < length.itemsize:
+            raise TruncatedError(f"cut short inside its element {element.name}")
+        size = int(np.frombuffer(data, length)[0])
+        if size < 0:
+            raise FormatError(f"bad PLY data: a list of {size} values in its element {element.name}")
+        file.seek(size * values.itemsize, io.SEEK_CUR)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import BinaryIO
 
 import numpy as np
@@ -14,12 +15,15 @@ import numpy as np
 from ..model.scene import Scene
 from ..model.sh import COEFFICIENTS
 from ..model.splats import FloatArray, Splats
+from ..model.streams import SceneStream
 from ..support.errors import FormatError, VersionError
-from ..support.parallel import for_blocks
+from ..support.parallel import blocks_of, for_blocks
 from ..support.progress import Progress, silent
 from . import quantize
 from .compression import check_promise
+from .content import Content, Scratch, rows_in
 from .sog_files import Files, Meta, Texels
+from .stream import Positioned
 
 #: Entries in a row of the image of SH centroids.
 PALETTE_WIDTH = 64
@@ -32,9 +36,6 @@ MAX_SPLATS = 1 << 28
 
 #: Alpha of a rotation's texel minus the index, in w x y z, of the largest component.
 FIRST_TAG = 252
-
-#: One pass over all splats: fills the rows of a slice.
-Pass = Callable[[slice], None]
 
 
 def decode(
@@ -55,6 +56,44 @@ def decode(
     Raises:
         FormatError: the file is not SOG, not of version 1 or 2, corrupt, or lacks an image.
     """
+    return _content(file, beside, None).scene(threads, progress)
+
+
+def stream(
+    file: BinaryIO,
+    *,
+    scratch: Scratch,
+    threads: int = 1,
+    progress: Progress = silent,
+    beside: Callable[[str], BinaryIO] | None = None,
+) -> SceneStream:
+    """The same splats, block by block; raises as `decode`. The images are unpacked to `scratch`, one at a time."""
+    return _content(file, beside, functools.partial(_unpacked, scratch, progress)).stream(threads)
+
+
+@dataclass(frozen=True)
+class Step:
+    """What is decoded of some images.
+
+    Attributes:
+        images: the texture and the number of each.
+        fill: called with rows of a scene and, for each image, their (n, 4) texels.
+    """
+
+    images: tuple[tuple[str, int], ...]
+    fill: Callable[[Splats, list[Texels]], None]
+
+
+#: Gives the texels of a step that belong to some rows; called with the number of the step.
+TexelsOf = Callable[[int, slice], list[Texels]]
+
+
+def _content(
+    file: BinaryIO,
+    beside: Callable[[str], BinaryIO] | None,
+    unpacked: Callable[[Files, list[Step], int], TexelsOf] | None,
+) -> Content:
+    """The content of a file; without `unpacked` it can only be read as a whole, an image after the other."""
     files = Files(file, beside)
     meta = files.meta
     version = meta.integer("version") if meta.has("version") else 1
@@ -68,40 +107,89 @@ def decode(
     palette = _read_palette(files, version) if meta.has("shN") else None
     degree = COEFFICIENTS.index(palette.shape[1]) if palette is not None else 0
     check_promise(count * 4 * (14 + 3 * COEFFICIENTS[degree]), files.size)
-    splats = Splats.empty(count, degree)
-    passes = 5 if palette is not None else 4
-    for index, work in enumerate(_passes(files, version, splats, palette)):
-        before = index * count
+    steps = _steps(meta, version, palette)
 
-        def report(done: int, before: int = before) -> None:
-            progress("reading", before + done, passes * count, "texel")
+    def fill_all(out: Splats, start: int, threads: int, progress: Progress) -> None:
+        for number, step in enumerate(steps):
+            texels = _texels(files, step, count)  # of at most two images at a time
+            before = number * count
 
-        for_blocks(work, count, threads, report)
+            def work(part: slice, step: Step = step, texels: list[Texels] = texels) -> None:
+                step.fill(rows_in(out, part), [each[part] for each in texels])
+
+            def report(done: int, before: int = before) -> None:
+                progress("reading", before + done, len(steps) * count, "texel")
+
+            for_blocks(work, count, threads, report)
+
+    def fill_some(out: Splats, start: int, threads: int, progress: Progress) -> None:
+        assert unpacked is not None
+        texels_of = unpacked(files, steps, count)
+
+        def work(part: slice) -> None:
+            for number, step in enumerate(steps):
+                step.fill(rows_in(out, part), texels_of(number, slice(start + part.start, start + part.stop)))
+
+        for_blocks(work, len(out), threads, lambda done: None)
+
     antialiased = version == 2 and meta.has("antialias") and meta.flag("antialias")
     header = {"version": version, "palette": len(palette) if palette is not None else 0, "bytes": files.size}
-    return Scene(splats, antialiased=antialiased, format=f"SOG {version}", header=header)
+    fill = fill_some if unpacked is not None else fill_all
+    return Content(count, degree, fill, f"SOG {version}", antialiased, header=header)
 
 
-def _passes(files: Files, version: int, splats: Splats, palette: FloatArray | None) -> Iterator[Pass]:
-    """Decodes the images one after the other, so that at most two are in memory."""
-    count = len(splats)
-    yield _centers(splats, files.texels("means", 0, count), files.texels("means", 1, count), files.meta)
-    yield functools.partial(_fill_quats, splats, files.texels("quats", 0, count))
-    scales = quantize.decode_log(_tables(files.meta, "scales", version, 3))
-    yield functools.partial(_look_up, list(splats.scale.T), files.texels("scales", 0, count), scales)
-    colors = _tables(files.meta, "sh0", version, 4 if version == 1 else 3)
+def _texels(files: Files, step: Step, count: int) -> list[Texels]:
+    return [files.texels(texture, index, count) for texture, index in step.images]
+
+
+def _unpacked(scratch: Scratch, progress: Progress, files: Files, steps: list[Step], count: int) -> TexelsOf:
+    """Texels from a scratch file that has those of all images, one image after the other."""
+    images = [len(step.images) for step in steps]
+
+    def pieces() -> Iterator[bytes]:
+        for number, step in enumerate(steps):
+            for texels in _texels(files, step, count):
+                yield from (texels[part].tobytes() for part in blocks_of(count))
+            progress("reading", (number + 1) * count, len(steps) * count, "texel")
+
+    source = Positioned(scratch(pieces))
+
+    def texels_of(number: int, part: slice) -> list[Texels]:
+        first, places = sum(images[:number]), range(images[number])
+        size = 4 * (part.stop - part.start)
+        data = (source.read(4 * ((first + place) * count + part.start), size) for place in places)
+        return [np.frombuffer(each, np.uint8).reshape(-1, 4) for each in data]
+
+    return texels_of
+
+
+def _steps(meta: Meta, version: int, palette: FloatArray | None) -> list[Step]:
+    scales = quantize.decode_log(_tables(meta, "scales", version, 3))
+    colors = _tables(meta, "sh0", version, 4 if version == 1 else 3)
     byte = np.arange(256, dtype=np.uint8)
     opacity = quantize.decode_logit(colors[3]) if version == 1 else quantize.decode_unorm8(byte)
     tables = np.stack([*quantize.decode_dc(colors[:3]), opacity])
-    yield functools.partial(_look_up, [*splats.rgb.T, splats.opacity], files.texels("sh0", 0, count), tables)
-    if palette is not None:
-        yield functools.partial(_fill_sh, splats, files.texels("shN", 1, count), palette)
+    steps = [
+        Step((("means", 0), ("means", 1)), functools.partial(_fill_centers, _center_tables(meta))),
+        Step((("quats", 0),), _fill_quats),
+        Step((("scales", 0),), functools.partial(_fill_scales, scales)),
+        Step((("sh0", 0),), functools.partial(_fill_colors, tables)),
+    ]
+    return steps if palette is None else [*steps, Step((("shN", 1),), functools.partial(_fill_sh, palette))]
 
 
-def _look_up(columns: list[FloatArray], texels: Texels, tables: FloatArray, part: slice) -> None:
-    """Fills each column, (N,), from a channel of the texels by a table of 256 values."""
+def _look_up(columns: list[FloatArray], tables: FloatArray, texels: Texels) -> None:
+    """Fills each column, (n,), from a channel of (n, 4) texels by a table of 256 values."""
     for channel, (column, table) in enumerate(zip(columns, tables, strict=True)):
-        column[part] = table[texels[part, channel]]
+        column[:] = table[texels[:, channel]]
+
+
+def _fill_scales(tables: FloatArray, splats: Splats, texels: list[Texels]) -> None:
+    _look_up(list(splats.scale.T), tables, texels[0])
+
+
+def _fill_colors(tables: FloatArray, splats: Splats, texels: list[Texels]) -> None:
+    _look_up([*splats.rgb.T, splats.opacity], tables, texels[0])
 
 
 def _tables(meta: Meta, name: str, version: int, channels: int) -> FloatArray:
@@ -116,33 +204,34 @@ def _codebook(meta: Meta, name: str) -> FloatArray:
     return meta.numbers(256, name, "codebook", first_may_be_null=True).astype(np.float32)
 
 
-def _centers(splats: Splats, low: Texels, high: Texels, meta: Meta) -> Pass:
-    """Decodes coordinates: 16 bits over two images, between the bounds of sign(x) * log(1 + abs(x))."""
+def _center_tables(meta: Meta) -> FloatArray:
+    """(3, 65536) coordinates of each word, between the bounds of sign(x) * log(1 + abs(x))."""
     logs = quantize.range_table(meta.numbers(3, "means", "mins"), meta.numbers(3, "means", "maxs"), 1 << 16)
     with np.errstate(over="ignore"):
-        tables = np.copysign(np.expm1(np.abs(logs)), logs).astype(np.float32)
-
-    def fill(part: slice) -> None:
-        for axis, table in enumerate(tables):
-            splats.center[part, axis] = table[low[part, axis] | high[part, axis].astype(np.uint16) << np.uint16(8)]
-
-    return fill
+        return np.copysign(np.expm1(np.abs(logs)), logs).astype(np.float32)
 
 
-def _fill_quats(splats: Splats, texels: Texels, part: slice) -> None:
+def _fill_centers(tables: FloatArray, splats: Splats, texels: list[Texels]) -> None:
+    """Decodes coordinates: 16 bits over two images."""
+    low, high = texels
+    for axis, table in enumerate(tables):
+        splats.center[:, axis] = table[low[:, axis] | high[:, axis].astype(np.uint16) << np.uint16(8)]
+
+
+def _fill_quats(splats: Splats, texels: list[Texels]) -> None:
     """Decodes rotations: three components in r g b. A texel without a tag gives NaN, an invalid splat."""
-    others = [(texels[part, k].astype(np.float32) / np.float32(127.5) - 1) * np.float32(np.sqrt(0.5)) for k in range(3)]
-    tag = texels[part, 3]
+    others = [(texels[0][:, k].astype(np.float32) / np.float32(127.5) - 1) * np.float32(np.sqrt(0.5)) for k in range(3)]
+    tag = texels[0][:, 3]
     quat = quantize.quat_of_others(tag.astype(np.int16) - FIRST_TAG, *others)[:, [1, 2, 3, 0]]
     quat[tag < FIRST_TAG] = np.nan
-    splats.quat_xyzw[part] = quat
+    splats.quat_xyzw[:] = quat
 
 
-def _fill_sh(splats: Splats, texels: Texels, palette: FloatArray, part: slice) -> None:
-    label = texels[part, 0] | texels[part, 1].astype(np.uint16) << np.uint16(8)
+def _fill_sh(palette: FloatArray, splats: Splats, texels: list[Texels]) -> None:
+    label = texels[0][:, 0] | texels[0][:, 1].astype(np.uint16) << np.uint16(8)
     if label.max(initial=0) >= len(palette):
         raise FormatError(f"SH label {label.max()} is beyond the {len(palette):,} entries of its palette")
-    splats.sh[part] = palette[label]
+    splats.sh[:] = palette[label]
 
 
 def _read_palette(files: Files, version: int) -> FloatArray:

@@ -10,11 +10,13 @@ from numpy.typing import NDArray
 
 from ..model.scene import Scene
 from ..model.splats import Splats
+from ..model.streams import SceneStream
 from ..support.errors import FormatError, TruncatedError
 from ..support.progress import Progress, silent
 from . import quantize
+from .content import Content, Scratch, rows_in
 from .options import DEFAULTS, WriteOptions
-from .stream import decode_rows, encode_rows, rows_of, size_of
+from .stream import Positioned, decode_rows, encode_rows, rows_between, size_of
 
 ROW = np.dtype(
     [
@@ -34,21 +36,33 @@ def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> 
     Raises:
         TruncatedError: the size is not a multiple of 32.
     """
+    return _content(file).scene(threads, progress)
+
+
+def stream(file: BinaryIO, *, scratch: Scratch, threads: int = 1, progress: Progress = silent) -> SceneStream:
+    """The same splats, block by block; raises as `decode`."""
+    return _content(file).stream(threads)
+
+
+def _content(file: BinaryIO) -> Content:
     size = size_of(file)
     if size % ROW.itemsize:
         raise TruncatedError(f"cut short, or not .splat: its {size:,} bytes are not a multiple of {ROW.itemsize}")
-    count = size // ROW.itemsize
-    splats = Splats.empty(count, 0)
+    count, source = size // ROW.itemsize, Positioned(file)
 
-    def fill(part: slice, rows: NDArray[Any]) -> None:
-        splats.center[part] = rows["center"]
-        splats.scale[part] = rows["scale"]
-        splats.rgb[part] = quantize.decode_unorm8(rows["rgb"])
-        splats.opacity[part] = quantize.decode_unorm8(rows["opacity"])
-        splats.quat_xyzw[part] = quantize.decode_quat_bytes(rows["quat_wxyz"])[:, [1, 2, 3, 0]]
+    def fill(out: Splats, start: int, threads: int, progress: Progress) -> None:
+        def decode_part(part: slice, rows: NDArray[Any]) -> None:
+            splats = rows_in(out, part, start)
+            splats.center[:] = rows["center"]
+            splats.scale[:] = rows["scale"]
+            splats.rgb[:] = quantize.decode_unorm8(rows["rgb"])
+            splats.opacity[:] = quantize.decode_unorm8(rows["opacity"])
+            splats.quat_xyzw[:] = quantize.decode_quat_bytes(rows["quat_wxyz"])[:, [1, 2, 3, 0]]
 
-    decode_rows(rows_of(file.read, ROW, count), fill, count, threads, progress)
-    return Scene(splats, format="SPLAT")
+        rows = rows_between(source, 0, ROW, start, start + len(out), count)
+        decode_rows(rows, decode_part, count, threads, progress)
+
+    return Content(count, 0, fill, "SPLAT")
 
 
 def importance_order(splats: Splats) -> NDArray[np.intp]:

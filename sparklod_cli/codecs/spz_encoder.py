@@ -14,7 +14,7 @@ from ..model.scene import Scene
 from ..model.splats import Splats
 from ..model.streams import NodeStream
 from ..support.parallel import blocks_of
-from ..support.progress import Progress
+from ..support.progress import Progress, silent
 from . import clamps, compression
 from .clamps import Range
 from .encoder import CLAMPED, Encoded, Get, windows_of
@@ -28,18 +28,23 @@ class SpzEncoder:
 
     Attributes:
         layout: of the file.
-        level: of compression.
+        options: with nothing left open.
         ranges: beyond which values are counted; none unless somebody wants to know.
     """
 
     layout: Layout
-    level: int
+    options: WriteOptions
     ranges: tuple[Range, ...] = ()
 
     @property
     def count(self) -> int:
         """Splats of the file."""
         return self.layout.count
+
+    @property
+    def sh_degree(self) -> int:
+        """SH degree of the file."""
+        return self.layout.sh_degree
 
     def encode(self, splats: Splats, tree: LodTree | None, start: int) -> Encoded:
         """The result of a window, wherever it begins."""
@@ -62,16 +67,26 @@ class SpzEncoder:
                 for number in range(len(windows_of(layout.count))):
                     yield get(number, stream.name)
 
-        yield from compression.gzip_member(data(), HEADER.size + layout.total, self.level, threads, progress)
+        yield from compression.gzip_member(
+            data(), HEADER.size + layout.total, self.options.compression_level, threads, progress
+        )
 
 
-def encoder(scene: Scene | NodeStream, options: WriteOptions, ranges: tuple[Range, ...] = ()) -> SpzEncoder:
+def encoder(
+    scene: Scene | NodeStream,
+    options: WriteOptions,
+    ranges: tuple[Range, ...] = (),
+    *,
+    threads: int = 1,
+    progress: Progress = silent,
+) -> SpzEncoder:
     """The encoder of a scene.
 
     Args:
         scene: of which nothing is read.
         options: settled.
         ranges: beyond which the results count values, see `clamps.tally`.
+        threads, progress: not needed.
 
     Raises:
         ValueError: the options are not settled.
@@ -84,4 +99,4 @@ def encoder(scene: Scene | NodeStream, options: WriteOptions, ranges: tuple[Rang
         count, sh_degree, tree = len(scene), scene.splats.sh_degree, scene.tree is not None
     flags = (ANTIALIASED if scene.antialiased else 0) | (LOD if tree else 0)
     layout = Layout(options.spz_version, count, sh_degree, options.fractional_bits, flags)
-    return SpzEncoder(layout, options.compression_level, ranges)
+    return SpzEncoder(layout, options, ranges)

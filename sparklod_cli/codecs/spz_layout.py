@@ -42,6 +42,11 @@ class Stream(NamedTuple):
     decode: Callable[[quantize.Bytes], NDArray[Any]]
     encode: Callable[[NDArray[Any]], NDArray[Any]]
 
+    @property
+    def row_type(self) -> np.dtype[Any]:
+        """(size,) bytes."""
+        return np.dtype((np.uint8, (self.size,)))
+
 
 #: Some rows of a stream: the stream, which rows, and (n, size) bytes.
 StreamRows = tuple[Stream, slice, quantize.Bytes]

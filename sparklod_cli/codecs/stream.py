@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import os
+import threading
 from collections.abc import Callable, Iterator
 from typing import Any, BinaryIO
 
@@ -31,13 +33,72 @@ def size_of(file: BinaryIO) -> int:
     return size
 
 
+class Positioned:
+    """A file that is read by position, by several threads at once, whatever else reads it.
+
+    Args:
+        file: open for reading, until the last read.
+    """
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+        self._lock = threading.Lock()
+        plain = isinstance(file, (io.BufferedReader, io.BufferedRandom)) and hasattr(os, "pread")
+        self._descriptor = file.fileno() if plain else None
+
+    def read(self, at: int, size: int) -> bytes:
+        """The `size` bytes from `at` on, or fewer at the end of the file."""
+        if self._descriptor is None:
+            with self._lock:
+                self._file.seek(at)
+                return self._file.read(size)
+        data = os.pread(self._descriptor, size, at)
+        while 0 < len(data) < size:  # a read may give less, at most 2 GiB
+            more = os.pread(self._descriptor, size - len(data), at + len(data))
+            if not more:
+                break
+            data += more
+        return data
+
+    def reader(self, at: int) -> Read:
+        """What reads on from a position; for one thread."""
+
+        def read(size: int) -> bytes:
+            nonlocal at
+            data = self.read(at, size)
+            at += len(data)
+            return data
+
+        return read
+
+
 def rows_of(read: Read, row_type: np.dtype[Any], count: int, what: str = "splats") -> Iterator[Rows]:
     """`count` rows in blocks of at least `BLOCK_ROWS` rows and `BLOCK_BYTES` bytes, read when they are asked for.
 
     Raises:
         TruncatedError: the data ends early.
     """
-    for part in blocks_of(count, max(BLOCK_ROWS, BLOCK_BYTES // row_type.itemsize)):
+    yield from _rows(read, row_type, 0, count, count, what)
+
+
+def rows_between(
+    file: Positioned,
+    offset: int,
+    row_type: np.dtype[Any],
+    start: int,
+    stop: int,
+    count: int,
+    what: str = "splats",
+) -> Iterator[Rows]:
+    """The rows from `start` to `stop`, of `count` that begin at `offset` in a file; blocks and errors as `rows_of`."""
+    read = file.reader(offset + start * row_type.itemsize)
+    yield from _rows(read, row_type, start, stop, count, what)
+
+
+def _rows(read: Read, row_type: np.dtype[Any], start: int, stop: int, count: int, what: str) -> Iterator[Rows]:
+    step = max(BLOCK_ROWS, BLOCK_BYTES // row_type.itemsize)
+    for first in range(start, stop, step):
+        part = slice(first, min(first + step, stop))
         data = read((part.stop - part.start) * row_type.itemsize)
         whole = len(data) // row_type.itemsize
         if part.start + whole < part.stop:

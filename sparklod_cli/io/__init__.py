@@ -5,6 +5,7 @@ from .chunks import read_rad_chunk, read_rad_header
 from .names import is_file_name
 from .reading import examine_scene, opened, read_arrays, read_scene, size_of_input
 from .scenes import SceneSink, scene_sink
+from .streams import open_stream
 from .texts import MAX_TEXT, read_rgba, read_text, read_together
 from .together import SinkTogether, chunk_files, sink_together, write_together
 from .writing import Sink, check_writable, sink, write_stdout, write_whole
@@ -19,6 +20,7 @@ __all__ = [
     "companions",
     "examine_scene",
     "is_file_name",
+    "open_stream",
     "opened",
     "read_arrays",
     "read_rad_chunk",

@@ -70,7 +70,7 @@ def opened(path: Path) -> Iterator[tuple[BinaryIO, Format, dict[str, Any]]]:
     Raises:
         FormatError: it is not a file, empty, or of no known format; an `OSError` of the body becomes one.
     """
-    try:
+    with readable():
         if path.is_dir():
             path = in_folder(path)
         if path != DASH and path.exists() and not path.is_file():
@@ -93,6 +93,13 @@ def opened(path: Path) -> Iterator[tuple[BinaryIO, Format, dict[str, Any]]]:
                     " Python"
                 )
             yield file, form, {"beside": functools.partial(open_beside, path)} if form.companions else {}
+
+
+@contextlib.contextmanager
+def readable() -> Iterator[None]:
+    """An `OSError` of the body, which reads a file, becomes an `UnreadableError`."""
+    try:
+        yield
     except OSError as error:
         raise UnreadableError(f"cannot be read: {reason_of(error)}") from None
 

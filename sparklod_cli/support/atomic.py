@@ -27,7 +27,7 @@ _FLAGS = os.O_RDWR | getattr(os, "O_BINARY", 0) | getattr(os, "O_CLOEXEC", 0) | 
 _COPY_BYTES = 1 << 20  # per read when a file is copied
 
 
-def write(target: Path, pieces: Iterable[bytes], *, overwrite: bool) -> int:
+def write(target: Path, pieces: Iterable[bytes | memoryview], *, overwrite: bool, sync: bool = True) -> int:
     """Writes a file that appears only when it is complete, and returns its size in bytes.
 
     A new file gets the permissions that the umask allows. A replacement gets the permissions of the file it replaces,
@@ -37,6 +37,7 @@ def write(target: Path, pieces: Iterable[bytes], *, overwrite: bool) -> int:
         target: path of the file; a symbolic link would be replaced, not followed.
         pieces: content of the file, in order.
         overwrite: replace an existing file.
+        sync: wait until it is on the disk. Otherwise it may be damaged after a power failure, though not after a kill.
 
     Raises:
         FileExistsError: the file exists, and `overwrite` is not set.
@@ -45,24 +46,25 @@ def write(target: Path, pieces: Iterable[bytes], *, overwrite: bool) -> int:
     leftovers.sweep(target.parent)
     descriptor = _open_unnamed(target, overwrite)
     if descriptor is None:
-        return _write_named(target, pieces, overwrite)
+        return _write_named(target, pieces, overwrite, sync)
     with os.fdopen(descriptor, "w+b") as file:
-        size = fill(file, pieces)
+        size = fill(file, pieces, sync=sync)
         try:
             _name(file, target, overwrite)
         except FileExistsError:
             raise
         except OSError:  # a file system without links
             file.seek(0)
-            _write_named(target, iter(lambda: file.read(_COPY_BYTES), b""), overwrite)
+            _write_named(target, iter(lambda: file.read(_COPY_BYTES), b""), overwrite, sync)
     return size
 
 
-def fill(file: BinaryIO, pieces: Iterable[bytes]) -> int:
-    """Writes the content of a file and syncs it; returns its size in bytes."""
+def fill(file: BinaryIO, pieces: Iterable[bytes | memoryview], *, sync: bool = True) -> int:
+    """Writes the content of a file and syncs it, if that is asked for; returns its size in bytes."""
     size = sum(map(file.write, pieces))
     file.flush()
-    os.fsync(file.fileno())
+    if sync:
+        os.fsync(file.fileno())
     return size
 
 
@@ -117,12 +119,12 @@ def _link(number: int, path: Path) -> None:
     os.link(OPEN_FILES / str(number), path, src_dir_fd=number, follow_symlinks=True)
 
 
-def _write_named(target: Path, pieces: Iterable[bytes], overwrite: bool) -> int:
+def _write_named(target: Path, pieces: Iterable[bytes | memoryview], overwrite: bool, sync: bool) -> int:
     """As `write`, with a file that has a temporary name until it is complete."""
     temporary, descriptor = _open_part(target, overwrite)
     try:
         with os.fdopen(descriptor, "w+b") as file:
-            size = fill(file, pieces)
+            size = fill(file, pieces, sync=sync)
             mode = _replaced_mode(target, overwrite)
             if mode is not None:
                 temporary.chmod(mode)

@@ -67,6 +67,10 @@ class MembersError(FormatError):
     code = "container.members"
 
 
+class HasTreeError(FormatError):
+    """A file is a Level-of-Detail tree where splats without one are needed."""
+
+
 class TooLongError(FormatError):
     """A stream is longer than the header declares."""
 
@@ -83,6 +87,10 @@ class TreeError(SparklodError):
 
 class OutputError(SparklodError):
     """An output file already exists, or the file system refused to write it."""
+
+
+class ScratchError(OutputError):
+    """The scratch folder of a bake cannot be used: it is full, damaged, in use, or has the results of another bake."""
 
 
 class StdoutError(OutputError):

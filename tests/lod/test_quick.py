@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod import quick
+from sparklod_cli.lod.voxel_tree import SHRINK
 from sparklod_cli.model.lod_tree import MAX_CHILDREN, LodTree
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.support.errors import InvalidSplatsError
@@ -25,7 +26,7 @@ from tests.scenes import random_splats
 def as_merged(nodes: Splats, tree: LodTree) -> Splats:
     """Nodes with the scales that they were merged with, larger than those that are drawn."""
     scale = nodes.scale.copy()
-    scale[~tree.is_leaf] /= quick.SHRINK
+    scale[~tree.is_leaf] /= SHRINK
     return dataclasses.replace(nodes, scale=scale)
 
 

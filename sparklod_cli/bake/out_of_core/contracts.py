@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -13,11 +14,33 @@ from ...support.progress import Progress
 Arrays = Mapping[str, NDArray[Any]]
 
 
+class Traffic:
+    """Bytes of results that a store has written and read in this process; a copy in another one begins at 0."""
+
+    def __init__(self) -> None:
+        self.written = self.read = 0
+        self._lock = threading.Lock()
+
+    def add(self, *, written: int = 0, read: int = 0) -> None:
+        """Counts bytes; may be called by several threads at once."""
+        with self._lock:
+            self.written += written
+            self.read += read
+
+    def __reduce__(self) -> tuple[type[Traffic], tuple[()]]:
+        return Traffic, ()
+
+
 class Store(Protocol):
     """Where the results of tasks are: a folder, or a URL that several machines reach. Small, so it can be pickled.
 
-    A result appears whole or not at all, and is on the disk then.
+    A result appears whole or not at all. Methods may be called by several threads at once, and raise `ScratchError`
+    where the results cannot be read or written, which says what to do.
     """
+
+    @property
+    def traffic(self) -> Traffic:
+        """What was written and read."""
 
     def has(self, name: str) -> bool:
         """Whether there is a result."""
@@ -36,6 +59,12 @@ class Store(Protocol):
 
     def remove(self, name: str) -> None:
         """Removes a result, if it is there."""
+
+    def names(self) -> list[str]:
+        """The names of all results, in order."""
+
+    def is_sound(self, name: str) -> bool:
+        """Whether a result is there, and has the bytes that were put; reads all of it."""
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from ...support.progress import Progress, silent
 from .. import clamps, octahedral
 from ..clamps import Range
 from ..encoder import CLAMPED, Encoded, Get, windows_of
-from ..options import RadOptions, WriteOptions
+from ..options import WriteOptions
 from ..splat_encoding import SplatEncoding
 from .comment import comment_of
 from .encodings import CODINGS
@@ -51,7 +51,6 @@ class RadEncoder:
         tree: whether there is one.
         antialiased: as in `Scene`.
         options: with nothing left open.
-        level: of compression.
         palette: of SH, or None.
         ranges: beyond which values are counted; none unless somebody wants to know.
     """
@@ -60,16 +59,15 @@ class RadEncoder:
     sh_degree: int
     tree: bool
     antialiased: bool
-    options: RadOptions
-    level: int
+    options: WriteOptions
     palette: Palette | None = None
     ranges: tuple[Range, ...] = ()
 
     @property
     def _codes(self) -> SplatEncoding:
         """The ranges of the codes."""
-        assert self.options.ranges is not None
-        return self.options.ranges
+        assert self.options.rad.ranges is not None
+        return self.options.rad.ranges
 
     def encode(self, splats: Splats, tree: LodTree | None, start: int) -> Encoded:
         """The bytes of a chunk, and how many they are."""
@@ -119,7 +117,7 @@ class RadEncoder:
         payload, properties, at = [], [], 0
         labels = None if self.palette is None else self.palette.labels_of(splats, start)
         for row in self._rows(first=start == 0):
-            encoding = getattr(self.options, row.option) if row.option else row.encodings[0]
+            encoding = getattr(self.options.rad, row.option) if row.option else row.encodings[0]
             low, high = code_range(row, self._codes)
             values = self._values(row, encoding, splats, tree, labels)
             data = self._deflated(CODINGS[encoding].encode(values, low, high), encoding)
@@ -158,8 +156,8 @@ class RadEncoder:
             return _alpha(column, encoding, self._codes)[:, None]
         if row.column == "quat_xyzw" and encoding != "oct88r8":
             return column[:, :3] * np.where(column[:, 3:] < 0, np.float32(-1), np.float32(1))
-        if row.column == "center" and self.options.center_bits is not None:
-            return rounded(column, self.options.center_bits)
+        if row.column == "center" and self.options.rad.center_bits is not None:
+            return rounded(column, self.options.rad.center_bits)
         return column if column.ndim == 2 else column[:, None]
 
     def _deflated(self, codes: NDArray[Any], encoding: str) -> bytes:
@@ -168,7 +166,9 @@ class RadEncoder:
         Of codes of a byte, only runs are looked for: longer matches are chance, which makes them longer and slower.
         """
         strategy = zlib_ng.Z_RLE if SIZES[encoding] == 1 else zlib_ng.Z_DEFAULT_STRATEGY
-        packer = zlib_ng.compressobj(self.level, zlib_ng.DEFLATED, _RAW, zlib_ng.DEF_MEM_LEVEL, strategy)
+        packer = zlib_ng.compressobj(
+            self.options.compression_level, zlib_ng.DEFLATED, _RAW, zlib_ng.DEF_MEM_LEVEL, strategy
+        )
         return packer.compress(codes.data.cast("B")) + packer.flush()
 
 
@@ -201,8 +201,7 @@ def encoder(
     palette = None
     if rad.sh_codes is not None and sh_degree and count:
         palette = Palette.of(scene, rad.sh_codes, threads, progress)
-    level = options.compression_level
-    return RadEncoder(count, sh_degree, tree, scene.antialiased, rad, level, palette, ranges)
+    return RadEncoder(count, sh_degree, tree, scene.antialiased, options, palette, ranges)
 
 
 def rounded(center: FloatArray, bits: int) -> FloatArray:

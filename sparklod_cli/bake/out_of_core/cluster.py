@@ -1,0 +1,187 @@
+"""Dask clusters: one that runs already, or one of processes on this machine, for as long as it is needed."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import logging
+import tempfile
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ...support import machine
+from ...support.errors import SparklodError
+from ...support.optional import optional_import
+from .cluster_engine import ClusterEngine
+from .cluster_pool import Connection
+
+#: Seconds that a scheduler, or the workers of a cluster, are waited for.
+PATIENCE = 30
+
+#: How often a task is tried on another worker after one was lost with it.
+LOSSES = 2
+
+#: Part of the machine's free memory beyond which a worker of our own is ended, before the system ends something else.
+MEMORY_SHARE = 0.9
+
+#: Bytes that a process takes before it has read anything: Python, Dask, numba and compiled kernels.
+LEAST_MEMORY = 500_000_000
+
+#: How Dask runs processes of our own.
+OWN_CONFIG = {
+    # It would set variables in this process's environment, too.
+    "distributed.nanny.pre-spawn-environ": {},
+    # Tasks hold what they need in arrays of their own, which Dask can neither spill nor wait for.
+    "distributed.worker.memory.target": False,
+    "distributed.worker.memory.spill": False,
+    "distributed.worker.memory.pause": False,
+}
+
+#: Loggers of Dask and what it is made of, and a level that nothing reaches.
+TALKERS, SILENT = ("bokeh", "distributed", "tornado"), logging.CRITICAL + 1
+
+#: What listens for requests on this machine alone.
+LOOPBACK = "127.0.0.1"
+
+
+@dataclass(frozen=True)
+class ClusterSettings:
+    """Which cluster.
+
+    Attributes:
+        scheduler: address of one that runs, as tcp://host:8786; None starts one on this machine.
+        workers: processes of the latter.
+        threads: of a task; None for those of its worker.
+    """
+
+    scheduler: str | None = None
+    workers: int = 1
+    threads: int | None = None
+
+
+@contextlib.contextmanager
+def cluster(
+    settings: ClusterSettings,
+    *,
+    threads: int = 1,
+    memory: int | None = None,
+    scratch: Path | None = None,
+    say: Callable[[str], None] = lambda text: None,
+) -> Iterator[ClusterEngine]:
+    """An engine on a cluster, which is left alone at the end, or ended if it was started here.
+
+    Args:
+        settings: which cluster.
+        threads: of this machine, which workers of our own share.
+        memory: bytes that workers of our own share, as --memory; they get more only where the machine has it.
+        scratch: folder for files of workers of our own; one for temporary files unless given.
+        say: is told the address of the dashboard, and of workers that are lost.
+
+    Raises:
+        SparklodError: there is no distributed, or no scheduler or worker answers.
+    """
+    with optional_import("clusters are Dask's", "sparklod[cluster]"):
+        import distributed  # noqa: F401  # sets its loggers up
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(_quiet())
+        if settings.scheduler is None:
+            client = stack.enter_context(_started(settings.workers, threads, memory, scratch))
+            own = max(1, threads // settings.workers)
+        else:
+            client = stack.enter_context(_connected(settings.scheduler))
+            own = settings.threads or 1
+        if importlib.util.find_spec("bokeh") is not None or settings.scheduler is not None:
+            say(f"the cluster's dashboard is at {client.dashboard_link}")
+        with Connection(client, say) as connection:
+            yield ClusterEngine(connection, threads=own)
+
+
+@contextlib.contextmanager
+def _connected(address: str) -> Iterator[Any]:
+    """A client of a cluster that runs."""
+    from distributed import Client
+
+    whole = address if "://" in address else f"tcp://{address}"
+    try:
+        client = Client(whole, timeout=PATIENCE, set_as_default=False)
+    except (OSError, ValueError, TypeError) as error:
+        raise SparklodError(
+            f"no scheduler answers at {whole} ({error}); start one with dask scheduler, and dask worker {whole}"
+        ) from None
+    try:
+        try:
+            client.wait_for_workers(1, timeout=PATIENCE)
+        except TimeoutError:
+            raise SparklodError(
+                f"the cluster at {whole} has no workers; start some with dask worker {whole} --nthreads 1"
+            ) from None
+        yield client
+    finally:
+        with contextlib.suppress(TimeoutError):  # a scheduler that is gone
+            client.close(timeout=1)
+
+
+@contextlib.contextmanager
+def _started(workers: int, threads: int, memory: int | None, scratch: Path | None) -> Iterator[Any]:
+    """A client of a cluster of processes on this machine."""
+    import dask
+    from distributed import Client, LocalCluster
+
+    with contextlib.ExitStack() as stack:
+        folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="sparklod-", dir=scratch))
+        stack.enter_context(dask.config.set(OWN_CONFIG))
+        try:
+            own = LocalCluster(
+                n_workers=workers,
+                threads_per_worker=1,
+                host=LOOPBACK,
+                dashboard_address=f"{LOOPBACK}:8787",
+                memory_limit=_memory_limit(workers, memory),
+                local_directory=folder,
+                env={"NUMBA_NUM_THREADS": str(max(1, threads // workers))},
+                preload=["sparklod_cli.bake.out_of_core.cluster_worker"],
+                scheduler_kwargs={"allowed_failures": LOSSES},
+                silence_logs=SILENT,
+            )
+        except (OSError, RuntimeError, TimeoutError) as error:
+            raise SparklodError(f"no cluster can be started on this machine: {error}") from None
+        stack.callback(_end, own)
+        client = stack.enter_context(contextlib.closing(Client(own, timeout=PATIENCE, set_as_default=False)))
+        yield client
+
+
+def _end(own: Any) -> None:
+    """Ends workers, what they do included: all that is wanted of them is in the store."""
+    for nanny in list(own.workers.values()):
+        process = getattr(getattr(nanny, "process", None), "process", None)
+        nanny.auto_restart = False
+        if process is not None:
+            with contextlib.suppress(Exception):
+                own.sync(process.kill)
+    with contextlib.suppress(Exception):
+        own.close(timeout=5)
+
+
+def _memory_limit(workers: int, memory: int | None) -> int:
+    """Bytes beyond which a worker of our own is ended: its share of --memory, or of what is free if that is more."""
+    free = machine.available_memory() or 0
+    return max(LEAST_MEMORY, max(memory or 0, int(MEMORY_SHARE * free)) // workers)
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Keeps Dask's own messages off the screen: what they tell of workers and schedulers, the engine says."""
+    names = [name for name in logging.Logger.manager.loggerDict if name.partition(".")[0] in TALKERS]
+    before = {name: logging.getLogger(name).level for name in names}
+    for name in names:
+        logging.getLogger(name).setLevel(SILENT)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        for name, level in before.items():
+            logging.getLogger(name).setLevel(level)

@@ -1,0 +1,275 @@
+"""Stores of results: in a folder, which several machines may mount, or at an address."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import threading
+from abc import ABC, abstractmethod
+from collections.abc import Collection, Iterable, Iterator
+from io import BufferedReader, FileIO
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...support import atomic
+from ...support.addresses import Address, Place
+from ...support.errors import ScratchError
+from .contracts import Arrays, Traffic
+from .results import HEAD, DamagedError, Entry, Table, check, decode_table, encode, table_bytes
+
+#: Suffix of the files of results, so that a result may have the name of a folder of others.
+SUFFIX = ".result"
+
+#: Bytes that are read at once of a result that is only checked.
+CHECK_BYTES = 1 << 24
+
+#: Bytes that are read at once at an address: the head and the table of most results.
+READ_AHEAD = 1 << 16
+
+#: What the system says of a disk, or a share of one, that is full.
+FULL = {errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC)}
+
+#: The file of a result, open.
+_File = FileIO | BufferedReader
+
+
+class FileStore(ABC):
+    """A file for each result.
+
+    A checksum of each array, in its file, tells what was damaged. `get` compares it, `rows` does not; `is_sound` reads
+    all of a result for that, as a bake does that resumes.
+
+    Attributes:
+        folder: of the files; made when the first result is put.
+        traffic: what was written and read by this process.
+    """
+
+    def __init__(self, folder: Place) -> None:
+        self.folder = folder
+        self.traffic = Traffic()
+        self._tables: dict[str, Table] = {}
+        self._lock = threading.Lock()
+
+    def __reduce__(self) -> tuple[type[FileStore], tuple[Place]]:
+        return type(self), (self.folder,)
+
+    def __str__(self) -> str:
+        return str(self.folder)
+
+    @abstractmethod
+    def names(self) -> list[str]:
+        """The names of all results, in order."""
+
+    @abstractmethod
+    def _open(self, name: str) -> _File:
+        """Opens the file of a result."""
+
+    @abstractmethod
+    def _write(self, name: str, pieces: Iterable[bytes | memoryview]) -> int:
+        """Writes the file of a result, which appears when it is whole; returns its size."""
+
+    @abstractmethod
+    def _unlink(self, name: str) -> None:
+        """Removes the file of a result, if it is there."""
+
+    def has(self, name: str) -> bool:
+        """Whether there is a result of the length that it was written with."""
+        try:
+            with self._open(name) as file:
+                self._table(name, file)
+        except (FileNotFoundError, NotADirectoryError, DamagedError):
+            return False
+        except OSError as error:
+            self._refused("read", error)
+        return True
+
+    def put(self, name: str, arrays: Arrays) -> None:
+        """Writes a result; replaces one of this name."""
+        self._forget(name)
+        try:
+            self.traffic.add(written=self._write(name, encode(arrays)))
+        except OSError as error:
+            self._refused("write", error)
+
+    def get(self, name: str, keys: Collection[str] | None = None) -> dict[str, NDArray[Any]]:
+        """Reads a result, or some of its arrays, and compares their checksums."""
+        found = {}
+        with self._reading(name) as (file, table):
+            for key in table.entries if keys is None else keys:
+                entry = table.entries[key]
+                found[key] = _filled(file, entry.offset, np.empty(entry.shape, entry.dtype))
+                check(entry, [found[key]])
+                self.traffic.add(read=entry.bytes)
+        return found
+
+    def rows(self, name: str, key: str, start: int, stop: int) -> NDArray[Any]:
+        """Reads rows of an array and nothing else."""
+        with self._reading(name) as (file, table):
+            entry = table.entries[key]
+            start, stop, _ = slice(start, stop).indices(entry.shape[0])
+            rows = np.empty((max(0, stop - start), *entry.shape[1:]), entry.dtype)
+            _filled(file, entry.offset + start * entry.row_bytes, rows)
+        self.traffic.add(read=rows.nbytes)
+        return rows
+
+    def shape(self, name: str, key: str) -> tuple[int, ...]:
+        """The shape of an array."""
+        with self._reading(name) as (_, table):
+            return table.entries[key].shape
+
+    def remove(self, name: str) -> None:
+        """Removes a result, if it is there."""
+        self._forget(name)
+        try:
+            self._unlink(name)
+        except OSError as error:
+            self._refused("write", error)
+
+    def is_sound(self, name: str) -> bool:
+        """Whether a result is there, and has the bytes that were put; reads all of it."""
+        self._forget(name)
+        if not self.has(name):
+            return False
+        try:
+            with self._open(name) as file:
+                for entry in self._table(name, file).entries.values():
+                    check(entry, _pieces(file, entry))
+                    self.traffic.add(read=entry.bytes)
+        except (FileNotFoundError, DamagedError):
+            return False
+        except OSError as error:
+            self._refused("read", error)
+        return True
+
+    def _forget(self, name: str) -> None:
+        with self._lock:
+            self._tables.pop(name, None)
+
+    def _table(self, name: str, file: _File) -> Table:
+        """The table of a file that is open, which is read once."""
+        size = file.seek(0, os.SEEK_END)
+        with self._lock:
+            table = self._tables.get(name)
+        if table is None or table.bytes != size:
+            file.seek(0)
+            head = file.read(HEAD.size)
+            table = decode_table(head, file.read(table_bytes(head)), size)
+            with self._lock:
+                self._tables[name] = table
+        return table
+
+    @contextlib.contextmanager
+    def _reading(self, name: str) -> Iterator[tuple[_File, Table]]:
+        """The file of a result, and its table."""
+        try:
+            with self._open(name) as file:
+                yield file, self._table(name, file)
+        except DamagedError as error:
+            raise ScratchError(
+                f"{name} in the scratch folder {self.folder} is damaged: {error}; run it again with --resume, which"
+                " makes it anew"
+            ) from None
+        except OSError as error:
+            self._refused("read", error)
+
+    def _refused(self, what: str, error: OSError) -> NoReturn:
+        reason = (error.strerror or str(error)).lower()
+        if error.errno in FULL:
+            raise ScratchError(
+                f"there is no room left in the scratch folder {self.folder}: {reason}; free some and run it again with"
+                " --resume, or choose another disk with --scratch-dir"
+            ) from None
+        raise ScratchError(
+            f"cannot {what} in the scratch folder {self.folder}: {reason}; choose another one with --scratch-dir"
+        ) from None
+
+
+class FolderStore(FileStore):
+    """A folder of this machine, or one that several machines mount.
+
+    Files are not synced, which would take half of the time of writing: what a process has written is there when the
+    process is killed, and checksums tell what a power failure damaged.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
+        self._folder = folder
+
+    def names(self) -> list[str]:
+        files = self._folder.rglob(f"*{SUFFIX}")
+        return sorted(path.relative_to(self._folder).as_posix().removesuffix(SUFFIX) for path in files)
+
+    def _open(self, name: str) -> FileIO:
+        return self._path(name).open("rb", buffering=0)
+
+    def _write(self, name: str, pieces: Iterable[bytes | memoryview]) -> int:
+        path = self._path(name)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return atomic.write(path, pieces, overwrite=True, sync=False)
+
+    def _unlink(self, name: str) -> None:
+        self._path(name).unlink(missing_ok=True)
+
+    def _path(self, name: str) -> Path:
+        return self._folder / f"{name}{SUFFIX}"
+
+
+class AddressStore(FileStore):
+    """An object for each result, which appears when all of it was sent."""
+
+    def __init__(self, folder: Address) -> None:
+        super().__init__(folder)
+        self._folder = folder
+
+    def has(self, name: str) -> bool:
+        try:
+            return self._path(name).is_file()
+        except OSError as error:
+            self._refused("read", error)
+
+    def names(self) -> list[str]:
+        try:
+            return [name.removesuffix(SUFFIX) for name in self._folder.files() if name.endswith(SUFFIX)]
+        except OSError as error:
+            self._refused("read", error)
+
+    def _open(self, name: str) -> BufferedReader:
+        table = self._tables.get(name)
+        return self._path(name).open(buffering=READ_AHEAD, size=None if table is None else table.bytes)
+
+    def _write(self, name: str, pieces: Iterable[bytes | memoryview]) -> int:
+        return self._path(name).write(pieces)
+
+    def _unlink(self, name: str) -> None:
+        self._path(name).unlink(missing_ok=True)
+
+    def _path(self, name: str) -> Address:
+        return self._folder / f"{name}{SUFFIX}"
+
+
+def store_of(folder: Place) -> FileStore:
+    """The store in a folder, wherever it is."""
+    return AddressStore(folder) if isinstance(folder, Address) else FolderStore(folder)
+
+
+def _filled(file: _File, offset: int, array: NDArray[Any]) -> NDArray[Any]:
+    """An array with the bytes of a file."""
+    view = array.reshape(-1).view(np.uint8).data
+    file.seek(offset)
+    while view:
+        count = file.readinto(view)
+        if not count:
+            raise DamagedError("it is cut short")
+        view = view[count:]
+    return array
+
+
+def _pieces(file: _File, entry: Entry) -> Iterator[NDArray[Any]]:
+    """The bytes of an array, some at a time."""
+    for start in range(0, entry.bytes, CHECK_BYTES):
+        piece = np.empty(min(CHECK_BYTES, entry.bytes - start), np.uint8)
+        yield _filled(file, entry.offset + start, piece)

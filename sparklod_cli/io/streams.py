@@ -1,0 +1,187 @@
+"""Reads splat files of any format block by block, so that they need not fit into memory."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import hashlib
+import tempfile
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, BinaryIO, Protocol
+
+from ..model.splats import Splats
+from ..model.streams import SceneStream
+from ..support import atomic
+from ..support.errors import FormatError, OutputError
+from ..support.progress import Progress, silent
+from ..support.stdin import DASH
+from .names import reason_of
+from .reading import opened, readable
+
+#: Makes the bytes of a scratch file.
+Pieces = Callable[[], Iterable[bytes]]
+
+
+@contextlib.contextmanager
+def open_stream(
+    path: Path,
+    *,
+    scratch: Path | None = None,
+    keep: bool = False,
+    threads: int = 1,
+    progress: Progress = silent,
+) -> Iterator[SceneStream]:
+    """The splats of a file of any known format without a tree, block by block.
+
+    Only its header is read now. Each read of the stream opens the file anew, so that it may be read by several threads.
+    Columns that lie one after the other (SPZ, SOG), and text, are unpacked once, when splats are first read; see
+    docs/formats.md for the room that takes.
+
+    Args:
+        path: as for `io.read_scene`.
+        scratch: folder for what is unpacked; None for that of the system's temporary files.
+        keep: leave what is unpacked in `scratch`, where the same file is found unpacked the next time, by other
+            processes, too; whoever owns the folder removes it. The stream can be pickled then, if `progress` can.
+        threads: to decode with.
+        progress: told of what is unpacked.
+
+    Raises:
+        HasTreeError: the file is a tree.
+        FormatError: as `io.read_scene`. What is wrong behind the header is raised by reading; so is `OutputError`,
+            where there is no room for what is unpacked.
+        ValueError: `keep` without `scratch`.
+    """
+    if keep and scratch is None:
+        raise ValueError("keep needs a scratch folder")
+    store: _Store = _Folder(scratch) if keep and scratch is not None else _Unnamed(scratch)
+    try:
+        source = _Source(path, store, threads, progress)
+        with source.opened() as stream:
+            found = stream
+        yield dataclasses.replace(found, read=_Read(source, found.count, found.sh_degree))
+    finally:
+        store.close()
+
+
+class _Store(Protocol):
+    """Where the one file is that is unpacked."""
+
+    def file(self, path: Path, pieces: Pieces) -> contextlib.AbstractContextManager[BinaryIO]:
+        """What has been unpacked of a file; `pieces` are written first if they have not been."""
+
+    def close(self) -> None:
+        """Removes it, unless it is to stay."""
+
+
+@dataclass
+class _Unnamed:
+    """A file without a name, which is gone with this process at the latest."""
+
+    folder: Path | None
+    _file: BinaryIO | None = None
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def file(self, path: Path, pieces: Pieces) -> contextlib.AbstractContextManager[BinaryIO]:
+        with self._lock:
+            if self._file is None:
+                with _room(self.folder), contextlib.ExitStack() as stack:
+                    file: BinaryIO = stack.enter_context(tempfile.TemporaryFile(prefix="sparklod-", dir=self.folder))
+                    for piece in pieces():
+                        file.write(piece)
+                    file.flush()
+                    stack.pop_all()
+                self._file = file
+        return contextlib.nullcontext(self._file)
+
+    def close(self) -> None:
+        if self._file is not None:
+            self._file.close()
+
+
+#: One thread of a process unpacks a file, and the others wait.
+_LOCKS: dict[Path, threading.Lock] = {}
+
+
+@dataclass(frozen=True)
+class _Folder:
+    """A folder of such files, each named after what it was unpacked from, which appear whole or not at all."""
+
+    folder: Path
+
+    def file(self, path: Path, pieces: Pieces) -> contextlib.AbstractContextManager[BinaryIO]:
+        target = self.folder / f"{_digest(path)}.unpacked"
+        with _LOCKS.setdefault(target, threading.Lock()), _room(self.folder):
+            if not target.exists():
+                target.parent.mkdir(parents=True, exist_ok=True)
+                atomic.write(target, pieces(), overwrite=True)
+            return target.open("rb")
+
+    def close(self) -> None:
+        pass
+
+
+def _digest(path: Path) -> str:
+    """A name for this version of a file."""
+    status = None if path == DASH else path.stat()
+    parts = (path.absolute(), *((status.st_size, status.st_mtime_ns) if status else ()))
+    return hashlib.sha256("\n".join(map(str, parts)).encode("utf-8", "surrogateescape")).hexdigest()[:32]
+
+
+@contextlib.contextmanager
+def _room(folder: Path | None) -> Iterator[None]:
+    """An `OSError` of the body becomes an `OutputError`."""
+    try:
+        yield
+    except OSError as error:
+        where = folder or tempfile.gettempdir()
+        raise OutputError(f"cannot write to the scratch folder {where}: {reason_of(error)}") from None
+
+
+@dataclass(frozen=True)
+class _Source:
+    """A file, and what opens it."""
+
+    path: Path
+    store: _Store
+    threads: int
+    progress: Progress
+
+    @contextlib.contextmanager
+    def opened(self) -> Iterator[SceneStream]:
+        """The stream of the file, which is open as long as the body runs."""
+        with contextlib.ExitStack() as stack:
+            unpacked: list[BinaryIO] = []
+
+            def scratch(pieces: Pieces) -> BinaryIO:
+                def readable_pieces() -> Iterator[bytes]:
+                    with readable():
+                        yield from pieces()
+
+                if not unpacked:
+                    unpacked.append(stack.enter_context(self.store.file(self.path, readable_pieces)))
+                return unpacked[0]
+
+            file, form, more = stack.enter_context(opened(self.path))
+            codec: Any = form.codec()
+            stream: SceneStream = codec.stream(
+                file, scratch=scratch, threads=self.threads, progress=self.progress, **more
+            )
+            yield stream
+
+
+@dataclass(frozen=True)
+class _Read:
+    """`SceneStream.read` of a file that is opened anew."""
+
+    source: _Source
+    count: int
+    sh_degree: int
+
+    def __call__(self, start: int, stop: int) -> Iterator[Splats]:
+        with self.source.opened() as stream:
+            if (stream.count, stream.sh_degree) != (self.count, self.sh_degree):
+                raise FormatError("it was changed while it was read; start again")
+            yield from stream.read(start, stop)

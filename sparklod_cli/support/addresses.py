@@ -1,0 +1,245 @@
+"""Files at addresses such as s3://bucket/scan.ply, which fsspec opens: they are used as paths are.
+
+Passwords and signatures in an address are never shown: its text is without them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import functools
+import io
+import posixpath
+import re
+import tempfile
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+from urllib.parse import unquote, urlsplit
+
+from .errors import SparklodError
+from .optional import optional_import
+
+#: How addresses begin. A letter and a colon alone are a drive of Windows.
+ADDRESS = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+)://")
+
+#: Bytes that are asked for at once by those who read little at a time; a request takes as long as some megabytes.
+READ_AHEAD = 1 << 23
+
+#: What stands where something of an address is not shown.
+HIDDEN = "***"
+
+
+@dataclass(frozen=True)
+class Address:
+    """A file or folder that fsspec opens. Has those attributes and methods of a `Path` that the program needs.
+
+    What goes wrong is an `OSError`, or a `SparklodError` where a package is missing.
+
+    Attributes:
+        url: all of it, with passwords.
+    """
+
+    url: str
+
+    def __str__(self) -> str:
+        """The address without a password, or a query, which may be a signature."""
+        whole, query = _cut(self.url)
+        scheme, rest = whole.split("://", 1)
+        host, slash, path = rest.partition("/")
+        user, at, host = host.rpartition("@")
+        shown = f"{HIDDEN}@" if at and ":" in user else f"{user}{at}"
+        return f"{scheme}://{shown}{host}{slash}{path}" + (f"?{HIDDEN}" if query else "")
+
+    def __repr__(self) -> str:
+        return f"Address({str(self)!r})"
+
+    def __truediv__(self, name: str) -> Address:
+        path, query = _cut(self.url)
+        return Address(f"{path.rstrip('/')}/{name}{query}")
+
+    @property
+    def name(self) -> str:
+        """Its last part."""
+        return posixpath.basename(_cut(self.url)[0].rstrip("/").split("://", 1)[-1])
+
+    @property
+    def suffix(self) -> str:
+        """As that of a path."""
+        return Path(self.name).suffix
+
+    @property
+    def stem(self) -> str:
+        """As that of a path."""
+        return Path(self.name).stem
+
+    @property
+    def parent(self) -> Address:
+        """The folder that it is in."""
+        path, query = _cut(self.url)
+        scheme, rest = path.split("://", 1)
+        folder = rest.rstrip("/").rpartition("/")[0]
+        return Address(f"{scheme}://{folder}{query}") if folder else self
+
+    def exists(self) -> bool:
+        """Whether there is a file or folder."""
+        with self._opened() as (system, path):
+            return bool(system.exists(path))
+
+    def is_file(self) -> bool:
+        """Whether it is a file."""
+        with self._opened() as (system, path):
+            return bool(system.isfile(path))
+
+    def is_dir(self) -> bool:
+        """Whether it is a folder."""
+        with self._opened() as (system, path):
+            return bool(system.isdir(path))
+
+    def size(self) -> int:
+        """Bytes of the file."""
+        with self._opened() as (system, path):
+            size = system.info(path)["size"]
+        if size is None:
+            raise OSError(f"{self} does not tell its size; download it first")
+        return int(size)
+
+    def open(
+        self, mode: Literal["rb"] = "rb", buffering: int = READ_AHEAD, *, size: int | None = None
+    ) -> io.BufferedReader:
+        """Opens the file for reading, wherever in it.
+
+        Args:
+            mode: as of a path.
+            buffering: bytes that are read at once where less is wanted.
+            size: bytes of the file, where that is known.
+        """
+        return io.BufferedReader(_Ranged(self, self.size() if size is None else size), buffering)
+
+    def read(self, start: int, stop: int) -> bytes:
+        """Some bytes of the file."""
+        with self._opened() as (system, path):
+            data = bytes(system.cat_file(path, start=start, end=stop))
+        if len(data) > stop - start:
+            raise OSError("its server does not send parts of files; download it first")
+        return data
+
+    def write(self, pieces: Iterable[bytes | memoryview]) -> int:
+        """Writes the file, which appears when all of it is there, and returns its size.
+
+        It is made as a temporary file on this machine first, so that nothing is sent of what fails halfway.
+        """
+        with tempfile.NamedTemporaryFile(prefix="sparklod-") as file:
+            size = sum(map(file.write, pieces))
+            file.flush()
+            with self._opened() as (system, path):
+                system.put_file(file.name, path)
+        return size
+
+    def unlink(self, missing_ok: bool = False) -> None:
+        """Removes the file."""
+        try:
+            with self._opened() as (system, path):
+                system.rm_file(path)
+        except FileNotFoundError:
+            if not missing_ok:
+                raise
+
+    def files(self) -> list[str]:
+        """The names of all files in this folder and those in it, as they are below it."""
+        with self._opened() as (system, path):
+            try:
+                found = system.find(path)
+            except FileNotFoundError:
+                return []
+            root = path.rstrip("/") + "/"
+            return sorted(str(each).removeprefix(root) for each in found)
+
+    @contextlib.contextmanager
+    def _opened(self) -> Iterator[tuple[Any, str]]:
+        """The file system of the address, and what the latter is called there."""
+        system, path = _system(self.url)
+        try:
+            yield system, path
+        except SparklodError:
+            raise
+        except FileNotFoundError:
+            raise FileNotFoundError(errno.ENOENT, "no such file", str(self)) from None
+        except PermissionError as error:
+            raise PermissionError(errno.EACCES, f"no permission ({self._shown(error)})", str(self)) from None
+        except OSError as error:
+            raise OSError(error.errno or errno.EIO, error.strerror or self._shown(error), str(self)) from None
+        except Exception as error:  # packages that talk to services have errors of their own
+            raise OSError(errno.EIO, f"{type(error).__name__}: {self._shown(error)}", str(self)) from None
+
+    def _shown(self, error: Exception) -> str:
+        """The text of an error, which may have the address in it."""
+        return str(error).replace(self.url, str(self))
+
+
+class _Ranged(io.RawIOBase):
+    """A file at an address, whose bytes are asked for when they are read."""
+
+    def __init__(self, address: Address, size: int) -> None:
+        self._address, self._size, self._at = address, size, 0
+
+    def readable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def tell(self) -> int:
+        return self._at
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        self._at = max(0, offset + {io.SEEK_SET: 0, io.SEEK_CUR: self._at, io.SEEK_END: self._size}[whence])
+        return self._at
+
+    def readinto(self, buffer: Any) -> int:
+        view = memoryview(buffer).cast("B")
+        stop = min(self._at + len(view), self._size)
+        if stop <= self._at:
+            return 0
+        data = self._address.read(self._at, stop)
+        view[: len(data)] = data
+        self._at += len(data)
+        return len(data)
+
+
+#: A file or folder, wherever it is.
+Place = Path | Address
+
+
+def place_of(text: str) -> Place:
+    """What a text names: an address, or a path; file:// is a path."""
+    match = ADDRESS.match(text)
+    if match is None:
+        return Path(text)
+    if match[1].lower() == "file":
+        return Path(unquote(urlsplit(text).path))
+    return Address(text)
+
+
+def _cut(url: str) -> tuple[str, str]:
+    """An address before its query, and the query with its mark, which only those of the web have."""
+    if not url.lower().startswith(("http://", "https://")):
+        return url, ""
+    path, mark, query = url.partition("?")
+    return path, mark + query
+
+
+@functools.lru_cache(maxsize=64)
+def _system(url: str) -> tuple[Any, str]:
+    """The file system that opens an address, and what the address is called there."""
+    with optional_import("addresses are opened by fsspec and packages for each service", "sparklod[cloud]"):
+        import fsspec
+
+        try:
+            # Others write at the same time, so a list of files is old at once.
+            system, path = fsspec.core.url_to_fs(url, use_listings_cache=False)
+        except ValueError:
+            known = url.split("://", 1)[0]
+            raise SparklodError(f"nothing is known that opens addresses of {known}://; s3, gs and az are") from None
+    return system, path

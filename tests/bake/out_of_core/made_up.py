@@ -1,0 +1,90 @@
+"""Tasks of a few lines, and a job of them, for the tests of engines."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from sparklod_cli.bake.out_of_core.contracts import Store, Task
+from sparklod_cli.support.errors import ScratchError
+
+
+@dataclass(frozen=True)
+class Job:
+    """A job that has nothing but a store."""
+
+    store: Store
+
+
+def add_up(job: Job, name: str, needs: tuple[str, ...], seconds: float, **_: Any) -> None:
+    """Puts 1 and the sum of what it needs, and which process it was."""
+    time.sleep(seconds)
+    total = 1 + sum(int(job.store.get(need)["total"][0]) for need in needs)
+    job.store.put(name, {"total": np.array([total]), "process": np.array([os.getpid()])})
+
+
+def _once(job: Job, name: str) -> bool:
+    """Whether this is the first call for a task."""
+    first = not job.store.has(f"tried/{name}")
+    job.store.put(f"tried/{name}", {"at": np.zeros(1)})
+    return first
+
+
+def die_once(job: Job, name: str, **more: Any) -> None:
+    """Kills its process at the first try."""
+    if _once(job, name):
+        os.kill(os.getpid(), signal.SIGKILL)
+    add_up(job, name, (), 0, **more)
+
+
+def die(job: Job, name: str, **_: Any) -> None:
+    """Kills its process."""
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def stumble_once(job: Job, name: str, **more: Any) -> None:
+    """Loses its connection at the first try."""
+    if _once(job, name):
+        raise ConnectionResetError("reset by peer")
+    add_up(job, name, (), 0, **more)
+
+
+def fill_disk(job: Job, name: str, **_: Any) -> None:
+    """Finds no room; notes each try."""
+    tries = sum(job.store.has(f"tried/{name}/{number}") for number in range(9))
+    job.store.put(f"tried/{name}/{tries}", {"at": np.zeros(1)})
+    raise ScratchError("there is no room left in the scratch folder /scratch")
+
+
+def devour(job: Job, name: str, **_: Any) -> None:
+    """Takes memory until somebody ends it."""
+    held = []
+    while True:
+        held.append(np.ones(5_000_000))
+        time.sleep(0.02)
+
+
+def tree_of(count: int, *, seconds: float = 0.0) -> list[Task]:
+    """Leaves, and joins of four each, until one is left; the last task's total is the number of tasks."""
+    tasks, names = [], [f"leaf/{number}" for number in range(count)]
+    tasks = [Task(name, add_up, (name, (), seconds), weight=10) for name in names]
+    while len(names) > 1:
+        groups = [tuple(names[at : at + 4]) for at in range(0, len(names), 4)]
+        names = [f"join/{len(tasks) + number}" for number in range(len(groups))]
+        tasks += [Task(name, add_up, (name, needs, seconds), needs) for name, needs in zip(names, groups, strict=True)]
+    return tasks
+
+
+def call(number: int, *, failing: int = -1) -> int:
+    """Twice a number, later the smaller it is."""
+    return refuse(number) if number == failing else number * 2
+
+
+def refuse(number: int) -> int:
+    """Fails."""
+    raise ScratchError(f"no {number}")

@@ -1,0 +1,80 @@
+"""Schedulers that are not there, or go away."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("distributed")
+
+import distributed
+
+from sparklod_cli.bake.out_of_core import cluster as module
+from sparklod_cli.bake.out_of_core.cluster import ClusterSettings, cluster
+from sparklod_cli.bake.out_of_core.store import FolderStore
+from sparklod_cli.support.errors import SparklodError
+from sparklod_cli.support.progress import silent
+
+from .made_up import Job, tree_of
+
+
+@pytest.fixture
+def scheduler(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """A scheduler with a worker, in this process."""
+    monkeypatch.setattr(module, "PATIENCE", 0.5)
+    with module._quiet():
+        yield from _scheduler()
+
+
+def _scheduler() -> Any:
+    own = distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=False, protocol="tcp", dashboard_address=None
+    )
+    try:
+        yield own
+    finally:
+        with contextlib.suppress(TimeoutError):  # a test closed it
+            own.close(timeout=1)
+
+
+def test_a_scheduler_that_runs_is_used_and_left_alone(scheduler: Any, tmp_path: Path) -> None:
+    job, address = Job(FolderStore(tmp_path)), scheduler.scheduler_address.removeprefix("tcp://")
+    said: list[str] = []
+    for count in (4, 8):
+        tasks = tree_of(count)
+        with cluster(ClusterSettings(scheduler=address), say=said.append) as engine:
+            engine.run("building", tasks, job, silent)
+        assert job.store.has(tasks[-1].name)
+    assert len(said) == 2 and "dashboard" in said[0]
+
+
+def test_a_scheduler_that_goes_away_keeps_what_is_done(scheduler: Any, tmp_path: Path) -> None:
+    job, tasks = Job(FolderStore(tmp_path)), tree_of(64, seconds=0.05)
+    with cluster(ClusterSettings(scheduler=scheduler.scheduler_address)) as engine:
+        threading.Timer(0.5, lambda: scheduler.loop.add_callback(scheduler.scheduler.close)).start()
+        with pytest.raises(SparklodError, match=r"scheduler of the cluster does not answer any more.*add --resume"):
+            engine.run("building", tasks, job, silent)
+    assert job.store.has(tasks[0].name) and not job.store.has(tasks[-1].name)
+
+
+def test_a_cluster_without_workers_is_refused(scheduler: Any) -> None:
+    scheduler.scale(0)
+    with (
+        pytest.raises(SparklodError, match=r"has no workers; start some with dask worker tcp://"),
+        cluster(ClusterSettings(scheduler=scheduler.scheduler_address)),
+    ):
+        pass
+
+
+@pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "127.0.0.1:9", "nonsense://x:1"])
+def test_an_address_without_a_scheduler_is_refused(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "PATIENCE", 0.2)
+    with (
+        pytest.raises(SparklodError, match=r"no scheduler answers at .*; start one with dask scheduler"),
+        cluster(ClusterSettings(scheduler=address)),
+    ):
+        pass
