@@ -14,6 +14,7 @@ from ..model.lod_tree import LodTree
 from ..model.scene import Scene
 from ..model.splats import Splats
 from ..model.transforms import Transform
+from ..support.addresses import Place
 from ..support.errors import InvalidSplatsError, memory_errors_translated
 from ..support.progress import Progress, silent
 from ..support.threads import on_threads
@@ -68,8 +69,8 @@ _Made = tuple[Splats, LodTree, int, dict[str, int]]
 
 
 def bake(
-    source: Path,
-    target: Path,
+    source: Place,
+    target: Place,
     settings: BakeSettings,
     *,
     overwrite: bool = False,

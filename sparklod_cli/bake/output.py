@@ -21,6 +21,7 @@ from ..io import SceneSink, Sink, scene_sink, sink
 from ..model.nodes import CHUNK_NODES
 from ..model.scene import Scene
 from ..model.streams import NodeStream
+from ..support.addresses import Place
 from ..support.errors import FormatError
 from ..support.progress import Progress
 from .settings import BakeSettings
@@ -101,7 +102,7 @@ class Output(Protocol):
         """
 
 
-def output_of(target: Path, settings: BakeSettings, *, overwrite: bool) -> Output:
+def output_of(target: Place, settings: BakeSettings, *, overwrite: bool) -> Output:
     """The output that settings ask for; fails now if it cannot be written later.
 
     Raises:

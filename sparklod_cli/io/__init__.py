@@ -2,6 +2,7 @@
 
 from .beside import companions
 from .chunks import read_rad_chunk, read_rad_header
+from .identity import Identity, content_of, files_of, identity_of
 from .names import is_file_name
 from .reading import examine_scene, opened, read_arrays, read_scene, size_of_input
 from .scenes import SceneSink, scene_sink
@@ -12,13 +13,17 @@ from .writing import Sink, check_writable, sink, write_stdout, write_whole
 
 __all__ = [
     "MAX_TEXT",
+    "Identity",
     "SceneSink",
     "Sink",
     "SinkTogether",
     "check_writable",
     "chunk_files",
     "companions",
+    "content_of",
     "examine_scene",
+    "files_of",
+    "identity_of",
     "is_file_name",
     "open_stream",
     "opened",

@@ -10,6 +10,7 @@ from ..codecs.encoder import Encoder, Get
 from ..codecs.formats import Format
 from ..codecs.options import WriteOptions
 from ..model.scene import Scene
+from ..support.addresses import Address, Place
 from ..support.progress import Progress, silent
 from .together import SinkTogether, sink_together
 from .writing import Sink, sink
@@ -21,13 +22,13 @@ class SceneSink:
 
     Attributes:
         form: that is written.
-        whole: writes one file.
+        whole: writes one file; None for several.
         together: writes a header and its chunks; None for one file.
         stem: of the names of chunks.
     """
 
     form: Format
-    whole: Sink
+    whole: Sink | None
     together: SinkTogether | None
     stem: str
 
@@ -38,8 +39,9 @@ class SceneSink:
             OutputError: see `scene_sink`; and what the codec raises.
         """
         codec = self.form.codec()
-        if self.together is None:
+        if self.whole is not None:
             return self.whole(codec.encode(scene, options, threads=threads, progress=progress))
+        assert self.together is not None
         return self.together(codec.encode_chunked(scene, options, self.stem, threads=threads, progress=progress))
 
     def assemble(self, encoder: Encoder, get: Get, *, threads: int = 1, progress: Progress = silent) -> int:
@@ -54,12 +56,13 @@ class SceneSink:
         Raises:
             OutputError: see `scene_sink`.
         """
-        if self.together is None:
+        if self.whole is not None:
             return self.whole(encoder.pieces(get, threads=threads, progress=progress))
+        assert self.together is not None
         return self.together(self.form.codec().assemble_chunked(encoder, get, self.stem, progress=progress))
 
 
-def scene_sink(path: Path, form: Format, *, chunked: bool = False, overwrite: bool) -> SceneSink:
+def scene_sink(path: Place, form: Format, *, chunked: bool = False, overwrite: bool) -> SceneSink:
     """What writes a scene in a format. Fails now if the output cannot be written later.
 
     Args:
@@ -71,6 +74,7 @@ def scene_sink(path: Path, form: Format, *, chunked: bool = False, overwrite: bo
     Raises:
         OutputError: see `sink` and `sink_together`. Writing raises that, too, and what the codec raises.
     """
-    together = sink_together(path, overwrite=overwrite) if chunked else None
-    stem = Path(os.path.realpath(path)).stem
-    return SceneSink(form, sink(path, overwrite=overwrite), together, stem)
+    stem = path.stem if isinstance(path, Address) else Path(os.path.realpath(path)).stem
+    if chunked:
+        return SceneSink(form, None, sink_together(path, overwrite=overwrite), stem)
+    return SceneSink(form, sink(path, overwrite=overwrite), None, stem)

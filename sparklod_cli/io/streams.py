@@ -15,6 +15,7 @@ from typing import Any, BinaryIO, Protocol
 from ..model.splats import Splats
 from ..model.streams import SceneStream
 from ..support import atomic
+from ..support.addresses import Address, Place
 from ..support.errors import FormatError, OutputError
 from ..support.progress import Progress, silent
 from ..support.stdin import DASH
@@ -27,7 +28,7 @@ Pieces = Callable[[], Iterable[bytes]]
 
 @contextlib.contextmanager
 def open_stream(
-    path: Path,
+    path: Place,
     *,
     scratch: Path | None = None,
     keep: bool = False,
@@ -69,7 +70,7 @@ def open_stream(
 class _Store(Protocol):
     """Where the one file is that is unpacked."""
 
-    def file(self, path: Path, pieces: Pieces) -> contextlib.AbstractContextManager[BinaryIO]:
+    def file(self, path: Place, pieces: Pieces) -> contextlib.AbstractContextManager[BinaryIO]:
         """What has been unpacked of a file; `pieces` are written first if they have not been."""
 
     def close(self) -> None:
@@ -84,7 +85,7 @@ class _Unnamed:
     _file: BinaryIO | None = None
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
-    def file(self, path: Path, pieces: Pieces) -> contextlib.AbstractContextManager[BinaryIO]:
+    def file(self, path: Place, pieces: Pieces) -> contextlib.AbstractContextManager[BinaryIO]:
         with self._lock:
             if self._file is None:
                 with _room(self.folder), contextlib.ExitStack() as stack:
@@ -111,7 +112,7 @@ class _Folder:
 
     folder: Path
 
-    def file(self, path: Path, pieces: Pieces) -> contextlib.AbstractContextManager[BinaryIO]:
+    def file(self, path: Place, pieces: Pieces) -> contextlib.AbstractContextManager[BinaryIO]:
         target = self.folder / f"{_digest(path)}.unpacked"
         with _LOCKS.setdefault(target, threading.Lock()), _room(self.folder):
             if not target.exists():
@@ -123,10 +124,13 @@ class _Folder:
         pass
 
 
-def _digest(path: Path) -> str:
+def _digest(path: Place) -> str:
     """A name for this version of a file."""
-    status = None if path == DASH else path.stat()
-    parts = (path.absolute(), *((status.st_size, status.st_mtime_ns) if status else ()))
+    if isinstance(path, Address):
+        parts: tuple[Any, ...] = (path.url, path.version())
+    else:
+        status = None if path == DASH else path.stat()
+        parts = (path.absolute(), *((status.st_size, status.st_mtime_ns) if status else ()))
     return hashlib.sha256("\n".join(map(str, parts)).encode("utf-8", "surrogateescape")).hexdigest()[:32]
 
 
@@ -144,7 +148,7 @@ def _room(folder: Path | None) -> Iterator[None]:
 class _Source:
     """A file, and what opens it."""
 
-    path: Path
+    path: Place
     store: _Store
     threads: int
     progress: Progress
