@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import time
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -14,6 +13,7 @@ from .codecs.options import WriteOptions
 from .codecs.spz_options import like
 from .io import read_scene, scene_sink
 from .model.scene import Scene
+from .support.addresses import Place
 from .support.errors import FormatError, memory_errors_translated
 from .support.progress import Progress, silent
 
@@ -53,8 +53,8 @@ def leaves_of(scene: Scene) -> Scene:
 
 
 def extract_leaves(
-    source: Path,
-    target: Path,
+    source: Place,
+    target: Place,
     options: WriteOptions,
     *,
     suffix: str,

@@ -43,7 +43,7 @@ class Positioned:
     def __init__(self, file: BinaryIO) -> None:
         self._file = file
         self._lock = threading.Lock()
-        plain = isinstance(file, (io.BufferedReader, io.BufferedRandom)) and hasattr(os, "pread")
+        plain = isinstance(getattr(file, "raw", None), io.FileIO) and hasattr(os, "pread")
         self._descriptor = file.fileno() if plain else None
 
     def read(self, at: int, size: int) -> bytes:

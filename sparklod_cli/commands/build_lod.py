@@ -6,12 +6,12 @@ import dataclasses
 import functools
 import json
 from collections.abc import Callable
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from ..codecs.rad.names import SUFFIX as RAD
+from ..support.addresses import Place
 from ..support.errors import SparklodError
 from ..support.printable import MOST, shortened
 from ..support.stdin import DASH, name_of
@@ -46,16 +46,17 @@ Examples:
 
 
 @click.command("build-lod", cls=Command, epilog=EXAMPLES, context_settings={"show_default": True})
-@click.argument("inputs", metavar="INPUT...", nargs=-1, required=True, type=InputPath(stdin=True))
+@click.argument("inputs", metavar="INPUT...", nargs=-1, required=True, type=InputPath(stdin=True, addresses=True))
 @output_option(
     "Output of a single input; - is standard output.  [default: NAME-lod.spz beside the input;"
-    " NAME-lod.rad with --format rad, NAME-lod.npz with --encoding, NAME-unlod.spz with --unlod]"
+    " NAME-lod.rad with --format rad, NAME-lod.npz with --encoding, NAME-unlod.spz with --unlod]",
+    addresses=True,
 )
 @option(
     "--output-dir",
     heading=COMMON,
     metavar="DIR",
-    type=OutputPath(folder=True),
+    type=OutputPath(folder=True, addresses=True),
     help="Folder for the outputs; created if it does not exist.",
     show_default=False,
 )
@@ -70,7 +71,7 @@ Examples:
 @baking_options
 @common_options
 @click.pass_context
-def build_lod(ctx: click.Context, /, inputs: tuple[Path, ...], **_: Any) -> None:
+def build_lod(ctx: click.Context, /, inputs: tuple[Place, ...], **_: Any) -> None:
     """Bake splat files into Level-of-Detail files for Spark.
 
     Reads PLY (also PlayCanvas's compressed PLY), SPZ, RAD, SOG (.sog, or a folder with a meta.json), .splat and
@@ -104,7 +105,7 @@ def build_lod(ctx: click.Context, /, inputs: tuple[Path, ...], **_: Any) -> None
         ctx.exit(1)
 
 
-def _check(ctx: click.Context, inputs: tuple[Path, ...], outputs: Outputs, general: General) -> None:
+def _check(ctx: click.Context, inputs: tuple[Place, ...], outputs: Outputs, general: General) -> None:
     """Raises a `click.UsageError` where options contradict each other, or the names of files."""
     if outputs.output is not None:
         if outputs.output_dir is not None:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import click
 
 from ..codecs.formats import FORMATS, WRITABLE
 from ..codecs.gpu.table import NPZ, RAW_SUFFIXES
+from ..support.addresses import Place
 from ..support.stdin import DASH
 from .options.baking import FORMS, OF_BOTH, OF_PLACE, OF_RAD, OF_SELECTION, OF_SPZ, OF_TREES
 from .paths import stem_of
@@ -35,8 +35,8 @@ class Outputs:
         encoding: of array files.
     """
 
-    output: Path | None
-    output_dir: Path | None
+    output: Place | None
+    output_dir: Place | None
     overwrite: bool
     unlod: bool
     form: str | None
@@ -69,11 +69,11 @@ class Outputs:
         """Whether somebody chose the format, by --format or by a name."""
         return self.form is not None or self.named_suffix in TREES
 
-    def target(self, source: Path) -> Path:
+    def target(self, source: Place) -> Place:
         """Where an input goes."""
         return self.output or (self.output_dir or source.parent) / self._name(source)
 
-    def _name(self, source: Path) -> str:
+    def _name(self, source: Place) -> str:
         stem = stem_of(source)
         if self.unlod:
             return f"{stem.removesuffix('-lod')}-unlod{self.suffix}"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import os
-import re
 import stat
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -13,6 +12,7 @@ from typing import Any
 
 import click
 
+from ..support.addresses import Address, Place, place_of
 from ..support.stdin import DASH
 from .console import is_terminal
 from .usage import flag_of
@@ -20,36 +20,40 @@ from .usage import flag_of
 #: What a place is taken by.
 INPUT, OUTPUT = "an input", "an output"
 
-#: How addresses begin. A letter and a colon alone are a drive of Windows.
-URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+://")
-
 
 class _NamedPath(click.Path):
     """A path as it was given. Whether it can be opened turns out when it is opened, so that one file fails alone."""
 
     _to_do = ""
 
-    def __init__(self, *, folder: bool = False, suffixes: Sequence[str] = ()) -> None:
+    def __init__(self, *, folder: bool = False, suffixes: Sequence[str] = (), addresses: bool = False) -> None:
         super().__init__(path_type=Path, file_okay=not folder, readable=False)
         self.folder = folder
         self.suffixes = suffixes
+        self.addresses = addresses
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         text = os.fsdecode(value)
         if not text:
             self.fail("the name is empty", param, ctx)
-        if URL.match(text):
-            self.fail(f"{text!r} is an address on a network, not a path; {self._to_do}", param, ctx)
-        return super().convert(value, param, ctx)
+        place = place_of(text)
+        if isinstance(place, Path):
+            return super().convert(os.fspath(place), param, ctx)
+        if not self.addresses:
+            self.fail(f"'{place}' is an address on a network, not a path; {self._to_do}", param, ctx)
+        return place
 
 
 class InputPath(_NamedPath):
-    """A file or folder that a command reads; with `stdin` also -, which is standard input."""
+    """A file or folder that a command reads; with `stdin` also -, which is standard input.
+
+    With `addresses`, also s3://bucket/file and the like.
+    """
 
     _to_do = "download it first"
 
-    def __init__(self, *, stdin: bool = False) -> None:
-        super().__init__()
+    def __init__(self, *, stdin: bool = False, addresses: bool = False) -> None:
+        super().__init__(addresses=addresses)
         self.stdin = stdin
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
@@ -62,13 +66,14 @@ class InputPath(_NamedPath):
 class OutputPath(_NamedPath):
     """A file that a command writes, or with `folder` a folder that it fills.
 
-    With `suffixes`, that is all it is written as: `keep_apart` refuses a name that promises something else.
+    With `suffixes`, that is all it is written as: `keep_apart` refuses a name that promises something else. With
+    `addresses`, also s3://bucket/file and the like.
     """
 
     _to_do = "write a file and upload that"
 
 
-def keep_apart(ctx: click.Context, stands_for: Mapping[str, Iterable[Path]] | None = None) -> None:
+def keep_apart(ctx: click.Context, stands_for: Mapping[str, Iterable[Place]] | None = None) -> None:
     """Raises a `click.UsageError` if an output of a command is also an input or another output of it.
 
     Also raises one if the suffix of an output is that of another format than what is written.
@@ -82,9 +87,9 @@ def keep_apart(ctx: click.Context, stands_for: Mapping[str, Iterable[Path]] | No
             and those that are written into an output folder.
     """
     stands_for = stands_for or {}
-    inputs: list[Path] = []
-    outputs: list[Path] = []
-    promised: list[tuple[click.Parameter, OutputPath, Path]] = []
+    inputs: list[Place] = []
+    outputs: list[Place] = []
+    promised: list[tuple[click.Parameter, OutputPath, Place]] = []
     for parameter in ctx.command.params:
         kind, value, more = parameter.type, ctx.params.get(parameter.name or ""), stands_for.get(parameter.name or "")
         values = [] if value is None else list(value) if isinstance(value, tuple) else [value]
@@ -103,11 +108,14 @@ def keep_apart(ctx: click.Context, stands_for: Mapping[str, Iterable[Path]] | No
             )
 
 
-def with_chunks(headers: Iterable[Path]) -> list[Path]:
+def with_chunks(headers: Iterable[Place]) -> list[Place]:
     """Outputs whose chunks are files of their own, and the files beside them that are replaced or removed with them."""
     from ..io import chunk_files
 
-    return [path for header in headers for path in (header, *chunk_files(header))]
+    chunks: list[Place] = []
+    for header in headers:
+        chunks += [header, *(chunk_files(header) if isinstance(header, Path) else ())]
+    return chunks
 
 
 def claim_stdout(ctx: click.Context, name: str, *, as_json: bool, binary: bool = False) -> None:
@@ -128,7 +136,7 @@ def claim_stdout(ctx: click.Context, name: str, *, as_json: bool, binary: bool =
         raise click.UsageError(f"{flag} - writes binary data; redirect it to a file or a pipe")
 
 
-def _keep_apart(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:
+def _keep_apart(outputs: Iterable[Place], inputs: Iterable[Place]) -> None:
     files = set[tuple[int, int]]()
     places = dict[str, str]()
     for path in _all_read(inputs):
@@ -148,7 +156,7 @@ def _keep_apart(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:
         places[place] = OUTPUT
 
 
-def _all_read(paths: Iterable[Path]) -> Iterator[Path]:
+def _all_read(paths: Iterable[Place]) -> Iterator[Place]:
     """Each path and its companion files."""
     from ..cameras.formats.table import NAMES
     from ..io import companions
@@ -157,11 +165,14 @@ def _all_read(paths: Iterable[Path]) -> Iterator[Path]:
         if path == DASH:
             continue
         yield path
-        yield from companions(path, NAMES)
+        if isinstance(path, Path):
+            yield from companions(path, NAMES)
 
 
-def _identity(path: Path) -> tuple[int, int] | None:
-    """Device and inode of a file; None if it does not exist."""
+def _identity(path: Place) -> tuple[int, int] | None:
+    """Device and inode of a file; None if it does not exist, or is at an address."""
+    if isinstance(path, Address):
+        return None
     try:
         found = path.stat()
     except (OSError, ValueError):
@@ -169,7 +180,9 @@ def _identity(path: Path) -> tuple[int, int] | None:
     return found.st_dev, found.st_ino
 
 
-def _is_stream(path: Path) -> bool:
+def _is_stream(path: Place) -> bool:
+    if isinstance(path, Address):
+        return False
     try:
         mode = path.stat().st_mode
     except (OSError, ValueError):
@@ -177,8 +190,10 @@ def _is_stream(path: Path) -> bool:
     return not (stat.S_ISREG(mode) or stat.S_ISDIR(mode))
 
 
-def _place(path: Path) -> str:
-    """The path of a file that exists or not: the same for all links and spellings."""
+def _place(path: Place) -> str:
+    """The path of a file that exists or not: the same for all links and spellings. Or its address."""
+    if isinstance(path, Address):
+        return path.url
     place = os.path.realpath(path)
     folder = os.path.dirname(place)  # noqa: PTH120
     return os.path.join(folder, os.path.basename(place).casefold()) if _folds_case(folder) else place  # noqa: PTH118, PTH119
@@ -194,9 +209,9 @@ def _folds_case(folder: str) -> bool:
         return False
 
 
-def stem_of(source: Path) -> str:
+def stem_of(source: Place) -> str:
     """What outputs made of an input are named after: the input, or its folder where it is an unpacked SOG."""
-    whole = source.absolute()
+    whole = source if isinstance(source, Address) else source.absolute()
     return whole.parent.name if source.name == "meta.json" else whole.stem or whole.name
 
 

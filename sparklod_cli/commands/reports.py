@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..support.addresses import Place
 from ..support.stdin import DASH, name_of
 from .console import Console, count_of, size_of
 
@@ -41,7 +41,7 @@ CLAMPED_BY_RAD = {
 }
 
 
-def report_baked(console: Console, source: Path, target: Path, baked: Baked) -> None:
+def report_baked(console: Console, source: Place, target: Place, baked: Baked) -> None:
     """A line about the file, and one for each thing that a person should know."""
     from ..model.selection import describe
 
@@ -90,7 +90,7 @@ def _clamped(clamp: Clamp, baked: Baked) -> str:
     )
 
 
-def report_extracted(console: Console, source: Path, target: Path, extracted: Extracted) -> None:
+def report_extracted(console: Console, source: Place, target: Place, extracted: Extracted) -> None:
     """A line about the file."""
     console.say(
         f"{name_of(source)}  {count_of(extracted.nodes, 'node')}  ->  {_name(target)} "
@@ -100,7 +100,7 @@ def report_extracted(console: Console, source: Path, target: Path, extracted: Ex
     console.detail(f"  {extracted.format}; {_stages(extracted.seconds)}")
 
 
-def _name(target: Path) -> str:
+def _name(target: Place) -> str:
     return "standard output" if target == DASH else str(target)
 
 

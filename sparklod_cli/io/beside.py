@@ -10,6 +10,7 @@ from typing import BinaryIO
 from ..codecs.formats import HEAD
 from ..codecs.rad import header as rad_header
 from ..codecs.sog_files import MAX_META, META, names_beside
+from ..support.addresses import Place
 from ..support.errors import FormatError, UnreadableError
 from ..support.stdin import DASH
 from ..support.untrusted import quoted_value
@@ -50,7 +51,7 @@ def _named_in(path: Path) -> list[str]:
     return []
 
 
-def in_folder(folder: Path) -> Path:
+def in_folder(folder: Place) -> Place:
     """The splat file that a folder stands for; `UnreadableError` where it holds no unpacked SOG."""
     path = folder / META
     if not path.is_file():
@@ -60,19 +61,24 @@ def in_folder(folder: Path) -> Path:
 
 def path_beside(first: Path, name: str) -> Path:
     """Where a file would be that another one names; `FormatError` where the name could lead out of their folder."""
-    if leads_away(name):
-        raise FormatError(f"it names {quoted_value(name)}, which is not a file beside it")
+    _check_name(name)
     return first.parent / name
 
 
-def open_beside(first: Path, name: str) -> BinaryIO:
+def open_beside(first: Place, name: str) -> BinaryIO:
     """Opens a file that another one names; `FormatError` where the name could lead out of their folder."""
     if first == DASH:
         raise FormatError(f"it names {quoted_value(name)}, but standard input has no folder; give the path instead")
-    path = path_beside(first, name)
+    _check_name(name)
+    path = first.parent / name
     try:
         if path.exists() and not path.is_file():
             raise FormatError(f"{quoted_value(name)}, which it names, is not a file")
         return path.open("rb")
     except OSError as error:
         raise FormatError(f"{quoted_value(name)}, which it names, cannot be read: {reason_of(error)}") from None
+
+
+def _check_name(name: str) -> None:
+    if leads_away(name):
+        raise FormatError(f"it names {quoted_value(name)}, which is not a file beside it")

@@ -19,8 +19,9 @@ from .reading import opened
 #: Name of the format in `codecs.formats`.
 FORMAT = "RAD"
 
-#: Files whose decoded columns take more bytes than this, or than this share of the free memory, are read chunk by chunk:
-#: what is computed of them takes as much again, and it is no slower (docs/decisions/2026-11-22-files-larger-than-memory.md).
+#: Files whose decoded columns take more bytes than this, or than this share of the free memory, are read chunk by
+#: chunk: what is computed of them takes as much again, and chunk by chunk is no slower
+#: (docs/decisions/2026-11-22-files-larger-than-memory.md).
 AT_ONCE, SHARE = 1 << 28, 0.25
 
 

@@ -14,6 +14,7 @@ from ..codecs.gpu import dump
 from ..codecs.gpu.table import NPZ, RAW_SUFFIXES
 from ..model.scene import Scene
 from ..model.splats import COLUMNS
+from ..support.addresses import Place, size_of
 from ..support.errors import UnknownFormatError, UnreadableError
 from ..support.progress import Progress, silent
 from ..support.stdin import DASH, spooled
@@ -24,7 +25,7 @@ from .names import reason_of
 ZIP = b"PK\x03\x04"
 
 
-def read_scene(path: Path, *, threads: int = 1, progress: Progress = silent) -> Scene:
+def read_scene(path: Place, *, threads: int = 1, progress: Progress = silent) -> Scene:
     """Reads a splat file of any known format, told by its content, or else by its suffix.
 
     Args:
@@ -41,7 +42,7 @@ def read_scene(path: Path, *, threads: int = 1, progress: Progress = silent) -> 
 
 
 def examine_scene(
-    path: Path, *, columns: Collection[str] = COLUMNS, threads: int = 1, progress: Progress = silent
+    path: Place, *, columns: Collection[str] = COLUMNS, threads: int = 1, progress: Progress = silent
 ) -> Scene:
     """Reads a splat file for a report on it: its tree may be broken, and columns that are not asked for may be 0.
 
@@ -64,7 +65,7 @@ def examine_scene(
 
 
 @contextlib.contextmanager
-def opened(path: Path) -> Iterator[tuple[BinaryIO, Format, dict[str, Any]]]:
+def opened(path: Place) -> Iterator[tuple[BinaryIO, Format, dict[str, Any]]]:
     """A splat file of any known format, the format, and what else its codec takes.
 
     Raises:
@@ -121,17 +122,17 @@ def read_arrays(path: Path) -> dump.Arrays | None:
         return None
 
 
-def _file_of(path: Path) -> contextlib.AbstractContextManager[BinaryIO]:
+def _file_of(path: Place) -> contextlib.AbstractContextManager[BinaryIO]:
     """A file that is closed at the end, or standard input, which is not."""
     return contextlib.nullcontext(spooled()) if path == DASH else path.open("rb")
 
 
-def size_of_input(path: Path) -> int | None:
+def size_of_input(path: Place) -> int | None:
     """Bytes of a file, or of standard input; None where that cannot be told."""
     try:
         if path == DASH:
             return spooled().seek(0, os.SEEK_END)
-        return path.stat().st_size if path.is_file() else None
+        return size_of(path) if path.is_file() else None
     except UnreadableError:
         return None
     except OSError:

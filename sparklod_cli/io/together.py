@@ -9,9 +9,11 @@ from pathlib import Path
 
 from ..codecs.rad.names import CHUNK_SUFFIX, number_of
 from ..support import atomic_set
+from ..support.addresses import Address, Place
 from ..support.errors import OutputError
 from ..support.stdin import DASH
 from .names import reason_of
+from .uploads import check_together, upload_together
 from .writing import check_writable
 
 #: The name and content of each file; the header comes last.
@@ -35,7 +37,7 @@ def chunk_files(path: Path) -> list[Path]:
     return [found[number] for number in sorted(number for number in found if number is not None)]
 
 
-def write_together(path: Path, files: Files, *, overwrite: bool) -> int:
+def write_together(path: Place, files: Files, *, overwrite: bool) -> int:
     """Writes a header and the files of its chunks, all or none of them, and returns their size; makes their folder.
 
     With `overwrite`, chunks of a longer output that was there before are removed. See `atomic_set.write` for what an
@@ -50,6 +52,8 @@ def write_together(path: Path, files: Files, *, overwrite: bool) -> int:
     Raises:
         OutputError: a file exists and `overwrite` is not set, or the file system refused something.
     """
+    if isinstance(path, Address):
+        return upload_together(path, files, overwrite=overwrite)
     _check(path, overwrite=overwrite)
     target = Path(os.path.realpath(path))
     placed = ((name if name.endswith(CHUNK_SUFFIX) else target.name, pieces) for name, pieces in files)
@@ -67,7 +71,7 @@ def write_together(path: Path, files: Files, *, overwrite: bool) -> int:
         raise OutputError(f"cannot write {path}: {reason_of(error)}") from None
 
 
-def sink_together(path: Path, *, overwrite: bool) -> SinkTogether:
+def sink_together(path: Place, *, overwrite: bool) -> SinkTogether:
     """The function that writes a header and the files of its chunks. Fails now if they cannot be written later.
 
     Raises:
@@ -77,7 +81,10 @@ def sink_together(path: Path, *, overwrite: bool) -> SinkTogether:
     return functools.partial(write_together, path, overwrite=overwrite)
 
 
-def _check(path: Path, *, overwrite: bool) -> None:
+def _check(path: Place, *, overwrite: bool) -> None:
+    if isinstance(path, Address):
+        check_together(path, overwrite=overwrite)
+        return
     if path == DASH:
         raise OutputError("standard output cannot take several files; name a file")
     check_writable(path, overwrite=overwrite)

@@ -9,16 +9,18 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from ..support import atomic
+from ..support.addresses import Address, Place
 from ..support.errors import OutputError, StdoutError
 from ..support.stdin import DASH
 from ..support.stdout import ReaderGoneError, guarded
 from .names import reason_of
+from .uploads import check_address, upload
 
 #: Writes the pieces of an output and returns how many bytes it wrote.
 Sink = Callable[[Iterable[bytes]], int]
 
 
-def check_writable(path: Path, *, overwrite: bool) -> None:
+def check_writable(path: Place, *, overwrite: bool) -> None:
     """Raises `OutputError` where an output cannot be written, before work goes into it.
 
     Folders on the way to it that do not exist are no error: `write_whole` makes them.
@@ -27,6 +29,9 @@ def check_writable(path: Path, *, overwrite: bool) -> None:
         path: of the output.
         overwrite: an existing file may be replaced.
     """
+    if isinstance(path, Address):
+        check_address(path, overwrite=overwrite)
+        return
     try:
         if path.is_dir():
             raise OutputError(f"{path} is a directory")
@@ -40,7 +45,7 @@ def check_writable(path: Path, *, overwrite: bool) -> None:
         raise OutputError(f"cannot write {path}: {reason_of(error)}") from None
 
 
-def write_whole(path: Path, pieces: Iterable[bytes], *, overwrite: bool) -> int:
+def write_whole(path: Place, pieces: Iterable[bytes], *, overwrite: bool) -> int:
     """Writes a file so that it appears complete or not at all, and returns its size; makes its folder if need be.
 
     It gets its name when it is filled and synced, see `whole`; an interruption leaves nothing behind.
@@ -48,6 +53,8 @@ def write_whole(path: Path, pieces: Iterable[bytes], *, overwrite: bool) -> int:
     Raises:
         OutputError: it exists and `overwrite` is not set, or the file system refused something.
     """
+    if isinstance(path, Address):
+        return upload(path, pieces, overwrite=overwrite)
     check_writable(path, overwrite=overwrite)
     try:
         if path.exists() and not path.is_file():  # a pipe or a device is written to, never replaced
@@ -62,7 +69,7 @@ def write_whole(path: Path, pieces: Iterable[bytes], *, overwrite: bool) -> int:
         raise OutputError(f"cannot write {path}: {reason_of(error)}") from None
 
 
-def sink(path: Path, *, overwrite: bool) -> Sink:
+def sink(path: Place, *, overwrite: bool) -> Sink:
     """The function that writes an output; - is standard output. Fails now if the output cannot be written later.
 
     Raises:

@@ -105,6 +105,11 @@ class Address:
             raise OSError(f"{self} does not tell its size; download it first")
         return int(size)
 
+    def version(self) -> str:
+        """A text that is another one when the file was changed."""
+        with self._opened() as (system, path):
+            return str(system.ukey(path))
+
     def open(
         self, mode: Literal["rb"] = "rb", buffering: int = READ_AHEAD, *, size: int | None = None
     ) -> io.BufferedReader:
@@ -220,6 +225,11 @@ def place_of(text: str) -> Place:
     if match[1].lower() == "file":
         return Path(unquote(urlsplit(text).path))
     return Address(text)
+
+
+def size_of(place: Place) -> int:
+    """Bytes of a file, wherever it is."""
+    return place.size() if isinstance(place, Address) else place.stat().st_size
 
 
 def _cut(url: str) -> tuple[str, str]:

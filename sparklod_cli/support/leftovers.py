@@ -37,6 +37,19 @@ def lock(descriptor: int) -> None:
             fcntl.flock(descriptor, fcntl.LOCK_EX)
 
 
+def try_lock(descriptor: int) -> bool:
+    """Locks a file as `lock` does, without waiting; returns False if somebody else has locked it."""
+    if fcntl is None:
+        return True
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:  # a file system without locks
+        return True
+    return True
+
+
 @functools.lru_cache(256)
 def sweep(folder: Path) -> None:
     """Removes what killed writers have left in a folder; once, as it may get thousands of files."""

@@ -9,13 +9,14 @@ import tempfile
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from .addresses import Place
 from .errors import UnreadableError
 
 #: The path that means standard input or output.
 DASH = Path("-")
 
 
-def name_of(path: Path) -> str:
+def name_of(path: Place) -> str:
     """The name of an input in messages."""
     return "standard input" if path == DASH else str(path)
 

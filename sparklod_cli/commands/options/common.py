@@ -81,9 +81,10 @@ def overwrite_option(command: Command) -> Command:
     return option("-f", "--overwrite", heading=COMMON, is_flag=True, help="Replace outputs that exist.")(command)
 
 
-def output_option(text: str) -> Callable[[Command], Command]:
-    """`-o`, `--output`, with its help, which says the default."""
-    return option("-o", "--output", heading=COMMON, metavar="FILE", type=OutputPath(), help=text, show_default=False)
+def output_option(text: str, *, addresses: bool = False) -> Callable[[Command], Command]:
+    """`-o`, `--output`, with its help, which says the default; with `addresses` as of `OutputPath`."""
+    kind = OutputPath(addresses=addresses)
+    return option("-o", "--output", heading=COMMON, metavar="FILE", type=kind, help=text, show_default=False)
 
 
 def assert_option(text: str, heading: str = COMMON) -> Callable[[Command], Command]:

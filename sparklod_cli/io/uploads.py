@@ -1,0 +1,95 @@
+"""Writes outputs at addresses: each object appears when all of it was sent, and a header after its chunks."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterable
+
+from ..codecs.rad.names import number_of
+from ..support.addresses import Address
+from ..support.errors import OutputError
+from .names import reason_of
+
+#: Schemes of addresses that are only read.
+READ_ONLY = ("http", "https")
+
+
+def check_address(address: Address, *, overwrite: bool) -> None:
+    """Raises `OutputError` where an output cannot be written, as far as that can be told without writing it."""
+    scheme = address.url.split("://", 1)[0].lower()
+    if scheme in READ_ONLY:
+        raise OutputError(f"cannot write {address}: {scheme}:// is for reading; write a file and upload that")
+    try:
+        if not overwrite and address.is_file():
+            raise _taken(address)
+    except OSError as error:
+        raise OutputError(f"cannot write {address}: {reason_of(error)}") from None
+
+
+def upload(address: Address, pieces: Iterable[bytes], *, overwrite: bool) -> int:
+    """Writes a file, and returns its size.
+
+    Raises:
+        OutputError: it exists and `overwrite` is not set, or it cannot be sent.
+    """
+    check_address(address, overwrite=overwrite)
+    try:
+        return address.write(pieces)
+    except OSError as error:
+        raise OutputError(f"cannot write {address}: {reason_of(error)}") from None
+
+
+def chunks_at(address: Address) -> list[Address]:
+    """The files beside a header that are called as its chunks would be."""
+    try:
+        names = [name for name in address.parent.files() if "/" not in name]
+    except OSError as error:
+        raise OutputError(f"cannot list {address.parent}: {reason_of(error)}") from None
+    found = {number_of(name, address.stem): address.parent / name for name in names}
+    return [found[number] for number in sorted(number for number in found if number is not None)]
+
+
+def upload_together(address: Address, files: Iterable[tuple[str, Iterable[bytes]]], *, overwrite: bool) -> int:
+    """Writes the files of chunks, and then their header; returns their size.
+
+    If something fails, what was sent is removed, so that no header names chunks that are not there. Where files are
+    replaced, the old header is removed first for the same reason: services replace one object at a time.
+
+    Args:
+        address: of the header.
+        files: names and contents; the last is the header, whose name is that of `address`.
+        overwrite: replace existing files, and remove chunks of a longer output.
+
+    Raises:
+        OutputError: a file exists and `overwrite` is not set, or one cannot be sent.
+    """
+    check_together(address, overwrite=overwrite)
+    former, sent, size = chunks_at(address), list[Address](), 0
+    try:
+        address.unlink(missing_ok=True)
+        for name, pieces in files:
+            place = address if number_of(name, address.stem) is None else address.parent / name
+            sent.append(place)
+            size += place.write(pieces)
+        for outdated in former:
+            if outdated not in sent:
+                outdated.unlink(missing_ok=True)
+    except BaseException as error:
+        for place in reversed(sent):
+            with contextlib.suppress(OSError):
+                place.unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            raise OutputError(f"cannot write {address}: {reason_of(error)}") from None
+        raise
+    return size
+
+
+def check_together(address: Address, *, overwrite: bool) -> None:
+    """As `check_address`, of a header and its chunks."""
+    check_address(address, overwrite=overwrite)
+    for each in [] if overwrite else chunks_at(address):
+        raise _taken(each)
+
+
+def _taken(address: Address) -> OutputError:
+    return OutputError(f"{address} exists, add --overwrite to replace it")
