@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,9 +14,11 @@ from ..model.scene import Scene
 from ..model.splats import Splats
 from ..model.transforms import Transform
 from ..support.addresses import Place
-from ..support.errors import InvalidSplatsError, memory_errors_translated
+from ..support.errors import memory_errors_translated
 from ..support.progress import Progress, silent
 from ..support.threads import on_threads
+from .checks import check_transformed
+from .clock import Clock
 from .kept_tree import check_kept
 from .output import Output, WrittenTree, output_of
 from .settings import BakeSettings
@@ -50,20 +51,6 @@ class Baked(WrittenTree):
     seconds: dict[str, float]
 
 
-class _Clock:
-    """How long the stages took."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-        self._start = time.perf_counter()
-
-    def end(self, stage: str) -> None:
-        """Ends a stage; the next one begins."""
-        now = time.perf_counter()
-        self.seconds[stage] = round(now - self._start, 4)
-        self._start = now
-
-
 #: Nodes and their tree, the number of leaves, and the splats that were left out, by reason.
 _Made = tuple[Splats, LodTree, int, dict[str, int]]
 
@@ -93,7 +80,7 @@ def bake(
         OutOfMemoryError: it does not fit into memory.
     """
     with memory_errors_translated():
-        output, clock = output_of(target, settings, overwrite=overwrite), _Clock()
+        output, clock = output_of(target, settings, overwrite=overwrite), Clock()
         # A list, so that whoever takes the scene out of it can free it.
         scenes = [read_scene(source, threads=threads, progress=progress)]
         form, notes, read = scenes[0].format, scenes[0].notes, len(scenes[0])
@@ -125,7 +112,7 @@ def bake(
     )
 
 
-def _kept(scenes: list[Scene], settings: BakeSettings, clock: _Clock) -> _Made:
+def _kept(scenes: list[Scene], settings: BakeSettings, clock: Clock) -> _Made:
     """The tree that the input has."""
     scene = scenes.pop()
     check_kept(scene, settings)
@@ -135,7 +122,7 @@ def _kept(scenes: list[Scene], settings: BakeSettings, clock: _Clock) -> _Made:
 
 
 def _built(
-    scenes: list[Scene], settings: BakeSettings, output: Output, clock: _Clock, threads: int, progress: Progress
+    scenes: list[Scene], settings: BakeSettings, output: Output, clock: Clock, threads: int, progress: Progress
 ) -> _Made:
     """A tree of the splats of the input."""
     scene = scenes.pop()
@@ -160,10 +147,7 @@ def _transformed(splats: Splats, transform: Transform) -> Splats:
         InvalidSplatsError: one leaves the range of float32.
     """
     turned = transform.apply(splats)
-    if turned is not splats and turned.invalid():
-        raise InvalidSplatsError(
-            "scaled and moved like this, it leaves the range of float32; give a smaller --scale or --translate"
-        )
+    check_transformed(0 if turned is splats else len(turned.invalid()))
     return turned
 
 

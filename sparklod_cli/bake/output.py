@@ -13,6 +13,7 @@ from ..codecs.options import WriteOptions
 from ..codecs.rad import options as rad_options
 from ..codecs.rad.layout import OPTIONS
 from ..codecs.rad.names import SUFFIX as RAD
+from ..codecs.statistics import Statistics
 from ..io import SceneSink, Sink, scene_sink, sink
 from ..model.nodes import CHUNK_NODES
 from ..model.scene import Scene
@@ -59,6 +60,9 @@ class Output(Protocol):
     def check(self, scene: Scene) -> None:
         """Raises `FormatError` where a tree of these splats cannot be written."""
 
+    def check_statistics(self, found: Statistics) -> None:
+        """As `check`, of statistics of these splats."""
+
     def write(self, scene: Scene, threads: int, progress: Progress) -> WrittenTree:
         """Writes a tree."""
 
@@ -95,6 +99,9 @@ class _Arrays:
     def check(self, scene: Scene) -> None:
         """They hold anything."""
 
+    def check_statistics(self, found: Statistics) -> None:
+        """They hold anything."""
+
     def write(self, scene: Scene, threads: int, progress: Progress) -> WrittenTree:
         """Writes them."""
         arrays = dump.pack(scene, self.encoding, threads)
@@ -122,6 +129,10 @@ class _File:
     def check(self, scene: Scene) -> None:
         """The codec knows."""
         self.form.codec().settled(scene, self.options)
+
+    def check_statistics(self, found: Statistics) -> None:
+        """The codec knows."""
+        self.form.codec().settled(found, self.options)
 
     def write(self, scene: Scene, threads: int, progress: Progress) -> WrittenTree:
         """Writes it."""

@@ -46,6 +46,11 @@ def check(splats: Splats) -> Bounds:
         raise InvalidSplatsError(f"{describe_invalid(invalid)}: see Selection.apply")
     with threads_for(len(splats)) as threads:
         low, high, smallest, largest = find_bounds(splats.center, splats.scale, threads)
-    if not (smallest > 0 and splats.opacity.min() > 0):
-        raise InvalidSplatsError("a splat is without opacity or scale: see Selection.apply")
+    check_visible(smallest, float(splats.opacity.min()))
     return Bounds(low, high, smallest, largest)
+
+
+def check_visible(smallest: float, faintest: float = 1.0) -> None:
+    """Raises `InvalidSplatsError` where the least size, or the least opacity, of splats is 0."""
+    if not (smallest > 0 and faintest > 0):
+        raise InvalidSplatsError("a splat is without opacity or scale: see Selection.apply")

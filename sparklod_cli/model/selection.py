@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..support.errors import InvalidSplatsError
-from .splats import INVALID, Splats, describe_invalid
+from .splats import INVALID, Splats, describe_counts
 
 Vector = tuple[float, float, float]
 
@@ -19,6 +19,34 @@ REASONS = INVALID | {
     "low_opacity": "below --min-opacity",
     "cropped": "cropped",
 }
+
+
+@dataclass(frozen=True)
+class Tally:
+    """What becomes of the splats of a scene, or of a part of it.
+
+    Attributes:
+        count: N splats.
+        dropped: how many are not kept, by those of `REASONS` that occur.
+        first_invalid: place of the first invalid one; None without any.
+    """
+
+    count: int = 0
+    dropped: dict[str, int] = field(default_factory=dict)
+    first_invalid: int | None = None
+
+    @property
+    def kept(self) -> int:
+        """How many are kept."""
+        return self.count - sum(self.dropped.values())
+
+    def then(self, after: Tally) -> Tally:
+        """That of these splats and those that come after them."""
+        first = self.first_invalid
+        if first is None and after.first_invalid is not None:
+            first = self.count + after.first_invalid
+        dropped = {reason: self.dropped.get(reason, 0) + after.dropped.get(reason, 0) for reason in REASONS}
+        return Tally(self.count + after.count, {reason: count for reason, count in dropped.items() if count}, first)
 
 
 @dataclass(frozen=True)
@@ -44,11 +72,16 @@ class Selection:
         Raises:
             InvalidSplatsError: there are no splats, some are invalid without `drop_invalid`, or none is left.
         """
-        if len(splats) == 0:
-            raise InvalidSplatsError("it has no splats")
+        keep, tally = self.examine(splats)
+        self.check(tally)
+        return (splats if keep.all() else splats.take(keep)), tally.dropped
+
+    def examine(self, splats: Splats) -> tuple[NDArray[np.bool_], Tally]:
+        """(N,) which splats of a scene, or of a part of it, are kept, and what becomes of the others.
+
+        Invalid ones are not kept in any case.
+        """
         invalid = splats.invalid()
-        if invalid and not self.drop_invalid:
-            raise InvalidSplatsError(f"{describe_invalid(invalid)}, add --on-invalid drop to leave them out")
         keeps = {kind: ~mask for kind, mask in invalid.items()} | {
             "zero_opacity": splats.opacity > 0,
             "zero_scale": splats.scale.max(axis=1, initial=0) > 0,
@@ -61,10 +94,23 @@ class Selection:
             before = int(np.count_nonzero(keep))
             keep &= keeps[reason]
             dropped[reason] = before - int(np.count_nonzero(keep))
-        dropped = {reason: count for reason, count in dropped.items() if count}
-        if not keep.any():
-            raise InvalidSplatsError(f"no splat is left of {len(splats):,} ({describe(dropped)})")
-        return (splats if keep.all() else splats.take(keep)), dropped
+        first = min((int(np.argmax(mask)) for mask in invalid.values()), default=None)
+        return keep, Tally(len(splats), {reason: count for reason, count in dropped.items() if count}, first)
+
+    def check(self, tally: Tally) -> None:
+        """Checks that a tree can be made of what is kept of a whole scene.
+
+        Raises:
+            InvalidSplatsError: see `apply`.
+        """
+        if tally.count == 0:
+            raise InvalidSplatsError("it has no splats")
+        if tally.first_invalid is not None and not self.drop_invalid:
+            counts = {kind: count for kind, count in tally.dropped.items() if kind in INVALID}
+            text = describe_counts(counts, tally.count, tally.first_invalid)
+            raise InvalidSplatsError(f"{text}, add --on-invalid drop to leave them out")
+        if not tally.kept:
+            raise InvalidSplatsError(f"no splat is left of {tally.count:,} ({describe(tally.dropped)})")
 
     def _inside(self, center: NDArray[np.float32]) -> NDArray[np.bool_]:
         inside = np.ones(len(center), np.bool_)

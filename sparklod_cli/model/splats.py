@@ -153,8 +153,12 @@ def describe_invalid(invalid: dict[str, NDArray[np.bool_]]) -> str:
     """
     counts = {kind: int(np.count_nonzero(mask)) for kind, mask in invalid.items()}
     total = len(next(iter(invalid.values())))
-    first = min(int(np.argmax(mask)) for mask in invalid.values())
-    if set(invalid) == {"non_finite"}:
+    return describe_counts(counts, total, min(int(np.argmax(mask)) for mask in invalid.values()))
+
+
+def describe_counts(counts: dict[str, int], total: int, first: int) -> str:
+    """As `describe_invalid`: of `total` splats, so many are invalid, by kind, and this is the first."""
+    if set(counts) == {"non_finite"}:
         what = "not finite (NaN, infinite, or a rotation of length 0"
     else:
         what = "invalid (" + ", ".join(f"{count:,} {INVALID[kind]}" for kind, count in counts.items())

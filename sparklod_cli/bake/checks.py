@@ -1,0 +1,13 @@
+"""Checks of a scene that is baked, in memory or out of core."""
+
+from __future__ import annotations
+
+from ..support.errors import InvalidSplatsError
+
+
+def check_transformed(beyond: int) -> None:
+    """Raises `InvalidSplatsError` where a transform moved this many splats out of the range of float32."""
+    if beyond:
+        raise InvalidSplatsError(
+            "scaled and moved like this, it leaves the range of float32; give a smaller --scale or --translate"
+        )

@@ -1,0 +1,82 @@
+"""The plainest store, engine and stream: files of numpy, a loop, and a scene in memory."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sparklod_cli.bake.out_of_core.contracts import Arrays, Task
+from sparklod_cli.model.scene import Scene
+from sparklod_cli.model.splats import Splats
+from sparklod_cli.model.streams import SceneStream
+from sparklod_cli.support.progress import Progress, silent
+
+
+@dataclass
+class PlainStore:
+    """A folder for each result, in which each array is a file."""
+
+    folder: Path
+
+    def has(self, name: str) -> bool:
+        return self._path(name).is_dir()
+
+    def put(self, name: str, arrays: Arrays) -> None:
+        self.remove(name)
+        self._path(name).mkdir(parents=True)
+        for key, array in arrays.items():
+            np.save(self._path(name) / f"{key}.npy", array)
+
+    def get(self, name: str, keys: Collection[str] | None = None) -> dict[str, np.ndarray]:
+        found = sorted(path.stem for path in self._path(name).iterdir()) if keys is None else keys
+        return {key: np.load(self._path(name) / f"{key}.npy") for key in found}
+
+    def rows(self, name: str, key: str, start: int, stop: int) -> np.ndarray:
+        return np.array(np.load(self._path(name) / f"{key}.npy", mmap_mode="r")[start:stop])
+
+    def shape(self, name: str, key: str) -> tuple[int, ...]:
+        return np.load(self._path(name) / f"{key}.npy", mmap_mode="r").shape
+
+    def remove(self, name: str) -> None:
+        shutil.rmtree(self._path(name), ignore_errors=True)
+
+    def names(self) -> list[str]:
+        return sorted(path.name.replace("!", "/") for path in self.folder.iterdir())
+
+    def _path(self, name: str) -> Path:
+        return self.folder / name.replace("/", "!")
+
+
+@dataclass
+class Loop:
+    """Runs tasks one after the other; in any order that their needs allow, if it has random numbers."""
+
+    rng: np.random.Generator | None = None
+    threads: int = 1
+
+    def run(self, stage: str, tasks: Sequence[Task], job: Any, progress: Progress = silent) -> None:
+        left = {task.name: task for task in tasks if not job.store.has(task.name)}
+        assert len({task.name for task in tasks}) == len(tasks)
+        while left:
+            ready = [task for task in left.values() if not any(need in left for need in task.needs)]
+            task = ready[0] if self.rng is None else ready[self.rng.integers(len(ready))]
+            task.run(job, *task.arguments, threads=self.threads, progress=silent)
+            assert job.store.has(task.name)
+            del left[task.name]
+
+
+def stream_of(scene: Scene, block: int = 1000) -> SceneStream:
+    """A scene as a stream whose blocks are that long."""
+
+    def read(start: int, stop: int) -> Iterator[Splats]:
+        for at in range(start, stop, block):
+            yield scene.splats.take(slice(at, min(at + block, stop)))
+
+    return SceneStream(
+        len(scene), scene.splats.sh_degree, read, scene.antialiased, scene.format, scene.notes, scene.header
+    )
