@@ -2,6 +2,7 @@
 
 from ..bake import Baked as Baked
 from ..bake import BakeSettings as BakeSettings
+from ..bake import Resources as Resources
 from ..bake import bake as bake
 from ..bake.out_of_core.cluster import ClusterSettings as ClusterSettings
 from ..bake.out_of_core.cluster import cluster as cluster

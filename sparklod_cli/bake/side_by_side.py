@@ -12,6 +12,8 @@ from ..support.errors import SparklodError
 from ..support.progress import Progress, silent
 from .baking import Baked, bake
 from .out_of_core.cluster_engine import ClusterEngine
+from .resources import Resources
+from .scaling import fits_in_memory
 from .settings import BakeSettings
 
 
@@ -20,7 +22,7 @@ def bake_side_by_side(
     settings: BakeSettings,
     engine: ClusterEngine,
     *,
-    fits: Callable[[Place], bool],
+    resources: Resources,
     bake_large: Callable[[Place, Place], Any],
     overwrite: bool = False,
     progress: Progress = silent,
@@ -31,15 +33,15 @@ def bake_side_by_side(
         pairs: inputs and outputs, which all workers see.
         settings: how.
         engine: of the cluster.
-        fits: whether a worker can hold an input.
+        resources: of a worker; a scene that its memory holds is one task.
         bake_large: bakes one that none can, and returns what came of it.
         overwrite: replace files that exist.
         progress: told how many scenes are done.
     """
-    small = [fits(source) for source, _ in pairs]
+    small = [fits_in_memory(source, settings, resources.memory) for source, _ in pairs]
     settings = dataclasses.replace(settings, rgba=settings.rgba and settings.rgba.absolute())
     whole = [(absolute(source), absolute(target)) for source, target in pairs]  # workers have folders of their own
-    calls = [(*pair, settings, overwrite) for pair, is_small in zip(whole, small, strict=True) if is_small]
+    calls = [(*pair, settings, overwrite, resources) for pair, is_small in zip(whole, small, strict=True) if is_small]
     engine.check(None, [source for source, _ in whole])
     with engine.each("baking", _bake_small, calls, progress, "scene") as outcomes:
         for pair, is_small in zip(pairs, small, strict=True):
@@ -56,6 +58,8 @@ def _found(outcome: Any, target: Place) -> Any:
     return outcome
 
 
-def _bake_small(source: Place, target: Place, settings: BakeSettings, overwrite: bool, *, threads: int) -> Baked:
+def _bake_small(
+    source: Place, target: Place, settings: BakeSettings, overwrite: bool, resources: Resources, *, threads: int
+) -> Baked:
     """What a worker does."""
-    return bake(source, target, settings, overwrite=overwrite, threads=threads)
+    return bake(source, target, settings, overwrite=overwrite, threads=threads, resources=resources)

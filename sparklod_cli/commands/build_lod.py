@@ -20,6 +20,7 @@ from .command import COMMON, Command, option
 from .options.baking import bake_settings, baking_options, check_method, write_options
 from .options.cluster import OF_CLUSTERS, check_cluster, cluster_of, cluster_options
 from .options.common import General, common_options, output_option, overwrite_option
+from .options.resources import OF_BAKES, resources_of, resources_options
 from .paths import InputPath, OutputPath, claim_stdout, keep_apart, with_chunks
 from .reports import report_baked, report_extracted
 from .usage import exclude, options_of
@@ -39,7 +40,8 @@ Examples:
   sparklod build-lod scene.ply --method quality         # for publishing
   sparklod build-lod scans/*.ply --output-dir web -f
   sparklod build-lod scans/*.ply --output-dir web --workers 4
-  sparklod build-lod s3://bucket/scan.ply --scheduler tcp://host:8786
+  sparklod build-lod city.ply -o city-lod.rad --memory 4G --scratch-dir /fast
+  sparklod build-lod s3://bucket/city.ply --scheduler tcp://host:8786 --scratch-dir s3://bucket/scratch
   cat scene.ply | sparklod build-lod - -o - | aws s3 cp - s3://bucket/scene-lod.spz
   sparklod build-lod scene.ply --within 0,1,0,25 --min-opacity 0.02
   sparklod build-lod scene.ply --json | jq .nodes
@@ -75,6 +77,7 @@ Examples:
     " .splat.",
 )
 @baking_options
+@resources_options
 @cluster_options
 @common_options
 @click.pass_context
@@ -131,7 +134,7 @@ def _check(ctx: click.Context, inputs: tuple[Place, ...], outputs: Outputs, gene
     check_formats(ctx, outputs)
     check_cluster(ctx)
     if outputs.unlod:
-        exclude(ctx, OF_CLUSTERS, "--unlod")
+        exclude(ctx, (*OF_BAKES, *OF_CLUSTERS), "--unlod")
     else:
         check_method(ctx)
     if DASH in inputs:
@@ -152,11 +155,23 @@ def _job(
     settings = bake_settings(ctx, suffix=outputs.suffix, raw=outputs.is_raw, converts=outputs.format_is_asked_for)
     more = [] if outputs.suffix != RAD else ["rad"] if settings.options.rad.sh_codes is None else ["rad", "palette"]
     console.announce_compiling(settings.method, *more)
-    make = functools.partial(bake, settings=settings, threads=general.threads, **shared)
+    resources = resources_of(ctx)
+    shared |= {"settings": settings, "threads": general.threads, "say": console.say}
     if engine is None:
+        return _one_by_one(functools.partial(bake, resources=resources, **shared)), report_baked
+    resources = dataclasses.replace(resources, memory=engine.memory)
+    make = functools.partial(bake, resources=resources, engine=engine, **shared)
+    if len(ctx.params["inputs"]) == 1:
         return _one_by_one(make), report_baked
-    beside = functools.partial(bake_side_by_side, settings=settings, engine=engine, fits=lambda _: True, **shared)
-    return functools.partial(beside, bake_large=functools.partial(_outcome, make)), report_baked
+    return functools.partial(
+        bake_side_by_side,
+        settings=settings,
+        engine=engine,
+        resources=resources,
+        bake_large=functools.partial(_outcome, make),
+        overwrite=outputs.overwrite,
+        progress=console.progress,
+    ), report_baked
 
 
 def _one_by_one(make: Callable[..., Baked | Extracted]) -> Make:

@@ -10,9 +10,14 @@ from typing import Any
 import pytest
 
 from sparklod_cli.bake import BakeSettings, side_by_side
+from sparklod_cli.bake.out_of_core.estimate import in_memory_bytes
+from sparklod_cli.bake.resources import Resources
 from sparklod_cli.bake.side_by_side import bake_side_by_side
 from sparklod_cli.support.errors import OutputError, SparklodError
 from tests.conftest import FIXTURES
+
+#: Splats and SH degree of the largest scene that a worker of these tests holds.
+HELD = 1000, 1
 
 
 class Engine:
@@ -32,13 +37,13 @@ class Engine:
 def test_large_scenes_are_baked_here_in_their_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     engine, large = Engine(), OutputError("too large for words")
-    names = ("sh0.ply", "sh2.ply", "sh1.ply")
+    names = ("sh0.ply", "demo.ply", "sh1.ply")
     pairs = [(FIXTURES / name, Path(name).with_suffix(".spz")) for name in names]
     outcomes = bake_side_by_side(
         pairs,
         BakeSettings(),
         engine,  # type: ignore[arg-type]
-        fits=lambda source: source.name != "sh2.ply",
+        resources=Resources(memory=in_memory_bytes("quick", *HELD)),
         bake_large=lambda source, target: large if (source, target) == pairs[1] else None,
     )
     found = list(outcomes)
@@ -52,6 +57,7 @@ def test_an_output_that_is_nowhere_to_be_seen_is_an_error(tmp_path: Path, monkey
     baked = side_by_side.bake(FIXTURES / "one.ply", tmp_path / "there.spz", BakeSettings())
     monkeypatch.setattr(side_by_side, "_bake_small", lambda *_, **__: baked)
     pair = (FIXTURES / "one.ply", tmp_path / "one.spz")
-    (found,) = bake_side_by_side([pair], BakeSettings(), Engine(), fits=lambda _: True, bake_large=NotImplemented)  # type: ignore[arg-type]
+    how = {"resources": Resources(), "bake_large": None}
+    (found,) = bake_side_by_side([pair], BakeSettings(), Engine(), **how)  # type: ignore[arg-type]
     assert isinstance(found, SparklodError)
     assert "wrote" in str(found) and "give --output-dir a folder that all machines share, or a URL" in str(found)

@@ -18,6 +18,7 @@ from ...support.optional import optional_import
 from ...support.threads import thread_count
 from .cluster_engine import ClusterEngine
 from .cluster_pool import Connection
+from .estimate import default_memory
 
 #: Seconds that a scheduler, or the workers of a cluster, are waited for.
 PATIENCE = 30
@@ -78,7 +79,8 @@ def cluster(
 
     Args:
         settings: which cluster.
-        memory: bytes that workers of our own share, as --memory; they get more only where the machine has it.
+        memory: bytes that workers of our own share, or that a task of a cluster that runs may take; None for the part
+            of what is available, or of the memory of a worker, that is usual.
         scratch: folder for files of workers of our own; one for temporary files unless given.
         say: is told the address of the dashboard, and of workers that are lost.
 
@@ -92,7 +94,8 @@ def cluster(
         if settings.scheduler is None:
             threads = max(1, thread_count(settings.threads) // settings.workers)
             client = stack.enter_context(_started(settings.workers, threads, memory, scratch))
-            limit = None if memory is None else memory // settings.workers
+            shared = default_memory() if memory is None else memory
+            limit = None if shared is None else shared // settings.workers
         else:
             threads = settings.threads or 1
             client = stack.enter_context(_connected(settings.scheduler))

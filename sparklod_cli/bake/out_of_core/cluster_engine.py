@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import pickle
+import shutil
 import uuid
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -126,6 +127,13 @@ class ClusterEngine:
                 store.remove(name)
         for worker, answer in found.items():
             _check_answer(worker, answer, store)
+
+    def remove(self, folder: Path) -> None:
+        """Removes a folder on the machines of all workers, and on this one."""
+        shutil.rmtree(folder, ignore_errors=True)
+        if self._connection.alive:
+            with contextlib.suppress(SparklodError), self._connection.guarded():
+                self._connection.client.run(shutil.rmtree, folder, ignore_errors=True)
 
 
 def _check_answer(worker: str, answer: Any, store: Store | None) -> None:

@@ -52,9 +52,7 @@ def check_cluster(ctx: click.Context) -> None:
 
 
 @contextlib.contextmanager
-def cluster_of(
-    ctx: click.Context, general: General, console: Console, *, memory: int | None = None
-) -> Iterator[ClusterEngine | None]:
+def cluster_of(ctx: click.Context, general: General, console: Console) -> Iterator[ClusterEngine | None]:
     """The cluster that is asked for, as long as the context lasts; None where none is."""
     if not given(ctx, OF_CLUSTERS):
         yield None
@@ -64,5 +62,5 @@ def cluster_of(
     asked = ctx.params
     threads = general.threads if asked["scheduler"] is None or is_given(ctx, "threads") else None
     settings = ClusterSettings(asked["scheduler"], asked["workers"] or 1, threads)
-    with cluster(settings, memory=memory, say=console.say) as engine:
+    with cluster(settings, memory=asked["memory"], say=console.say) as engine:
         yield engine
