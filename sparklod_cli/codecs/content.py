@@ -58,11 +58,14 @@ class Content:
     def stream(self, threads: int) -> streams.SceneStream:
         """The splats block by block, each filled by several threads."""
 
+        def block(start: int, stop: int) -> Splats:
+            out = Splats.empty(stop - start, self.sh_degree)
+            self.fill(out, start, threads, silent)
+            return out
+
         def read(start: int, stop: int) -> Iterator[Splats]:
             for first in range(start, stop, streams.BLOCK_SPLATS):
-                out = Splats.empty(min(first + streams.BLOCK_SPLATS, stop) - first, self.sh_degree)
-                self.fill(out, first, threads, silent)
-                yield out
+                yield block(first, min(first + streams.BLOCK_SPLATS, stop))
 
         return streams.SceneStream(
             self.count, self.sh_degree, read, self.antialiased, self.format, self.notes, self.header

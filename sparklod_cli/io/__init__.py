@@ -4,9 +4,10 @@ from .beside import companions
 from .chunks import read_rad_chunk, read_rad_header
 from .identity import Identity, content_of, files_of, identity_of
 from .names import is_file_name
+from .rad_file import RadFile
 from .reading import examine_scene, opened, read_arrays, read_scene, size_of_input
 from .scenes import SceneSink, scene_sink
-from .streams import open_stream
+from .streams import PlacedFile, open_stream, open_streams
 from .texts import MAX_TEXT, read_rgba, read_text, read_together
 from .together import SinkTogether, chunk_files, sink_together, write_together
 from .writing import Sink, check_writable, sink, write_stdout, write_whole
@@ -14,6 +15,8 @@ from .writing import Sink, check_writable, sink, write_stdout, write_whole
 __all__ = [
     "MAX_TEXT",
     "Identity",
+    "PlacedFile",
+    "RadFile",
     "SceneSink",
     "Sink",
     "SinkTogether",
@@ -26,6 +29,7 @@ __all__ = [
     "identity_of",
     "is_file_name",
     "open_stream",
+    "open_streams",
     "opened",
     "read_arrays",
     "read_rad_chunk",

@@ -4,21 +4,24 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import hashlib
 import tempfile
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO, Protocol
 
+from ..model.merged import Placed, merged
 from ..model.splats import Splats
 from ..model.streams import SceneStream
+from ..model.transforms import Transform
 from ..support import atomic
 from ..support.addresses import Address, Place
-from ..support.errors import FormatError, OutputError
+from ..support.errors import FormatError, OutputError, SparklodError
 from ..support.progress import Progress, silent
-from ..support.stdin import DASH
+from ..support.stdin import DASH, name_of
 from .names import reason_of
 from .reading import opened, readable
 
@@ -65,6 +68,61 @@ def open_stream(
         yield dataclasses.replace(found, read=_Read(source, found.count, found.sh_degree))
     finally:
         store.close()
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedFile:
+    """A file and where its splats stand.
+
+    Attributes:
+        file: of any format that is read, without a tree.
+        transform: turns, scales and moves them.
+    """
+
+    file: Place
+    transform: Transform = field(default_factory=Transform)
+
+
+@contextlib.contextmanager
+def open_streams(
+    files: Sequence[PlacedFile],
+    *,
+    scratch: Path | None = None,
+    keep: bool = False,
+    threads: int = 1,
+    progress: Progress = silent,
+) -> Iterator[SceneStream]:
+    """The splats of several files, each where it stands, as those of one scene; see `model.merged`.
+
+    Nothing is kept open between reads, and the header of a file that is named twice is read once.
+
+    Args:
+        files: at least one.
+        scratch, keep, threads, progress: as for `open_stream`. Unless `keep` is set, a file is unpacked for each read.
+
+    Raises:
+        HasTreeError, FormatError, ValueError: as `open_stream`; names the file.
+    """
+    names = dict.fromkeys(each.file for each in files)
+    streams = {file: _again(file, scratch, keep, threads, progress) for file in names}
+    yield merged([Placed(streams[each.file], name_of(each.file), each.transform) for each in files])
+
+
+def _again(file: Place, scratch: Path | None, keep: bool, threads: int, progress: Progress) -> SceneStream:
+    """The stream of a file that need not stay open."""
+    try:
+        with open_stream(file, scratch=scratch, keep=keep, threads=threads, progress=progress) as stream:
+            once = functools.partial(_read_once, file, scratch, threads, progress)
+            return stream if keep else dataclasses.replace(stream, read=once)
+    except SparklodError as error:
+        raise type(error)(f"{name_of(file)}: {error}") from None
+
+
+def _read_once(
+    path: Place, scratch: Path | None, threads: int, progress: Progress, start: int, stop: int
+) -> Iterator[Splats]:
+    with open_stream(path, scratch=scratch, threads=threads, progress=progress) as stream:
+        yield from stream.read(start, stop)
 
 
 class _Store(Protocol):

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from .foveation import Foveation
 from .scene import Scene
+from .transforms import LARGEST, SKEW, Transform
 
 Matrix = NDArray[np.float64]
 
@@ -55,6 +56,17 @@ class Instance:
     def file(self) -> Path | None:
         """The splat file; None for a scene in memory."""
         return self.source if isinstance(self.source, Path) else None
+
+    @property
+    def transform(self) -> Transform:
+        """What `object_to_world` does, with the rotation that is nearest where the axes of a matrix are a bit askew."""
+        axes = self.object_to_world[:3, :3]
+        scale = min(max(float(np.cbrt(np.linalg.det(axes))), 1 / LARGEST), LARGEST)
+        rotation = axes / scale
+        if np.abs(rotation.T @ rotation - np.eye(3)).max() > SKEW:
+            left, _, right = np.linalg.svd(rotation)
+            rotation = left @ right
+        return Transform(rotation, scale, self.object_to_world[:3, 3])
 
 
 def names_of(files: Sequence[Path], taken: Collection[str] = ()) -> list[str]:

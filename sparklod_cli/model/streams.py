@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 
+from ..support.progress import Progress, silent
 from .lod_tree import LodTree
-from .splats import Splats
+from .scene import Scene
+from .splats import COLUMNS, Splats
 
-#: Splats of a block that a scene is read in, unless its format has other ones: some 60 MB with SH of degree 3.
-BLOCK_SPLATS = 1 << 18
+#: Splats of a block that a scene is read in, unless its format has other ones: some 30 MB with SH of degree 3.
+BLOCK_SPLATS = 1 << 17
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,3 +62,26 @@ class NodeStream:
         """All nodes, in order, so many at a time."""
         for start in range(0, self.count, rows):
             yield self.read(start, min(start + rows, self.count))
+
+
+def stream_of(scene: Scene) -> SceneStream:
+    """A stream of a scene in memory, which has no tree."""
+    assert scene.tree is None
+
+    def read(start: int, stop: int) -> Iterator[Splats]:
+        for first in range(start, stop, BLOCK_SPLATS):
+            yield scene.splats.take(slice(first, min(first + BLOCK_SPLATS, stop)))
+
+    splats = scene.splats
+    return SceneStream(len(splats), splats.sh_degree, read, scene.antialiased, scene.format, scene.notes, scene.header)
+
+
+def collected(stream: SceneStream, progress: Progress = silent) -> Scene:
+    """All of a stream in memory, which takes no more of it than the scene and a block."""
+    splats, done = Splats.empty(stream.count, stream.sh_degree), 0
+    for block in stream.blocks():
+        part = slice(done, done := done + len(block))
+        for name in COLUMNS:
+            getattr(splats, name)[part] = getattr(block, name)
+        progress("reading", done, stream.count, "splat")
+    return Scene(splats, None, stream.antialiased, stream.format, stream.notes, stream.header)

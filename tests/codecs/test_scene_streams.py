@@ -8,14 +8,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sparklod_cli.io import open_stream, read_scene
+from sparklod_cli.io import PlacedFile, open_stream, open_streams, read_scene
 from sparklod_cli.model import streams
+from sparklod_cli.model.merged import Placed, merged
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
-from sparklod_cli.model.streams import SceneStream
-from sparklod_cli.support.errors import FormatError, HasTreeError
+from sparklod_cli.model.streams import SceneStream, collected, stream_of
+from sparklod_cli.model.transforms import Transform
+from sparklod_cli.support.errors import FormatError, HasTreeError, OutputError, UnreadableError
 from tests.codecs.test_round_trip import CASES, star
 from tests.codecs.writers import WRITERS, put
+from tests.conftest import FIXTURES
 from tests.scenes import random_splats
 
 COUNT = 2600  # no multiple of a block, a chunk of compressed PLY, or a chunk of the RAD by hand
@@ -91,3 +94,44 @@ def test_a_file_that_changes_is_noticed(tmp_path: Path) -> None:
 def test_keeping_needs_a_folder(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="keep needs a scratch folder"), open_stream(tmp_path / "x", keep=True):
         pass
+
+
+def test_several_files_are_one_scene_and_one_that_is_named_twice_is_read_twice(tmp_path: Path) -> None:
+    turned = Transform.from_parts(rotate=(0, 90, 0), translate=(9, 0, 0))
+    paths, scenes = {}, {}
+    for form, way, degree in (("PLY", "binary", 1), ("SPZ", "3", 2)):
+        (tmp_path / form).mkdir()
+        source = Scene(random_splats(99, sh_degree=degree))
+        paths[form] = put(WRITERS[form][way].write(source), tmp_path / form, form)
+        scenes[form] = read_scene(paths[form])
+    order = ("PLY", "SPZ", "PLY")
+    files = [PlacedFile(paths[form]) for form in order[:2]] + [PlacedFile(paths["PLY"], turned)]
+    parts = [Placed(stream_of(scenes[form]), form) for form in order[:2]]
+    parts += [Placed(stream_of(scenes["PLY"]), "", turned)]
+    expected = collected(merged(parts)).splats
+    for keep in (False, True):
+        with open_streams(files, scratch=tmp_path, keep=keep) as stream:
+            assert_rows([collected(stream).splats], expected)
+            assert_rows(list(stream.read(150, 250)), expected.take(slice(150, 250)))
+        assert len(list(tmp_path.glob("*.unpacked"))) == keep
+
+
+def test_errors_on_one_of_several_files_name_it(tmp_path: Path) -> None:
+    good, bad, tree = tmp_path / "good.ply", tmp_path / "bad.ply", FIXTURES / "golden/tree-v3.spz"
+    good.write_bytes((FIXTURES / "sh1.ply").read_bytes())
+    bad.write_bytes((FIXTURES / "sh1-ascii.ply").read_bytes()[:-300])
+    for file, kind, text in (
+        (tree, HasTreeError, "it is a Level-of-Detail file"),
+        (bad / "x", UnreadableError, "cannot"),
+    ):
+        with pytest.raises(kind, match=rf"{file.name}: {text}"), open_streams([PlacedFile(good), PlacedFile(file)]):
+            pass
+    with open_streams([PlacedFile(good), PlacedFile(bad)]) as stream, pytest.raises(FormatError, match=r"bad\.ply: "):
+        list(stream.blocks())
+
+
+def test_a_scratch_folder_without_room_is_named(tmp_path: Path) -> None:
+    path = put(WRITERS["SPZ"]["3"].write(Scene(random_splats(99))), tmp_path, "SPZ")
+    for keep in (False, True):
+        with open_stream(path, scratch=path, keep=keep) as stream, pytest.raises(OutputError, match="scratch folder"):
+            list(stream.blocks())

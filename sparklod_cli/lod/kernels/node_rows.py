@@ -100,12 +100,13 @@ def morton_keys(rows, nodes, low, step):
 
 
 @kernel(parallel=True)
-def fill_merged_splats(order, leaves, rows, space, center, scale, quat, opacity):
+def fill_merged_splats(order, leaves, row, rows, space, center, scale, quat, opacity):
     """Fills the geometry of merged splats in final order; leaves are left as they are.
 
     Args:
         order: (M,) uint32, the node of each final index.
         leaves: number of leaves; nodes from there on are merged.
+        row: (nodes - leaves,) uint32 row of each merged node.
         rows: node rows.
         space: `Space`.
         center, scale, quat, opacity: columns of M splats.
@@ -115,22 +116,22 @@ def fill_merged_splats(order, leaves, rows, space, center, scale, quat, opacity)
     for block in prange((n + BLOCK - 1) // BLOCK):
         begin, end = block * BLOCK, min(n, block * BLOCK + BLOCK)
         moments = np.empty((ROWS, BLOCK), np.float64)
-        found = np.empty(BLOCK, np.int64)
+        found, source = np.empty(BLOCK, np.int64), np.empty(BLOCK, np.int64)
         count = 0
         for i in range(begin, end):
             if order[i] >= leaves:
+                found[count], source[count] = i, row[order[i] - leaves]
                 for element in range(6):
-                    moments[element, count] = rows[order[i], COVARIANCE + element]
-                found[count] = i
+                    moments[element, count] = rows[source[count], COVARIANCE + element]
                 count += 1
         decompose(moments, np.int64(count))  # a literal 0 would be compiled as a type of its own
         for k in range(count):
             i = found[k]
-            row = rows[order[i]]
-            linear, spread = profile_of(np.float64(row[DENSITY]))
+            merged = rows[source[k]]
+            linear, spread = profile_of(np.float64(merged[DENSITY]))
             opacity[i] = linear
             for axis in range(3):
-                place = np.float64(row[CENTER + axis]) * unit + middle[axis]
+                place = np.float64(merged[CENTER + axis]) * unit + middle[axis]
                 center[i, axis] = min(max(place, -LARGEST), LARGEST)
                 scale[i, axis] = min(max(math.sqrt(max(moments[axis, k], 0.0) / spread) * unit, SCALE_FLOOR), LARGEST)
             for part in range(4):

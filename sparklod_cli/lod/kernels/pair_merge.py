@@ -15,7 +15,7 @@ from numba import prange
 
 from ...support.jit import kernel
 from .geometry import ellipsoid_area
-from .pair_cost import CENTER, COLOR, COVARIANCE, COVERED, DENSITY, LOG_DET, WEIGHT, log_det
+from .pair_cost import CENTER, COLOR, COVARIANCE, COVERED, DENSITY, LOG_DET, WEIGHT, WIDTH, log_det
 from .profile import profile_of, size_factor
 
 #: Weight of opacity relative to each colour channel in the error of a picture, which may have any background. Chosen.
@@ -262,20 +262,26 @@ def fill_covariance_matrix(row, matrix):
 
 
 @kernel(parallel=True)
-def merge_pairs(pairs, made, rows, children, size, error):
-    """Merges each pair of nodes into one.
+def merge_pairs(pairs, made, leaves, rows, row, spare, children, size, error):
+    """Merges each pair of nodes into one, which takes over the row that is to spare in the tree of the first.
 
     Args:
         pairs: (P, 2) uint32 nodes.
         made: the first node to fill; the next pair's is one more.
-        rows: node rows, see `pair_cost.py`; those from `made` on are filled.
-        children: (nodes, 2) uint32, filled.
-        size: (nodes,) float32, filled with the feature size of the splat that will be drawn, in units.
-        error: (nodes,) float32, filled with `picture_error`.
+        leaves: number of leaves, the nodes below it; `row` and the rest are of merged nodes.
+        rows: (leaves, WIDTH) node rows, see `pair_cost.py`; that of a leaf is its own.
+        row: (leaves,) uint32, filled with their rows.
+        spare: (leaves,) uint32, filled with a row that is to spare in their trees.
+        children: (leaves, 2) uint32, filled.
+        size: (2 * leaves,) float32, of all nodes, filled with the feature size of the splat that will be drawn, in
+            units.
+        error: (leaves,) float32, filled with `picture_error`.
     """
     for pair in prange(len(pairs)):
-        a, b, merged = rows[pairs[pair, 0]], rows[pairs[pair, 1]], rows[made + pair]
-        children[made + pair, 0], children[made + pair, 1] = pairs[pair, 0], pairs[pair, 1]
+        first, second, node = pairs[pair, 0], pairs[pair, 1], made + pair - leaves
+        a = rows[first if first < leaves else row[first - leaves]]
+        b = rows[second if second < leaves else row[second - leaves]]
+        merged = np.empty(WIDTH, np.float32)  # its row may be that of `a`
         merge_pair(a, b, merged)
         weight = np.float64(a[WEIGHT]) + np.float64(b[WEIGHT])
         for channel in range(3):
@@ -291,4 +297,9 @@ def merge_pairs(pairs, made, rows, children, size, error):
         opacity, spread = profile_of(np.float64(merged[DENSITY]))
         mean = (large + middle + small) / (3 * math.sqrt(spread))
         size[made + pair] = 2 * mean * size_factor(opacity)
-        error[made + pair] = picture_error(a, b, merged)
+        error[node] = picture_error(a, b, merged)
+        children[node, 0], children[node, 1] = first, second
+        row[node] = first if first < leaves else spare[first - leaves]
+        spare[node] = second if second < leaves else spare[second - leaves]
+        for column in range(WIDTH):
+            rows[row[node], column] = merged[column]

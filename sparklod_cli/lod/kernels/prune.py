@@ -40,6 +40,15 @@ ROUNDS = 8
 #: draw with budgets between 1 and 2,575 (docs/decisions/2026-11-21-fidelity.md).
 MOST_CHILDREN = 16
 
+#: ln(size) of a root whose own size is not known yet: larger than any. Chosen.
+ABOVE_ALL = np.float32(1e6)
+
+#: What such a root has less in `saved` of `drop_nodes`: it may have any number of children.
+ROOM = 1 << 30
+
+#: The rank of a node that is dropped.
+NO_RANK = np.int32(-(1 << 31))
+
 #: Bits of a float32 usefulness by which nodes are ordered: sign, exponent and 7 bits of fraction. Chosen.
 KEY_BITS = 16
 
@@ -51,47 +60,50 @@ def size_step(size):
 
 
 @kernel()
-def fill_usefulness_terms(children, leaves, size, error, log_size, weight, lost):
+def fill_usefulness_terms(children, leaves, drawn_leaves, top, log_size, lost, weight):
     """Fills the terms of `usefulness`.
 
     Args:
-        children: (T, 2) uint32; parents come after their children, and the root is last.
-        leaves: number of leaves; they come first.
-        size: (T,) float32 feature sizes.
-        error: (T,) float32, `picture_error`.
-        log_size: (T,) float32, filled with ln(size), but no more than the parent's: the threshold above which the
-            traversal does not refine the node.
-        weight: (T,) float32, filled for merged nodes with their rarity weight.
-        lost: (T,) float32, filled for merged nodes with their error cost, in splats.
+        children: (T - leaves, 2) uint32 of merged nodes; parents come after their children, and the root is last.
+        leaves: number of leaves; they come first, and have no place in arrays of merged nodes.
+        drawn_leaves: number of splats of the scene under them.
+        top: the root. T - 1, or T if nodes without a parent are to get one later, which is that root until then.
+        log_size: (top + 1,) float32 feature sizes, replaced by ln(size), but no more than the parent's: the threshold
+            above which the traversal does not refine the node.
+        lost: (top + 1 - leaves,) float32, `picture_error`, replaced by the error cost of merged nodes, in splats.
+        weight: (top + 1 - leaves,) float32, filled for merged nodes with their rarity weight.
 
     Returns:
-        (T,) uint32 parents; the root's is itself.
+        (top + 1,) uint32 parents; the root's is itself.
     """
-    total = len(size)
-    parent = np.empty(total, np.uint32)
-    parent[total - 1] = total - 1
-    log_size[total - 1] = math.log(max(size[total - 1], LEAST_SIZE))
+    total = leaves + len(children)
+    parent = np.empty(top + 1, np.uint32)
+    parent[:] = top
+    log_size[top] = ABOVE_ALL if top == total else math.log(max(log_size[top], LEAST_SIZE))
     count, inner, sums = np.zeros(STEPS * OCTAVES), np.zeros(STEPS * OCTAVES), np.zeros(STEPS * OCTAVES)
     for node in range(total - 1, -1, -1):
-        if node < total - 1:
-            own = np.float32(math.log(max(size[node], LEAST_SIZE)))
+        if node < top:
+            own = np.float32(math.log(max(log_size[node], LEAST_SIZE)))
             log_size[node] = min(own, log_size[parent[node]])
         step = size_step(math.exp(log_size[node]))
         count[step] += 1
         if node >= leaves:
-            parent[children[node, 0]] = parent[children[node, 1]] = node
+            parent[children[node - leaves, 0]] = parent[children[node - leaves, 1]] = node
             inner[step] += 1
-            sums[step] += error[node]
+            sums[step] += lost[node - leaves]
     drawn, rare = 0.0, np.empty(STEPS * OCTAVES)
     for step in range(STEPS * OCTAVES - 1, -1, -1):
         drawn += count[step]  # roughly the splats of a cut with this threshold
-        rare[step] = min(1.0, drawn / (FEW * leaves))
-        count[step] = max(min(drawn, float(leaves)), 1.0) ** -RARITY
+        rare[step] = min(1.0, drawn / (FEW * drawn_leaves))
+        count[step] = max(min(drawn, float(drawn_leaves)), 1.0) ** -RARITY
     for node in range(leaves, total):
         step = size_step(math.exp(log_size[node]))
-        weight[node] = count[step]
+        weight[node - leaves] = count[step]
         mean = sums[step] / inner[step]
-        lost[node] = ERROR_COST * rare[step] * math.sqrt(error[node] / mean) if mean > 0 else 0.0
+        error = lost[node - leaves]
+        lost[node - leaves] = ERROR_COST * rare[step] * math.sqrt(error / mean) if mean > 0 else 0.0
+        if parent[node] == top and top == total:
+            lost[node - leaves] = -np.inf
     return parent
 
 
@@ -104,29 +116,27 @@ def usefulness_key(useful):
 
 
 @kernel()
-def drop_nodes(leaves, most, parent, log_size, weight, lost, saved):
-    """Drops the least useful merged nodes until `most` are left.
+def drop_nodes(leaves, most, parent, log_size, lost, weight, saved):
+    """Drops the least useful merged nodes until `most` are left, or none can be dropped.
 
     Args:
-        leaves, log_size, weight, lost: as for `fill_usefulness_terms`; the error cost of a dropped node is added to
-            its parent's.
+        leaves: number of leaves; they come first, and have no place in arrays of merged nodes.
         most: number of merged nodes to keep, at least 1, the root.
         parent: (T,) uint32, updated: the nearest ancestor that is kept.
-        saved: (T,) int32, filled with the number of children minus 1 of merged nodes that are kept, -1 for dropped
-            nodes, and 0 for leaves.
+        log_size, lost, weight: of `fill_usefulness_terms`; the error cost of a dropped node is added to its parent's.
+        saved: (T - leaves,) int32, on entry 1 for each merged node; what is less for the root allows it that many more
+            children. Updated: the number of children minus 1 of those that are kept, -1 for dropped nodes.
     """
     total = len(parent)
-    saved[:leaves] = 0
-    saved[leaves:] = 1
     left = total - leaves
     count = np.zeros(1 << KEY_BITS, np.int64)
     turn, children = ROUNDS, MOST_CHILDREN
     while left > most:  # also after ROUNDS, where nodes gained usefulness as their children were dropped
         count[:] = 0
         candidates = 0
-        for node in range(leaves, total - 1):
-            if saved[node] > 0 and saved[parent[node]] + saved[node] < children:
-                count[usefulness_key(usefulness(node, parent, log_size, weight, lost, saved))] += 1
+        for node in range(total - 1 - leaves):
+            if saved[node] > 0 and saved[parent[node + leaves] - leaves] + saved[node] < children:
+                count[usefulness_key(usefulness(node, leaves, parent, log_size, lost, weight, saved))] += 1
                 candidates += 1
         if candidates == 0:
             if children == MAX_CHILDREN:
@@ -137,57 +147,71 @@ def drop_nodes(leaves, most, parent, log_size, weight, lost, saved):
         while below + count[threshold] < wanted:
             below += count[threshold]
             threshold += 1
-        for node in range(leaves, total - 1):
+        for node in range(total - 1 - leaves):
             if left <= most:
                 break
-            above = parent[node]
+            above = parent[node + leaves] - leaves
             if saved[node] < 1 or saved[above] + saved[node] >= children:
                 continue
-            if usefulness_key(usefulness(node, parent, log_size, weight, lost, saved)) <= threshold:
+            if usefulness_key(usefulness(node, leaves, parent, log_size, lost, weight, saved)) <= threshold:
                 saved[above] += saved[node]
                 lost[above] += lost[node]
                 saved[node] = -1
                 left -= 1
         for node in range(total - 2, -1, -1):
-            if saved[parent[node]] < 0:
+            if saved[parent[node] - leaves] < 0:
                 parent[node] = parent[parent[node]]
         turn = max(turn - 1, 1)
 
 
 @kernel(inline=True)
-def usefulness(node, parent, log_size, weight, lost, saved):
-    """Usefulness of a merged node, see above: (span of ln(size)) * (children - 1 - error cost) * rarity weight."""
-    return (log_size[parent[node]] - log_size[node]) * (np.float32(saved[node]) - lost[node]) * weight[node]
+def usefulness(node, leaves, parent, log_size, lost, weight, saved):
+    """Usefulness of merged node `leaves + node`: (span of ln(size)) * (children - 1 - error cost) * rarity weight."""
+    span = log_size[parent[node + leaves]] - log_size[node + leaves]
+    return span * (np.float32(saved[node]) - lost[node]) * weight[node]
 
 
 @kernel()
-def size_ranks(leaves, parent, log_size, saved):
-    """The rank of merged nodes in the final order: size steps below the root, and more than the parent's rank.
+def size_ranks(leaves, highest, parent, log_size, saved, latest):
+    """The rank of merged nodes in the final order: size steps below the highest, and more than the parent's rank.
 
     Args:
         leaves, parent, log_size, saved: as for `drop_nodes`.
+        highest: ln(size) of rank 0.
+        latest: (leaves,) int32 rank that the leaves' parents must be below; or empty.
 
     Returns:
-        (T,) int32, -1 for leaves and dropped nodes.
+        (T - leaves,) int32, NO_RANK for dropped nodes.
     """
     total = len(parent)
-    rank = np.full(total, -1, np.int32)
-    rank[total - 1] = 0
-    top = log_size[total - 1]
+    rank = np.full(total - leaves, NO_RANK, np.int32)
     per_unit = np.float32(STEPS / math.log(2))
-    for node in range(total - 2, leaves - 1, -1):
-        if saved[node] > 0:
-            own = np.int32(min((top - log_size[node]) * per_unit, np.float32(STEPS * OCTAVES)))
-            rank[node] = max(own, rank[parent[node]] + 1)
+    for node in range(total - 1, leaves - 1, -1):
+        if saved[node - leaves] != -1:
+            own = np.int32(min((highest - log_size[node]) * per_unit, np.float32(STEPS * OCTAVES)))
+            if node < total - 1:
+                own = max(own, rank[parent[node] - leaves] + 1)
+            rank[node - leaves] = own
+    if len(latest):
+        for node in range(total - 1):
+            if node < leaves:
+                own = latest[node]
+            elif saved[node - leaves] > 0:
+                own = rank[node - leaves]
+            else:
+                continue
+            above = parent[node] - leaves
+            rank[above] = min(rank[above], own - 1)
     return rank
 
 
 @kernel()
-def lay_out_children(inner, parent, saved, order, child_start, child_count):
+def lay_out_children(inner, leaves, parent, saved, order, child_start, child_count):
     """Assigns final indices: the root is 0, siblings are consecutive, and come in the order of their parents.
 
     Args:
         inner: (I,) uint32, the merged nodes that are kept, parents before their children.
+        leaves: number of leaves.
         parent, saved: of `drop_nodes`.
         order: (M,) uint32, filled with the node of each final index.
         child_start, child_count: columns of a `LodTree` of M nodes, filled.
@@ -196,23 +220,25 @@ def lay_out_children(inner, parent, saved, order, child_start, child_count):
         (I,) uint32 final indices of `inner`.
     """
     total = len(parent)
-    start = np.zeros(total, np.uint32)  # final index of a node's next child
+    start = np.zeros(total - leaves, np.uint32)  # final index of a node's next child
     at = 1
     for node in inner:
-        start[node] = at
-        at += saved[node] + 1
-    index = np.empty(total, np.uint32)
+        start[node - leaves] = at
+        at += saved[node - leaves] + 1
+    index = np.empty(total - leaves, np.uint32)
     order[0] = total - 1
-    index[total - 1] = 0
+    index[total - 1 - leaves] = 0
     for node in range(total - 2, -1, -1):
-        if saved[node] >= 0:
-            above = parent[node]
-            index[node] = start[above]
+        if node < leaves or saved[node - leaves] >= 0:
+            above = parent[node] - leaves
             order[start[above]] = node
+            if node >= leaves:
+                index[node - leaves] = start[above]
             start[above] += 1
     final = np.empty(len(inner), np.uint32)
     for i in range(len(inner)):
-        final[i] = index[inner[i]]
-        child_count[final[i]] = saved[inner[i]] + 1
-        child_start[final[i]] = start[inner[i]] - (saved[inner[i]] + 1)
+        own = inner[i] - leaves
+        final[i] = index[own]
+        child_count[final[i]] = saved[own] + 1
+        child_start[final[i]] = start[own] - (saved[own] + 1)
     return final

@@ -42,17 +42,18 @@ def test_merged_nodes_are_drawn_with_the_variance_and_coverage_of_their_rows() -
     out = random_splats(100, seed=11)
     before = out.take(np.arange(100))
     space, geometry = node_rows.Space(middle, unit), (out.center, out.scale, out.quat_xyzw, out.opacity)
-    node_rows.fill_merged_splats(order, 40, rows, space, *geometry)
+    row = np.random.default_rng(3).permutation(60).astype(np.uint32)  # of nodes 40 to 99
+    node_rows.fill_merged_splats(order, 40, row, rows, space, *geometry)
     for i, node in enumerate(order):
         if node < 40:  # a leaf
             assert np.array_equal(out.center[i], before.center[i])
             assert out.opacity[i] == before.opacity[i]
             continue
-        row = rows[node]
-        np.testing.assert_allclose(out.center[i], row[CENTER : CENTER + 3] * unit + middle, rtol=1e-5)
-        opacity, spread = profile.profile_of(float(row[DENSITY]))
+        drawn = rows[row[node - 40]]
+        np.testing.assert_allclose(out.center[i], drawn[CENTER : CENTER + 3] * unit + middle, rtol=1e-5)
+        opacity, spread = profile.profile_of(float(drawn[DENSITY]))
         assert out.opacity[i] == pytest.approx(opacity)
-        covariance = twin.matrix(row) * unit**2 / spread
+        covariance = twin.matrix(drawn) * unit**2 / spread
         got = gaussians.covariance(out.scale[i], out.quat_xyzw[i])
         np.testing.assert_allclose(got, covariance, atol=1e-5 * np.trace(covariance))
 

@@ -9,8 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sparklod_cli.lod.kernels import pair_cost, pair_merge, profile
+from sparklod_cli.lod.kernels import pair_merge, profile
 from sparklod_cli.lod.kernels.pair_cost import CENTER, COLOR, COVARIANCE, COVERED, DENSITY, LOG_DET, WEIGHT
+from sparklod_cli.lod.pairs.binary import BinaryTree
 from sparklod_cli.model.gaussian import lod_opacity
 from tests.references import gaussians
 from tests.references import quality as twin
@@ -163,14 +164,15 @@ def test_needles_side_by_side_are_as_long_together_as_each(thickness: float) -> 
 
 
 def test_pairs_become_rows_that_cover_as_much_and_are_as_large_as_they_are_drawn() -> None:
-    rows = np.zeros((30, pair_cost.WIDTH), np.float32)
-    rows[:20] = twin.random_rows(20, seed=8, spread=0.5)
+    rows = twin.random_rows(20, seed=8, spread=0.5)
+    before = rows.copy()
     joined = np.arange(20, dtype=np.uint32).reshape(10, 2)[::-1].copy()
-    children = np.zeros((30, 2), np.uint32)
-    size, error = np.zeros(30, np.float32), np.zeros(30, np.float32)
-    pair_merge.merge_pairs(joined, 20, rows, children, size, error)
-    assert np.array_equal(children[20:], joined)
-    for (a, b), row, seen, off in zip(rows[joined], rows[20:], size[20:], error[20:], strict=True):
+    tree = BinaryTree.of_leaves(rows, np.zeros(20, np.float32))
+    merge(tree, joined)
+    assert np.array_equal(tree.children[:10], joined)
+    assert np.array_equal(tree.row[:10], joined[:, 0])
+    merged = rows[tree.row[:10]], tree.size[20:30], tree.error[:10]
+    for (a, b), row, seen, off in zip(before[joined], *merged, strict=True):
         expected = united(a, b)
         assert np.array_equal(row[COVARIANCE : COVARIANCE + 6], expected[COVARIANCE : COVARIANCE + 6])
         assert row[COVERED] == expected[COVERED]
@@ -184,3 +186,33 @@ def test_pairs_become_rows_that_cover_as_much_and_are_as_large_as_they_are_drawn
         larger = 1 + 0.7 * max(0.0, float(lod_opacity(np.float32([opacity]))[0]) - 1)
         assert seen == pytest.approx(2 * axes.mean() / math.sqrt(spread) * larger, rel=1e-5)
         assert off == pytest.approx(pair_merge.picture_error(a, b, row), rel=1e-6)
+
+
+def merge(tree: BinaryTree, pairs: np.ndarray) -> None:
+    columns = tree.rows, tree.row, tree.spare, tree.children, tree.size, tree.error
+    pair_merge.merge_pairs(pairs, tree.used, tree.leaves, *columns)
+    tree.used += len(pairs)
+
+
+@given(st.integers(2, 60), st.integers(0, 2**32 - 1))
+@settings(max_examples=30)
+def test_merged_nodes_have_the_rows_that_leaves_no_longer_need(count: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    expected = list(twin.random_rows(count, seed=seed % 1000))
+    tree = BinaryTree.of_leaves(np.array(expected), np.zeros(count, np.float32))
+    active = np.arange(count, dtype=np.uint32)
+    while len(active) > 1:
+        active = rng.permutation(active)
+        pairs = active[: 2 * int(rng.integers(1, len(active) // 2 + 1))].reshape(-1, 2)
+        active = np.concatenate([active[2 * len(pairs) :], np.arange(len(pairs), dtype=np.uint32) + tree.used])
+        active = active.astype(np.uint32)
+        expected += [united(expected[a], expected[b]) for a, b in pairs]
+        merge(tree, pairs)
+        for node in active:  # those that will be merged, which no other may have written over
+            row = tree.rows[tree.rows_of(np.array([node], np.uint32))[0]]
+            assert np.array_equal(row[:COLOR], expected[node][:COLOR])
+            expected[node] = row.copy()  # with what `united` does not fill
+    inner = np.arange(count, 2 * count - 1, dtype=np.uint32)
+    assert len(np.unique(tree.rows_of(inner))) == count - 1
+    for node in inner:
+        assert np.array_equal(tree.rows[tree.rows_of(np.array([node], np.uint32))[0]], expected[node])

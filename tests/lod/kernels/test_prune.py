@@ -22,39 +22,49 @@ class Binary:
         rng = np.random.default_rng(seed)
         total = 2 * leaves - 1
         self.leaves = leaves
-        self.children = np.zeros((total, 2), np.uint32)
+        self.children = np.zeros((leaves - 1, 2), np.uint32)
         self.size = np.ones(total, np.float32)
-        self.error = np.zeros(total, np.float32)
+        self.error = np.zeros(leaves - 1, np.float32)
         if not equal:
             self.size[:] = np.exp(rng.normal(0, 2, total))
-            self.error[leaves:] = rng.uniform(0, 1, leaves - 1)
+            self.error[:] = rng.uniform(0, 1, leaves - 1)
         left = list(range(leaves))
         for node in range(leaves, total):
             for side in range(2):
-                self.children[node, side] = left.pop(int(rng.integers(len(left))))
+                self.children[node - leaves, side] = left.pop(int(rng.integers(len(left))))
             left.append(node)
             if not equal and rng.random() < 0.8:  # mostly larger than their children
-                self.size[node] = self.size[self.children[node]].max() * rng.uniform(1, 2)
-        self.log_size, self.weight, self.lost = (np.empty(total, np.float32) for _ in range(3))
-        self.saved = np.empty(total, np.int32)
-        self.parent = prune.fill_usefulness_terms(
-            self.children, leaves, self.size, self.error, self.log_size, self.weight, self.lost
-        )
+                self.size[node] = self.size[self.children[node - leaves]].max() * rng.uniform(1, 2)
+        self.log_size, self.lost, self.weight = self.size.copy(), self.error.copy(), np.empty(leaves - 1, np.float32)
+        self.saved = np.ones(leaves - 1, np.int32)
+        terms = self.log_size, self.lost, self.weight
+        self.parent = prune.fill_usefulness_terms(self.children, leaves, leaves, total - 1, *terms)
 
     def drop(self, most: int) -> np.ndarray:
         """Drops; returns which are kept, leaves among them."""
-        prune.drop_nodes(self.leaves, most, self.parent, self.log_size, self.weight, self.lost, self.saved)
-        return np.flatnonzero(self.saved >= 0)
+        prune.drop_nodes(self.leaves, most, self.parent, self.log_size, self.lost, self.weight, self.saved)
+        return np.flatnonzero(self.is_kept)
+
+    @property
+    def is_kept(self) -> np.ndarray:
+        """Of every node."""
+        return np.concatenate([np.ones(self.leaves, bool), self.saved >= 0])
+
+    def ranks(self) -> np.ndarray:
+        """Of merged nodes."""
+        highest, latest = self.log_size[-1], np.empty(0, np.int32)
+        return prune.size_ranks(self.leaves, highest, self.parent, self.log_size, self.saved, latest)
 
     def place(self) -> tuple[np.ndarray, LodTree, np.ndarray, np.ndarray]:
         """The node of each final index, the tree, inner nodes and their places."""
-        level = prune.size_ranks(self.leaves, self.parent, self.log_size, self.saved)
-        inner = np.flatnonzero(level >= 0).astype(np.uint32)
-        inner = inner[np.argsort(level[inner], kind="stable")]
+        rank = self.ranks()
+        inner = np.flatnonzero(rank != prune.NO_RANK).astype(np.uint32)
+        inner = inner[np.argsort(rank[inner], kind="stable")] + np.uint32(self.leaves)
         total = self.leaves + len(inner)
         order = np.full(total, UNUSED)
         tree = LodTree(np.zeros(total, np.uint16), np.zeros(total, np.uint32))
-        places = prune.lay_out_children(inner, self.parent, self.saved, order, tree.child_start, tree.child_count)
+        columns = order, tree.child_start, tree.child_count
+        places = prune.lay_out_children(inner, self.leaves, self.parent, self.saved, *columns)
         return order, tree, inner, places
 
 
@@ -66,15 +76,14 @@ def test_every_node_is_valued_below_its_parent(binary: Binary) -> None:
     total = len(binary.size)
     assert binary.parent[total - 1] == total - 1
     for node in range(binary.leaves, total):
-        assert (binary.parent[binary.children[node]] == node).all()
+        assert (binary.parent[binary.children[node - binary.leaves]] == node).all()
     expected = np.log(binary.size)
     for node in range(total - 2, -1, -1):
         expected[node] = min(expected[node], expected[binary.parent[node]])
     np.testing.assert_allclose(binary.log_size, expected, atol=1e-5)
     assert (binary.log_size <= binary.log_size[binary.parent]).all()
-    inner = slice(binary.leaves, None)
-    assert (binary.weight[inner] > 0).all() and (binary.weight[inner] <= 1).all()
-    assert np.isfinite(binary.lost[inner]).all() and (binary.lost[inner] >= 0).all()
+    assert (binary.weight > 0).all() and (binary.weight <= 1).all()
+    assert np.isfinite(binary.lost).all() and (binary.lost >= 0).all()
 
 
 @given(BINARIES, st.floats(0, 1))
@@ -82,11 +91,9 @@ def test_no_more_are_kept_than_asked_for_and_their_parents_are_nearest_of_them(b
     most = max(1, int(share * (binary.leaves - 1)))
     above = binary.parent.copy()
     kept = binary.drop(most)
-    root = len(above) - 1
-    assert binary.saved[root] > 0
-    assert (binary.saved[: binary.leaves] == 0).all()
+    assert binary.saved[-1] > 0
     assert len(kept) - binary.leaves == min(most, binary.leaves - 1)  # neither more than wanted is dropped
-    is_kept = binary.saved >= 0
+    is_kept = binary.is_kept
     children = np.zeros(len(above), int)
     for node in kept[:-1]:
         nearest = above[node]
@@ -95,36 +102,66 @@ def test_no_more_are_kept_than_asked_for_and_their_parents_are_nearest_of_them(b
         assert binary.parent[node] == nearest
         children[nearest] += 1
     inner = kept[kept >= binary.leaves]
-    assert np.array_equal(binary.saved[inner] + 1, children[inner])
+    assert np.array_equal(binary.saved[inner - binary.leaves] + 1, children[inner])
 
 
 def test_the_most_useful_nodes_are_kept() -> None:
     """Of two inner nodes under a root, equal but for their errors, the one with less of it."""
-    children = np.array([[0, 0]] * 4 + [[0, 1], [2, 3], [4, 5]], np.uint32)
-    for worse in (4, 5):
-        size = np.array([1, 1, 1, 1, 2, 2, 8], np.float32)
-        error = np.array([0, 0, 0, 0, 0.1, 0.1, 1], np.float32)
-        error[worse] = 0.4
-        log_size, weight, lost = (np.empty(7, np.float32) for _ in range(3))
-        saved = np.empty(7, np.int32)
-        parent = prune.fill_usefulness_terms(children, 4, size, error, log_size, weight, lost)
-        prune.drop_nodes(4, 2, parent, log_size, weight, lost, saved)
-        assert saved[worse] == -1
-        assert saved[9 - worse] == 1
-        assert saved[6] == 2
+    children = np.array([[0, 1], [2, 3], [4, 5]], np.uint32)
+    for worse in (0, 1):
+        log_size = np.array([1, 1, 1, 1, 2, 2, 8], np.float32)
+        lost = np.array([0.1, 0.1, 1], np.float32)
+        lost[worse] = 0.4
+        weight, saved = np.empty(3, np.float32), np.ones(3, np.int32)
+        parent = prune.fill_usefulness_terms(children, 4, 4, 6, log_size, lost, weight)
+        prune.drop_nodes(4, 2, parent, log_size, lost, weight, saved)
+        assert saved.tolist() == ([-1, 1, 2] if worse == 0 else [1, -1, 2])
 
 
 @given(BINARIES, st.floats(0, 1))
 def test_levels_rise_along_every_path(binary: Binary, share: float) -> None:
     kept = binary.drop(max(1, int(share * (binary.leaves - 1))))
-    level = prune.size_ranks(binary.leaves, binary.parent, binary.log_size, binary.saved)
-    inner = kept[kept >= binary.leaves]
-    assert level[inner[-1]] == 0
-    assert (level[inner[:-1]] > level[binary.parent[inner[:-1]]]).all()
-    others = np.setdiff1d(np.arange(len(level)), inner)
-    assert (level[others] == -1).all()
-    octaves = (binary.log_size[-1] - binary.log_size[inner]) / math.log(2)
-    assert (level[inner] >= np.floor(prune.STEPS * octaves - 1e-3)).all()
+    rank = binary.ranks()
+    inner = kept[kept >= binary.leaves] - binary.leaves
+    assert rank[inner[-1]] == 0
+    assert (rank[inner[:-1]] > rank[binary.parent[inner[:-1] + binary.leaves] - binary.leaves]).all()
+    assert np.array_equal(np.flatnonzero(rank != prune.NO_RANK), inner)
+    octaves = (binary.log_size[-1] - binary.log_size[inner + binary.leaves]) / math.log(2)
+    assert (rank[inner] >= np.floor(prune.STEPS * octaves - 1e-3)).all()
+
+
+@given(BINARIES, st.floats(0, 1), st.integers(0, 2**32 - 1))
+def test_ranks_are_below_those_that_leaves_have_already(binary: Binary, share: float, seed: int) -> None:
+    binary.drop(max(1, int(share * (binary.leaves - 1))))
+    latest = np.random.default_rng(seed).integers(-20, 20, binary.leaves).astype(np.int32)
+    terms = binary.leaves, np.float32(3), binary.parent, binary.log_size, binary.saved
+    free, bound = (prune.size_ranks(*terms, ranks) for ranks in (latest[:0], latest))
+    assert (bound <= free).all()
+    rank = np.concatenate([latest, bound])
+    for node in np.flatnonzero(binary.is_kept)[:-1]:
+        assert rank[node] > rank[binary.parent[node]]
+
+
+@given(BINARIES, st.integers(0, 150), st.integers(0, 100))
+def test_nodes_that_get_their_parents_later_are_dropped_last(binary: Binary, cut: int, most: int) -> None:
+    """The last merges are undone: what they merged is without a parent."""
+    total = max(2 * binary.leaves - 1 - cut, binary.leaves)
+    made = total - binary.leaves
+    children = binary.children[:made]
+    log_size, lost = np.append(binary.size[:total], np.float32(0)), np.ones(made + 1, np.float32)
+    weight = np.empty(made + 1, np.float32)
+    parent = prune.fill_usefulness_terms(children, binary.leaves, binary.leaves, total, log_size, lost, weight)
+    loose = np.setdiff1d(np.arange(total), children)
+    assert np.array_equal(np.flatnonzero(parent[:-1] == total), loose)
+    saved = np.ones(made + 1, np.int32)
+    saved[-1] = len(loose) - 1 - prune.ROOM
+    prune.drop_nodes(binary.leaves, most + 1, parent, log_size, lost, weight, saved)
+    assert np.count_nonzero(saved[:-1] >= 0) == min(most, made)
+    kept = np.concatenate([np.ones(binary.leaves, bool), saved[:-1] >= 0])
+    assert saved[-1] + prune.ROOM + 1 == np.count_nonzero((parent[:-1] == total) & kept)
+    merged = loose[loose >= binary.leaves]
+    if most >= len(merged) and binary.leaves <= prune.MOST_CHILDREN:  # otherwise rather than exceed that
+        assert (saved[merged - binary.leaves] > 0).all()
 
 
 @given(BINARIES, st.floats(0, 1))
@@ -150,7 +187,7 @@ def test_with_nothing_dropped_the_tree_is_the_binary_one(binary: Binary) -> None
     for place, node in zip(places, inner, strict=True):
         start = int(tree.child_start[place])
         assert tree.child_count[place] == 2
-        assert set(order[start : start + 2].tolist()) == set(binary.children[node].tolist())
+        assert set(order[start : start + 2].tolist()) == set(binary.children[node - binary.leaves].tolist())
 
 
 @given(st.lists(st.floats(width=32, allow_nan=False), min_size=2, max_size=30))
