@@ -2,6 +2,7 @@
 
 from ..bake import Baked as Baked
 from ..bake import BakeSettings as BakeSettings
+from ..bake import Resources as Resources
 from ..bake import bake as bake
 from ..extract_leaves import Extracted as Extracted
 from ..extract_leaves import extract_leaves as extract_leaves

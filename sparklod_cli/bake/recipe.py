@@ -7,13 +7,13 @@ import hashlib
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from .. import __version__
 from ..io import files_of, identity_of
+from ..support.addresses import Place
 from ..support.untrusted import parse_json, quoted_value
 from .settings import BakeSettings
 
@@ -72,7 +72,7 @@ class Recipe:
             raise ValueError(f"it is no recipe: {error!r}") from None
 
 
-def recipe_of(sources: Iterable[Path], settings: BakeSettings, **more: Any) -> Recipe:
+def recipe_of(sources: Iterable[Place], settings: BakeSettings, **more: Any) -> Recipe:
     """The recipe of a bake that may go on later; files are told apart by size, time and a sample of their bytes.
 
     Args:
@@ -84,7 +84,9 @@ def recipe_of(sources: Iterable[Path], settings: BakeSettings, **more: Any) -> R
         UnreadableError: an input cannot be read.
     """
     files = [file for source in sources for file in files_of(source)]
-    found = [identity_of(file) for file in [*files, *([settings.rgba] if settings.rgba else [])]]
+    if settings.rgba is not None:
+        files.append(settings.rgba)
+    found = [identity_of(file) for file in files]
     inputs = tuple(f"{each.bytes} {each.modified} {each.sample}" for each in found)
     return Recipe(inputs, tuple(each.name for each in found), settings_of(settings) | more)
 

@@ -19,9 +19,10 @@ from .build_lod_outputs import Outputs, check_formats
 from .command import COMMON, Command, option
 from .options.baking import bake_settings, baking_options, check_method, write_options
 from .options.common import General, common_options, output_option, overwrite_option
+from .options.resources import OF_BAKES, resources_of, resources_options
 from .paths import InputPath, OutputPath, claim_stdout, keep_apart, with_chunks
 from .reports import report_baked, report_extracted
-from .usage import options_of
+from .usage import exclude, options_of
 
 if TYPE_CHECKING:
     from ..api.bake_jobs import Baked, Extracted
@@ -34,6 +35,7 @@ Examples:
   sparklod build-lod scene.ply --up -y                  # y up, as viewers want it
   sparklod build-lod scene.ply --method quality         # for publishing
   sparklod build-lod scans/*.ply --output-dir web -f
+  sparklod build-lod city.ply -o city-lod.rad --memory 4G --scratch-dir /fast
   cat scene.ply | sparklod build-lod - -o - | aws s3 cp - s3://bucket/scene-lod.spz
   sparklod build-lod scene.ply --within 0,1,0,25 --min-opacity 0.02
   sparklod build-lod scene.ply --json | jq .nodes
@@ -69,6 +71,7 @@ Examples:
     " .splat.",
 )
 @baking_options
+@resources_options
 @common_options
 @click.pass_context
 def build_lod(ctx: click.Context, /, inputs: tuple[Place, ...], **_: Any) -> None:
@@ -122,7 +125,9 @@ def _check(ctx: click.Context, inputs: tuple[Place, ...], outputs: Outputs, gene
     if ctx.params["rgba"] is not None and len(inputs) > 1:
         raise click.UsageError(f"--rgba takes one input, not {len(inputs)}")
     check_formats(ctx, outputs)
-    if not outputs.unlod:
+    if outputs.unlod:
+        exclude(ctx, OF_BAKES, "--unlod")
+    else:
         check_method(ctx)
 
 
@@ -138,4 +143,4 @@ def _job(
     settings = bake_settings(ctx, suffix=outputs.suffix, raw=outputs.is_raw, converts=outputs.format_is_asked_for)
     more = [] if outputs.suffix != RAD else ["rad"] if settings.options.rad.sh_codes is None else ["rad", "palette"]
     console.announce_compiling(settings.method, *more)
-    return functools.partial(bake, settings=settings), report_baked
+    return functools.partial(bake, settings=settings, resources=resources_of(ctx), say=console.say), report_baked
