@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Protocol
 
 from ..codecs import clamps
-from ..codecs.clamps import Clamp
+from ..codecs.clamps import Clamp, Range
+from ..codecs.encoder import CLAMPED, Encoder, Get, Kept, results, windows_of
 from ..codecs.formats import WRITABLE, Format
 from ..codecs.gpu import dump
 from ..codecs.options import WriteOptions
@@ -17,7 +20,9 @@ from ..codecs.statistics import Statistics
 from ..io import SceneSink, Sink, scene_sink, sink
 from ..model.nodes import CHUNK_NODES
 from ..model.scene import Scene
+from ..model.streams import NodeStream
 from ..support.addresses import Place
+from ..support.errors import FormatError
 from ..support.progress import Progress
 from .settings import BakeSettings
 
@@ -57,14 +62,44 @@ class Output(Protocol):
     def in_chunks(self) -> bool:
         """Whether it is read in chunks, so that nodes are put in an order for that first."""
 
+    @property
+    def needed(self) -> frozenset[str]:
+        """The statistics of all nodes by which it is written, see `codecs.statistics`."""
+
     def check(self, scene: Scene) -> None:
         """Raises `FormatError` where a tree of these splats cannot be written."""
 
     def check_statistics(self, found: Statistics) -> None:
-        """As `check`, of statistics of these splats."""
+        """As `check`, of statistics of these splats; and where it cannot be written without all nodes in memory."""
 
     def write(self, scene: Scene, threads: int, progress: Progress) -> WrittenTree:
         """Writes a tree."""
+
+    def encoder(self, nodes: NodeStream, found: Statistics, threads: int, progress: Progress) -> Encoder:
+        """The encoder of a tree, which `write_windows` takes.
+
+        Args:
+            nodes: of the tree, in their final order.
+            found: statistics of all of them.
+            threads, progress: for what has to be found out of the nodes first.
+
+        Raises:
+            FormatError: the tree cannot be written, or not without all nodes in memory.
+        """
+
+    def write_windows(self, encoder: Encoder, get: Get, threads: int, progress: Progress) -> WrittenTree:
+        """Writes a tree whose windows are encoded; `get` reads their results."""
+
+    def write_stream(
+        self, nodes: NodeStream, found: Statistics, scratch: Path, threads: int, progress: Progress
+    ) -> WrittenTree:
+        """Writes a tree in little memory, on this machine.
+
+        Args:
+            nodes, found: as for `encoder`.
+            scratch: folder for a temporary file of encoded windows.
+            threads, progress: as for `write`.
+        """
 
 
 def output_of(target: Place, settings: BakeSettings, *, overwrite: bool) -> Output:
@@ -96,11 +131,20 @@ class _Arrays:
     sink: Sink
     in_chunks: bool = False
 
+    @property
+    def needed(self) -> frozenset[str]:
+        """None: nothing is settled by statistics."""
+        return frozenset()
+
     def check(self, scene: Scene) -> None:
         """They hold anything."""
 
     def check_statistics(self, found: Statistics) -> None:
-        """They hold anything."""
+        """They are made of all nodes at once."""
+        raise FormatError(
+            "the arrays of --encoding are packed in memory, and this tree does not fit: give more --memory, or write"
+            " .spz or .rad"
+        )
 
     def write(self, scene: Scene, threads: int, progress: Progress) -> WrittenTree:
         """Writes them."""
@@ -108,6 +152,22 @@ class _Arrays:
         size = self.sink(dump.encode_raw(arrays) if self.raw else dump.encode_npz(arrays))
         shapes = {name: words.shape for name, words in arrays.items()}
         return WrittenTree(output_format=self.encoding, bytes=size, arrays=shapes)
+
+    def encoder(self, nodes: NodeStream, found: Statistics, threads: int, progress: Progress) -> Encoder:
+        """There is none."""
+        self.check_statistics(found)
+        raise AssertionError
+
+    def write_windows(self, encoder: Encoder, get: Get, threads: int, progress: Progress) -> WrittenTree:
+        """There are none."""
+        raise AssertionError
+
+    def write_stream(
+        self, nodes: NodeStream, found: Statistics, scratch: Path, threads: int, progress: Progress
+    ) -> WrittenTree:
+        """They cannot."""
+        self.check_statistics(found)
+        raise AssertionError
 
 
 @dataclass(frozen=True)
@@ -126,6 +186,12 @@ class _File:
     sink: SceneSink
     in_chunks: bool
 
+    @property
+    def needed(self) -> frozenset[str]:
+        """Those of the codec."""
+        needed: frozenset[str] = self.form.codec().needed(self.options)
+        return needed
+
     def check(self, scene: Scene) -> None:
         """The codec knows."""
         self.form.codec().settled(scene, self.options)
@@ -138,8 +204,43 @@ class _File:
         """Writes it."""
         options: WriteOptions = self.form.codec().settled(scene, self.options)
         size = self.sink(scene, options, threads=threads, progress=progress)
+        beyond = clamps.find(scene.splats, threads, self._held(options, scene.splats.sh_degree))
+        return self._written(options, size, len(scene), scene.splats.sh_degree, beyond)
+
+    def encoder(self, nodes: NodeStream, found: Statistics, threads: int, progress: Progress) -> Encoder:
+        """That of the codec."""
+        codec = self.form.codec()
+        options = codec.settled(found, self.options)
+        ranges = tuple(self._held(options, nodes.sh_degree))
+        encoder: Encoder = codec.encoder(nodes, options, ranges, threads=threads, progress=progress)
+        return encoder
+
+    def write_windows(self, encoder: Encoder, get: Get, threads: int, progress: Progress) -> WrittenTree:
+        """Writes it."""
+        size = self.sink.assemble(encoder, get, threads=threads, progress=progress)
+        tallies = [get(number, CLAMPED) for number in range(len(windows_of(encoder.count)))]
+        beyond = clamps.clamps_of(clamps.merged(tallies), encoder.ranges)
+        return self._written(encoder.options, size, encoder.count, encoder.sh_degree, beyond)
+
+    def write_stream(
+        self, nodes: NodeStream, found: Statistics, scratch: Path, threads: int, progress: Progress
+    ) -> WrittenTree:
+        """Writes it."""
+        encoder = self.encoder(nodes, found, threads, progress)
+        with Kept(scratch) as kept:
+            for result in results(encoder, nodes, threads, progress, "encoding"):
+                kept.put(result)
+            return self.write_windows(encoder, kept.get, threads, progress)
+
+    def _held(self, options: WriteOptions, sh_degree: int) -> Sequence[Range]:
+        """The values that are not clamped."""
+        return rad_options.held(options, sh_degree) if self.in_chunks else clamps.SPZ
+
+    def _written(
+        self, options: WriteOptions, size: int, count: int, sh_degree: int, beyond: clamps.Clamps
+    ) -> WrittenTree:
+        """What was written, of so many bytes and nodes, with settled options."""
         if not self.in_chunks:
-            beyond = clamps.find(scene.splats, threads)
             return WrittenTree(
                 output_format="spz",
                 bytes=size,
@@ -148,14 +249,12 @@ class _File:
                 clamped=beyond.splats,
                 clamps=beyond.ends,
             )
-        degree = scene.splats.sh_degree
-        beyond = clamps.find(scene.splats, threads, rad_options.held(options, degree))
         return WrittenTree(
             output_format="rad-chunked" if options.rad.chunked else "rad",
             bytes=size,
-            chunks=-(-len(scene) // CHUNK_NODES),
-            encodings={name: getattr(options.rad, name) for name in OPTIONS if degree or name != "sh"},
-            sh_codes=min(options.rad.sh_codes, len(scene)) if options.rad.sh_codes and degree else None,
+            chunks=-(-count // CHUNK_NODES),
+            encodings={name: getattr(options.rad, name) for name in OPTIONS if sh_degree or name != "sh"},
+            sh_codes=min(options.rad.sh_codes, count) if options.rad.sh_codes and sh_degree else None,
             clamped=beyond.splats,
             clamps=beyond.ends,
         )

@@ -8,9 +8,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from ..model.splats import FloatArray, Splats
+from ..model.splats import Splats
 from ..support.parallel import blocks_of, ordered_map
 from . import quantize
+from .encoder import rows_of
 
 
 @dataclass(frozen=True)
@@ -35,6 +36,10 @@ class Range:
 
 #: What SPZ holds.
 SPZ = tuple(Range(column, low, high) for column, (low, high) in quantize.CLAMPS.items())
+
+
+#: Counts of what lies beyond ranges, see `tally`.
+Tally = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -73,43 +78,68 @@ class Clamps:
     ends: tuple[Clamp, ...] = ()
 
 
-def find(splats: Splats, threads: int = 1, ranges: Sequence[Range] = SPZ) -> Clamps:
-    """The values of splats that lie beyond ranges, in the order of the ranges."""
+def tally(splats: Splats, ranges: Sequence[Range]) -> Tally:
+    """What lies beyond ranges among some splats of a file.
+
+    Args:
+        splats: n of them.
+        ranges: those of one column are side by side.
+
+    Returns:
+        (ranges, 6) float64: splats below the range, above, and either; splats beyond any range of its column; the
+        least and the largest value, infinite where there is none.
+    """
+    found = np.zeros((len(ranges), 6))
+    found[:, 4:] = np.inf, -np.inf
+    for name in dict.fromkeys(each.column for each in ranges):
+        column, either = getattr(splats, name).reshape(len(splats), -1), np.zeros(len(splats), np.bool_)
+        numbers = [number for number, each in enumerate(ranges) if each.column == name]
+        for number in numbers:
+            each = ranges[number]
+            values = column[:, slice(*each.numbers)]
+            if not values.size:
+                continue
+            if each.zero:
+                values = np.where(values < each.zero, each.low, values)
+            below, above = _rows_with(values < each.low), _rows_with(values > each.high)
+            either |= below | above
+            counts = (np.count_nonzero(mask) for mask in (below, above, below | above))
+            found[number] = (*counts, 0, values.min(), values.max())
+        found[numbers, 3] = np.count_nonzero(either)
+    return found
+
+
+def merged(tallies: Sequence[Tally]) -> Tally:
+    """The tally of all splats of one part or more."""
+    parts = np.stack(tallies)
+    return np.column_stack([parts[:, :, :4].sum(axis=0), parts[:, :, 4].min(axis=0), parts[:, :, 5].max(axis=0)])
+
+
+def clamps_of(found: Tally, ranges: Sequence[Range]) -> Clamps:
+    """What a tally of these ranges says, in their order."""
     counts: dict[str, int] = {}
     ends = []
-    for name in dict.fromkeys(each.column for each in ranges):
-        rows = [each for each in ranges if each.column == name]
-        column = getattr(splats, name).reshape(len(splats), -1)
-        if not column.size:
+    for each, (below, above, beyond, either, least, most) in zip(ranges, found.tolist(), strict=True):
+        if either:
+            counts[each.column] = int(either)
+        if each.low == -each.high:
+            if beyond:
+                farthest = max(-least, most)
+                ends.append(Clamp(each.column, True, int(beyond), each.high, farthest, each.degree, both=True))
             continue
-
-        def look(part: slice, column: FloatArray = column, rows: Sequence[Range] = rows) -> list[tuple[float, ...]]:
-            found, either = [], np.zeros(part.stop - part.start, np.bool_)
-            for each in rows:
-                values = column[part, slice(*each.numbers)]
-                if each.zero:
-                    values = np.where(values < each.zero, each.low, values)
-                below, above = _rows_with(values < each.low), _rows_with(values > each.high)
-                either |= below | above
-                counted = (int(np.count_nonzero(mask)) for mask in (below, above, below | above))
-                found.append((*counted, float(values.min()), float(values.max())))
-            return [(int(np.count_nonzero(either)),), *found]
-
-        parts = list(ordered_map(look, blocks_of(len(splats)), threads))
-        if total := sum(int(part[0][0]) for part in parts):
-            counts[name] = total
-        for index, each in enumerate(rows, 1):
-            below, above, beyond, least, most = zip(*(part[index] for part in parts), strict=True)
-            if each.low == -each.high:
-                if sum(beyond):
-                    farthest = max(-min(least), max(most))
-                    ends.append(Clamp(name, True, int(sum(beyond)), each.high, farthest, each.degree, both=True))
-                continue
-            if sum(below):
-                ends.append(Clamp(name, False, int(sum(below)), each.low, min(least), each.degree))
-            if sum(above):
-                ends.append(Clamp(name, True, int(sum(above)), each.high, max(most), each.degree))
+        if below:
+            ends.append(Clamp(each.column, False, int(below), each.low, least, each.degree))
+        if above:
+            ends.append(Clamp(each.column, True, int(above), each.high, most, each.degree))
     return Clamps(counts, tuple(ends))
+
+
+def find(splats: Splats, threads: int = 1, ranges: Sequence[Range] = SPZ) -> Clamps:
+    """The values of splats that lie beyond ranges, in the order of the ranges."""
+    if not len(splats):
+        return Clamps()
+    parts = (rows_of(splats, None, part)[0] for part in blocks_of(len(splats)))
+    return clamps_of(merged(list(ordered_map(lambda part: tally(part, ranges), parts, threads))), ranges)
 
 
 def _rows_with(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:

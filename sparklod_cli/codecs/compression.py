@@ -6,12 +6,10 @@ docs/decisions explains why the library's own threaded gzip is not used.
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any, BinaryIO
 
-import numpy as np
 import zstandard
-from numpy.typing import NDArray
 from zlib_ng import zlib_ng
 
 from ..support.errors import ChecksumError, FormatError, PromiseError, TooLongError, TruncatedError
@@ -31,28 +29,65 @@ GZIP_MAGIC = b"\x1f\x8b"
 _RAW, _GZIP = -zlib_ng.MAX_WBITS, zlib_ng.MAX_WBITS + 16
 
 
-def gzip_member(data: NDArray[np.uint8], level: int, threads: int, progress: Progress) -> Iterator[bytes]:
-    """One gzip member of `data`, piece by piece; the same bytes for any number of threads.
+def gzip_member(pieces: Iterable[Any], total: int, level: int, threads: int, progress: Progress) -> Iterator[bytes]:
+    """One gzip member, piece by piece; the same bytes for any number of threads, and however the data are cut.
 
     As in pigz, blocks are deflated separately, each with the end of the previous one as its dictionary, and end on a
     byte boundary with an empty stored block, so that together they are one deflate stream.
-    """
-    view = data.data.cast("B")
-    starts = list(range(0, len(view), BLOCK)) or [0]
 
-    def deflate(start: int) -> bytes:
-        end = start + BLOCK
-        finish = zlib_ng.Z_FINISH if end >= len(view) else zlib_ng.Z_SYNC_FLUSH
-        window = view[max(0, start - WINDOW) : start]
-        memory, strategy = zlib_ng.DEF_MEM_LEVEL, zlib_ng.Z_DEFAULT_STRATEGY
-        packer = zlib_ng.compressobj(level, zlib_ng.DEFLATED, _RAW, memory, strategy, zdict=window)
-        return packer.compress(view[start:end]) + packer.flush(finish)
+    Args:
+        pieces: bytes, or contiguous arrays, asked for a few blocks ahead.
+        total: their bytes.
+        level: of compression.
+        threads: to deflate on.
+        progress: told of the bytes.
+    """
+    check = 0
+
+    def blocks() -> Iterator[tuple[memoryview, memoryview, bool]]:
+        nonlocal check
+        before, at = memoryview(b""), 0
+        for block in blocks_of_pieces(pieces, BLOCK):
+            check, at = zlib_ng.crc32(block, check), at + len(block)
+            yield before, block, at >= total
+            before = block[-WINDOW:]
 
     yield b"\x1f\x8b\x08\0\0\0\0\0\0\xff"  # no name, no time, no system: the same scene gives the same bytes
-    for start, block in zip(starts, ordered_map(deflate, starts, threads), strict=True):
-        yield block
-        progress("writing", min(start + BLOCK, len(view)), len(view), "B")
-    yield struct.pack("<II", zlib_ng.crc32(view), len(view) & 0xFFFFFFFF)
+    done = 0
+    for size, packed in ordered_map(lambda each: _deflated(*each, level), blocks(), threads):
+        yield packed
+        done += size
+        progress("writing", done, total, "B")
+    yield struct.pack("<II", check, total & 0xFFFFFFFF)
+
+
+def _deflated(before: memoryview, block: memoryview, last: bool, level: int) -> tuple[int, bytes]:
+    """The bytes of a block, and its part of a deflate stream, in which it comes after the bytes `before`."""
+    memory, strategy = zlib_ng.DEF_MEM_LEVEL, zlib_ng.Z_DEFAULT_STRATEGY
+    packer = zlib_ng.compressobj(level, zlib_ng.DEFLATED, _RAW, memory, strategy, zdict=before)
+    return len(block), packer.compress(block) + packer.flush(zlib_ng.Z_FINISH if last else zlib_ng.Z_SYNC_FLUSH)
+
+
+def blocks_of_pieces(pieces: Iterable[Any], size: int) -> Iterator[memoryview]:
+    """The data of pieces in blocks of `size` bytes; the last may be shorter, and is empty where there are no data.
+
+    A block that lies within one piece is a view of it.
+    """
+    rest: list[memoryview] = []
+    missing = size
+    block = None
+    for piece in pieces:
+        view = memoryview(piece)
+        view = view.cast("B") if view.nbytes else memoryview(b"")
+        while len(view) >= missing:
+            block = view[:missing] if missing == size else memoryview(b"".join([*rest, view[:missing]]))
+            view, rest, missing = view[missing:], [], size
+            yield block
+        if len(view):
+            rest.append(view)
+            missing -= len(view)
+    if rest or block is None:
+        yield memoryview(b"".join(rest))
 
 
 def check_promise(total: int, file_size: int) -> None:

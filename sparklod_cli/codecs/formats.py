@@ -21,7 +21,9 @@ class Format:
         writable: its module also has `encode(scene, options, *, threads, progress) -> Iterator[bytes]`, and
             `settled(scene, options) -> WriteOptions`, the options with nothing left open, which raises `FormatError`
             if the scene cannot be written.
-        trees: it can be written with a Level-of-Detail tree.
+        trees: it can be written with a Level-of-Detail tree. Its `encode` then takes a `NodeStream`, too, and
+            `scratch`, a folder; its `settled` takes `Statistics`, too, those that `needed(options)` names; and
+            `encoder(scene, options, ranges, *, threads, progress)` gives its `encoder.Encoder`.
         suffixes: lower case, with the dot.
         beginning: a regular expression that the first bytes of its files match; None if any bytes are possible, so that
             only the suffix decides.

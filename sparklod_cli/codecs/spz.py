@@ -7,52 +7,50 @@ byte.
 from __future__ import annotations
 
 from collections.abc import Iterator
-
-import numpy as np
+from pathlib import Path
 
 from ..model.scene import Scene
-from ..support.parallel import for_blocks
+from ..model.streams import NodeStream
 from ..support.progress import Progress, silent
-from . import compression
+from .encoder import Kept, results
 from .options import DEFAULTS, WriteOptions
-from .spz_layout import ANTIALIASED, HEADER, LOD, MAGIC, Layout
+from .spz_encoder import encoder as encoder
 from .spz_options import needed as needed
 from .spz_options import settled as settled
-from .spz_reading import column_of
 from .spz_reading import decode as decode
 from .spz_reading import examine as examine
 from .spz_reading import stream as stream
 
 
 def encode(
-    scene: Scene, options: WriteOptions = DEFAULTS, *, threads: int = 1, progress: Progress = silent
+    scene: Scene | NodeStream,
+    options: WriteOptions = DEFAULTS,
+    *,
+    threads: int = 1,
+    progress: Progress = silent,
+    scratch: Path | None = None,
 ) -> Iterator[bytes]:
     """The bytes of a file, piece by piece: an LoD file if the scene has a tree, otherwise a plain one.
 
-    The same scene and options give the same bytes for any number of threads.
+    The same scene and options give the same bytes for any number of threads, and for a stream of the same nodes.
+
+    Args:
+        scene: what is written.
+        options: settled where the scene is a stream; otherwise they may leave choices open.
+        threads: to encode on.
+        progress: told of the splats, and then of the bytes.
+        scratch: folder for a temporary file of the bytes before they are compressed; None to keep them in memory.
 
     Raises:
         FormatError: a coordinate does not fit the fractional bits; the text names the most that would.
     """
-    splats, tree = scene.splats, scene.tree
-    options = settled(scene, options)
-    assert options.spz_version is not None and options.fractional_bits is not None
-    bits = options.fractional_bits
-    flags = (ANTIALIASED if scene.antialiased else 0) | (LOD if tree is not None else 0)
-    layout = Layout(options.spz_version, len(splats), splats.sh_degree, bits, flags)
-    data = np.empty(HEADER.size + layout.total, np.uint8)
-    data[: HEADER.size] = np.frombuffer(
-        HEADER.pack(MAGIC, layout.version, layout.count, layout.sh_degree, bits, flags, 0), np.uint8
-    )
-    codes, at = {}, HEADER.size
-    for each in layout.streams():
-        codes[each] = data[at : at + each.size * layout.count].reshape(layout.count, each.size)
-        at += codes[each].size
-
-    def fill(part: slice) -> None:
-        for each, out in codes.items():
-            values = np.ascontiguousarray(each.encode(column_of(splats, tree, each)[part]))
-            out[part] = values.view(np.uint8).reshape(-1, each.size)
-
-    for_blocks(fill, layout.count, threads, lambda done: progress("encoding", done, layout.count, "splat"))
-    yield from compression.gzip_member(data, options.compression_level, threads, progress)
+    made = encoder(scene, settled(scene, options) if isinstance(scene, Scene) else options)
+    found = results(made, scene, threads, progress, "encoding")
+    if scratch is None:
+        kept = list(found)
+        yield from made.pieces(lambda number, name: kept[number][name], threads=threads, progress=progress)
+        return
+    with Kept(scratch) as spilled:
+        for result in found:
+            spilled.put(result)
+        yield from made.pieces(spilled.get, threads=threads, progress=progress)

@@ -11,7 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..model.gaussian import linear_opacity, lod_opacity
+from ..model.lod_tree import LodTree
 from ..model.sh import COEFFICIENTS
+from ..model.splats import Splats
 from ..support.defaults import MAX_SH_DEGREE
 from . import quantize
 
@@ -48,6 +50,12 @@ class Stream(NamedTuple):
 
 #: Some rows of a stream: the stream, which rows, and (n, size) bytes.
 StreamRows = tuple[Stream, slice, quantize.Bytes]
+
+
+def column_of(splats: Splats, tree: LodTree | None, stream: Stream) -> NDArray[Any]:
+    """The column that a stream holds."""
+    column: NDArray[Any] = getattr(splats if hasattr(splats, stream.column) else tree, stream.column)
+    return column
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from ..support.progress import Progress, silent
 from . import compression, quantize
 from .content import HAS_TREE, Content, Scratch
 from .sound import with_sound_tree
-from .spz_layout import ANTIALIASED, EXTENSIONS, HEADER, LOD, MAGIC, Layout, Stream, StreamRows
+from .spz_layout import ANTIALIASED, EXTENSIONS, HEADER, LOD, MAGIC, Layout, Stream, StreamRows, column_of
 from .stream import Positioned, Read, rows_between, rows_of, size_of
 
 HEADER_V4 = struct.Struct("<IIIBBBBI12s")  # ..., streams, offset of the table of streams, reserved
@@ -140,12 +140,6 @@ def _notes(layout: Layout, header: dict[str, int]) -> tuple[str, ...]:
 
 def _decode(stream: Stream, codes: quantize.Bytes, out: NDArray[Any]) -> None:
     out[...] = stream.decode(codes).reshape(out.shape)
-
-
-def column_of(splats: Splats, tree: LodTree | None, stream: Stream) -> NDArray[Any]:
-    """The column that a stream holds."""
-    column: NDArray[Any] = getattr(splats if hasattr(splats, stream.column) else tree, stream.column)
-    return column
 
 
 def _checked(layout: Layout, file_size: int) -> Layout:

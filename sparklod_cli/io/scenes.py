@@ -3,28 +3,67 @@
 from __future__ import annotations
 
 import os
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
+from ..codecs.encoder import Encoder, Get
 from ..codecs.formats import Format
 from ..codecs.options import WriteOptions
 from ..model.scene import Scene
 from ..support.addresses import Address, Place
 from ..support.progress import Progress, silent
-from .together import sink_together
-from .writing import sink
+from .together import SinkTogether, sink_together
+from .writing import Sink, sink
 
 
-class SceneSink(Protocol):
-    """Writes a scene and returns how many bytes it wrote."""
+@dataclass(frozen=True)
+class SceneSink:
+    """Writes a scene.
 
-    def __call__(
-        self, scene: Scene, options: WriteOptions, *, threads: int = 1, progress: Progress = silent
-    ) -> int: ...
+    Attributes:
+        form: that is written.
+        whole: writes one file; None for several.
+        together: writes a header and its chunks; None for one file.
+        stem: of the names of chunks.
+    """
+
+    form: Format
+    whole: Sink | None
+    together: SinkTogether | None
+    stem: str
+
+    def __call__(self, scene: Scene, options: WriteOptions, *, threads: int = 1, progress: Progress = silent) -> int:
+        """Writes a scene and returns how many bytes it wrote.
+
+        Raises:
+            OutputError: see `scene_sink`; and what the codec raises.
+        """
+        codec = self.form.codec()
+        if self.whole is not None:
+            return self.whole(codec.encode(scene, options, threads=threads, progress=progress))
+        assert self.together is not None
+        return self.together(codec.encode_chunked(scene, options, self.stem, threads=threads, progress=progress))
+
+    def assemble(self, encoder: Encoder, get: Get, *, threads: int = 1, progress: Progress = silent) -> int:
+        """Writes a tree whose windows are encoded, and returns how many bytes it wrote.
+
+        Args:
+            encoder: of the tree, in the format of this sink.
+            get: reads the results of the windows.
+            threads: to compress on.
+            progress: told of what is written.
+
+        Raises:
+            OutputError: see `scene_sink`.
+        """
+        if self.whole is not None:
+            return self.whole(encoder.pieces(get, threads=threads, progress=progress))
+        assert self.together is not None
+        return self.together(self.form.codec().assemble_chunked(encoder, get, self.stem, progress=progress))
 
 
 def scene_sink(path: Place, form: Format, *, chunked: bool = False, overwrite: bool) -> SceneSink:
-    """The function that writes a scene in a format. Fails now if the output cannot be written later.
+    """What writes a scene in a format. Fails now if the output cannot be written later.
 
     Args:
         path: of the file, or of the header where `chunked`; - is standard output, for one file.
@@ -33,15 +72,9 @@ def scene_sink(path: Place, form: Format, *, chunked: bool = False, overwrite: b
         overwrite: replace files that exist.
 
     Raises:
-        OutputError: see `sink` and `sink_together`. The function itself raises that, too, and what the codec raises.
+        OutputError: see `sink` and `sink_together`. Writing raises that, too, and what the codec raises.
     """
-    if not chunked:
-        whole = sink(path, overwrite=overwrite)
-        return lambda scene, options, *, threads=1, progress=silent: whole(
-            form.codec().encode(scene, options, threads=threads, progress=progress)
-        )
-    together = sink_together(path, overwrite=overwrite)
     stem = path.stem if isinstance(path, Address) else Path(os.path.realpath(path)).stem
-    return lambda scene, options, *, threads=1, progress=silent: together(
-        form.codec().encode_chunked(scene, options, stem, threads=threads, progress=progress)
-    )
+    if chunked:
+        return SceneSink(form, None, sink_together(path, overwrite=overwrite), stem)
+    return SceneSink(form, sink(path, overwrite=overwrite), None, stem)

@@ -34,7 +34,7 @@ def sample(size: int, kind: str = "mixed") -> np.ndarray:
 
 
 def packed(data: np.ndarray, *, level: int = 5, threads: int = 1) -> bytes:
-    return b"".join(compression.gzip_member(data, level, threads, silent))
+    return b"".join(compression.gzip_member([data], data.size, level, threads, silent))
 
 
 @pytest.mark.parametrize("size", SIZES)
@@ -76,7 +76,7 @@ def test_blocks_refer_to_the_block_before() -> None:
 def test_progress_ends_at_the_end() -> None:
     said: list[tuple[str, int, int, str]] = []
     data = sample(3 * BLOCK + 7)
-    list(compression.gzip_member(data, 1, 2, lambda *args: said.append(args)))
+    list(compression.gzip_member([data], data.size, 1, 2, lambda *args: said.append(args)))
     assert said == [("writing", min(BLOCK * (i + 1), len(data)), len(data), "B") for i in range(4)]
 
 

@@ -33,8 +33,15 @@ def test_a_codec_has_the_signatures_of_all(form: Format) -> None:
     assert hasattr(codec, "examine") == form.selective
     assert hasattr(codec, "encode") == hasattr(codec, "settled") == form.writable
     if form.writable:
-        assert parameters(codec.encode) == {"scene": False, "options": False, "threads": True, "progress": True}
+        more = {"scratch": True} if form.trees else {}
+        written = {"scene": False, "options": False, "threads": True, "progress": True}
+        assert parameters(codec.encode) == written | more
         assert parameters(codec.settled) == {"scene": False, "options": False}
+    assert hasattr(codec, "encoder") == hasattr(codec, "needed") == form.trees
+    if form.trees:
+        assert parameters(codec.needed) == {"options": False}
+        named = {"threads": True, "progress": True}
+        assert parameters(codec.encoder) == {"scene": False, "options": False, "ranges": False} | named
 
 
 def test_one_format_is_written_by_each_suffix() -> None:

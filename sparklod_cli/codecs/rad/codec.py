@@ -5,17 +5,19 @@ A file is a header and its chunks, or a header that names a file for each chunk;
 
 from __future__ import annotations
 
-import itertools
-import tempfile
 from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
 
 from ...model.scene import Scene
+from ...model.streams import NodeStream
 from ...support.progress import Progress, silent
-from .. import compression
+from ..encoder import Get, Kept, results, windows_of
 from ..options import DEFAULTS, WriteOptions
-from .encoding import Writing
-from .header import pack_header
-from .names import SUFFIX, chunk_name
+from .encoding import CHUNK, RadEncoder
+from .encoding import encoder as encoder
 from .options import needed as needed
 from .options import settled as settled
 from .reading import RadChunk as RadChunk
@@ -24,38 +26,43 @@ from .reading import examine as examine
 from .reading import name_of as name_of
 from .reading import read_chunk as read_chunk
 from .reading import stream as stream
-from .records import RadChunkEntry
 
 #: Bytes of chunks that wait in memory for their header; beyond, they wait on disk.
 SPOOLED = 1 << 26
 
 
 def encode(
-    scene: Scene, options: WriteOptions = DEFAULTS, *, threads: int = 1, progress: Progress = silent
+    scene: Scene | NodeStream,
+    options: WriteOptions = DEFAULTS,
+    *,
+    threads: int = 1,
+    progress: Progress = silent,
+    scratch: Path | None = None,
 ) -> Iterator[bytes]:
     """The bytes of one file, piece by piece; the chunks wait in a temporary file for the header, which has their sizes.
 
-    The same scene and options give the same bytes for any number of threads. Nodes keep their order; that of
-    `lod.chunk_order` is for streaming.
+    The same scene and options give the same bytes for any number of threads, and for a stream of the same nodes. Nodes
+    keep their order; that of `lod.chunk_order` is for streaming.
+
+    Args:
+        scene: what is written.
+        options: settled where the scene is a stream; otherwise they may leave choices open.
+        threads: to encode on.
+        progress: told of the splats.
+        scratch: folder for the temporary file; None for that of the system.
 
     Raises:
         FormatError, ValueError: see `options.settled`.
     """
-    writing = Writing.of(scene, settled(scene, options), threads, progress)
-    sizes = []
-    with tempfile.SpooledTemporaryFile(SPOOLED) as spool:
-        for chunk in writing.chunks(threads, progress):
-            spool.write(chunk)
-            sizes.append(len(chunk))
-        spool.seek(0)
-        offsets = itertools.accumulate(sizes, initial=0)
-        yield pack_header(writing.header(map(RadChunkEntry, offsets, sizes)))
-        while piece := spool.read(compression.PIECE):
-            yield piece
+    made = _encoder(scene, options, threads, progress)
+    with Kept(scratch, SPOOLED) as kept:
+        for result in results(made, scene, threads, progress, "encoding"):
+            kept.put(result)
+        yield from made.pieces(kept.get, threads=threads, progress=progress)
 
 
 def encode_chunked(
-    scene: Scene, options: WriteOptions, stem: str, *, threads: int = 1, progress: Progress = silent
+    scene: Scene | NodeStream, options: WriteOptions, stem: str, *, threads: int = 1, progress: Progress = silent
 ) -> Iterator[tuple[str, Iterable[bytes]]]:
     """The files of a scene whose chunks are files of their own: the name of each, and its bytes; the header is last.
 
@@ -66,10 +73,31 @@ def encode_chunked(
     Raises:
         FormatError, ValueError: see `options.settled`.
     """
-    writing = Writing.of(scene, settled(scene, options), threads, progress)
-    entries = []
-    for number, chunk in enumerate(writing.chunks(threads, progress)):
-        name = chunk_name(stem, number)
-        entries.append(RadChunkEntry(0, len(chunk), name))
-        yield name, [chunk]
-    yield stem + SUFFIX, [pack_header(writing.header(entries))]
+    made = _encoder(scene, options, threads, progress)
+    found = results(made, scene, threads, progress, "writing")
+    yield from made.files((result[CHUNK] for result in found), stem)
+
+
+def assemble_chunked(
+    made: RadEncoder, get: Get, stem: str, *, progress: Progress = silent
+) -> Iterator[tuple[str, Iterable[bytes]]]:
+    """The files of a tree whose windows are encoded, as `encode_chunked`.
+
+    Args:
+        made: its encoder.
+        get: reads the results of the windows.
+        stem: of the names.
+        progress: told of the splats.
+    """
+
+    def chunks() -> Iterator[NDArray[np.uint8]]:
+        for number, part in enumerate(windows_of(made.count)):
+            yield get(number, CHUNK)
+            progress("writing", part.stop, made.count, "splat")
+
+    yield from made.files(chunks(), stem)
+
+
+def _encoder(scene: Scene | NodeStream, options: WriteOptions, threads: int, progress: Progress) -> RadEncoder:
+    options = settled(scene, options) if isinstance(scene, Scene) else options
+    return encoder(scene, options, threads=threads, progress=progress)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -10,21 +11,29 @@ import numpy as np
 from numpy.typing import NDArray
 from zlib_ng import zlib_ng
 
+from ...model.lod_tree import LodTree
 from ...model.nodes import CHUNK_NODES
 from ...model.scene import Scene
 from ...model.sh import COEFFICIENTS
-from ...model.splats import FloatArray, Splats
-from ...support.parallel import blocks_of, ordered_map
-from ...support.progress import Progress
-from .. import octahedral, sh_palette
-from ..options import RadOptions, WriteOptions
+from ...model.splats import COLUMNS, FloatArray, Splats
+from ...model.streams import NodeStream
+from ...support.progress import Progress, silent
+from .. import clamps, octahedral
+from ..clamps import Range
+from ..encoder import CLAMPED, Encoded, Get, windows_of
+from ..options import WriteOptions
 from ..splat_encoding import SplatEncoding
 from .comment import comment_of
 from .encodings import CODINGS
-from .header import pack_chunk_header, padding
+from .header import pack_chunk_header, pack_header, padding
 from .layout import PROPERTIES, RANGES, SIZES, Row
+from .names import SUFFIX, chunk_name
 from .options import code_range
+from .palette import Palette
 from .records import GZ, Property, RadChunkEntry, RadChunkHeader, RadHeader
+
+#: Names of the arrays of a window's result: the bytes of a chunk, and their number.
+CHUNK, SIZE = "chunk", "size"
 
 _RAW = -zlib_ng.MAX_WBITS
 
@@ -33,123 +42,122 @@ _BELOW_1 = np.nextafter(np.float32(1), np.float32(0))
 
 
 @dataclass(frozen=True, eq=False)
-class Palette:
-    """Spherical harmonics that splats share.
+class RadEncoder:
+    """The encoder of a file, see `encoder.Encoder`: the result of a window is a chunk.
 
     Attributes:
-        codes: (codes, K, 3) coefficients, as many codes as the first chunk has splats: Spark reads no other number.
-        labels: (N,) the code of each splat.
-    """
-
-    codes: FloatArray
-    labels: NDArray[np.uint32]
-
-    @classmethod
-    def of(cls, splats: Splats, most: int, threads: int, progress: Progress) -> Palette:
-        """A palette of at most so many codes, with zeros behind them up to as many as Spark reads."""
-        room = min(len(splats), CHUNK_NODES)
-        weight = sh_palette.visible_weight(splats)
-        found = sh_palette.cluster(splats.sh, min(most, room), weight=weight, threads=threads, progress=progress)
-        padded = np.zeros((room, *found.codes.shape[1:]), np.float32)
-        padded[: len(found.codes)] = found.codes
-        return cls(padded, found.labels)
-
-
-@dataclass(frozen=True)
-class Writing:
-    """What the chunks of a file have in common.
-
-    Attributes:
-        scene: as it is written.
+        count: splats of the file, which are nodes where there is a tree.
+        sh_degree: of them.
+        tree: whether there is one.
+        antialiased: as in `Scene`.
         options: with nothing left open.
-        ranges: of the codes.
         palette: of SH, or None.
-        level: of compression.
+        ranges: beyond which values are counted; none unless somebody wants to know.
     """
 
-    scene: Scene
-    options: RadOptions
-    ranges: SplatEncoding
-    palette: Palette | None
-    level: int
+    count: int
+    sh_degree: int
+    tree: bool
+    antialiased: bool
+    options: WriteOptions
+    palette: Palette | None = None
+    ranges: tuple[Range, ...] = ()
 
-    @classmethod
-    def of(cls, scene: Scene, options: WriteOptions, threads: int, progress: Progress) -> Writing:
-        """That of a scene with settled options; finds the palette, if there is to be one."""
-        rad, palette = options.rad, None
-        assert rad.ranges is not None
-        if rad.sh_codes is not None and scene.splats.sh_degree and len(scene):
-            palette = Palette.of(scene.splats, rad.sh_codes, threads, progress)
-        return cls(scene, rad, rad.ranges, palette, options.compression_level)
+    @property
+    def _codes(self) -> SplatEncoding:
+        """The ranges of the codes."""
+        assert self.options.rad.ranges is not None
+        return self.options.rad.ranges
 
-    def header(self, entries: Iterable[RadChunkEntry]) -> RadHeader:
+    def encode(self, splats: Splats, tree: LodTree | None, start: int) -> Encoded:
+        """The bytes of a chunk, and how many they are."""
+        chunk = np.frombuffer(self._chunk(splats, tree, start), np.uint8)
+        result = {CHUNK: chunk, SIZE: np.array([len(chunk)])}
+        return result | ({CLAMPED: clamps.tally(splats, self.ranges)} if self.ranges else {})
+
+    def pieces(self, get: Get, *, threads: int, progress: Progress) -> Iterator[bytes]:
+        """The header and all chunks."""
+        windows = windows_of(self.count)
+        sizes = [int(get(number, SIZE)[0]) for number in range(len(windows))]
+        yield pack_header(self._header(map(RadChunkEntry, itertools.accumulate(sizes, initial=0), sizes)))
+        for number, part in enumerate(windows):
+            yield get(number, CHUNK).tobytes()
+            progress("writing", part.stop, self.count, "splat")
+
+    def files(self, chunks: Iterable[NDArray[np.uint8]], stem: str) -> Iterator[tuple[str, Iterable[bytes]]]:
+        """The files of a scene whose chunks are files of their own, see `codec.encode_chunked`.
+
+        Args:
+            chunks: in order, asked for one by one.
+            stem: of the names.
+        """
+        entries = []
+        for number, chunk in enumerate(chunks):
+            name = chunk_name(stem, number)
+            entries.append(RadChunkEntry(0, len(chunk), name))
+            yield name, [chunk.tobytes()]
+        yield stem + SUFFIX, [pack_header(self._header(entries))]
+
+    def _header(self, entries: Iterable[RadChunkEntry]) -> RadHeader:
         """The header of the file whose chunks are there."""
-        scene, chunks = self.scene, tuple(entries)
+        chunks = tuple(entries)
         return RadHeader(
-            len(scene),
-            scene.splats.sh_degree,
-            scene.tree is not None,
+            self.count,
+            self.sh_degree,
+            self.tree,
             CHUNK_NODES,
             sum(entry.bytes for entry in chunks),
             chunks,
-            self.ranges,
+            self._codes,
             None if self.palette is None else len(self.palette.codes),
-            comment_of(antialiased=scene.antialiased),
+            comment_of(antialiased=self.antialiased),
         )
 
-    def chunks(self, threads: int, progress: Progress) -> Iterator[bytes]:
-        """The bytes of each chunk in order, a few encoded ahead."""
-        parts = blocks_of(len(self.scene), CHUNK_NODES)
-        for part, chunk in zip(parts, ordered_map(self.chunk, parts, threads), strict=True):
-            progress("writing", part.stop, len(self.scene), "splat")
-            yield chunk
-
-    def chunk(self, part: slice) -> bytes:
-        """The bytes of the chunk of these splats."""
+    def _chunk(self, splats: Splats, tree: LodTree | None, start: int) -> bytes:
         payload, properties, at = [], [], 0
-        for row in self._rows(first=part.start == 0):
-            encoding = getattr(self.options, row.option) if row.option else row.encodings[0]
-            low, high = code_range(row, self.ranges)
-            data = self._deflated(CODINGS[encoding].encode(self._values(row, encoding, part), low, high), encoding)
+        labels = None if self.palette is None else self.palette.labels_of(splats, start)
+        for row in self._rows(first=start == 0):
+            encoding = getattr(self.options.rad, row.option) if row.option else row.encodings[0]
+            low, high = code_range(row, self._codes)
+            values = self._values(row, encoding, splats, tree, labels)
+            data = self._deflated(CODINGS[encoding].encode(values, low, high), encoding)
             ends = (low, high) if RANGES.get(encoding) else (None, None)
             properties.append(Property(at, len(data), row.name, encoding, GZ, *ends))
             payload += [data, bytes(padding(len(data)))]
             at += len(data) + padding(len(data))
-        splats, tree = self.scene.splats, self.scene.tree
-        header = RadChunkHeader(
-            part.start, part.stop - part.start, at, splats.sh_degree, tree is not None, tuple(properties), self.ranges
-        )
+        header = RadChunkHeader(start, len(splats), at, self.sh_degree, self.tree, tuple(properties), self._codes)
         return b"".join([pack_chunk_header(header), *payload])
 
     def _rows(self, *, first: bool) -> Iterator[Row]:
         """The properties of a chunk."""
-        degree = self.scene.splats.sh_degree
         for row in PROPERTIES:
             if row.degree:
-                present = row.degree <= degree and (row.codes and first if self.palette is not None else not row.codes)
+                own = row.codes and first if self.palette is not None else not row.codes
+                present = row.degree <= self.sh_degree and own
             elif row.column == "labels":
                 present = self.palette is not None
             else:
-                present = hasattr(self.scene.splats, row.column) or self.scene.tree is not None
+                present = row.column in COLUMNS or self.tree
             if present:
                 yield row
 
-    def _values(self, row: Row, encoding: str, part: slice) -> NDArray[Any]:
+    def _values(
+        self, row: Row, encoding: str, splats: Splats, tree: LodTree | None, labels: NDArray[np.uint32] | None
+    ) -> NDArray[Any]:
         """(n, numbers) values of a property, as its encoding takes them."""
-        splats, tree = self.scene.splats, self.scene.tree
         if row.degree:
-            source = splats.sh[part] if self.palette is None else self.palette.codes
+            source = splats.sh if self.palette is None else self.palette.codes
             return source[:, COEFFICIENTS[row.degree - 1] : COEFFICIENTS[row.degree]].reshape(len(source), -1)
         if row.column == "labels":
-            assert self.palette is not None
-            return self.palette.labels[part, None]
-        column: NDArray[Any] = getattr(splats if hasattr(splats, row.column) else tree, row.column)[part]
+            assert labels is not None
+            return labels[:, None]
+        column: NDArray[Any] = getattr(splats if row.column in COLUMNS else tree, row.column)
         if row.column == "opacity":
-            return _alpha(column, encoding, self.ranges)[:, None]
+            return _alpha(column, encoding, self._codes)[:, None]
         if row.column == "quat_xyzw" and encoding != "oct88r8":
             return column[:, :3] * np.where(column[:, 3:] < 0, np.float32(-1), np.float32(1))
-        if row.column == "center" and self.options.center_bits is not None:
-            return rounded(column, self.options.center_bits)
+        if row.column == "center" and self.options.rad.center_bits is not None:
+            return rounded(column, self.options.rad.center_bits)
         return column if column.ndim == 2 else column[:, None]
 
     def _deflated(self, codes: NDArray[Any], encoding: str) -> bytes:
@@ -158,8 +166,42 @@ class Writing:
         Of codes of a byte, only runs are looked for: longer matches are chance, which makes them longer and slower.
         """
         strategy = zlib_ng.Z_RLE if SIZES[encoding] == 1 else zlib_ng.Z_DEFAULT_STRATEGY
-        packer = zlib_ng.compressobj(self.level, zlib_ng.DEFLATED, _RAW, zlib_ng.DEF_MEM_LEVEL, strategy)
+        packer = zlib_ng.compressobj(
+            self.options.compression_level, zlib_ng.DEFLATED, _RAW, zlib_ng.DEF_MEM_LEVEL, strategy
+        )
         return packer.compress(codes.data.cast("B")) + packer.flush()
+
+
+def encoder(
+    scene: Scene | NodeStream,
+    options: WriteOptions,
+    ranges: tuple[Range, ...] = (),
+    *,
+    threads: int = 1,
+    progress: Progress = silent,
+) -> RadEncoder:
+    """The encoder of a scene; finds its palette, if there is to be one.
+
+    Args:
+        scene: of which nothing is read but what the palette is made of.
+        options: settled.
+        ranges: beyond which the results count values, see `clamps.tally`.
+        threads, progress: for the palette.
+
+    Raises:
+        ValueError: the options are not settled.
+    """
+    rad = options.rad
+    if rad.ranges is None:
+        raise ValueError("the options leave choices open; `settled` makes them")
+    if isinstance(scene, NodeStream):
+        count, sh_degree, tree = scene.count, scene.sh_degree, True
+    else:
+        count, sh_degree, tree = len(scene), scene.splats.sh_degree, scene.tree is not None
+    palette = None
+    if rad.sh_codes is not None and sh_degree and count:
+        palette = Palette.of(scene, rad.sh_codes, threads, progress)
+    return RadEncoder(count, sh_degree, tree, scene.antialiased, options, palette, ranges)
 
 
 def rounded(center: FloatArray, bits: int) -> FloatArray:

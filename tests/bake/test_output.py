@@ -1,0 +1,91 @@
+"""An output that is given a stream of nodes writes, and says, what it does of the scene in memory."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sparklod_cli.bake.output import WrittenTree, output_of
+from sparklod_cli.bake.settings import BakeSettings
+from sparklod_cli.codecs import encoder
+from sparklod_cli.codecs.options import RadOptions, WriteOptions
+from sparklod_cli.codecs.statistics import Statistics
+from sparklod_cli.lod import quick
+from sparklod_cli.model.scene import Scene
+from sparklod_cli.support.errors import FormatError
+from sparklod_cli.support.progress import silent
+from tests.node_streams import node_stream
+from tests.scenes import random_splats
+
+SETTINGS = {
+    "spz": BakeSettings(),
+    "rad": BakeSettings(suffix=".rad"),
+    "rad-chunked": BakeSettings(suffix=".rad", options=WriteOptions(rad=RadOptions(chunked=True))),
+    "a palette": BakeSettings(suffix=".rad", options=WriteOptions(rad=RadOptions(sh_codes=50))),
+}
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    splats = random_splats(2_000, sh_degree=1)
+    splats.rgb[7], splats.scale[3, 1] = 40, 1e-20
+    return Scene(*quick.build(splats, 1.5))
+
+
+def files_of(folder: Path) -> dict[str, bytes]:
+    return {each.name: each.read_bytes() for each in folder.iterdir()}
+
+
+@pytest.mark.parametrize("name", SETTINGS)
+def test_a_stream_is_written_as_the_scene(
+    name: str, scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(encoder, "CHUNK_NODES", 900)
+    settings, scratch = SETTINGS[name], tmp_path / "scratch"
+    scratch.mkdir()
+    said: list[WrittenTree] = []
+    for folder in ("scene", "stream"):
+        target = tmp_path / folder / f"town{settings.suffix}"
+        target.parent.mkdir()
+        output = output_of(target, settings, overwrite=False)
+        if folder == "scene":
+            said.append(output.write(scene, 2, silent))
+            continue
+        parts = np.array_split(np.arange(len(scene)), 3)
+        leaf = scene.tree.is_leaf
+        found = Statistics.merged([Statistics.of(scene.splats.take(at), leaf[at], output.needed) for at in parts])
+        output.check_statistics(found)
+        said.append(output.write_stream(node_stream(scene), found, scratch, 2, silent))
+    assert said[0] == said[1] and said[0].clamped
+    whole, streamed = files_of(tmp_path / "scene"), files_of(tmp_path / "stream")
+    assert len(whole) == (1 if name != "rad-chunked" else 1 + -(-len(scene) // 900))
+    assert streamed == whole
+    assert not list(scratch.iterdir())
+
+
+def test_a_stream_that_fails_leaves_no_output(scene: Scene, tmp_path: Path) -> None:
+    nodes = node_stream(scene)
+
+    def fails(start: int, stop: int) -> None:
+        raise OSError("gone")
+
+    for name in ("spz", "rad-chunked"):
+        output = output_of(tmp_path / "out" / f"town{SETTINGS[name].suffix}", SETTINGS[name], overwrite=False)
+        found = Statistics.of_scene(scene, output.needed)
+        with pytest.raises(OSError, match="gone"):
+            output.write_stream(dataclasses.replace(nodes, read=fails), found, tmp_path, 1, silent)
+    assert not list(tmp_path.iterdir())
+
+
+def test_arrays_are_packed_in_memory_only(scene: Scene, tmp_path: Path) -> None:
+    output = output_of(tmp_path / "town.npz", BakeSettings(encoding="packed"), overwrite=False)
+    assert output.needed == frozenset()
+    found = Statistics.of_scene(scene, output.needed)
+    with pytest.raises(FormatError, match=r"--encoding are packed in memory.*give more --memory"):
+        output.check_statistics(found)
+    with pytest.raises(FormatError, match="--encoding are packed in memory"):
+        output.write_stream(node_stream(scene), found, tmp_path, 1, silent)
+    assert not list(tmp_path.iterdir())
