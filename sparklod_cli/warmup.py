@@ -59,7 +59,7 @@ JOBS = {
     "inspect": Job(
         (
             *("tree_links.find_cycles", "tree_links.find_depths", "tree_links.find_parents"),
-            *("tree_links.mean_child_sizes", "tree_links.sum_by_depth"),
+            *("tree_links.add_child_sizes", "tree_links.sum_by_depth"),
         ),
         ("inspect tree.spz --check",),
     ),

@@ -1,0 +1,73 @@
+"""Runs `sparklod` within a limit, for `bench_scale.py`: `scale_child.py BYTES [ARGUMENT]...`, 0 for no limit.
+
+The last line of standard output is JSON: what the process took, and how long each task of a bake out of core was.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+import resource
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+
+def record_tasks(tasks: list[dict[str, Any]]) -> None:
+    """Has the engine of this process note how long each task takes."""
+    from sparklod_cli.bake.out_of_core.engine import LocalEngine
+
+    run = LocalEngine.run
+
+    def timed(task: Any) -> Any:
+        def work(*arguments: Any, **named: Any) -> None:
+            start = time.perf_counter()
+            task.run(*arguments, **named)
+            seconds = round(time.perf_counter() - start, 4)
+            tasks.append({"name": task.name, "needs": list(task.needs), "seconds": seconds})
+
+        return dataclasses.replace(task, run=work)
+
+    def recorded(self: Any, stage: str, given: Sequence[Any], *rest: Any) -> None:
+        run(self, stage, [timed(task) for task in given], *rest)
+
+    LocalEngine.run = recorded  # type: ignore[method-assign]
+
+
+def status(name: str) -> int:
+    """A figure of this process in bytes: "VmHWM", the most memory that it had."""
+    found = re.search(rf"{name}:\s+(\d+)", Path("/proc/self/status").read_text())
+    assert found is not None
+    return 1024 * int(found[1])
+
+
+def main() -> None:
+    """Runs the command line."""
+    limit, arguments = int(sys.argv[1]), sys.argv[2:]
+    if limit:
+        # Memory that the process asks for, not what it maps of files: a limit on address space would count those, too.
+        resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
+    tasks: list[dict[str, Any]] = []
+    record_tasks(tasks)
+    from sparklod_cli.cli import run
+
+    start = time.perf_counter()
+    code = run(arguments)
+    seconds = time.perf_counter() - start
+    transfers = dict(line.split(": ") for line in Path("/proc/self/io").read_text().splitlines())
+    figures = {
+        "code": code,
+        "seconds": round(seconds, 3),
+        "peak": status("VmHWM"),
+        "read": int(transfers["rchar"]),
+        "written": int(transfers["wchar"]),
+        "tasks": tasks,
+    }
+    print("\n" + json.dumps(figures))
+
+
+if __name__ == "__main__":
+    main()
