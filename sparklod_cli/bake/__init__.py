@@ -1,7 +1,8 @@
-"""Baking: from a splat file to a Level-of-Detail file."""
+"""Baking: from splat files to a Level-of-Detail file."""
 
 from .baking import Baked, bake
 from .resources import Resources
 from .settings import BakeSettings
+from .sources import Merged, Source
 
-__all__ = ["BakeSettings", "Baked", "Resources", "bake"]
+__all__ = ["BakeSettings", "Baked", "Merged", "Resources", "Source", "bake"]
