@@ -35,7 +35,7 @@ Examples:
   sparklod build-lod scene.ply                          # writes scene-lod.spz
   sparklod build-lod scene.ply --up -y                  # y up, as viewers want it
   sparklod build-lod scene.ply --method quality         # for publishing
-  sparklod build-lod scans/*.ply --output-dir web -f
+  sparklod build-lod scans/*.ply --output-dir web -f --skip-existing
   sparklod build-lod tiles/*.ply --merge -o city-lod.rad
   sparklod build-lod city.ply -o city-lod.rad --memory 4G --scratch-dir /fast
   cat scene.ply | sparklod build-lod - -o - | aws s3 cp - s3://bucket/scene-lod.spz
@@ -65,6 +65,13 @@ Examples:
     show_default=False,
 )
 @overwrite_option
+@option(
+    "--skip-existing",
+    heading=COMMON,
+    is_flag=True,
+    help="Bake nothing whose output is there already, of the same inputs and settings; a small file beside each output,"
+    " NAME.sparklod.json, tells of what it is.",
+)
 @option(
     "--unlod",
     heading=COMMON,
@@ -99,13 +106,17 @@ def build_lod(ctx: click.Context, /, **_: Any) -> None:
         for source, target in given.jobs(instances, outputs, console.say):
             try:
                 result = make(source, target, **shared)
-                report(console, source, target, result)
+                if result is None:
+                    console.say(f"{name_of(source)}  ->  {target}  is there already")
+                else:
+                    report(console, source, target, result)
             except SparklodError as error:
                 failed = True
                 console.error(f"{name_of(source)}: {error}")
                 record = {**record_of(source), "error": shortened(str(error), MOST)}
             else:
-                record = {**record_of(source), "output": str(target), **dataclasses.asdict(result)}
+                made = {"skipped": True} if result is None else dataclasses.asdict(result)
+                record = {**record_of(source), "output": str(target), **made}
             if general.as_json:
                 click.echo(json.dumps(record))
     if failed:
@@ -129,18 +140,20 @@ def _check(ctx: click.Context, given: Inputs, named: list[Path], outputs: Output
     claim_stdout(ctx, "output", as_json=general.as_json, binary=True)
     if ctx.params["rgba"] is not None and len(inputs) > 1:
         raise click.UsageError(f"--rgba takes one input, not {len(inputs)}")
+    if ctx.params["skip_existing"] and outputs.output == DASH:
+        raise click.UsageError("--skip-existing needs an output that can be there already; name a file")
     check_formats(ctx, outputs)
     if outputs.unlod:
-        exclude(ctx, OF_BAKES, "--unlod")
+        exclude(ctx, (*OF_BAKES, "skip_existing"), "--unlod")
     else:
         check_method(ctx)
 
 
 def _job(
     ctx: click.Context, outputs: Outputs, console: Console
-) -> tuple[Callable[..., Baked | Extracted], Callable[..., None]]:
+) -> tuple[Callable[..., Baked | Extracted | None], Callable[..., None]]:
     """What makes an output of an input, and what reports it; the point where numpy and numba are loaded."""
-    from ..api.bake_jobs import bake, extract_leaves
+    from ..api.bake_jobs import bake, bake_unless_there, extract_leaves
 
     if outputs.unlod:
         leaves = functools.partial(extract_leaves, suffix=outputs.suffix, options=write_options(ctx))
@@ -148,4 +161,5 @@ def _job(
     settings = bake_settings(ctx, suffix=outputs.suffix, raw=outputs.is_raw, converts=outputs.format_is_asked_for)
     more = [] if outputs.suffix != RAD else ["rad"] if settings.options.rad.sh_codes is None else ["rad", "palette"]
     console.announce_compiling(settings.method, *more)
-    return functools.partial(bake, settings=settings, resources=resources_of(ctx), say=console.say), report_baked
+    make = bake_unless_there if ctx.params["skip_existing"] else bake
+    return functools.partial(make, settings=settings, resources=resources_of(ctx), say=console.say), report_baked
