@@ -2,8 +2,11 @@
 
 from ..bake import Baked as Baked
 from ..bake import BakeSettings as BakeSettings
+from ..bake import Merged as Merged
 from ..bake import Resources as Resources
+from ..bake import Source as Source
 from ..bake import bake as bake
+from ..bake import bake_unless_there as bake_unless_there
 from ..bake.out_of_core.cluster import ClusterSettings as ClusterSettings
 from ..bake.out_of_core.cluster import cluster as cluster
 from ..bake.out_of_core.cluster_engine import ClusterEngine as ClusterEngine

@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..io import open_stream
 from ..model.streams import SceneStream
 from ..support.addresses import Place, absolute
 from ..support.errors import FormatError, HasTreeError, OutOfMemoryError, ScratchError
@@ -30,6 +29,7 @@ from .output import Output
 from .recipe import Recipe, recipe_of
 from .resources import Resources
 from .settings import BakeSettings
+from .sources import Merged, Source, absolute_source, opened_source, placement_of, places_of
 
 #: The folder in the scratch folder for what is unpacked of an input.
 UNPACKED = "input"
@@ -69,7 +69,7 @@ class _Size:
 
 
 def bake_scaled(
-    source: Place,
+    source: Source,
     target: Place,
     settings: BakeSettings,
     output: Output,
@@ -95,7 +95,7 @@ def bake_scaled(
     if size is None:
         return None
     memory = estimate.default_memory() if resources.memory is None else resources.memory
-    recipe = recipe_of([source], settings)
+    recipe = recipe_of(places_of(source), settings, **placement_of(source))
     folder = scratch_folder(target, recipe, resources.scratch_dir)
     if engine is not None:
         folder = absolute(folder)  # other processes work in folders of their own
@@ -137,7 +137,7 @@ def bake_scaled(
         return Scaled(baked, stream.format, stream.notes, stream.count, degree, written, read)
 
 
-def fits_in_memory(source: Place, settings: BakeSettings, memory: int | None) -> bool:
+def fits_in_memory(source: Source, settings: BakeSettings, memory: int | None) -> bool:
     """Whether an input can be baked in so much memory; one that cannot be read fits, as whoever bakes it will say why.
 
     Args:
@@ -153,12 +153,14 @@ def fits_in_memory(source: Place, settings: BakeSettings, memory: int | None) ->
     return estimate.in_memory_bytes(settings.method, size.splats, size.sh_degree) <= memory
 
 
-def _size_of(source: Place) -> _Size | None:
-    """What the header of an input says; None for a tree."""
+def _size_of(source: Source) -> _Size | None:
+    """What the headers of an input say; None for a tree."""
     try:
-        with open_stream(source) as stream:
+        with opened_source(source) as stream:
             return _Size(stream.count, stream.sh_degree)
     except HasTreeError:
+        if isinstance(source, Merged):
+            raise
         return None
 
 
@@ -219,18 +221,18 @@ def _work(
 
 
 @contextlib.contextmanager
-def _opened(source: Place, folder: Place, threads: int, engine: Engine | None) -> Iterator[SceneStream]:
-    """The input, which the processes of an engine can open, too, whatever folder they work in."""
+def _opened(source: Source, folder: Place, threads: int, engine: Engine | None) -> Iterator[SceneStream]:
+    """The input, which the processes of an engine can open, too, whatever folders they work in."""
     if isinstance(folder, Path):
-        with open_stream(absolute(source), scratch=folder.absolute() / UNPACKED, keep=True, threads=threads) as stream:
+        with opened_source(absolute_source(source), scratch=folder.absolute() / UNPACKED, threads=threads) as stream:
             yield stream
     elif isinstance(engine, ClusterEngine):
         own = Path(tempfile.gettempdir()) / f"sparklod-{uuid.uuid4().hex}"  # each machine unpacks what it needs
         try:
-            with open_stream(absolute(source), scratch=own, keep=True, threads=threads) as stream:
+            with opened_source(absolute_source(source), scratch=own, threads=threads) as stream:
                 yield stream
         finally:
             engine.remove(own)
     else:
-        with open_stream(source, threads=threads) as stream:
+        with opened_source(source, threads=threads) as stream:
             yield stream

@@ -15,15 +15,17 @@ from .out_of_core.cluster_engine import ClusterEngine
 from .resources import Resources
 from .scaling import fits_in_memory
 from .settings import BakeSettings
+from .sources import Source, absolute_source, places_of
 
 
 def bake_side_by_side(
-    pairs: Sequence[tuple[Place, Place]],
+    pairs: Sequence[tuple[Source, Place]],
     settings: BakeSettings,
     engine: ClusterEngine,
     *,
     resources: Resources,
-    bake_large: Callable[[Place, Place], Any],
+    bake_large: Callable[[Source, Place], Any],
+    make: Callable[..., Baked | None] = bake,
     overwrite: bool = False,
     progress: Progress = silent,
 ) -> Iterator[Any]:
@@ -35,14 +37,19 @@ def bake_side_by_side(
         engine: of the cluster.
         resources: of a worker; a scene that its memory holds is one task.
         bake_large: bakes one that none can, and returns what came of it.
+        make: bakes one; a function of a module.
         overwrite: replace files that exist.
         progress: told how many scenes are done.
     """
     small = [fits_in_memory(source, settings, resources.memory) for source, _ in pairs]
     settings = dataclasses.replace(settings, rgba=settings.rgba and settings.rgba.absolute())
-    whole = [(absolute(source), absolute(target)) for source, target in pairs]  # workers have folders of their own
-    calls = [(*pair, settings, overwrite, resources) for pair, is_small in zip(whole, small, strict=True) if is_small]
-    engine.check(None, [source for source, _ in whole])
+    whole = [
+        (absolute_source(source), absolute(target)) for source, target in pairs
+    ]  # workers have folders of their own
+    calls = [
+        (make, *pair, settings, overwrite, resources) for pair, is_small in zip(whole, small, strict=True) if is_small
+    ]
+    engine.check(None, [place for source, _ in whole for place in places_of(source)])
     with engine.each("baking", _bake_small, calls, progress, "scene") as outcomes:
         for pair, is_small in zip(pairs, small, strict=True):
             yield _found(next(outcomes), pair[1]) if is_small else bake_large(*pair)
@@ -59,7 +66,14 @@ def _found(outcome: Any, target: Place) -> Any:
 
 
 def _bake_small(
-    source: Place, target: Place, settings: BakeSettings, overwrite: bool, resources: Resources, *, threads: int
-) -> Baked:
+    make: Callable[..., Baked | None],
+    source: Source,
+    target: Place,
+    settings: BakeSettings,
+    overwrite: bool,
+    resources: Resources,
+    *,
+    threads: int,
+) -> Baked | None:
     """What a worker does."""
-    return bake(source, target, settings, overwrite=overwrite, threads=threads, resources=resources)
+    return make(source, target, settings, overwrite=overwrite, threads=threads, resources=resources)
