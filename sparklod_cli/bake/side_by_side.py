@@ -20,9 +20,9 @@ from .sources import Source, absolute_source, places_of
 
 def bake_side_by_side(
     pairs: Sequence[tuple[Source, Place]],
+    *,
     settings: BakeSettings,
     engine: ClusterEngine,
-    *,
     resources: Resources,
     bake_large: Callable[[Source, Place], Any],
     make: Callable[..., Baked | None] = bake,

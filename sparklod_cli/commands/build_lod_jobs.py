@@ -51,7 +51,7 @@ def job_of(
     alone = _one_by_one(here)
     if engine is None:
         return alone, report_baked
-    beside = functools.partial(
+    beside: Make = functools.partial(
         bake_side_by_side,
         make=make,
         settings=settings,

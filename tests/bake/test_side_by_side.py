@@ -41,8 +41,8 @@ def test_large_scenes_are_baked_here_in_their_place(tmp_path: Path, monkeypatch:
     pairs = [(FIXTURES / name, Path(name).with_suffix(".spz")) for name in names]
     outcomes = bake_side_by_side(
         pairs,
-        BakeSettings(),
-        engine,  # type: ignore[arg-type]
+        settings=BakeSettings(),
+        engine=engine,  # type: ignore[arg-type]
         resources=Resources(memory=in_memory_bytes("quick", *HELD)),
         bake_large=lambda source, target: large if (source, target) == pairs[1] else None,
     )
@@ -57,7 +57,7 @@ def test_an_output_that_is_nowhere_to_be_seen_is_an_error(tmp_path: Path, monkey
     baked = side_by_side.bake(FIXTURES / "one.ply", tmp_path / "there.spz", BakeSettings())
     monkeypatch.setattr(side_by_side, "_bake_small", lambda *_, **__: baked)
     pair = (FIXTURES / "one.ply", tmp_path / "one.spz")
-    how = {"resources": Resources(), "bake_large": None}
-    (found,) = bake_side_by_side([pair], BakeSettings(), Engine(), **how)  # type: ignore[arg-type]
+    how = {"settings": BakeSettings(), "engine": Engine(), "resources": Resources(), "bake_large": None}
+    (found,) = bake_side_by_side([pair], **how)  # type: ignore[arg-type]
     assert isinstance(found, SparklodError)
     assert "wrote" in str(found) and "give --output-dir a folder that all machines share, or a URL" in str(found)
