@@ -8,7 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
+from sparklod_cli.api.bake_jobs import BakeSettings, Merged, Resources, bake
+from sparklod_cli.cli import run
 from sparklod_cli.codecs import ply
 from sparklod_cli.io import read_scene
 from sparklod_cli.model.lod_tree import LodTree
@@ -110,15 +113,13 @@ def test_an_instances_file_places_what_is_merged(
 
 
 def test_pictures_of_a_merged_scene_are_those_of_its_instances(tmp_path: Path) -> None:
-    pytest.importorskip("PIL")
-    from PIL import Image
-
-    from sparklod_cli.cli import run
-
-    tiles = [put(tmp_path / f"{k}.ply", random_splats(200, sh_degree=1)) for k in range(2)]
+    splats = [random_splats(200, sh_degree=degree) for degree in (3, 1)]
+    tiles = [
+        put(tmp_path / f"{k}.ply", dataclasses.replace(each, scale=8 * each.scale)) for k, each in enumerate(splats)
+    ]
     city = instances_file(tmp_path, tiles)
     assert build("--scene", city, "-o", tmp_path / "city.rad", *EXACT) == 0
-    view = ["--eye", "40,20,60", "--look-at", "10,3,0", "--size", "200x150", "--full"]
+    view = ["--look-at", "40,20,60:10,3,0", "--size", "200x150", "--full"]
     for name, what in (("one", ["--scene", str(city)]), ("other", [str(tmp_path / "city.rad")])):
         assert run(["render", *what, *view, "-o", str(tmp_path / f"{name}.png")]) == 0
     one, other = (np.asarray(Image.open(tmp_path / f"{name}.png"), np.int64) for name in ("one", "other"))
@@ -133,21 +134,11 @@ def test_selection_goes_by_where_the_tiles_stand(
     centers = together([tiles[1]], (Transform(),)).center
     moved = Transform(Transform.from_quat(PLACES[0]["rotation"]).rotation, 1.5, np.array([30.0, 0, -5]))
     radius = 1.01 * 1.5 * float(np.linalg.norm(centers, axis=1).max())
-    others = together(
-        [tiles[0]] * 2, (Transform(), Transform.from_parts(rotate=(0, 0, 90), scale=2, translate=(9, 8, 7)))
-    )
+    third = Transform.from_parts(rotate=(0, 0, 90), scale=2, translate=(9, 8, 7))
+    others = together([tiles[0]] * 2, (Transform(), third))
     near = int((np.linalg.norm(others.center - moved.translation, axis=1) <= radius).sum())
-    record = baked(
-        "--scene",
-        city,
-        "-o",
-        tmp_path / "x.spz",
-        "--within",
-        f"30,0,-5,{radius}",
-        "--translate",
-        "0,99,0",
-        capsys=capsys,
-    )
+    options = ["--within", f"30,0,-5,{radius}", "--translate", "0,99,0"]  # the second comes after the first
+    record = baked("--scene", city, "-o", tmp_path / "x.spz", *options, capsys=capsys)
     assert (record["read"], record["splats"]) == (900, 300 + near)
 
 
@@ -192,11 +183,7 @@ def test_the_output_is_none_of_the_files_that_an_instances_file_names(
     capsys.readouterr()
 
 
-def test_what_goes_out_of_core_gives_the_same_tree(
-    tiles: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from sparklod_cli.api.bake_jobs import BakeSettings, Merged, Resources, bake
-
+def test_what_goes_out_of_core_gives_the_same_tree(tiles: list[Path], tmp_path: Path) -> None:
     merged = Merged.of([tiles[0], FIXTURES / "golden/sh3-v3.spz", tiles[1]])
     for name, resources in (("in.spz", None), ("out.spz", Resources(block_splats=128))):
         bake(merged, tmp_path / name, BakeSettings(), resources=resources)
