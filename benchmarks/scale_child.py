@@ -1,4 +1,6 @@
-"""Runs `sparklod` within a limit, for `bench_scale.py`: `scale_child.py BYTES [ARGUMENT]...`, 0 for no limit.
+"""Runs `sparklod` out of core and within a limit, for `bench_scale.py`: `scale_child.py BYTES [ARGUMENT]...`.
+
+With 0 bytes there is no limit, and it bakes as it likes.
 
 The last line of standard output is JSON: what the process took, and how long each task of a bake out of core was.
 """
@@ -31,8 +33,8 @@ def record_tasks(tasks: list[dict[str, Any]]) -> None:
 
         return dataclasses.replace(task, run=work)
 
-    def recorded(self: Any, stage: str, given: Sequence[Any], *rest: Any) -> None:
-        run(self, stage, [timed(task) for task in given], *rest)
+    def recorded(self: Any, stage: str, given: Sequence[Any], *rest: Any, **named: Any) -> None:
+        run(self, stage, [timed(task) for task in given], *rest, **named)
 
     LocalEngine.run = recorded  # type: ignore[method-assign]
 
@@ -51,7 +53,11 @@ def main() -> None:
         # Memory that the process asks for, not what it maps of files: a limit on address space would count those, too.
         resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
     tasks: list[dict[str, Any]] = []
-    record_tasks(tasks)
+    if limit:
+        from sparklod_cli.bake.out_of_core import estimate
+
+        estimate.in_memory_bytes = lambda *_: 1 << 62  # out of core, also where that is not needed
+        record_tasks(tasks)
     from sparklod_cli.cli import run
 
     start = time.perf_counter()

@@ -57,6 +57,20 @@ def table(runs: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
+def looks(runs: dict[str, Any]) -> str:
+    """A Markdown table of the commands that looked at the trees."""
+    lines = ["| tree | nodes | command | s | peak GB | bytes a node | read GB |", "|---|---|---|---|---|---|---|"]
+    for name, run in runs.items():
+        for command, found in run.get("looks", {}).items():
+            nodes = run["report"]["nodes"]
+            cells = [name.rpartition(" ")[0], f"{nodes:,}", f"`{command}`", found.get("error")]
+            if "error" not in found:
+                cells[3:] = [f"{found['seconds']:.1f}", f"{found['peak'] / 1e9:.2f}"]
+                cells += [f"{found['peak'] / nodes:.0f}", f"{found['read'] / 1e9:.2f}"]
+            lines.append("| " + " | ".join(map(str, cells)) + " |")
+    return "\n".join(lines)
+
+
 def growth(runs: dict[str, Any]) -> str:
     """How time and memory grow from the smallest to the largest size of each series."""
     lines = []
@@ -163,7 +177,7 @@ def main() -> None:
     arguments = parser.parse_args()
     results = json.loads(arguments.results.read_text())
     print(f"Machine: {results['machine']}.\n")
-    for part in (table, growth, model):
+    for part in (table, growth, looks, model):
         print(part(results["runs"]) + "\n")
     if arguments.plot is not None:
         plot(arguments.plot, results["runs"])
