@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..io import read_rgba, read_scene
+from ..io import read_rgba
 from ..model.lod_tree import LodTree
 from ..model.scene import Scene
 from ..model.splats import Splats
@@ -26,6 +26,7 @@ from .output import Output, WrittenTree, output_of
 from .resources import Resources
 from .scaling import Scaled, bake_scaled
 from .settings import BakeSettings
+from .sources import Source, read_source
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,7 +66,7 @@ _Made = tuple[Splats, LodTree, int, dict[str, int]]
 
 
 def bake(
-    source: Place,
+    source: Source,
     target: Place,
     settings: BakeSettings,
     *,
@@ -76,12 +77,12 @@ def bake(
     engine: Engine | None = None,
     say: Callable[[str], None] = lambda text: None,
 ) -> Baked:
-    """Reads a splat file, builds its tree and writes a Level-of-Detail file. A tree that it has may be kept.
+    """Reads splat files, builds a tree of them and writes a Level-of-Detail file. The tree of a single one may be kept.
 
     What does not fit into the memory that it may take is baked out of core: block by block, with a scratch folder.
 
     Args:
-        source: of any format that is read; - is standard input.
+        source: a file of any format that is read, - for standard input, or several files as one scene.
         target: a file of the format that is set, or one of arrays, whatever its name; - is standard output.
         settings: how.
         overwrite: replace files that exist.
@@ -92,7 +93,7 @@ def bake(
         say: told in a line that it goes out of core, and what is left after an interruption.
 
     Raises:
-        FormatError, InvalidSplatsError, OutputError: see `io.read_scene`, `Selection.apply` and `io.scene_sink`; or the
+        FormatError, InvalidSplatsError, OutputError: see `read_source`, `Selection.apply` and `io.scene_sink`; or the
             input has a tree, and the settings do not keep it.
         ScratchError: the scratch folder is full, in use, or has the results of another bake.
         OutOfMemoryError: it does not fit into memory.
@@ -114,7 +115,7 @@ def bake(
         if scaled is not None:
             return _baked_of(scaled, settings)
         # A list, so that whoever takes the scene out of it can free it.
-        scenes = [read_scene(source, threads=threads, progress=progress)]
+        scenes = [read_source(source, threads=threads, progress=progress)]
         form, notes, read = scenes[0].format, scenes[0].notes, len(scenes[0])
         antialiased, has_tree = scenes[0].antialiased, scenes[0].tree is not None
         if has_tree:

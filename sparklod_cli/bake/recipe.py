@@ -58,18 +58,26 @@ class Recipe:
                 found.append(f"{name} was {quoted_value(before)} and is {quoted_value(now)}")
         return found
 
-    def to_json(self) -> bytes:
-        """The text of which `from_json` makes it again."""
-        return json.dumps(dataclasses.asdict(self), sort_keys=True, indent=1).encode()
+    def to_record(self) -> dict[str, Any]:
+        """As values that JSON has, of which `from_record` makes it again."""
+        return dataclasses.asdict(self)
 
     @classmethod
-    def from_json(cls, text: bytes) -> Recipe:
-        """The recipe of `to_json`; `ValueError` where the text is none."""
-        found = parse_json(text)
+    def from_record(cls, found: Any) -> Recipe:
+        """The recipe of `to_record`; `ValueError` where the values are of none."""
         try:
             return cls(tuple(found["inputs"]), tuple(found["names"]), dict(found["settings"]))
         except (KeyError, TypeError) as error:
             raise ValueError(f"it is no recipe: {error!r}") from None
+
+    def to_json(self) -> bytes:
+        """The text of which `from_json` makes it again."""
+        return json.dumps(self.to_record(), sort_keys=True).encode()
+
+    @classmethod
+    def from_json(cls, text: bytes) -> Recipe:
+        """The recipe of `to_json`; `ValueError` where the text is none."""
+        return cls.from_record(parse_json(text))
 
 
 def recipe_of(sources: Iterable[Place], settings: BakeSettings, **more: Any) -> Recipe:

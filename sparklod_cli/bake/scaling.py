@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..io import open_stream
 from ..model.streams import SceneStream
 from ..support.addresses import Place
 from ..support.errors import HasTreeError, OutOfMemoryError, ScratchError
@@ -26,6 +25,7 @@ from .output import Output
 from .recipe import Recipe, recipe_of
 from .resources import Resources
 from .settings import BakeSettings
+from .sources import Merged, Source, opened_source, placement_of, places_of
 
 #: The folder in the scratch folder for what is unpacked of an input.
 UNPACKED = "input"
@@ -65,7 +65,7 @@ class _Size:
 
 
 def bake_scaled(
-    source: Place,
+    source: Source,
     target: Place,
     settings: BakeSettings,
     output: Output,
@@ -91,7 +91,7 @@ def bake_scaled(
     if size is None:
         return None
     memory = estimate.default_memory() if resources.memory is None else resources.memory
-    recipe = recipe_of([source], settings)
+    recipe = recipe_of(places_of(source), settings, **placement_of(source))
     folder = scratch_folder(target, recipe, resources.scratch_dir)
     store = store_of(folder)
     left = bool(store.names())
@@ -131,12 +131,14 @@ def bake_scaled(
         return Scaled(baked, stream.format, stream.notes, stream.count, degree, written, read)
 
 
-def _size_of(source: Place) -> _Size | None:
-    """What the header of an input says; None for a tree."""
+def _size_of(source: Source) -> _Size | None:
+    """What the headers of an input say; None for a tree."""
     try:
-        with open_stream(source) as stream:
+        with opened_source(source) as stream:
             return _Size(stream.count, stream.sh_degree)
     except HasTreeError:
+        if isinstance(source, Merged):
+            raise
         return None
 
 
@@ -196,12 +198,7 @@ def _work(
     return at_work(store, recipe, block_splats, resume=resources.resume, overwrite=overwrite, forget=forget, say=say)
 
 
-@contextlib.contextmanager
-def _opened(source: Place, folder: Place, threads: int) -> Iterator[SceneStream]:
+def _opened(source: Source, folder: Place, threads: int) -> contextlib.AbstractContextManager[SceneStream]:
     """The input, which other processes can open, too, where the scratch folder is one of this machine."""
-    if isinstance(folder, Path):
-        with open_stream(source, scratch=folder / UNPACKED, keep=True, threads=threads) as stream:
-            yield stream
-    else:
-        with open_stream(source, threads=threads) as stream:
-            yield stream
+    scratch = folder / UNPACKED if isinstance(folder, Path) else None
+    return opened_source(source, scratch=scratch, threads=threads)
