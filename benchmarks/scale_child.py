@@ -8,6 +8,7 @@ The last line of standard output is JSON: what the process took, and how long ea
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 import re
 import resource
@@ -19,22 +20,23 @@ from typing import Any
 
 
 def record_tasks(tasks: list[dict[str, Any]]) -> None:
-    """Has the engine of this process note how long each task takes."""
+    """Has the engine of this process note how long each task takes; those of a round wait for all of the one before."""
     from sparklod_cli.bake.out_of_core.engine import LocalEngine
 
-    run = LocalEngine.run
+    run, rounds = LocalEngine.run, itertools.count()
 
-    def timed(task: Any) -> Any:
+    def timed(task: Any, number: int) -> Any:
         def work(*arguments: Any, **named: Any) -> None:
             start = time.perf_counter()
             task.run(*arguments, **named)
             seconds = round(time.perf_counter() - start, 4)
-            tasks.append({"name": task.name, "needs": list(task.needs), "seconds": seconds})
+            tasks.append({"name": task.name, "needs": list(task.needs), "seconds": seconds, "round": number})
 
         return dataclasses.replace(task, run=work)
 
     def recorded(self: Any, stage: str, given: Sequence[Any], *rest: Any, **named: Any) -> None:
-        run(self, stage, [timed(task) for task in given], *rest, **named)
+        number = next(rounds)
+        run(self, stage, [timed(task, number) for task in given], *rest, **named)
 
     LocalEngine.run = recorded  # type: ignore[method-assign]
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import heapq
+import itertools
 import json
 import math
 from collections.abc import Sequence
@@ -134,7 +135,8 @@ def model(runs: dict[str, Any]) -> str:
             continue
         inside = sum(task["seconds"] for task in run["tasks"])
         outside = run["seconds"] - inside
-        times = [outside + makespan(run["tasks"], each) for each in WORKERS]
+        rounds = [list(each) for _, each in itertools.groupby(run["tasks"], lambda task: task["round"])]
+        times = [outside + sum(makespan(each, workers) for each in rounds) for workers in WORKERS]
         cells = [name, f"{inside:.0f}", f"{outside:.0f}"]
         cells += [f"{each:.0f} ({times[0] / each:.1f}x)" for each in times]
         lines.append("| " + " | ".join(cells) + " |")
