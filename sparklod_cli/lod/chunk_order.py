@@ -21,13 +21,14 @@ from ..model.nodes import CHUNK_NODES
 from ..model.splats import FloatArray, Splats
 from ..support.jit import threads_for
 from ..support.progress import Progress, silent
+from .chunk_parts import FamilyTree, Index, parts_of
 from .foveation import set_foveation
 from .kernels.chunk_demand import fill_demand
 from .kernels.chunk_inside import sort_within_chunks
 from .kernels.chunk_sets import Families, split_sets
 from .kernels.pixel_scale import NODE, VIEW
 from .kernels.sort import sort_by_key
-from .kernels.tree_links import find_depths, find_parents
+from .kernels.tree_links import find_parents
 
 #: Viewpoints: half outside of the scene looking at it, a quarter anywhere inside, a quarter near a node. Chosen: 16
 #: are as good for large trees, not for those of four chunks (docs/decisions/2026-11-22-chunk-order.md).
@@ -48,8 +49,10 @@ LEAST_BUDGET = 1 / 16
 #: Bases of the Halton sequences that viewpoints are made of.
 PRIMES = (2, 3, 5, 7, 11, 13, 17)
 
+#: Bytes that `sequence_of` takes for each family of a part, on two threads.
+FAMILY_BYTES = 300
+
 Matrix = NDArray[np.float64]
-Index = NDArray[np.int32]
 
 
 def arrange(splats: Splats, tree: LodTree, *, progress: Progress = silent) -> tuple[Splats, LodTree]:
@@ -74,16 +77,11 @@ def chunk_order(
     """The order of `arrange`: (M,) uint32 the node at each place, and (M,) uint32 the `child_start` of each place."""
     total = len(tree)
     order, child_start = np.zeros(total, np.uint32), np.zeros(total, np.uint32)
-    inner = int(np.count_nonzero(tree.child_count))
-    if not inner:
+    nodes = np.flatnonzero(tree.child_count).astype(np.uint32)
+    if not len(nodes):
         return order, child_start
-    with threads_for(inner) as threads:
-        size = np.fmax(spark_size(splats), np.float32(0))
-        _, limit = find_depths(tree.child_count, tree.child_start, size)
-        nodes = _largest_first(tree, limit, threads)
-        families = _families(splats.center, size, tree, nodes, threads)
-        sequence = _sequence(families, total, progress)
-    parents = nodes[sequence]
+    families = _family_tree(splats, tree, nodes)
+    parents = nodes[sequence_of(families, progress=progress)]
     count = tree.child_count[parents].astype(np.int64)
     first = np.cumsum(count) - count
     order[1:] = np.repeat(tree.child_start[parents] - first, count) + np.arange(total - 1)
@@ -93,20 +91,62 @@ def chunk_order(
     return order, child_start
 
 
-def _largest_first(tree: LodTree, limit: FloatArray, threads: int) -> NDArray[np.uint32]:
-    """(F,) the nodes with children, parents first: by descending limit, the least size from the root to the node."""
-    nodes = np.flatnonzero(tree.child_count).astype(np.uint32)
-    keys = np.uint64(0x7FFFFFFF) - limit[nodes].view(np.uint32).astype(np.uint64)
-    return sort_by_key(keys, nodes, 31, threads)[1]
-
-
-def _families(center: FloatArray, size: FloatArray, tree: LodTree, nodes: NDArray[np.uint32], threads: int) -> Families:
+def _family_tree(splats: Splats, tree: LodTree, nodes: NDArray[np.uint32]) -> FamilyTree:
     """The families of these nodes."""
     number = np.full(len(tree), -1, np.int32)
     number[nodes] = np.arange(len(nodes), dtype=np.int32)
     parent, _ = find_parents(tree.child_count, tree.child_start)
     parent = np.where(parent[nodes] < 0, np.int32(-1), number[parent[nodes]])
-    centers = center[nodes]
+    return FamilyTree(parent, tree.child_count[nodes], splats.center[nodes], spark_size(splats)[nodes])
+
+
+def sequence_of(tree: FamilyTree, *, most: int | None = None, progress: Progress = silent) -> Index:
+    """The families of a tree in the order for streaming.
+
+    Args:
+        tree: its families, at least 1.
+        most: how many are put in order at a time, which takes `FAMILY_BYTES` each; None for all. See `parts_of`.
+        progress: called with the number of nodes that have a chunk.
+
+    Returns:
+        (F,) int32 numbers of families; each comes after the one that has its parent.
+    """
+    limit, total = tree.limits(), 1 + int(tree.count.sum(dtype=np.int64))
+    filled, found = 1, []  # the root
+    for members in parts_of(tree, limit, np.arange(len(tree), dtype=np.int32), most or len(tree)):
+        with threads_for(len(members)) as threads:
+            nodes = _largest_first(limit, members, threads)
+            families = _families(tree, members, nodes, threads)
+            found.append(nodes[_sequence(families, filled, total, progress)])
+        filled += int(families.count.sum(dtype=np.int64))
+    return found[0] if len(found) == 1 else np.concatenate(found)
+
+
+def _largest_first(limit: FloatArray, members: Index, threads: int) -> Index:
+    """Members by descending limit, the least size from the root on; parents first."""
+    keys = np.uint64(0x7FFFFFFF) - limit[members].view(np.uint32).astype(np.uint64)
+    return sort_by_key(keys, members.astype(np.uint32), 31, threads)[1].view(np.int32)
+
+
+def _families(tree: FamilyTree, members: Index, nodes: Index, threads: int) -> Families:
+    """The families of a part, for kernels.
+
+    Args:
+        tree: all families.
+        members: (F,) of the part, ascending.
+        nodes: (F,) the same in the order in which they shall be.
+        threads: to sort on.
+    """
+    number = np.empty(len(members), np.int32)
+    at = nodes if len(members) == len(tree) else np.searchsorted(members, nodes)
+    number[at] = np.arange(len(nodes), dtype=np.int32)
+    parent = tree.parent[nodes]
+    if len(members) < len(tree):
+        at = np.minimum(np.searchsorted(members, parent), len(members) - 1)
+        parent = np.where(members[at] == parent, number[at], np.int32(-1))
+    else:
+        parent = np.where(parent < 0, np.int32(-1), number[parent])
+    centers, count = tree.center[nodes], tree.count[nodes].astype(np.int32)
     rank = np.empty((len(nodes), 3), np.int32)
     for axis in range(3):
         bits = centers[:, axis].view(np.uint32)
@@ -115,28 +155,32 @@ def _families(center: FloatArray, size: FloatArray, tree: LodTree, nodes: NDArra
         rank[by_place, axis] = np.arange(len(nodes), dtype=np.int32)
     records = np.empty(len(nodes), NODE)
     records["x"], records["y"], records["z"] = centers.T
-    records["size"], records["child_count"] = size[nodes], tree.child_count[nodes]
+    records["size"], records["child_count"] = np.fmax(tree.size[nodes], np.float32(0)), count
     records["child_start"] = 0  # not read
     demand = np.empty((len(nodes), VIEWPOINTS), np.uint8)
-    least = min(len(tree) * LEAST_BUDGET, float(CHUNK_NODES))
-    fill_demand(records, parent, viewpoints(centers), least, float(len(tree)), demand)
-    return Families(parent, tree.child_count[nodes].astype(np.int32), rank, demand)
+    total = 1 + int(count.sum(dtype=np.int64))  # a part is looked at as if it were a tree
+    least = min(total * LEAST_BUDGET, float(CHUNK_NODES))
+    fill_demand(records, parent, viewpoints(centers), least, float(total), demand)
+    return Families(parent, count, rank, demand)
 
 
-def _sequence(families: Families, total: int, progress: Progress) -> Index:
+def _sequence(families: Families, filled: int, total: int, progress: Progress) -> Index:
     """(F,) the families in the order in which they are written.
 
     Args:
-        families: F at least 1.
-        total: number of nodes: those of the families, and the root.
+        families: of a part, F at least 1.
+        filled: number of nodes that come before.
+        total: number of nodes of the tree.
         progress: of `arrange`.
     """
-    length = len(families.count)
+    length, own = len(families.count), int(families.count.sum(dtype=np.int64))
     sequence = np.arange(length, dtype=np.int32)
     set_of, root, spare = (np.full(length, -1, np.int32) for _ in range(3))
     weight = np.empty(length, np.int64)
-    # Where a set begins, where it ends, its nodes, and for the first one how many of its nodes fit beside the root.
-    sets, ends, used = [(0, length, total - 1, CHUNK_NODES - 1)], [0], 0
+    # Where a set begins, where it ends, its nodes, and for the first one how many of its nodes fit into the chunk that
+    # was begun: beside the root, or at the end of the part before.
+    room = -filled % CHUNK_NODES
+    sets, ends, used = ([(0, length, own, room)] if room or own > CHUNK_NODES else []), [0, length], 0
     while sets:
         rows = [
             (begin, end, used + number, CHUNK_NODES, -(-nodes // CHUNK_NODES), room)
@@ -147,11 +191,11 @@ def _sequence(families: Families, total: int, progress: Progress) -> Index:
         used += len(sets)
         parts = []
         for (begin, end, nodes, _), first in zip(sets, lengths.tolist(), strict=True):
-            filled = int(families.count[sequence[begin : begin + first]].sum(dtype=np.int64))
-            parts += [(begin, begin + first, filled, 0), (begin + first, end, nodes - filled, 0)]
+            inside = int(families.count[sequence[begin : begin + first]].sum(dtype=np.int64))
+            parts += [(begin, begin + first, inside, 0), (begin + first, end, nodes - inside, 0)]
         ends += [end for _, end, nodes, _ in parts if nodes <= CHUNK_NODES]
         sets = [part for part in parts if part[2] > CHUNK_NODES]
-        progress("arranging", total - sum(nodes for _, _, nodes, _ in sets), total, "node")
+        progress("arranging", filled + own - sum(nodes for _, _, nodes, _ in sets), total, "node")
     bits = (length - 1).bit_length()
     sort_within_chunks(np.unique(ends), families.parent, families.rank, bits, sequence, set_of, root)
     return sequence
