@@ -33,27 +33,39 @@ def tiled(splats: Splats, count: int, seed: int = 0) -> Splats:
     return Splats.concat(parts).take(rng.permutation(copies * len(splats))[:count])
 
 
-def write_ply(path: Path, splats: Splats) -> None:
-    """Writes a binary PLY as Inria's trainer does, but without normals."""
-    rest = splats.sh.transpose(0, 2, 1).reshape(len(splats), -1)
-    names = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", *(f"f_rest_{i}" for i in range(rest.shape[1]))]
+def ply_header(count: int, coefficients: int) -> bytes:
+    """The header of a binary PLY as Inria's trainer writes it, but without normals.
+
+    Args:
+        count: of splats.
+        coefficients: of SH above degree 0, of each colour.
+    """
+    names = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", *(f"f_rest_{i}" for i in range(3 * coefficients))]
     names += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+    header = "\n".join(["ply", "format binary_little_endian 1.0", f"element vertex {count}"])
+    return (header + "".join(f"\nproperty float {name}" for name in names) + "\nend_header\n").encode()
+
+
+def ply_rows(splats: Splats) -> bytes:
+    """The rows of some splats behind a `ply_header`."""
     opacity = np.clip(splats.opacity, 1e-6, 1 - 1e-6)
     columns = [
         splats.center,
         (splats.rgb - 0.5) / SH_C0,
-        rest,
+        splats.sh.transpose(0, 2, 1).reshape(len(splats), -1),
         np.log(opacity / (1 - opacity))[:, None],
         np.log(splats.scale),
         splats.quat_xyzw[:, [3, 0, 1, 2]],
     ]
-    header = "\n".join(["ply", "format binary_little_endian 1.0", f"element vertex {len(splats)}"])
-    header += "".join(f"\nproperty float {name}" for name in names) + "\nend_header\n"
+    return np.concatenate(columns, axis=1).astype("<f4").tobytes()
+
+
+def write_ply(path: Path, splats: Splats) -> None:
+    """Writes a binary PLY."""
     with path.open("wb") as file:
-        file.write(header.encode())
+        file.write(ply_header(len(splats), splats.sh.shape[1]))
         for start in range(0, len(splats), 1 << 18):
-            part = np.concatenate([column[start : start + (1 << 18)] for column in columns], axis=1)
-            file.write(part.astype("<f4").tobytes())
+            file.write(ply_rows(splats.take(slice(start, start + (1 << 18)))))
 
 
 def load(path: Path) -> Splats:

@@ -59,7 +59,7 @@ JOBS = {
     "inspect": Job(
         (
             *("tree_links.find_cycles", "tree_links.find_depths", "tree_links.find_parents"),
-            *("tree_links.mean_child_sizes", "tree_links.sum_by_depth"),
+            *("tree_links.add_child_sizes", "tree_links.sum_by_depth"),
         ),
         ("inspect tree.spz --check",),
     ),
@@ -75,7 +75,7 @@ JOBS = {
     "rad": Job(
         (
             *("chunk_demand.fill_demand", "chunk_inside.sort_within_chunks", "chunk_sets.split_sets", "sort.sort_pass"),
-            *("tree_links.find_depths", "tree_links.find_parents"),
+            *("family_links.find_limits", "tree_links.find_parents"),
         ),
         ("build-lod tree.spz --format rad -o tree.rad",),
     ),

@@ -22,7 +22,8 @@ from sparklod_cli.model.nodes import CHUNK_NODES
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.scenes import reading
 from sparklod_cli.scenes.loaded import Cut, Part
-from sparklod_cli.scenes.reading import TRAVERSED, read_scenes
+from sparklod_cli.scenes.pages import TRAVERSED
+from sparklod_cli.scenes.reading import read_scenes
 from sparklod_cli.support.errors import FormatError, SparklodError, TreeError
 from tests.conftest import FIXTURES
 from tests.lod.forests import transform

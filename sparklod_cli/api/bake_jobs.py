@@ -2,6 +2,10 @@
 
 from ..bake import Baked as Baked
 from ..bake import BakeSettings as BakeSettings
+from ..bake import Merged as Merged
+from ..bake import Resources as Resources
+from ..bake import Source as Source
 from ..bake import bake as bake
+from ..bake import bake_unless_there as bake_unless_there
 from ..extract_leaves import Extracted as Extracted
 from ..extract_leaves import extract_leaves as extract_leaves

@@ -35,6 +35,10 @@ if TYPE_CHECKING:
     from ..tables.output import Filter, TableOutput
 
 
+#: Colours of pictures whose scale is that of what cameras see, rather than of all that they may see.
+COLORS_OF_CUTS = ("level", "chunk", "overdraw")
+
+
 class UnfitError(ValueError):
     """What is asked for does not fit the scenes: a budget, or a chunk cache, too small for their roots."""
 
@@ -93,7 +97,9 @@ def draw_files(
     """
     from ..images.sequence import write_pictures
 
-    scenes = functools.cache(lambda: files.read(through=through))
+    # What looks at more than cuts is read whole.
+    paged = budget is not None and lod.continuous is None and render.color_by in (None, *COLORS_OF_CUTS)
+    scenes = functools.cache(lambda: files.read(through=through, paged=paged))
     path = files.path(scenes)
     if fit_planes:
         render = files.with_planes(render, path, scenes)
@@ -113,7 +119,7 @@ def draw_files(
 def _source(
     scenes: Scenes, budget: Budget | None, lod: LodSettings, loading: tuple[StreamingSettings, float] | None = None
 ) -> CutSource:
-    settings = None if budget is None else dataclasses.replace(lod, budget=budget.of(scenes.leaves))
+    settings = None if budget is None else dataclasses.replace(lod, budget=scenes.splats_of(budget))
     try:
         if loading is None or settings is None or not scenes.trees:
             return CutFinder(scenes, settings)
@@ -259,9 +265,9 @@ def traverse_files(
     from ..tables.assertions import check
 
     outputs.check()
-    scenes = files.read(trees_only=True, plain=outputs.plot is not None)
+    scenes = files.read(trees_only=True, plain=outputs.plot is not None, paged=True)
     path = files.path(lambda: scenes)
-    settings = dataclasses.replace(lod, budget=budget.of(scenes.leaves))
+    settings = dataclasses.replace(lod, budget=scenes.splats_of(budget))
     try:
         simulation = Simulation(scenes, settings, streaming, by_instance=by_instance)
     except ValueError as error:

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 
 from ..cameras.framing import reach
 from ..model.splats import COLUMNS
-from ..scenes.reading import TRAVERSED, read_scenes
+from ..scenes.pages import TRAVERSED
+from ..scenes.reading import read_scenes
 from ..support.progress import Progress, silent
 
 if TYPE_CHECKING:
@@ -41,14 +42,17 @@ class ViewedFiles:
     threads: int
     progress: Progress = silent
 
-    def read(self, *, trees_only: bool = False, through: str | None = None, plain: bool = True) -> Scenes:
-        """The scenes, with all columns if `plain`."""
+    def read(
+        self, *, trees_only: bool = False, through: str | None = None, plain: bool = True, paged: bool = False
+    ) -> Scenes:
+        """The scenes, with all columns if `plain`; as cuts need them if `paged`."""
         return read_scenes(
             self.instances,
             columns=COLUMNS if plain else TRAVERSED,
             trees_only=trees_only,
             through=through,
             precision=self.precision,
+            paged=paged,
             threads=self.threads,
             progress=self.progress,
         )

@@ -22,7 +22,8 @@ from ..render.rasterizer import Image
 from ..render.renderer import Renderer
 from ..render.settings import RenderSettings
 from ..scenes.finder import CutFinder, FixedCut
-from ..scenes.loaded import UNNAMED, Cut, Scenes
+from ..scenes.loaded import Cut, Scenes
+from ..scenes.loaded_scene import UNNAMED
 from ..scenes.reading import read_scenes
 from ..support.defaults import BLEND, PRECISIONS
 from ..support.errors import FormatError, memory_errors_translated

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from ..io import read_rgba, read_scene
+from ..io import read_rgba
 from ..model.lod_tree import LodTree
 from ..model.scene import Scene
 from ..model.splats import Splats
@@ -20,8 +21,12 @@ from ..support.threads import on_threads
 from .checks import check_transformed
 from .clock import Clock
 from .kept_tree import check_kept
+from .out_of_core.contracts import Engine
 from .output import Output, WrittenTree, output_of
+from .resources import Resources
+from .scaling import Scaled, bake_scaled
 from .settings import BakeSettings
+from .sources import Source, read_source
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,7 +41,9 @@ class Baked(WrittenTree):
         method: that built the tree; None for the tree of the input.
         nodes, levels: of the tree; levels is its depth and 1, so that a tree of one node has one.
         notes: what the reader had to leave out, for display.
-        seconds: by stage (read, build, arrange, write).
+        seconds: by stage (read, build, order, arrange, write).
+        blocks: that were built one after the other, out of core; None in memory.
+        scratch_bytes_written, scratch_bytes_read: in the scratch folder; None in memory.
     """
 
     format: str
@@ -49,6 +56,9 @@ class Baked(WrittenTree):
     levels: int
     notes: tuple[str, ...]
     seconds: dict[str, float]
+    blocks: int | None = None
+    scratch_bytes_written: int | None = None
+    scratch_bytes_read: int | None = None
 
 
 #: Nodes and their tree, the number of leaves, and the splats that were left out, by reason.
@@ -56,33 +66,56 @@ _Made = tuple[Splats, LodTree, int, dict[str, int]]
 
 
 def bake(
-    source: Place,
+    source: Source,
     target: Place,
     settings: BakeSettings,
     *,
     overwrite: bool = False,
     threads: int = 1,
     progress: Progress = silent,
+    resources: Resources | None = None,
+    engine: Engine | None = None,
+    say: Callable[[str], None] = lambda text: None,
 ) -> Baked:
-    """Reads a splat file, builds its tree and writes a Level-of-Detail file. A tree that it has may be kept.
+    """Reads splat files, builds a tree of them and writes a Level-of-Detail file. The tree of a single one may be kept.
+
+    What does not fit into the memory that it may take is baked out of core: block by block, with a scratch folder.
 
     Args:
-        source: of any format that is read; - is standard input.
+        source: a file of any format that is read, - for standard input, or several files as one scene.
         target: a file of the format that is set, or one of arrays, whatever its name; - is standard output.
         settings: how.
         overwrite: replace files that exist.
         threads: to work on.
         progress: told of the stages.
+        resources: that it may use; None for those of a machine that is otherwise idle.
+        engine: runs the tasks of a bake that goes out of core because of it; None for this process.
+        say: told in a line that it goes out of core, and what is left after an interruption.
 
     Raises:
-        FormatError, InvalidSplatsError, OutputError: see `io.read_scene`, `Selection.apply` and `io.scene_sink`; or the
+        FormatError, InvalidSplatsError, OutputError: see `read_source`, `Selection.apply` and `io.scene_sink`; or the
             input has a tree, and the settings do not keep it.
+        ScratchError: the scratch folder is full, in use, or has the results of another bake.
         OutOfMemoryError: it does not fit into memory.
     """
     with memory_errors_translated():
         output, clock = output_of(target, settings, overwrite=overwrite), Clock()
+        scaled = bake_scaled(
+            source,
+            target,
+            settings,
+            output,
+            overwrite=overwrite,
+            threads=threads,
+            progress=progress,
+            resources=resources or Resources(),
+            engine=engine,
+            say=say,
+        )
+        if scaled is not None:
+            return _baked_of(scaled, settings)
         # A list, so that whoever takes the scene out of it can free it.
-        scenes = [read_scene(source, threads=threads, progress=progress)]
+        scenes = [read_source(source, threads=threads, progress=progress)]
         form, notes, read = scenes[0].format, scenes[0].notes, len(scenes[0])
         antialiased, has_tree = scenes[0].antialiased, scenes[0].tree is not None
         if has_tree:
@@ -109,6 +142,27 @@ def bake(
         levels=int(tree.depths().max()) + 1,
         notes=notes,
         seconds=clock.seconds,
+    )
+
+
+def _baked_of(scaled: Scaled, settings: BakeSettings) -> Baked:
+    """The report of a bake out of core."""
+    made, tally = scaled.baked, scaled.baked.findings.tally
+    return Baked(
+        **vars(made.written),
+        format=scaled.format,
+        read=scaled.read,
+        splats=tally.kept,
+        sh_degree=scaled.sh_degree,
+        dropped=tally.dropped,
+        method=settings.method,
+        nodes=made.nodes,
+        levels=made.levels,
+        notes=scaled.notes,
+        seconds=made.seconds,
+        blocks=made.blocks,
+        scratch_bytes_written=scaled.scratch_bytes_written,
+        scratch_bytes_read=scaled.scratch_bytes_read,
     )
 
 

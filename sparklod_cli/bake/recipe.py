@@ -7,13 +7,13 @@ import hashlib
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from .. import __version__
 from ..io import files_of, identity_of
+from ..support.addresses import Place
 from ..support.untrusted import parse_json, quoted_value
 from .settings import BakeSettings
 
@@ -58,21 +58,29 @@ class Recipe:
                 found.append(f"{name} was {quoted_value(before)} and is {quoted_value(now)}")
         return found
 
-    def to_json(self) -> bytes:
-        """The text of which `from_json` makes it again."""
-        return json.dumps(dataclasses.asdict(self), sort_keys=True, indent=1).encode()
+    def to_record(self) -> dict[str, Any]:
+        """As values that JSON has, of which `from_record` makes it again."""
+        return dataclasses.asdict(self)
 
     @classmethod
-    def from_json(cls, text: bytes) -> Recipe:
-        """The recipe of `to_json`; `ValueError` where the text is none."""
-        found = parse_json(text)
+    def from_record(cls, found: Any) -> Recipe:
+        """The recipe of `to_record`; `ValueError` where the values are of none."""
         try:
             return cls(tuple(found["inputs"]), tuple(found["names"]), dict(found["settings"]))
         except (KeyError, TypeError) as error:
             raise ValueError(f"it is no recipe: {error!r}") from None
 
+    def to_json(self) -> bytes:
+        """The text of which `from_json` makes it again."""
+        return json.dumps(self.to_record(), sort_keys=True).encode()
 
-def recipe_of(sources: Iterable[Path], settings: BakeSettings, **more: Any) -> Recipe:
+    @classmethod
+    def from_json(cls, text: bytes) -> Recipe:
+        """The recipe of `to_json`; `ValueError` where the text is none."""
+        return cls.from_record(parse_json(text))
+
+
+def recipe_of(sources: Iterable[Place], settings: BakeSettings, **more: Any) -> Recipe:
     """The recipe of a bake that may go on later; files are told apart by size, time and a sample of their bytes.
 
     Args:
@@ -84,7 +92,9 @@ def recipe_of(sources: Iterable[Path], settings: BakeSettings, **more: Any) -> R
         UnreadableError: an input cannot be read.
     """
     files = [file for source in sources for file in files_of(source)]
-    found = [identity_of(file) for file in [*files, *([settings.rgba] if settings.rgba else [])]]
+    if settings.rgba is not None:
+        files.append(settings.rgba)
+    found = [identity_of(file) for file in files]
     inputs = tuple(f"{each.bytes} {each.modified} {each.sample}" for each in found)
     return Recipe(inputs, tuple(each.name for each in found), settings_of(settings) | more)
 

@@ -156,8 +156,8 @@ def reach(near: float, far: float, cameras: Sequence[Camera], scene: Balls) -> t
         scene: all that its splats cover.
     """
     sample = scene.center[:: max(len(scene.center) // SAMPLE, 1)]
-    corners = np.stack([scene.center.min(axis=0), scene.center.max(axis=0)])
-    largest = float(scene.radius.max())
+    corners = scene.box if scene.box is not None else np.stack([scene.center.min(axis=0), scene.center.max(axis=0)])
+    largest = scene.largest if scene.largest is not None else float(scene.radius.max())
     for camera in some(cameras):
         away = np.linalg.norm(sample - camera.position, axis=1)
         farthest = float(np.linalg.norm(np.abs(corners - camera.position).max(axis=0)))

@@ -6,22 +6,24 @@ import dataclasses
 import functools
 import json
 from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from ..codecs.rad.names import SUFFIX as RAD
-from ..support.addresses import Place
 from ..support.errors import SparklodError
 from ..support.printable import MOST, shortened
 from ..support.stdin import DASH, name_of
+from .build_lod_inputs import Inputs, check_inputs, input_options, record_of
 from .build_lod_outputs import Outputs, check_formats
 from .command import COMMON, Command, option
 from .options.baking import bake_settings, baking_options, check_method, write_options
 from .options.common import General, common_options, output_option, overwrite_option
-from .paths import InputPath, OutputPath, claim_stdout, keep_apart, with_chunks
+from .options.resources import OF_BAKES, resources_of, resources_options
+from .paths import OutputPath, claim_stdout, keep_apart, with_chunks
 from .reports import report_baked, report_extracted
-from .usage import options_of
+from .usage import exclude, options_of
 
 if TYPE_CHECKING:
     from ..api.bake_jobs import Baked, Extracted
@@ -33,7 +35,9 @@ Examples:
   sparklod build-lod scene.ply                          # writes scene-lod.spz
   sparklod build-lod scene.ply --up -y                  # y up, as viewers want it
   sparklod build-lod scene.ply --method quality         # for publishing
-  sparklod build-lod scans/*.ply --output-dir web -f
+  sparklod build-lod scans/*.ply --output-dir web -f --skip-existing
+  sparklod build-lod tiles/*.ply --merge -o city-lod.rad
+  sparklod build-lod city.ply -o city-lod.rad --memory 4G --scratch-dir /fast
   cat scene.ply | sparklod build-lod - -o - | aws s3 cp - s3://bucket/scene-lod.spz
   sparklod build-lod scene.ply --within 0,1,0,25 --min-opacity 0.02
   sparklod build-lod scene.ply --json | jq .nodes
@@ -46,7 +50,7 @@ Examples:
 
 
 @click.command("build-lod", cls=Command, epilog=EXAMPLES, context_settings={"show_default": True})
-@click.argument("inputs", metavar="INPUT...", nargs=-1, required=True, type=InputPath(stdin=True, addresses=True))
+@input_options
 @output_option(
     "Output of a single input; - is standard output.  [default: NAME-lod.spz beside the input;"
     " NAME-lod.rad with --format rad, NAME-lod.npz with --encoding, NAME-unlod.spz with --unlod]",
@@ -62,6 +66,13 @@ Examples:
 )
 @overwrite_option
 @option(
+    "--skip-existing",
+    heading=COMMON,
+    is_flag=True,
+    help="Bake nothing whose output is there already, of the same inputs and settings; a small file beside each output,"
+    " NAME.sparklod.json, tells of what it is.",
+)
+@option(
     "--unlod",
     heading=COMMON,
     is_flag=True,
@@ -69,68 +80,80 @@ Examples:
     " .splat.",
 )
 @baking_options
+@resources_options
 @common_options
 @click.pass_context
-def build_lod(ctx: click.Context, /, inputs: tuple[Place, ...], **_: Any) -> None:
+def build_lod(ctx: click.Context, /, **_: Any) -> None:
     """Bake splat files into Level-of-Detail files for Spark.
 
     Reads PLY (also PlayCanvas's compressed PLY), SPZ, RAD, SOG (.sog, or a folder with a meta.json), .splat and
     .ksplat; merges splats into a tree, and writes the tree as SPZ with Spark's extension, or as RAD, which Spark
     streams. An INPUT of - is standard input.
 
-    The axes of the input are kept unless --up or --rotate turns them. Selection goes by the coordinates of the input.
+    The axes of the input are kept unless --up or --rotate turns them. Selection goes by the coordinates of the input;
+    of merged inputs, by those at which they stand together.
 
     An input that fails does not stop the others; the exit status is 1 if any did.
     """
-    general, outputs = options_of(ctx, General), options_of(ctx, Outputs)
-    _check(ctx, inputs, outputs, general)
+    general, given, outputs = options_of(ctx, General), options_of(ctx, Inputs), options_of(ctx, Outputs)
+    check_inputs(ctx, given, outputs)
+    instances = given.instances()
+    _check(ctx, given, [each.file for each in instances if each.file is not None], outputs, general)
     failed = False
     with general.console() as console:
         make, report = _job(ctx, outputs, console)
         shared = {"overwrite": outputs.overwrite, "threads": general.threads, "progress": console.progress}
-        for source in inputs:
-            target = outputs.target(source)
+        for source, target in given.jobs(instances, outputs, console.say):
             try:
                 result = make(source, target, **shared)
-                report(console, source, target, result)
+                if result is None:
+                    console.say(f"{name_of(source)}  ->  {target}  is there already")
+                else:
+                    report(console, source, target, result)
             except SparklodError as error:
                 failed = True
                 console.error(f"{name_of(source)}: {error}")
-                record: dict[str, Any] = {"input": str(source), "error": shortened(str(error), MOST)}
+                record = {**record_of(source), "error": shortened(str(error), MOST)}
             else:
-                record = {"input": str(source), "output": str(target), **dataclasses.asdict(result)}
+                made = {"skipped": True} if result is None else dataclasses.asdict(result)
+                record = {**record_of(source), "output": str(target), **made}
             if general.as_json:
                 click.echo(json.dumps(record))
     if failed:
         ctx.exit(1)
 
 
-def _check(ctx: click.Context, inputs: tuple[Place, ...], outputs: Outputs, general: General) -> None:
+def _check(ctx: click.Context, given: Inputs, named: list[Path], outputs: Outputs, general: General) -> None:
     """Raises a `click.UsageError` where options contradict each other, or the names of files."""
+    inputs = given.inputs
     if outputs.output is not None:
         if outputs.output_dir is not None:
             raise click.UsageError("--output cannot be used with --output-dir")
-        if len(inputs) > 1:
+        if len(inputs) > 1 and not given.merge:
             raise click.UsageError(f"--output takes one input, not {len(inputs)}; use --output-dir")
     elif DASH in inputs:
         raise click.UsageError("standard input has no name to derive one from; give --output")
-    targets = [outputs.target(source) for source in inputs]
+    targets = [outputs.output] if outputs.output is not None else [outputs.target(source) for source in inputs]
     if outputs.is_chunked:
         targets = with_chunks(targets)
-    keep_apart(ctx, {"output" if outputs.output_dir is None else "output_dir": targets})
+    keep_apart(ctx, {"output" if outputs.output_dir is None else "output_dir": targets, "scene": named})
     claim_stdout(ctx, "output", as_json=general.as_json, binary=True)
     if ctx.params["rgba"] is not None and len(inputs) > 1:
         raise click.UsageError(f"--rgba takes one input, not {len(inputs)}")
+    if ctx.params["skip_existing"] and outputs.output == DASH:
+        raise click.UsageError("--skip-existing needs an output that can be there already; name a file")
     check_formats(ctx, outputs)
-    if not outputs.unlod:
+    if outputs.unlod:
+        exclude(ctx, (*OF_BAKES, "skip_existing"), "--unlod")
+    else:
         check_method(ctx)
 
 
 def _job(
     ctx: click.Context, outputs: Outputs, console: Console
-) -> tuple[Callable[..., Baked | Extracted], Callable[..., None]]:
+) -> tuple[Callable[..., Baked | Extracted | None], Callable[..., None]]:
     """What makes an output of an input, and what reports it; the point where numpy and numba are loaded."""
-    from ..api.bake_jobs import bake, extract_leaves
+    from ..api.bake_jobs import bake, bake_unless_there, extract_leaves
 
     if outputs.unlod:
         leaves = functools.partial(extract_leaves, suffix=outputs.suffix, options=write_options(ctx))
@@ -138,4 +161,5 @@ def _job(
     settings = bake_settings(ctx, suffix=outputs.suffix, raw=outputs.is_raw, converts=outputs.format_is_asked_for)
     more = [] if outputs.suffix != RAD else ["rad"] if settings.options.rad.sh_codes is None else ["rad", "palette"]
     console.announce_compiling(settings.method, *more)
-    return functools.partial(bake, settings=settings), report_baked
+    make = bake_unless_there if ctx.params["skip_existing"] else bake
+    return functools.partial(make, settings=settings, resources=resources_of(ctx), say=console.say), report_baked

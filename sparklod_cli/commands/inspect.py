@@ -101,4 +101,5 @@ def _report_settings(checks: Checks, output: Output, expected: Expectations | No
         all_quantities=everything or output.html is not None,
         check=checks.holds or field.startswith("findings"),
         chunks=output.chunks or output.chunks_out is not None or field.startswith("chunks"),
+        at_once=True if drawn or output.histogram or checks.leaves_of is not None else None,
     )

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from ..support.addresses import Place
 from ..support.stdin import DASH, name_of
+from ..support.units import format_size
 from .console import Console, count_of, size_of
 
 if TYPE_CHECKING:
@@ -59,6 +60,9 @@ def report_baked(console: Console, source: Place, target: Place, baked: Baked) -
         console.say(f"  {_clamped(clamp, baked)}")
     tree = f"{baked.method} tree" if baked.method is not None else "the same tree"
     console.detail(f"  {baked.format} -> {tree} -> {_written(baked)}; {_stages(baked.seconds)}")
+    if baked.blocks is not None:
+        written, read = (format_size(size or 0) for size in (baked.scratch_bytes_written, baked.scratch_bytes_read))
+        console.detail(f"  out of core in {count_of(baked.blocks, 'block')}; scratch: {written} written, {read} read")
 
 
 def _written(baked: Baked) -> str:

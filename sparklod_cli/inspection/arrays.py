@@ -14,7 +14,7 @@ from ..codecs.splat_encoding import SplatEncoding
 from ..model.scene import Scene
 from ..model.splats import Splats
 from ..support.errors import FormatError
-from . import tree, values
+from . import tree, value_checks, values
 from .findings import Finding
 
 if TYPE_CHECKING:
@@ -70,7 +70,7 @@ def _of_splats(name: str, splats: Splats, settings: ReportSettings) -> tuple[Fac
         sh_degree=splats.sh_degree,
         notes=[NO_CHILDREN],
         values=values.examine(splats, all_quantities=settings.all_quantities) if settings.values else None,
-        findings=values.check(Scene(opaque)) if settings.check else [],
+        findings=value_checks.check(Scene(opaque)) if settings.check else [],
     ), scene
 
 

@@ -6,13 +6,13 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..lod.kernels.tree_links import find_depths, find_parents
 from ..model.gaussian import spark_size
-from ..model.nodes import CHUNK_NODES
 from ..model.scene import Scene
 from ..tables.columns import Cell, Column, Row
+from . import tree
+from .blocks import Block, Blocks
 
 COLUMNS = (
     Column("chunk", int, "", "", "number of the chunk, from 0"),
@@ -33,6 +33,9 @@ COLUMNS = (
     Column("parent_chunks", int, "", "", "other chunks that hold parents of its nodes; empty without a tree"),
 )
 
+#: Columns of `Splats` that rows are computed from.
+USED = ("center", "scale", "opacity")
+
 #: The columns of a table that a person reads, and their widths.
 SHOWN = {
     "chunk": 6,
@@ -49,54 +52,65 @@ SHOWN = {
 }
 
 
-def rows_of(scene: Scene) -> list[Row]:
-    """A row for each chunk, with a cell for each of `COLUMNS`.
+class Rows:
+    """A row for each chunk of splats that pass once, block by block.
 
     Args:
-        scene: whose chunks are those of its file, or of `CHUNK_NODES` splats where its format has none.
+        blocks: of which each is a chunk of its file, or of `CHUNK_NODES` splats where its format has none.
     """
-    count = len(scene.splats)
-    step = scene.header.get("chunk_size") or CHUNK_NODES
-    if not count:
-        return []
-    starts = np.arange(0, count, step)
-    center, size = scene.splats.center, spark_size(scene.splats)
-    low, high = np.minimum.reduceat(center, starts), np.maximum.reduceat(center, starts)
-    with np.errstate(invalid="ignore", over="ignore"):
-        extent = np.linalg.norm(high.astype(np.float64) - low, axis=1)
-    numbers = {"extent": extent}
-    numbers |= {f"min_{axis}": low[:, at] for at, axis in enumerate("xyz")}
-    numbers |= {f"max_{axis}": high[:, at] for at, axis in enumerate("xyz")}
-    numbers |= {"size_min": np.minimum.reduceat(size, starts), "size_max": np.maximum.reduceat(size, starts)}
-    links = _links(scene, starts, step, size)
-    sizes = scene.chunk_bytes
-    rows = []
-    for chunk, base in enumerate(starts.tolist()):
+
+    def __init__(self, blocks: Blocks) -> None:
+        self._blocks = blocks
+        self._rows: list[dict[str, Any]] = []
+
+    def add(self, block: Block) -> None:
+        """Adds the chunk of a block, with the columns `USED`."""
+        center, size, chunk = block.splats.center, spark_size(block.splats), len(self._rows)
+        low, high = center.min(axis=0), center.max(axis=0)
+        with np.errstate(invalid="ignore", over="ignore"):
+            extent = np.linalg.norm(high.astype(np.float64) - low)
+        numbers = {"extent": extent, "size_min": size.min(), "size_max": size.max()}
+        numbers |= {f"min_{axis}": low[at] for at, axis in enumerate("xyz")}
+        numbers |= {f"max_{axis}": high[at] for at, axis in enumerate("xyz")}
         row: dict[str, Any] = dict.fromkeys(column.name for column in COLUMNS)
-        row |= {"chunk": chunk, "base": base, "splats": min(step, count - base)}
-        row["bytes"] = None if sizes is None else sizes[chunk]
-        row |= {name: int(values[chunk]) for name, values in links.items()}
-        row |= {name: float(values[chunk]) for name, values in numbers.items() if np.isfinite(values[chunk])}
-        rows.append({column.name: column.rounded(row[column.name]) for column in COLUMNS})
-    return rows
+        row |= {"chunk": chunk, "base": block.start, "splats": len(center)}
+        row["bytes"] = None if self._blocks.chunk_bytes is None else self._blocks.chunk_bytes[chunk]
+        row["leaves"] = None if block.tree is None else int(np.count_nonzero(block.tree.is_leaf))
+        row |= {name: float(value) for name, value in numbers.items() if np.isfinite(value)}
+        self._rows.append(row)
+
+    def rows(self, columns: tree.Columns | None) -> list[Row]:
+        """The rows, with a cell for each of `COLUMNS`, after the last block.
+
+        Args:
+            columns: of the tree; None without one.
+        """
+        if columns is not None:
+            self._add_links(columns)
+        return [{column.name: column.rounded(row[column.name]) for column in COLUMNS} for row in self._rows]
+
+    def _add_links(self, columns: tree.Columns) -> None:
+        links = columns.tree
+        depth, _ = find_depths(links.child_count, links.child_start, columns.size)
+        parent, _ = find_parents(links.child_count, links.child_start)
+        step = self._rows[0]["splats"]
+        for number, row in enumerate(self._rows):
+            part = slice(row["base"], row["base"] + row["splats"])
+            above = parent[part]
+            elsewhere = np.unique(above[above >= 0] // step)
+            row["parent_chunks"] = int(np.count_nonzero(elsewhere != number))
+            row["depth_min"], row["depth_max"] = (int(max(end, 0)) for end in (depth[part].min(), depth[part].max()))
 
 
-def _links(scene: Scene, starts: NDArray[np.intp], step: int, size: NDArray[Any]) -> dict[str, NDArray[Any]]:
-    """What each chunk has of the tree; nothing without one."""
-    tree = scene.tree
-    if tree is None:
-        return {}
-    depth, _ = find_depths(tree.child_count, tree.child_start, size)
-    parent, _ = find_parents(tree.child_count, tree.child_start)
-    child = np.flatnonzero(parent >= 0)
-    pairs = np.unique((child // step) * len(starts) + parent[child] // step)
-    elsewhere = pairs[pairs // len(starts) != pairs % len(starts)]
-    return {
-        "leaves": np.add.reduceat(tree.is_leaf.astype(np.int64), starts),
-        "depth_min": np.minimum.reduceat(np.maximum(depth, 0), starts),
-        "depth_max": np.maximum.reduceat(depth, starts).clip(0),
-        "parent_chunks": np.bincount(elsewhere // len(starts), minlength=len(starts)),
-    }
+def rows_of(scene: Scene) -> list[Row]:
+    """The rows of a scene in memory, see `Rows`."""
+    blocks = Blocks.of(scene)
+    found, columns = Rows(blocks), tree.Columns.of(blocks.count) if blocks.is_tree else None
+    for block in blocks.read(USED):
+        found.add(block)
+        if columns is not None:
+            columns.add(block)
+    return found.rows(columns if blocks.count else None)
 
 
 def lines(rows: list[dict[str, Any]]) -> Iterator[str]:

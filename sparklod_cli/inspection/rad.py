@@ -18,7 +18,7 @@ from ..codecs.splat_encoding import log_scale_table
 from ..io import opened
 from ..support.printable import MOST, printable
 from .findings import Finding
-from .values import Ends
+from .value_checks import Ends
 
 #: Name of the format in `codecs.formats`.
 FORMAT = "RAD"

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from ..codecs.rad.codec import name_of
 from ..codecs.spz_layout import KNOWN_FLAGS
-from ..io import examine_scene, read_arrays, size_of_input
+from ..io import RadFile, examine_scene, read_arrays, size_of_input
 from ..model.scene import Scene
 from ..model.sh import COEFFICIENTS
 from ..model.splats import COLUMNS
@@ -18,14 +19,15 @@ from ..support.printable import printable
 from ..support.progress import Progress, silent
 from ..support.untrusted import QUOTED
 from ..tables.columns import Row
-from . import arrays, chunks, rad, tree, values
+from . import arrays, chunks, rad, tree, value_checks, values
+from .blocks import Block, Blocks
 from .findings import Finding
 
 #: Version of the report: counts up when a field changes its meaning or is removed. schema.json describes this one.
 SCHEMA_VERSION = 1
 
 #: Columns that the facts of a tree are computed from.
-TREE_COLUMNS = ("scale", "opacity")
+TREE_COLUMNS = tree.USED
 
 
 #: Fields for which the headers of a RAD file are enough.
@@ -46,6 +48,8 @@ class ReportSettings:
         check: findings.
         chunks: a row for each chunk.
         headers_only: read no more than the headers of a RAD file; its tree and values are left out.
+        at_once: have the whole scene in memory, as those need who look at it besides; False reads RAD files chunk by
+            chunk; None does so with large ones, see `RadFile.fits`.
     """
 
     chunks: bool = False
@@ -53,6 +57,7 @@ class ReportSettings:
     values: bool = False
     all_quantities: bool = False
     check: bool = False
+    at_once: bool | None = None
 
 
 @dataclass(frozen=True)
@@ -128,7 +133,8 @@ def inspect(
 ) -> tuple[Report, Scene | None]:
     """The report on a file, and its scene as far as it was read.
 
-    A file that cannot be read gives a finding, not an error, and None for the scene.
+    A file that cannot be read gives a finding, not an error, and None for the scene. A large RAD file is
+    read chunk by chunk, which gives the same report, but no scene.
 
     Args:
         path: of the file, or of the folder of an unpacked SOG.
@@ -149,11 +155,16 @@ def inspect(
             return Report(str(path), size, findings=surveyed.findings if settings.check else surveyed.fatal), None
         if surveyed is not None and settings.headers_only:
             return _of_headers(path, surveyed), None
+        if surveyed is not None and settings.at_once is not True:
+            file = RadFile.open(path)
+            if file is not None and not (settings.at_once is None and file.fits):
+                blocks = Blocks.of_file(file, threads=threads, progress=progress)
+                return _of_blocks(path, blocks, size, settings, surveyed), None
         scene = examine_scene(path, columns=columns, threads=threads, progress=progress)
     except FormatError as error:
         found = surveyed.findings if surveyed is not None and settings.check else []
         return Report(str(path), size, findings=[*found, Finding(error.code, str(error))]), None
-    return _of_scene(path, scene, size, settings, surveyed), scene
+    return _of_blocks(path, Blocks.of(scene), size, settings, surveyed), scene
 
 
 def _of_headers(path: Path, surveyed: rad.Survey) -> Report:
@@ -173,41 +184,72 @@ def _of_headers(path: Path, surveyed: rad.Survey) -> Report:
     )
 
 
-def _of_scene(
-    path: Path, scene: Scene, size: int | None, settings: ReportSettings, surveyed: rad.Survey | None
+class _Passed(Protocol):
+    """What blocks pass through."""
+
+    def add(self, block: Block) -> None: ...
+
+
+def _of_blocks(
+    path: Path, blocks: Blocks, size: int | None, settings: ReportSettings, surveyed: rad.Survey | None
 ) -> Report:
-    splats, count = scene.splats, len(scene.splats)
-    size = scene.header.get("bytes", size)
-    ends = values.ends_of(scene)
-    findings = _container_findings(scene)
+    """The report on a file that can be read, block by block."""
+    size = blocks.header.get("bytes", size)
+    ends = value_checks.ends_of(blocks.header)
+    findings = _container_findings(blocks)
     if surveyed is not None and surveyed.facts is not None:
         size, ends = surveyed.facts.bytes, rad.ends_of(surveyed.facts)
         findings += surveyed.findings
+    columns = tree.Columns.of(blocks.count) if blocks.is_tree and blocks.count else None
+    statistics = values.Statistics(blocks.sh_degree, all_quantities=settings.all_quantities)
+    checks = value_checks.ValueChecks(ends, is_tree=blocks.is_tree)
+    rows = chunks.Rows(blocks)
+    wanted: list[tuple[_Passed, Collection[str]]] = [
+        *([] if columns is None else [(columns, tree.USED)]),
+        *([(statistics, COLUMNS)] if settings.values else []),
+        *([(checks, COLUMNS)] if settings.check else []),
+        *([(rows, chunks.USED)] if settings.chunks else []),
+    ]
+    for block in blocks.read({name for _, names in wanted for name in names}):
+        for each, _ in wanted:
+            each.add(block)
+    if settings.values:
+        _finish(statistics, blocks)
     facts = None
-    if scene.tree is not None and count:
-        facts, found = tree.examine(
-            splats, scene.tree, check=settings.check, scale_ends=ends.scale, in_chunks=surveyed is not None
+    in_order = rows.rows(columns) if settings.chunks else None
+    if columns is not None:
+        facts, found = tree.examine_blocks(
+            blocks, columns, check=settings.check, scale_ends=ends.scale, in_chunks=surveyed is not None
         )
         findings += found
     if settings.check:
-        findings += values.check(scene, ends)
+        findings += checks.findings()
     return Report(
         file=str(path),
         bytes=size,
-        format=scene.format,
-        splats=count,
-        sh_degree=splats.sh_degree,
-        antialiased=scene.antialiased,
-        header=dict(scene.header),
-        bytes_per_splat=_bytes_per_splat(size, count),
-        compression_ratio=_compression_ratio(size, count, splats.sh_degree),
-        notes=list(scene.notes),
+        format=blocks.format,
+        splats=blocks.count,
+        sh_degree=blocks.sh_degree,
+        antialiased=blocks.antialiased,
+        header=dict(blocks.header),
+        bytes_per_splat=_bytes_per_splat(size, blocks.count),
+        compression_ratio=_compression_ratio(size, blocks.count, blocks.sh_degree),
+        notes=list(blocks.notes),
         rad=None if surveyed is None else surveyed.facts,
         tree=facts,
-        values=values.examine(splats, all_quantities=settings.all_quantities) if settings.values else None,
-        chunks=chunks.rows_of(scene) if settings.chunks else None,
+        values=statistics.facts() if settings.values else None,
+        chunks=in_order,
         findings=findings if settings.check else None,
     )
+
+
+def _finish(statistics: values.Statistics, blocks: Blocks) -> None:
+    """Ends the first pass of the statistics, and makes those that they need besides."""
+    statistics.end_pass()
+    while statistics.passes:
+        for block in blocks.read(statistics.columns):
+            statistics.add(block)
+        statistics.end_pass()
 
 
 def _bytes_per_splat(size: int | None, count: int) -> float | None:
@@ -218,9 +260,9 @@ def _compression_ratio(size: int | None, count: int, sh_degree: int) -> float | 
     return round(4 * count * (14 + 3 * COEFFICIENTS[sh_degree]) / size, 3) if size else None
 
 
-def _container_findings(scene: Scene) -> list[Finding]:
-    header = scene.header
-    findings = [Finding("container.left-out", note) for note in scene.notes]
+def _container_findings(blocks: Blocks) -> list[Finding]:
+    header = blocks.header
+    findings = [Finding("container.left-out", note) for note in blocks.notes]
     unknown = header.get("flags", 0) & ~KNOWN_FLAGS
     if unknown:
         findings.append(Finding("container.flags", f"the header sets flags {unknown:#04x}, which have no meaning"))

@@ -9,11 +9,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..lod.kernels.tree_links import find_cycles, find_depths, find_parents, mean_child_sizes, sum_by_depth
+from ..lod.kernels.tree_links import add_child_sizes, find_cycles, find_depths, find_parents, sum_by_depth
 from ..model.gaussian import spark_size
 from ..model.lod_tree import LodTree
 from ..model.nodes import CHUNK_BITS, CHUNK_NODES
+from ..model.scene import Scene
 from ..model.splats import FloatArray, Splats
+from ..support.parallel import blocks_of
+from .blocks import Block, Blocks, Mask, Tally
 from .findings import Finding
 
 #: Smallest feature size of a node over the mean of its children's, weighted by area. A merged splat has at least their
@@ -29,7 +32,8 @@ PARTS, MAX_RISE, MIN_NODES = 16, 1.6, 1024
 #: Most depths that a report lists, from the root on. Good trees have some twenty; a chain could have one a node.
 MAX_DEPTHS = 1000
 
-Mask = NDArray[np.bool_]
+#: Columns of `Splats` that the facts of a tree are computed from.
+USED = ("scale", "opacity")
 
 
 @dataclass(frozen=True)
@@ -77,25 +81,76 @@ class TreeFacts:
     split_siblings: int
 
 
+@dataclass(frozen=True, eq=False)
+class Columns:
+    """What the facts of a tree of N nodes need of each of them, 10 bytes.
+
+    Attributes:
+        tree: children, (N,) as far as the blocks have come.
+        size: (N,) float32 feature sizes, world units.
+        tallies: merged nodes of D > 1, and leaves of D > 1.
+    """
+
+    tree: LodTree
+    size: FloatArray
+    opaque: Tally
+    opaque_leaves: Tally
+
+    @classmethod
+    def of(cls, count: int) -> Columns:
+        """For so many nodes, without any."""
+        tree = LodTree(np.empty(count, np.uint16), np.empty(count, np.uint32))
+        return cls(tree, np.empty(count, np.float32), Tally(), Tally())
+
+    def add(self, block: Block) -> None:
+        """Adds the nodes of a block, with the columns `USED`."""
+        assert block.tree is not None
+        part = slice(block.start, block.start + len(block.splats))
+        self.tree.child_count[part], self.tree.child_start[part] = block.tree.child_count, block.tree.child_start
+        self.size[part] = spark_size(block.splats)
+        opaque = block.splats.opacity > 1
+        self.opaque.add(opaque, block.start)
+        self.opaque_leaves.add(opaque & block.tree.is_leaf, block.start)
+
+
 def examine(
-    splats: Splats,
-    tree: LodTree,
-    *,
-    check: bool = True,
-    scale_ends: tuple[float, float] = (0.0, math.inf),
-    in_chunks: bool = False,
+    splats: Splats, tree: LodTree, *, check: bool = True, scale_ends: tuple[float, float] = (0.0, math.inf)
 ) -> tuple[TreeFacts, list[Finding]]:
-    """The facts of a tree and findings about it; of a broken tree, the facts of the nodes that its root leads to.
+    """The facts of a tree in memory and findings about it, see `examine_blocks`.
 
     Args:
         splats: N nodes, of which scale and opacity are used.
         tree: of N nodes, at least one.
         check: look for faults.
+        scale_ends: smallest and largest scale that the format holds, world units.
+    """
+    blocks, columns = Blocks.of(Scene(splats, tree)), Columns.of(len(tree))
+    for block in blocks.read(USED):
+        columns.add(block)
+    return examine_blocks(blocks, columns, check=check, scale_ends=scale_ends)
+
+
+def examine_blocks(
+    blocks: Blocks,
+    columns: Columns,
+    *,
+    check: bool,
+    scale_ends: tuple[float, float] = (0.0, math.inf),
+    in_chunks: bool = False,
+) -> tuple[TreeFacts, list[Finding]]:
+    """The facts of a tree and findings about it; of a broken tree, the facts of the nodes that its root leads to.
+
+    At most 31 bytes a node are in memory, those of `columns` among them; 18 where nothing is checked.
+
+    Args:
+        blocks: read once more to compare nodes with their children, where faults are looked for.
+        columns: of all blocks.
+        check: look for faults.
         scale_ends: smallest and largest scale that the format holds, world units. A scale at one of them may have been
             clamped.
         in_chunks: the format orders nodes by chunks, so that they need not be coarse before fine.
     """
-    size = spark_size(splats)
+    tree, size = columns.tree, columns.size
     depth, limit = find_depths(tree.child_count, tree.child_start, size)
     with np.errstate(divide="ignore", invalid="ignore"):
         nodes, ends, logs, children = sum_by_depth(depth, tree.child_count, size)
@@ -112,26 +167,40 @@ def examine(
         ],
         levels_left_out=max(0, len(nodes) - MAX_DEPTHS),
         children={str(number): int(children[number]) for number in np.flatnonzero(children) if number},
-        more_than_opaque=round(float(np.count_nonzero(splats.opacity > 1)) / len(tree), 4),
+        more_than_opaque=round(float(columns.opaque.count) / len(tree), 4),
         chunks=-(-len(tree) // CHUNK_NODES),
         chunks_of_coarse_cut=len(np.unique(_coarse_cut(tree, limit) // CHUNK_NODES)),
-        split_siblings=_split_siblings(tree),
+        split_siblings=sum(_split_siblings(tree, part) for part in _parts(tree)),
     )
     if not check:
         return facts, []
+    if in_chunks:
+        del limit
     parent, references = find_parents(tree.child_count, tree.child_start)
-    return facts, [
-        *_link_findings(tree, parent, references, depth),
-        *_node_findings(splats, tree, parent, size, scale_ends),
-        *([] if in_chunks else _order_findings(parent, limit)),
-    ]
+    found = _link_findings(tree, parent, references, depth)
+    del references, depth
+    found += columns.opaque_leaves.finding("tree.leaf-opacity", _told(columns.opaque_leaves, "is a leaf with D > 1"))
+    found += _size_findings(blocks, parent, size, scale_ends)
+    return facts, found if in_chunks else [*found, *_order_findings(parent, limit)]
+
+
+def _parts(tree: LodTree) -> list[slice]:
+    """Nodes that are looked at together, so that what is computed of them is small."""
+    return blocks_of(len(tree), CHUNK_NODES)
 
 
 def _coarse_cut(tree: LodTree, limit: FloatArray) -> NDArray[np.int64]:
     """The nodes of the cut that refines the largest nodes first, until it would have more than `CHUNK_NODES`."""
-    inner = np.flatnonzero(~tree.is_leaf & (limit > 0))
-    if len(inner) > CHUNK_NODES:  # each adds at least a node, so no more can be refined
-        inner = inner[limit[inner] >= -np.partition(-limit[inner], CHUNK_NODES)[CHUNK_NODES]]
+    # Each adds at least a node, so that no more than the largest ones can be refined.
+    largest = np.empty(0, np.float32)
+    for part in _parts(tree):
+        largest = np.concatenate([largest, limit[part][_refinable(tree, limit, part)]])
+        if len(largest) > CHUNK_NODES:
+            largest = -np.partition(-largest, CHUNK_NODES)[: CHUNK_NODES + 1]
+    least = largest.min() if len(largest) > CHUNK_NODES else 0
+    inner = np.concatenate(
+        [part.start + np.flatnonzero(_refinable(tree, limit, part) & (limit[part] >= least)) for part in _parts(tree)]
+    )
     # Stable: a node that is larger than its parent has its parent's limit, and comes after it.
     inner = inner[np.argsort(-limit[inner], kind="stable")]
     fits = np.cumsum(tree.child_count[inner].astype(np.int64) - 1) + 1 <= CHUNK_NODES
@@ -143,58 +212,76 @@ def _coarse_cut(tree: LodTree, limit: FloatArray) -> NDArray[np.int64]:
     return np.setdiff1d(nodes[nodes < len(tree)], refined)
 
 
-def _split_siblings(tree: LodTree) -> int:
-    inner = np.flatnonzero(~tree.is_leaf)
-    first = tree.child_start[inner].astype(np.int64)
-    last = first + tree.child_count[inner] - 1
+def _refinable(tree: LodTree, limit: FloatArray, part: slice) -> Mask:
+    return (tree.child_count[part] > 0) & (limit[part] > 0)
+
+
+def _split_siblings(tree: LodTree, part: slice) -> int:
+    count = tree.child_count[part]
+    first = tree.child_start[part][count > 0].astype(np.int64)
+    last = first + count[count > 0] - 1
     return int(np.count_nonzero(first >> CHUNK_BITS != last >> CHUNK_BITS))
 
 
-def _found(code: str, mask: Mask, what: str) -> list[Finding]:
-    """A finding about the nodes of a mask; none if the mask is empty."""
-    count = int(np.count_nonzero(mask))
-    if not count:
-        return []
-    index = int(np.argmax(mask))
-    more = f" (and {count - 1:,} more)" if count > 1 else ""
-    return [Finding(code, f"node {index:,} {what}{more}", index, count)]
+def _told(tally: Tally, what: str) -> str:
+    """The text of a finding about nodes."""
+    return f"node {{first}} {what}{' (and {more} more)' if tally.count > 1 else ''}"
 
 
 def _link_findings(
-    tree: LodTree, parent: NDArray[np.int32], references: NDArray[np.int64], depth: NDArray[np.int32]
+    tree: LodTree, parent: NDArray[np.int32], references: NDArray[np.int32], depth: NDArray[np.int32]
 ) -> list[Finding]:
-    leaf = tree.is_leaf
-    node = np.arange(len(tree))
-    start = tree.child_start.astype(np.int64)
-    end = start + tree.child_count
-    orphan = references == 0
-    orphan[0] = False
-    root = np.zeros(len(tree), np.bool_)
-    root[0] = references[0] > 0
-    return [
-        *_found("tree.root", root, "is the root but the child of another node"),
-        *_found("tree.range", ~leaf & (end > len(tree)), f"has children beyond the last node, {len(tree) - 1:,}"),
-        *_found("tree.order", ~leaf & (start <= node), "comes after one of its children, or is its own child"),
-        *_found("tree.shared", references > 1, "is the child of more than one node"),
-        *_found("tree.orphan", orphan, "has no parent"),
-        *_found("tree.unreachable", find_cycles(parent, depth), "has a parent, but the root does not lead to it"),
-        *_found("tree.leaf-start", leaf & (start != 0), "is a leaf with a child_start other than 0"),
-        *_found("tree.single-child", tree.child_count == 1, "has a single child"),
-    ]
+    faults = {
+        "tree.root": "is the root but the child of another node",
+        "tree.range": f"has children beyond the last node, {len(tree) - 1:,}",
+        "tree.order": "comes after one of its children, or is its own child",
+        "tree.shared": "is the child of more than one node",
+        "tree.orphan": "has no parent",
+        "tree.unreachable": "has a parent, but the root does not lead to it",
+        "tree.leaf-start": "is a leaf with a child_start other than 0",
+        "tree.single-child": "has a single child",
+    }
+    tallies = {code: Tally() for code in faults}
+    tallies["tree.root"].add(references[:1] > 0, 0)
+    cycles = find_cycles(parent, depth)
+    for part in _parts(tree):
+        count, start, held = tree.child_count[part], tree.child_start[part].astype(np.int64), references[part]
+        node = np.arange(part.start, part.stop)
+        inner = count > 0
+        masks = {
+            "tree.range": inner & (start + count > len(tree)),
+            "tree.order": inner & (start <= node),
+            "tree.shared": held > 1,
+            "tree.orphan": (held == 0) & (node > 0),
+            "tree.unreachable": cycles[part],
+            "tree.leaf-start": ~inner & (start != 0),
+            "tree.single-child": count == 1,
+        }
+        for code, mask in masks.items():
+            tallies[code].add(mask, part.start)
+    return [found for code, what in faults.items() for found in tallies[code].finding(code, _told(tallies[code], what))]
 
 
-def _node_findings(
-    splats: Splats, tree: LodTree, parent: NDArray[np.int32], size: FloatArray, scale_ends: tuple[float, float]
+def _size_findings(
+    blocks: Blocks, parent: NDArray[np.int32], size: FloatArray, scale_ends: tuple[float, float]
 ) -> list[Finding]:
-    findings = _found("tree.leaf-opacity", tree.is_leaf & (splats.opacity > 1), "is a leaf with D > 1")
-    smaller = size < MIN_SIZE_RATIO * mean_child_sizes(parent, size, splats.scale, splats.opacity)
-    # Where the format cannot hold a scale that small, the width of a line, and so its area, is unknown; where it cannot
-    # hold one that large, so is the size that the node was meant to have.
+    sums, weights, excused = np.zeros(len(parent)), np.zeros(len(parent)), np.zeros(len(parent), np.bool_)
     least, largest = scale_ends
-    line = np.count_nonzero(splats.scale <= least, axis=1) >= 2
-    smaller[parent[line & (parent >= 0)]] = False
-    smaller &= splats.scale.max(axis=1) < largest
-    return findings + _found("tree.size", smaller, "is less than a third as large as the mean of its children")
+    for block in blocks.read(USED):
+        part = slice(block.start, block.start + len(block.splats))
+        above, scale = parent[part], block.splats.scale
+        add_child_sizes(above, size[part], scale, block.splats.opacity, sums, weights)
+        # Where the format cannot hold a scale that small, the width of a line, and so its area, is unknown; where it
+        # cannot hold one that large, so is the size that the node was meant to have.
+        line = np.count_nonzero(scale <= least, axis=1) >= 2
+        excused[above[line & (above >= 0)]] = True
+        excused[part] |= ~(scale.max(axis=1) < largest)
+    small = Tally()
+    for part in blocks_of(len(parent), CHUNK_NODES):
+        weight = weights[part]
+        mean = np.divide(sums[part], weight, out=np.zeros(len(weight)), where=weight > 0)
+        small.add((size[part] < MIN_SIZE_RATIO * mean) & ~excused[part], part.start)
+    return small.finding("tree.size", _told(small, "is less than a third as large as the mean of its children"))
 
 
 def _order_findings(parent: NDArray[np.int32], limit: FloatArray) -> list[Finding]:

@@ -1,8 +1,7 @@
-"""Statistics of the values of splats, and findings about them."""
+"""Statistics of the values of splats."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -10,13 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..codecs import quantize
 from ..model.gaussian import spark_size
 from ..model.scene import Scene
 from ..model.sh import COEFFICIENTS
-from ..model.splats import FloatArray, Splats
+from ..model.splats import COLUMNS, FloatArray, Splats
 from ..tables.histograms import Histogram, histogram
-from .findings import Finding
+from .blocks import Block, Blocks
+from .percentiles import Percentiles
 
 #: The quantities of a splat by name, as functions of N splats to (N,) numbers. Splats with SH have `SH_QUANTITIES` too.
 QUANTITIES: dict[str, Callable[[Splats], FloatArray]] = {
@@ -32,31 +31,24 @@ QUANTITIES: dict[str, Callable[[Splats], FloatArray]] = {
     "green": lambda splats: splats.rgb[:, 1],
     "blue": lambda splats: splats.rgb[:, 2],
 }
+#: Columns of `Splats` that each of them is computed from.
+COLUMNS_OF = {
+    **dict.fromkeys(("x", "y", "z"), ("center",)),
+    **dict.fromkeys(("scale", "scale_min", "anisotropy"), ("scale",)),
+    "opacity": ("opacity",),
+    "size": ("scale", "opacity"),
+    **dict.fromkeys(("red", "green", "blue"), ("rgb",)),
+}
 #: Root mean square of a splat's SH coefficients of degree 1, 2 and 3.
 SH_QUANTITIES = ("sh1", "sh2", "sh3")
 
 #: Quantities whose histograms have bins of equal width, however many decades the numbers span.
 LINEAR = ("x", "y", "z", "opacity", "red", "green", "blue")
 
-#: Code and message of each reason that makes a splat invalid (`splats.INVALID`).
-OF_INVALID = {
-    "non_finite": ("values.non-finite", "a number is not finite, or the rotation has length 0"),
-    "bad_rotation": ("values.rotation", "the length of the rotation is not 1"),
-    "negative_scale": ("values.negative-scale", "a scale is below 0"),
-    "negative_opacity": ("values.opacity", "the opacity is below 0"),
-}
-
 #: The quantities of a report without --stats.
 MAIN = ("scale", "opacity", "anisotropy")
 #: Percentiles of a quantity, by name.
 PERCENTILES = {"p1": 1, "p25": 25, "p50": 50, "p75": 75, "p99": 99}
-
-#: Shares of splats above which clamped scales and invisible splats are findings: a few of either are the rounding of
-#: good files.
-MANY_CLAMPED, MANY_INVISIBLE = 0.01, 0.1
-
-#: Coordinates from this on become infinite in float16, which Spark's PackedSplats use.
-FLOAT16_END = 65_520
 
 
 @dataclass(frozen=True)
@@ -107,45 +99,109 @@ def quantity(splats: Splats, name: str) -> FloatArray:
         )
 
 
+def columns_of(name: str) -> tuple[str, ...]:
+    """The columns of `Splats` that a quantity is computed from."""
+    return COLUMNS_OF.get(name, ("sh",))
+
+
 def histogram_of(splats: Splats, name: str, *, bins: int = 40) -> Histogram:
     """The histogram of one of `names_of(splats)`, by its name."""
     return histogram(quantity(splats, name), bins=bins, log=False if name in LINEAR else None)
 
 
 def examine(splats: Splats, *, all_quantities: bool = False) -> ValueFacts:
-    """Statistics of N splats.
+    """Statistics of N splats in memory, see `Statistics`."""
+    blocks, found = Blocks.of(Scene(splats)), Statistics(splats.sh_degree, all_quantities=all_quantities)
+    while found.passes:
+        for block in blocks.read(COLUMNS):
+            found.add(block)
+        found.end_pass()
+    return found.facts()
+
+
+class Statistics:
+    """Statistics of splats that pass block by block, as often as `passes` says.
 
     Args:
-        splats: N splats.
+        sh_degree: of the splats.
         all_quantities: compute all quantities, not only those of `MAIN`.
     """
-    invalid = splats.invalid()
-    good = splats.take(splats.is_valid()) if invalid else splats
-    names = names_of(splats) if all_quantities else MAIN
-    box = box_98 = None
-    if len(good):
-        box = Box(_numbers(good.center.min(axis=0)), _numbers(good.center.max(axis=0)))
-        low, high = np.percentile(good.center.astype(np.float64), [1, 99], axis=0)
-        box_98 = Box(_numbers(low), _numbers(high))
-    return ValueFacts(
-        box=box,
-        box_98=box_98,
-        non_finite=int(np.count_nonzero(invalid.get("non_finite", False))),
-        negative_scale=int(np.count_nonzero(invalid.get("negative_scale", False))),
-        zero_opacity=int(np.count_nonzero(good.opacity == 0)),
-        zero_scale=int(np.count_nonzero(good.scale.max(axis=1, initial=0) == 0)),
-        more_than_opaque=int(np.count_nonzero(good.opacity > 1)),
-        quantities={name: _summary(quantity(good, name)) for name in names},
-    )
+
+    def __init__(self, sh_degree: int, *, all_quantities: bool = False) -> None:
+        none = Splats.empty(0, sh_degree)
+        self._numbers = {
+            name: Percentiles((0, *PERCENTILES.values(), 100), quantity(none, name).dtype)
+            for name in (names_of(none) if all_quantities else MAIN)
+        }
+        self._center = [Percentiles((1, 99), np.float32) for _ in range(3)]
+        self._low, self._high = np.full(3, np.inf, np.float32), np.full(3, -np.inf, np.float32)
+        self._counts = dict.fromkeys(("good", "non_finite", "negative_scale"), 0)
+        self._counts |= dict.fromkeys(("zero_opacity", "zero_scale", "more_than_opaque"), 0)
+        self._valid: dict[int, NDArray[np.bool_]] = {}  # by the start of each block in which some are not
+        self._first = True
+
+    @property
+    def passes(self) -> int:
+        """How often all blocks have to pass from here on."""
+        return int(self._first) or max(each.passes for each in (*self._center, *self._numbers.values()))
+
+    @property
+    def columns(self) -> set[str]:
+        """Columns of `Splats` that the next pass needs."""
+        if self._first:
+            return set(COLUMNS)
+        needed = {column for name, each in self._numbers.items() if each.passes for column in columns_of(name)}
+        return needed | ({"center"} if self._center[0].passes else set())
+
+    def add(self, block: Block) -> None:
+        """Adds a block; the first time with all columns."""
+        if self._first and block.invalid:
+            self._valid[block.start] = block.valid
+            for kind in ("non_finite", "negative_scale"):
+                self._counts[kind] += int(np.count_nonzero(block.invalid.get(kind, False)))
+        valid = self._valid.get(block.start)
+        good = block.splats if valid is None else block.splats.take(valid)
+        if self._first:
+            self._count(good)
+        for axis, each in enumerate(self._center):
+            if each.passes:
+                each.add(np.ascontiguousarray(good.center[:, axis]))
+        for name, each in self._numbers.items():
+            if each.passes:
+                values = quantity(good, name)
+                each.add(np.ascontiguousarray(values[np.isfinite(values)]))
+
+    def _count(self, good: Splats) -> None:
+        self._counts["good"] += len(good)
+        self._low = np.minimum(self._low, good.center.min(axis=0, initial=np.inf))
+        self._high = np.maximum(self._high, good.center.max(axis=0, initial=-np.inf))
+        self._counts["zero_opacity"] += int(np.count_nonzero(good.opacity == 0))
+        self._counts["zero_scale"] += int(np.count_nonzero(good.scale.max(axis=1, initial=0) == 0))
+        self._counts["more_than_opaque"] += int(np.count_nonzero(good.opacity > 1))
+
+    def end_pass(self) -> None:
+        """Ends a pass over all blocks."""
+        self._first = False
+        for each in (*self._center, *self._numbers.values()):
+            each.end_pass()
+
+    def facts(self) -> ValueFacts:
+        """What was found, after the last pass."""
+        box = box_98 = None
+        counts = dict(self._counts)
+        if counts.pop("good"):
+            box = Box(_numbers(self._low), _numbers(self._high))
+            low, high = np.stack([each.values() for each in self._center], axis=1)
+            box_98 = Box(_numbers(low), _numbers(high))
+        quantities = {name: _summary(each) for name, each in self._numbers.items()}
+        return ValueFacts(box=box, box_98=box_98, quantities=quantities, **counts)
 
 
-def _summary(values: FloatArray) -> dict[str, float | None]:
-    values = values[np.isfinite(values)].astype(np.float64)  # float32 would overflow where numbers span its range
-    if not len(values):
+def _summary(numbers: Percentiles) -> dict[str, float | None]:
+    if not numbers.count:
         return dict.fromkeys(("min", *PERCENTILES, "max", "mean"))
-    levels = _numbers(np.percentile(values, [0, *PERCENTILES.values(), 100]))
-    summary: dict[str, float | None] = dict(zip(("min", *PERCENTILES, "max"), levels, strict=True))
-    return summary | {"mean": _number(values.mean(dtype=np.float64))}
+    levels: dict[str, float | None] = dict(zip(("min", *PERCENTILES, "max"), _numbers(numbers.values()), strict=True))
+    return levels | {"mean": _number(numbers.mean)}
 
 
 def _number(value: Any) -> float:
@@ -154,77 +210,3 @@ def _number(value: Any) -> float:
 
 def _numbers(values: NDArray[Any]) -> list[float]:
     return [_number(value) for value in values]
-
-
-@dataclass(frozen=True)
-class Ends:
-    """The numbers at which a file's codes end; values at one of them may have been clamped.
-
-    Attributes:
-        scale: smallest and largest scale, world units; 0 and infinity for floats.
-        center: largest absolute coordinate, world units.
-    """
-
-    scale: tuple[float, float] = (0.0, math.inf)
-    center: float = math.inf
-
-
-def ends_of(scene: Scene) -> Ends:
-    """The ends of the codes of an SPZ file, and none for other formats, whose numbers are floats."""
-    header = scene.header
-    if "fractional_bits" not in header:
-        return Ends()
-    low, high = quantize.decode_log_scale(np.array([0, 255], np.uint8))
-    fixed = header["version"] >= 2  # version 1 has floats
-    return Ends((low, high), quantize.FIXED24_MAX * 2.0 ** -int(header["fractional_bits"]) if fixed else math.inf)
-
-
-def check(scene: Scene, ends: Ends | None = None) -> list[Finding]:
-    """Findings about the values of a scene.
-
-    Args:
-        scene: as it was read.
-        ends: of its codes; None for `ends_of(scene)`.
-    """
-    ends = ends_of(scene) if ends is None else ends
-    splats = scene.splats
-    if not len(splats):
-        return [Finding("values.empty", "there are no splats")]
-    found = []
-
-    def report(code: str, mask: Any, what: str) -> None:
-        count = int(np.count_nonzero(mask))
-        if count:
-            index = int(np.argmax(mask))
-            more = f" and {count - 1:,} more" if count > 1 else ""
-            found.append(Finding(code, f"splat {index:,}{more}: {what}", index, count))
-
-    invalid = splats.invalid()
-    valid = splats.is_valid() if invalid else np.ones(len(splats), np.bool_)
-    for kind, (code, what) in OF_INVALID.items():
-        if kind in invalid:
-            report(code, invalid[kind], what)
-    if scene.tree is None:
-        report("values.opacity", valid & (splats.opacity > 1), "the opacity is above 1")
-    invisible = (splats.opacity == 0) | (splats.scale.max(axis=1) == 0)
-    checked = len(splats)
-    if scene.tree is not None:  # merged splats of thin leaves far apart may be fainter than any code
-        invisible &= scene.tree.is_leaf
-        checked = int(np.count_nonzero(scene.tree.is_leaf))
-    if np.count_nonzero(invisible) > MANY_INVISIBLE * checked:
-        report("values.invisible", valid & invisible, "cannot be drawn, as its opacity or scale is 0")
-    if ends.center < math.inf:
-        clamped = valid & (np.abs(splats.center) >= ends.center).any(axis=1)
-        report("values.center-clamped", clamped, f"a coordinate is {ends.center:g}, the end of the range of its code")
-    low, high = ends.scale
-    if high < math.inf:
-        most = splats.scale.max(axis=1)  # a smallest scale that was clamped is not visible
-        clamped = (most > 0) & ((most <= low) | (most >= high))
-        if scene.tree is not None:  # merged splats of leaves far apart may be larger than any code
-            clamped &= scene.tree.is_leaf
-        if np.count_nonzero(clamped) > MANY_CLAMPED * checked:
-            text = f"a scale is {low:.2g} or {high:.0f}, the ends of the range of its code"
-            report("values.scale-clamped", clamped, text)
-    far = valid & (np.abs(splats.center) >= FLOAT16_END).any(axis=1)
-    report("values.center-far", far, f"a coordinate is {FLOAT16_END:,} or more, which float16 cannot hold")
-    return found

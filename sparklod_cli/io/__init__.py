@@ -4,6 +4,7 @@ from .beside import companions
 from .chunks import read_rad_chunk, read_rad_header
 from .identity import Identity, content_of, files_of, identity_of
 from .names import is_file_name
+from .rad_file import RadFile
 from .reading import examine_scene, opened, read_arrays, read_scene, size_of_input
 from .scenes import SceneSink, scene_sink
 from .streams import PlacedFile, open_stream, open_streams
@@ -15,6 +16,7 @@ __all__ = [
     "MAX_TEXT",
     "Identity",
     "PlacedFile",
+    "RadFile",
     "SceneSink",
     "Sink",
     "SinkTogether",

@@ -7,9 +7,9 @@ import hashlib
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import BinaryIO
 
+from ..support.addresses import Address, Place
 from ..support.errors import UnreadableError
 from ..support.stdin import DASH, name_of, spooled
 from .beside import companions
@@ -31,8 +31,8 @@ class Identity:
     Attributes:
         name: of it, for messages.
         bytes: that it had.
-        modified: nanoseconds since 1970; 0 for standard input.
-        sample: a digest of bytes from all over it.
+        modified: nanoseconds since 1970; 0 for standard input, and at an address.
+        sample: a digest of bytes from all over it, or of what the server of an address tells of its version.
     """
 
     name: str
@@ -41,21 +41,27 @@ class Identity:
     sample: str
 
 
-def files_of(path: Path) -> list[Path]:
+def files_of(path: Place) -> list[Place]:
     """The file of a path and those that it names beside itself, or the files of a folder that is an unpacked SOG."""
-    found = [] if path == DASH else companions(path, ())
-    return found if path.is_dir() else [path, *found]
+    if path == DASH or isinstance(path, Address):
+        return [path]
+    found = companions(path, ())
+    return [*found] if path.is_dir() else [path, *found]
 
 
-def identity_of(path: Path) -> Identity:
+def identity_of(path: Place) -> Identity:
     """What a file is like, without reading much of it; - is standard input.
 
     Raises:
         UnreadableError: it cannot be read.
     """
+    digest = hashlib.blake2b(digest_size=DIGEST_BYTES)
+    if isinstance(path, Address):
+        with _readable():
+            digest.update(path.version().encode())
+            return Identity(str(path), path.size(), 0, digest.hexdigest())
     with _opened(path) as file:
         size = file.seek(0, os.SEEK_END)
-        digest = hashlib.blake2b(digest_size=DIGEST_BYTES)
         last = max(0, size - PLACE_BYTES)
         for start in sorted({last * place // (PLACES - 1) for place in range(PLACES)}):
             file.seek(start)
@@ -64,7 +70,7 @@ def identity_of(path: Path) -> Identity:
     return Identity(name_of(path), size, modified, digest.hexdigest())
 
 
-def content_of(path: Path) -> str:
+def content_of(path: Place) -> str:
     """A digest of all of a file; - is standard input. Some 0.5 GB a second.
 
     Raises:
@@ -78,12 +84,20 @@ def content_of(path: Path) -> str:
 
 
 @contextlib.contextmanager
-def _opened(path: Path) -> Iterator[BinaryIO]:
-    try:
+def _opened(path: Place) -> Iterator[BinaryIO]:
+    """A file, or standard input, at its beginning."""
+    with _readable():
         if path == DASH:
             yield spooled()
         else:
             with path.open("rb") as file:
                 yield file
+
+
+@contextlib.contextmanager
+def _readable() -> Iterator[None]:
+    """An `OSError` of the body becomes an `UnreadableError`."""
+    try:
+        yield
     except OSError as error:
         raise UnreadableError(f"cannot be read: {reason_of(error)}") from None

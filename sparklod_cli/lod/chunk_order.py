@@ -21,11 +21,12 @@ from ..model.nodes import CHUNK_NODES
 from ..model.splats import FloatArray, Splats
 from ..support.jit import threads_for
 from ..support.progress import Progress, silent
-from .chunk_parts import FamilyTree, Index, parts_of
+from .chunk_parts import Index, parts_of
 from .foveation import set_foveation
 from .kernels.chunk_demand import fill_demand
 from .kernels.chunk_inside import sort_within_chunks
 from .kernels.chunk_sets import Families, split_sets
+from .kernels.family_links import find_limits
 from .kernels.pixel_scale import NODE, VIEW
 from .kernels.sort import sort_by_key
 from .kernels.tree_links import find_parents
@@ -49,8 +50,9 @@ LEAST_BUDGET = 1 / 16
 #: Bases of the Halton sequences that viewpoints are made of.
 PRIMES = (2, 3, 5, 7, 11, 13, 17)
 
-#: Bytes that `sequence_of` takes for each family of a part, on two threads.
-FAMILY_BYTES = 300
+#: Families that a bake out of core puts in order at a time, and the bytes that each takes on two threads. Chosen: 1.3
+#: GB, for the families of some 15 million splats.
+MOST_FAMILIES, FAMILY_BYTES = 1 << 22, 300
 
 Matrix = NDArray[np.float64]
 
@@ -80,8 +82,13 @@ def chunk_order(
     nodes = np.flatnonzero(tree.child_count).astype(np.uint32)
     if not len(nodes):
         return order, child_start
-    families = _family_tree(splats, tree, nodes)
-    parents = nodes[sequence_of(families, progress=progress)]
+    number = np.full(total, -1, np.int32)
+    number[nodes] = np.arange(len(nodes), dtype=np.int32)
+    above, _ = find_parents(tree.child_count, tree.child_start)
+    parent = np.where(above[nodes] < 0, np.int32(-1), number[above[nodes]])
+    del number, above
+    size = spark_size(splats)[nodes]
+    parents = nodes[family_order(parent, tree.child_count[nodes], splats.center[nodes], size, progress=progress)]
     count = tree.child_count[parents].astype(np.int64)
     first = np.cumsum(count) - count
     order[1:] = np.repeat(tree.child_start[parents] - first, count) + np.arange(total - 1)
@@ -91,77 +98,88 @@ def chunk_order(
     return order, child_start
 
 
-def _family_tree(splats: Splats, tree: LodTree, nodes: NDArray[np.uint32]) -> FamilyTree:
-    """The families of these nodes."""
-    number = np.full(len(tree), -1, np.int32)
-    number[nodes] = np.arange(len(nodes), dtype=np.int32)
-    parent, _ = find_parents(tree.child_count, tree.child_start)
-    parent = np.where(parent[nodes] < 0, np.int32(-1), number[parent[nodes]])
-    return FamilyTree(parent, tree.child_count[nodes], splats.center[nodes], spark_size(splats)[nodes])
-
-
-def sequence_of(tree: FamilyTree, *, most: int | None = None, progress: Progress = silent) -> Index:
-    """The families of a tree in the order for streaming.
+def family_order(
+    parent: NDArray[np.int32],
+    count: NDArray[np.uint16],
+    center: FloatArray,
+    size: FloatArray,
+    *,
+    most: int | None = None,
+    progress: Progress = silent,
+) -> Index:
+    """The order of families of which `arrange` speaks.
 
     Args:
-        tree: its families, at least 1.
-        most: how many are put in order at a time, which takes `FAMILY_BYTES` each; None for all. See `parts_of`.
+        parent: (F,) for each node that has children, in any order in which parents come first, the place here of its
+            parent; -1 for the root.
+        count: (F,) number of its children.
+        center: (F, 3) its centre, world units.
+        size: (F,) its feature size, world units.
+        most: how many families are put in order at a time, each of which takes `FAMILY_BYTES`; None for all. Parts, see
+            `chunk_parts.parts_of`, are each put in order as if they were a tree, one after the other.
         progress: called with the number of nodes that have a chunk.
 
     Returns:
-        (F,) int32 numbers of families; each comes after the one that has its parent.
+        (F,) int32 places here, in the order in which the children are written.
     """
-    limit, total = tree.limits(), 1 + int(tree.count.sum(dtype=np.int64))
-    filled, found = 1, []  # the root
-    for members in parts_of(tree, limit, np.arange(len(tree), dtype=np.int32), most or len(tree)):
+    total, filled, found = 1 + int(count.sum(dtype=np.int64)), 1, []
+    size = np.fmax(size, np.float32(0))
+    _, limit = find_limits(parent, size)
+    for members in parts_of(parent, center, limit, most or len(parent)):
         with threads_for(len(members)) as threads:
-            nodes = _largest_first(limit, members, threads)
-            families = _families(tree, members, nodes, threads)
-            found.append(nodes[_sequence(families, filled, total, progress)])
+            at = slice(None) if len(members) == len(parent) else members  # all of them without a copy
+            largest = _largest_first(limit[at], threads)
+            part = _part(parent, members), count[at], center[at], size[at]
+            families = _families(*part, largest, threads)
+            found.append(members[largest[_sequence(families, filled, total, progress)]])
         filled += int(families.count.sum(dtype=np.int64))
-    return found[0] if len(found) == 1 else np.concatenate(found)
+    return np.concatenate(found)
 
 
-def _largest_first(limit: FloatArray, members: Index, threads: int) -> Index:
-    """Members by descending limit, the least size from the root on; parents first."""
-    keys = np.uint64(0x7FFFFFFF) - limit[members].view(np.uint32).astype(np.uint64)
-    return sort_by_key(keys, members.astype(np.uint32), 31, threads)[1].view(np.int32)
+def _part(parent: Index, members: Index) -> Index:
+    """For each member the place among members, which are ascending, of its parent; -1 where that is none of them."""
+    if len(members) == len(parent):
+        return parent
+    above = parent[members]
+    at = np.minimum(np.searchsorted(members, above), len(members) - 1).astype(np.int32)
+    return np.where(members[at] == above, at, np.int32(-1))
 
 
-def _families(tree: FamilyTree, members: Index, nodes: Index, threads: int) -> Families:
-    """The families of a part, for kernels.
+def _largest_first(limit: FloatArray, threads: int) -> NDArray[np.uint32]:
+    """(F,) the families, parents first: by descending limit, the least size from the root to the parent."""
+    keys = np.uint64(0x7FFFFFFF) - limit.view(np.uint32).astype(np.uint64)
+    return sort_by_key(keys, np.arange(len(limit), dtype=np.uint32), 31, threads)[1]
 
-    Args:
-        tree: all families.
-        members: (F,) of the part, ascending.
-        nodes: (F,) the same in the order in which they shall be.
-        threads: to sort on.
-    """
-    number = np.empty(len(members), np.int32)
-    at = nodes if len(members) == len(tree) else np.searchsorted(members, nodes)
-    number[at] = np.arange(len(nodes), dtype=np.int32)
-    parent = tree.parent[nodes]
-    if len(members) < len(tree):
-        at = np.minimum(np.searchsorted(members, parent), len(members) - 1)
-        parent = np.where(members[at] == parent, number[at], np.int32(-1))
-    else:
-        parent = np.where(parent < 0, np.int32(-1), number[parent])
-    centers, count = tree.center[nodes], tree.count[nodes].astype(np.int32)
-    rank = np.empty((len(nodes), 3), np.int32)
+
+def _families(
+    parent: NDArray[np.int32],
+    count: NDArray[np.uint16],
+    center: FloatArray,
+    size: FloatArray,
+    order: NDArray[np.uint32],
+    threads: int,
+) -> Families:
+    """The families in an order."""
+    place = np.empty(len(order), np.int32)
+    place[order] = np.arange(len(order), dtype=np.int32)
+    above = parent[order]
+    parent = np.where(above < 0, np.int32(-1), place[above])
+    centers, counts = center[order], count[order]
+    rank = np.empty((len(order), 3), np.int32)
     for axis in range(3):
         bits = centers[:, axis].view(np.uint32)
         ordered = np.where(bits >> 31, ~bits, bits | np.uint32(1 << 31))  # in the order of the numbers
-        _, by_place = sort_by_key(ordered.astype(np.uint64), np.arange(len(nodes), dtype=np.uint32), 32, threads)
-        rank[by_place, axis] = np.arange(len(nodes), dtype=np.int32)
-    records = np.empty(len(nodes), NODE)
+        _, by_place = sort_by_key(ordered.astype(np.uint64), np.arange(len(order), dtype=np.uint32), 32, threads)
+        rank[by_place, axis] = np.arange(len(order), dtype=np.int32)
+    records = np.empty(len(order), NODE)
     records["x"], records["y"], records["z"] = centers.T
-    records["size"], records["child_count"] = np.fmax(tree.size[nodes], np.float32(0)), count
+    records["size"], records["child_count"] = size[order], counts
     records["child_start"] = 0  # not read
-    demand = np.empty((len(nodes), VIEWPOINTS), np.uint8)
-    total = 1 + int(count.sum(dtype=np.int64))  # a part is looked at as if it were a tree
+    demand = np.empty((len(order), VIEWPOINTS), np.uint8)
+    total = 1 + int(count.sum(dtype=np.int64))
     least = min(total * LEAST_BUDGET, float(CHUNK_NODES))
     fill_demand(records, parent, viewpoints(centers), least, float(total), demand)
-    return Families(parent, count, rank, demand)
+    return Families(parent, counts.astype(np.int32), rank, demand)
 
 
 def _sequence(families: Families, filled: int, total: int, progress: Progress) -> Index:
@@ -178,7 +196,7 @@ def _sequence(families: Families, filled: int, total: int, progress: Progress) -
     set_of, root, spare = (np.full(length, -1, np.int32) for _ in range(3))
     weight = np.empty(length, np.int64)
     # Where a set begins, where it ends, its nodes, and for the first one how many of its nodes fit into the chunk that
-    # was begun: beside the root, or at the end of the part before.
+    # was begun: beside the root, or behind the part before.
     room = -filled % CHUNK_NODES
     sets, ends, used = ([(0, length, own, room)] if room or own > CHUNK_NODES else []), [0, length], 0
     while sets:

@@ -1,9 +1,8 @@
-"""Parts of a tree that are put in order one after the other, where all families at once take too much memory."""
+"""Parts of a tree whose families are put in order one part after the other, where all at once take too much memory."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,65 +16,40 @@ Index = NDArray[np.int32]
 _ROWS = 1 << 16
 
 
-@dataclass(frozen=True, eq=False)
-class FamilyTree:
-    """The families of a tree, in ascending order of the nodes whose children they are: F of them.
-
-    Attributes:
-        parent: (F,) int32 the family that has that node; -1 for that of the root's children.
-        count: (F,) of any unsigned type, its nodes.
-        center: (F, 3) float32 of that node, world units.
-        size: (F,) float32 feature size of that node, as `model.gaussian.spark_size` has it.
-    """
-
-    parent: Index
-    count: NDArray[np.unsignedinteger]
-    center: FloatArray
-    size: FloatArray
-
-    def __len__(self) -> int:
-        return len(self.parent)
-
-    def limits(self) -> FloatArray:
-        """(F,) the least size from the root to each family's parent; 0 for what is not a number."""
-        limit: FloatArray = np.fmax(self.size, np.float32(0))
-        for part in blocks_of(len(self), _ROWS):
-            here, above = limit[part], self.parent[part].copy()
-            while (below := np.flatnonzero(above >= 0)).size:  # each round goes twice as far up within the block
-                ancestor = above[below]
-                here[below] = np.minimum(here[below], limit[ancestor])
-                inside = ancestor >= part.start
-                above[below] = np.where(inside, above[np.where(inside, ancestor - part.start, 0)], -1)
-        return limit
-
-
-def parts_of(tree: FamilyTree, limit: FloatArray, members: Index, most: int) -> Iterator[Index]:
-    """Members in parts of at most `most` families, of which none comes before the family of its parent.
+def parts_of(parent: Index, center: FloatArray, limit: FloatArray, most: int) -> Iterator[Index]:
+    """All families in parts of at most `most`, of which none comes before the one that has its parent.
 
     The largest families are the first part. What is left are subtrees below them: those that are near each other are
-    parts together, and one that is too large is divided like a tree.
+    parts together, and one that is too large is divided like the tree. All of it takes some 40 bytes a family.
 
     Args:
-        tree: its families.
-        limit: of `FamilyTree.limits`.
-        members: of a tree or a subtree, ascending.
+        parent: (F,) int32 the family that has each one's parent, which comes before it; -1 for that of the root.
+        center: (F, 3) of the parents.
+        limit: (F,) the least size from the root to the parent.
         most: at least 1.
+
+    Yields:
+        (n,) int32 families, ascending.
     """
+    yield from _divided(parent, center, limit, np.arange(len(parent), dtype=np.int32), most)
+
+
+def _divided(parent: Index, center: FloatArray, limit: FloatArray, members: Index, most: int) -> Iterator[Index]:
+    """Parts of the members, ascending, of a tree or a subtree."""
     if len(members) <= most:
         yield members
         return
     largest = _largest(limit[members], most)
     yield members[largest]
     rest = members[~largest]
-    root = _roots(tree.parent, rest)
-    roots, of_root, weight = np.unique(root, return_inverse=True, return_counts=True)
+    roots, of_root, weight = np.unique(_roots(parent, rest), return_inverse=True, return_counts=True)
     group = np.empty(len(roots), np.int32)
-    for number, some in enumerate(_neighbours(tree.center[rest[roots]], weight, np.arange(len(roots)), most)):
+    for number, some in enumerate(_neighbours(center[rest[roots]], weight, np.arange(len(roots)), most)):
         group[some] = number
     of_family = group[of_root]
     order = np.argsort(of_family, kind="stable")
     for found in np.split(rest[order], np.cumsum(np.bincount(of_family))[:-1]):
-        yield from parts_of(tree, limit, found, most)
+        yield from _divided(parent, center, limit, found, most)
 
 
 def _largest(limit: FloatArray, most: int) -> NDArray[np.bool_]:
@@ -93,7 +67,7 @@ def _roots(parent: Index, members: Index) -> Index:
     at = np.minimum(np.searchsorted(members, above), len(members) - 1).astype(np.int32)
     root = np.where(members[at] == above, at, np.arange(len(members), dtype=np.int32))
     for part in blocks_of(len(root), _ROWS):
-        while (higher := root[root[part]]).tobytes() != root[part].tobytes():
+        while not np.array_equal(higher := root[root[part]], root[part]):
             root[part] = higher
     return root
 

@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..model.splats import FloatArray
-from .kernels.geometry import CENTER
+from .kernels.group import split_box
 from .kernels.sort import Nodes
 from .voxel_grid import VoxelGrid
 
@@ -43,11 +42,9 @@ class Margins:
         sides = zip(self._below, self._above, self._grid.low, self._grid.high, strict=True)
         return any(float(below) >= min(float(above), high) or float(above) <= low for below, above, low, high in sides)
 
-    def are_inside(self, geometry: FloatArray, nodes: Nodes) -> NDArray[np.bool_]:
-        """(n,) whether the centre of each node is off the margins, so that no unknown node can be in its cell."""
-        center = geometry[nodes, CENTER : CENTER + 3]
-        below, above = np.array(self._below), np.array(self._above)
-        return np.asarray(((center > below) & (center < above)).all(axis=1))
+    def split(self, nodes: Nodes, geometry: FloatArray) -> tuple[Nodes, Nodes]:
+        """Separates nodes off the margins, whose cells no unknown node can be in, from the others."""
+        return split_box(nodes, geometry, np.array(self._below), np.array(self._above))
 
 
 def _first_from(value: float) -> np.float32:

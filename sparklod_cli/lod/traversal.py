@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,17 +77,24 @@ class Forest:
     """
 
     def __init__(self, trees: Sequence[Nodes]) -> None:
-        counts = [len(tree.size) for tree in trees]
+        self._make_room([len(tree.size) for tree in trees], np.empty)
+        for number, tree in enumerate(trees):
+            self._put(tree, int(self.node_base[number]))
+
+    def _make_room(self, counts: Sequence[int], make: Callable[..., NDArray[Any]]) -> None:
+        """For trees of so many nodes."""
         self.node_base = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
         chunks = [-(-count // CHUNK_NODES) for count in counts]
         self.chunk_base = np.concatenate([[0], np.cumsum(chunks)]).astype(np.int64)
-        self.nodes = np.empty(int(self.node_base[-1]), pixel_scale.NODE)
-        for tree, start in zip(trees, self.node_base, strict=False):
-            part = self.nodes[start : start + len(tree.size)]
-            part["x"], part["y"], part["z"] = tree.center.T
-            part["size"] = tree.size
-            part["child_start"] = tree.tree.child_start
-            part["child_count"] = tree.tree.child_count
+        self.nodes = make(int(self.node_base[-1]), pixel_scale.NODE)
+
+    def _put(self, tree: Nodes, start: int) -> None:
+        """Writes some nodes from an index on."""
+        part = self.nodes[start : start + len(tree.size)]
+        part["x"], part["y"], part["z"] = tree.center.T
+        part["size"] = tree.size
+        part["child_start"] = tree.tree.child_start
+        part["child_count"] = tree.tree.child_count
 
     def __len__(self) -> int:
         return len(self.node_base) - 1
@@ -94,6 +103,22 @@ class Forest:
     def chunks(self) -> int:
         """Number of chunks of all trees."""
         return int(self.chunk_base[-1])
+
+    def present(self) -> NDArray[np.bool_]:
+        """(chunks,) bool, those whose nodes are in memory; not changed later."""
+        return np.ones(self.chunks, np.bool_)
+
+    def read(self, chunks: NDArray[np.bool_]) -> None:
+        """Reads those of these chunks, (chunks,) bool, that are not in memory."""
+
+    def read_some(self, wanted: NDArray[np.float32], present: NDArray[np.bool_]) -> bool:
+        """Reads chunks that a cut wants; False if it lacked none.
+
+        Args:
+            wanted: (chunks,) float32, of a `TreeCut`.
+            present: (chunks,) bool that it was found with.
+        """
+        return False
 
 
 @dataclass(frozen=True)
@@ -112,6 +137,7 @@ class TreeCut:
         stop: (pixel scale, instance, index) of the node that would have exceeded the budget, or None.
         wanted: (chunks,) float32, for each chunk of all trees the largest limit of the nodes that are, or should be,
             refined and have children in it; 0 if there is none.
+        seconds: that it took to find, once its chunks were in memory.
     """
 
     views: NDArray[np.void]
@@ -123,6 +149,7 @@ class TreeCut:
     least: float
     stop: tuple[float, int, int] | None
     wanted: NDArray[np.float32]
+    seconds: float = 0.0
 
     def __len__(self) -> int:
         return len(self.node)
@@ -151,7 +178,6 @@ class Traversal:
 
     def __init__(self, forest: Forest, instances: Sequence[TreeInstance]) -> None:
         self.forest, self.instances = forest, list(instances)
-        self._all = np.ones(forest.chunks, np.bool_)
         self._local = threading.local()
         sizes = np.diff(forest.node_base)
         self._most = sum(int(sizes[instance.tree]) for instance in self.instances)
@@ -167,8 +193,20 @@ class Traversal:
             smallest: nodes of this pixel scale or less are not refined; see `settings.pixel_limit`.
             resident: (chunks,) bool, of all trees; all chunks are resident unless given.
         """
+        if resident is not None:
+            self.forest.read(resident)
+            return self._cut(view, budget, smallest, resident)
+        while True:
+            # As long as chunks are not in memory that would be read next, the cut is one of a viewer that lacks them.
+            present = self.forest.present()
+            found = self._cut(view, budget, smallest, present)
+            if not self.forest.read_some(found.wanted, present):
+                return found
+
+    def _cut(self, view: View, budget: int, smallest: float, present: NDArray[np.bool_]) -> TreeCut:
+        """The cut with these chunks, which are in memory."""
+        start = time.perf_counter()
         views = views_of(self.forest, self.instances, view)
-        present = self._all if resident is None else resident
         work = self._work(VISITS * budget + CHUNK_NODES)
         wanted = np.empty(self.forest.chunks, np.float32)
         length = min(budget, self._most) + 1
@@ -194,6 +232,7 @@ class Traversal:
             least=float(least),
             stop=None if last < 0 else work.slot(last),
             wanted=wanted,
+            seconds=time.perf_counter() - start,
         )
 
     def forget(self) -> None:

@@ -101,9 +101,8 @@ def grow(tree: VoxelTree, grid: VoxelGrid, arrivals: Arrivals, margins: Margins 
             active = np.concatenate([active, new])
             progress("building", int(new[-1]) + 1, arrivals.splats, "splat")
         if margins is not None:
-            is_inside = margins.are_inside(tree.geometry, active)
-            left.append((level, active[~is_inside]))
-            active = active[is_inside]
+            active, waiting = margins.split(active, tree.geometry)
+            left.append((level, waiting))
         if len(active) > 1:
             with threads_for(len(active)):
                 active = tree.merge_cells(level, *_by_cell(tree, grid, level, active))

@@ -24,10 +24,14 @@ class Balls:
     Attributes:
         center: (N, 3) float64 world units.
         radius: (N,) float64 world units.
+        box: (2, 3) lowest and highest coordinates of all centres, where these are a sample; None where they are all.
+        largest: radius, where these are a sample.
     """
 
     center: Matrix
     radius: Matrix
+    box: Matrix | None = None
+    largest: float | None = None
 
     def take(self, index: NDArray[np.bool_]) -> Balls:
         """Those of a mask (N,)."""

@@ -14,7 +14,8 @@ from ..model.gaussian import lod_opacity, moved, spark_size
 from ..model.nodes import CHUNK_NODES
 from ..model.splats import FloatArray
 from ..scenes.finder import CutSource
-from ..scenes.loaded import Index, LoadedScene, Part
+from ..scenes.loaded import Part
+from ..scenes.loaded_scene import Index, LoadedScene
 from ..support.errors import SparklodError
 from ..support.progress import Progress, silent
 from ..support.ticks import ticks

@@ -5,12 +5,11 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..codecs.gpu import lod_tree
+from ..lod.budget import Budget
 from ..lod.continuous import faded
 from ..lod.settings import LodSettings
 from ..lod.traversal import Forest, Traversal, TreeCut, TreeInstance
@@ -18,93 +17,19 @@ from ..model.balls import Balls, balls_of
 from ..model.foveation import Foveation
 from ..model.gaussian import placed
 from ..model.instances import Instance, Matrix
-from ..model.nodes import CHUNK_NODES, Nodes
+from ..model.nodes import Nodes
 from ..model.scene import Scene
 from ..model.splats import Splats
 from ..support.defaults import PRECISIONS
 from ..support.units import count_of
+from .loaded_scene import Index, LoadedScene, depth_of, nodes_of
+from .paged_forest import PagedForest
+from .paged_scene import PagedScene, sampled_balls
 
-Index = NDArray[np.signedinteger]
 Weights = NDArray[np.float64]
 
 #: A cut holds the number of an instance as a uint16.
 MAX_INSTANCES = 65_535
-
-#: What a scene without a file is called in messages and titles.
-UNNAMED = "scene"
-
-
-@dataclass(frozen=True, eq=False)
-class LoadedScene:
-    """A scene that instances are of, read once however often it stands.
-
-    Attributes:
-        file: that it was read from; None for a scene that was in memory.
-        bytes: of the file; of a scene that was in memory, of its columns.
-        scene: as the file has it; columns that were not asked for are 0.
-        splats: N, as they are drawn: those of the scene, or what a coding makes of them.
-        first_chunk: number of its first chunk, where the chunks of all scenes are counted.
-    """
-
-    file: Path | None
-    bytes: int
-    scene: Scene
-    splats: Splats
-    first_chunk: int
-
-    @property
-    def name(self) -> str:
-        """For messages and titles: that of the file."""
-        return self.file.name if self.file is not None else UNNAMED
-
-    @property
-    def is_tree(self) -> bool:
-        """Whether it has a Level-of-Detail tree, so that cuts of it can be drawn."""
-        return self.scene.tree is not None
-
-    @functools.cached_property
-    def depth(self) -> NDArray[np.int32] | None:
-        """(N,) edges from the root to each node; None without a tree."""
-        return None if self.scene.tree is None else self.scene.tree.depths()
-
-    @functools.cached_property
-    def every(self) -> Index:
-        """(N,) indices of all splats."""
-        return np.arange(len(self.splats))
-
-    @functools.cached_property
-    def leaves(self) -> Index:
-        """(M,) indices of full detail: the leaves of a tree, or all splats."""
-        return self.every if self.scene.tree is None else np.flatnonzero(self.scene.tree.is_leaf)
-
-    @functools.cached_property
-    def full(self) -> Splats:
-        """M splats of full detail, in the space of the scene."""
-        return self.splats if self.leaves is self.every else self.splats.take(self.leaves)
-
-    @property
-    def chunks(self) -> int:
-        """How many chunks it has, of 65,536 splats each."""
-        return -(-len(self.splats) // CHUNK_NODES)
-
-    @property
-    def has_chunks(self) -> bool:
-        """Whether its format has chunks of as many splats as Spark streams (RAD)."""
-        sizes, splats = self.scene.chunk_bytes, self.scene.header.get("chunk_size")
-        return sizes is not None and len(sizes) == self.chunks and splats == CHUNK_NODES
-
-    def chunk_bytes(self) -> NDArray[np.int64]:
-        """(chunks,) bytes of each in the file; without chunks of its own (SPZ) as if the file were cut evenly."""
-        if self.has_chunks:
-            return np.array(self.scene.chunk_bytes, np.int64)
-        nodes = len(self.splats)
-        ends = np.minimum(np.arange(1, self.chunks + 1) * CHUNK_NODES, nodes)
-        return np.diff(ends * self.bytes // nodes, prepend=0)
-
-    @property
-    def header_bytes(self) -> int:
-        """Bytes that a viewer needs before it can ask for a chunk; 0 where the format has no chunks."""
-        return self.scene.header.get("header_bytes", 0) if self.has_chunks else 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,9 +53,7 @@ class Part:
         """M splats in the space of the scene, as opaque as they are drawn."""
         if self.index is self.scene.leaves:
             return self.scene.full
-        if self.index is self.scene.every:
-            return self.scene.splats
-        splats = self.scene.splats.take(self.index)
+        splats = self.scene.rows(self.index)
         return splats if self.weight is None else replace(splats, opacity=faded(splats.opacity, self.weight))
 
     @property
@@ -213,18 +136,34 @@ class Scenes:
     @functools.cached_property
     def leaves(self) -> int:
         """Leaves of all instances of trees together: what budgets are shares of."""
-        return sum(len(loaded.leaves) for loaded in self.of_instance if loaded.is_tree)
+        return sum(loaded.leaf_count for loaded in self.of_instance if loaded.is_tree)
+
+    def splats_of(self, budget: Budget) -> int:
+        """The splats of a budget, of which some are shares of the leaves."""
+        return budget.of(self.leaves if budget.share is not None else 0)
 
     @functools.cached_property
     def forest(self) -> Forest:
         """The trees as the traversal reads them."""
-        return Forest([self._nodes(loaded.scene) for loaded in self.trees])
+        if not any(isinstance(loaded, PagedScene) for loaded in self.trees):
+            return Forest([self._nodes(loaded.scene) for loaded in self.trees])
+        return PagedForest(
+            [
+                loaded.pages if isinstance(loaded, PagedScene) else (self._nodes(loaded.scene), depth_of(loaded))
+                for loaded in self.trees
+            ]
+        )
+
+    @functools.cached_property
+    def depth(self) -> NDArray[np.int32]:
+        """(nodes,) edges from the root to each node of `forest`, as far as it was read."""
+        if isinstance(self.forest, PagedForest):
+            return self.forest.depth
+        return np.concatenate([depth_of(loaded) for loaded in self.trees])
 
     def _nodes(self, scene: Scene) -> Nodes:
         assert scene.tree is not None
-        if self.precision == "float16":
-            return lod_tree.unpack(lod_tree.pack(scene.splats, scene.tree, threads=self.threads))
-        return Nodes.of(scene.splats, scene.tree)
+        return nodes_of(scene.splats, scene.tree, self.precision, self.threads)
 
     def tree_instances(self, foveation: Foveation) -> list[TreeInstance]:
         """The instances of trees; those without a foveation of their own have this one."""
@@ -276,6 +215,8 @@ class Scenes:
 
     def balls(self) -> Balls:
         """What the splats cover in the world: full detail of every instance."""
+        if any(isinstance(loaded, PagedScene) for loaded in self.loaded):
+            return sampled_balls(self.instances, self.of_instance)
         return Balls.concat(
             balls_of(loaded.splats, loaded.leaves, at.object_to_world)
             for at, loaded in zip(self.instances, self.of_instance, strict=True)

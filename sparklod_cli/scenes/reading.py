@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from ..codecs.rounding import after
-from ..io import examine_scene, size_of_input
+from ..io import RadFile, examine_scene, size_of_input
 from ..model.instances import Instance
+from ..model.nodes import CHUNK_NODES
 from ..model.scene import Scene
 from ..model.selection import Selection, describe
 from ..model.splats import COLUMNS, Splats
 from ..support.defaults import PRECISIONS
 from ..support.errors import FormatError, InvalidSplatsError, SparklodError, TreeError, memory_errors_translated
 from ..support.progress import Progress, silent
-from .loaded import UNNAMED, LoadedScene, Scenes
-
-#: What a traversal reads of splats.
-TRAVERSED = ("center", "scale", "opacity")
+from ..support.stdin import DASH
+from .loaded import Scenes
+from .loaded_scene import UNNAMED, LoadedScene, nodes_of
+from .paged_scene import PagedScene, empty_scene
+from .pages import Pages
 
 
 def read_scenes(
@@ -28,6 +31,7 @@ def read_scenes(
     trees_only: bool = False,
     through: str | None = None,
     precision: str = PRECISIONS[0],
+    paged: bool = False,
     threads: int = 1,
     progress: Progress = silent,
 ) -> Scenes:
@@ -41,6 +45,8 @@ def read_scenes(
         trees_only: refuse scenes without trees.
         through: one of `rounding.ROUND_TRIPS`, a coding after which splats are drawn; cuts are those of the scene.
         precision: one of `PRECISIONS`, of the nodes that cuts are found with.
+        paged: only cuts are looked at, so that of large RAD trees those chunks suffice
+            that cuts need. Chunks that no cut needs are not looked at; all the rest is the same.
         threads: to decode on.
         progress: called with how much is done.
 
@@ -55,6 +61,14 @@ def read_scenes(
     chunks = 0
     for source in (instance.source for instance in instances):
         if _key(source) in loaded:
+            continue
+        pages = _pages(source, precision, threads) if paged and through is None else None
+        if pages is not None:
+            assert isinstance(source, Path)
+            size, empty = size_of_input(source) or 0, empty_scene(pages.file)
+            entry: LoadedScene = PagedScene(source, size, empty, empty.splats, chunks, pages=pages)
+            loaded[_key(source)] = entry
+            chunks += entry.chunks
             continue
         scene = _read(source, columns if trees_only else COLUMNS, threads, progress)
         file = source if isinstance(source, Path) else None
@@ -74,6 +88,19 @@ def read_scenes(
 
 def _key(source: Path | Scene) -> Path | int:
     return source if isinstance(source, Path) else id(source)
+
+
+def _pages(source: Path | Scene, precision: str, threads: int) -> Pages | None:
+    """The pages of a file that is too large to be read whole; None for others, and where reading them will fail."""
+    if isinstance(source, Scene) or source == DASH:
+        return None
+    try:
+        file = RadFile.open(source)
+    except FormatError:
+        return None
+    if file is None or file.fits or not file.header.lod_tree or file.header.chunk_size != CHUNK_NODES:
+        return None
+    return Pages(file, str(source), functools.partial(nodes_of, precision=precision, threads=1), threads)
 
 
 def _size_of(splats: Splats) -> int:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -48,12 +47,11 @@ class Frame:
 
 @dataclass(frozen=True)
 class _MeasuredCut:
-    """A cut, its statistics as a whole and by instance, and the seconds it took to find it."""
+    """A cut, and its statistics as a whole and by instance."""
 
     cut: TreeCut
     whole: CutStatistics
     parts: list[CutStatistics]
-    seconds: float
 
 
 class Simulation:
@@ -80,8 +78,7 @@ class Simulation:
         self.scenes, self.settings, self._by_instance = scenes, settings, by_instance
         self._streaming = streaming or StreamingSettings()
         self._traversal = scenes.traversal(settings)
-        depths = [tree.depth for tree in scenes.trees]
-        self._depth = np.concatenate([depth for depth in depths if depth is not None])
+        self._depth = scenes.depth
         self._chunks = chunks_of(scenes)
         self._names = [instance.name for instance in scenes.instances]
         self._stream()  # raises what would fail at the first frame
@@ -118,9 +115,7 @@ class Simulation:
     def _find(self, camera: Camera, resident: NDArray[np.bool_] | None = None) -> _MeasuredCut:
         view = view_of(camera)
         limit = self.settings.limit(camera.fov_y, camera.height)
-        start = time.perf_counter()
         cut = self._traversal.cut(view, budget=self.settings.budget, smallest=limit, resident=resident)
-        seconds = time.perf_counter() - start
         whole, parts = measure(
             self.scenes.forest,
             self._depth,
@@ -129,7 +124,7 @@ class Simulation:
             size=(camera.width, camera.height),
             by_instance=self._by_instance,
         )
-        return _MeasuredCut(cut, whole, parts, seconds)
+        return _MeasuredCut(cut, whole, parts)
 
     def _fetched(
         self, camera: Camera, ideal: _MeasuredCut, stream: Stream
@@ -176,7 +171,7 @@ class Simulation:
             "stop_reason": cut.reason,
             "pixel_scale_min": cut.least if np.isfinite(cut.least) else None,
             "missing": cut.missing,
-            "traverse_ms": 1000 * drawn.seconds,
+            "traverse_ms": 1000 * cut.seconds,
         }
         if not self._by_instance:
             return [total]

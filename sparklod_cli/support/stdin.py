@@ -9,15 +9,14 @@ import tempfile
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from .addresses import Place
 from .errors import UnreadableError
 
 #: The path that means standard input or output.
 DASH = Path("-")
 
 
-def name_of(path: Place) -> str:
-    """The name of an input in messages."""
+def name_of(path: object) -> str:
+    """The name of an input, a path or what has one as its text, in messages."""
     return "standard input" if path == DASH else str(path)
 
 

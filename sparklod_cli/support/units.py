@@ -21,6 +21,14 @@ def count_of(count: int, noun: str, plural: str | None = None) -> str:
     return f"{count:,} {noun if count == 1 else plural or noun + 's'}"
 
 
+def format_size(size: int) -> str:
+    """ "12.3 GB", "350 MB", "2 kB": bytes in words, of powers of 1000."""
+    for name, power in (("GB", 10**9), ("MB", 10**6)):
+        if size >= power:
+            return f"{size / power:,.1f} {name}" if size < 10 * power or name == "GB" else f"{size / power:,.0f} {name}"
+    return f"{size / 1000:.0f} kB"
+
+
 def parse_bandwidth(text: str) -> float:
     """Bytes per second of a text such as 20Mbit, 20Mbit/s, 20Mbps (bits) or 2.5MB/s, 2.5MBps, 2.5Mbyte (bytes).
 

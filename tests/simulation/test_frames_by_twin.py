@@ -14,7 +14,8 @@ from sparklod_cli.model.foveation import Frustum
 from sparklod_cli.model.instances import Instance
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.scenes.finder import CutFinder
-from sparklod_cli.scenes.loaded import LoadedScene, Scenes
+from sparklod_cli.scenes.loaded import Scenes
+from sparklod_cli.scenes.loaded_scene import LoadedScene
 from tests.lod.forests import random_tree, transform
 from tests.references import frames as twin
 from tests.scenes import random_splats

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ...support.addresses import Place
 from ...support.errors import FormatError, InvalidSplatsError, ScratchError, UnreadableError
 from ...support.parallel import ordered_map
 from ...support.stdin import DASH
@@ -38,19 +39,20 @@ HOPELESS = (FormatError, InvalidSplatsError)
 Forget = Callable[[Store, list[str]], None]
 
 
-def scratch_folder(target: Path, recipe: Recipe, parent: Path | None) -> Path:
+def scratch_folder(target: Place, recipe: Recipe, parent: Place | None) -> Place:
     """The scratch folder of a bake: beside its output, or in a folder for those of several bakes.
 
     Args:
-        target: the output; - is standard output, whose folder is among the system's temporary files.
+        target: the output. That of standard output (-) is among the system's temporary files.
         recipe: of the output.
         parent: the folder for several; None for that of the output.
     """
     if target == DASH:
         return (parent or Path(tempfile.gettempdir())) / f"standard-output-{recipe.digest[:8]}{SUFFIX}"
     if parent is None:
-        return target.with_name(target.name + SUFFIX)
-    place = hashlib.blake2b(os.fsencode(os.path.realpath(target)), digest_size=4).hexdigest()
+        return target.parent / f"{target.name}{SUFFIX}"
+    name = os.path.realpath(target) if isinstance(target, Path) else target.url
+    place = hashlib.blake2b(os.fsencode(name), digest_size=4).hexdigest()
     return parent / f"{target.name}-{place}{SUFFIX}"
 
 

@@ -8,7 +8,7 @@ from ...model.selection import Tally
 from ...support.progress import Progress
 from ...support.threads import on_threads
 from .job import Job
-from .parts import kept_of
+from .parts import Kept, kept_of
 from .rows import fill_rows, splats_of, width_of
 from .survey import SAMPLE_SPLATS, Findings
 
@@ -32,5 +32,5 @@ def scatter(job: Job, number: int, *, threads: int, progress: Progress) -> None:
         job.store.put(job.splats(number, group), {"rows": rows[some], "index": some.astype(np.int32)})
     stride = max(1, job.stream.count // SAMPLE_SPLATS)
     with on_threads(threads):
-        findings = Findings.of(splats_of(rows), tally, beyond, stride, threads)
+        findings = Findings.of(Kept(splats_of(rows), tally, beyond), stride, job.needed, threads)
     job.store.put(job.part(number), {**findings.arrays(), "first": first})

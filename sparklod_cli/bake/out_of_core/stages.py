@@ -15,7 +15,7 @@ from .job import ROOT, Job, clean_of, families_of, pending_of, stage_of
 from .rows import Rows, rows_of, splats_of, width_of
 
 
-def build(job: Job, number: int, *, threads: int, progress: Progress) -> None:
+def build_stage(job: Job, number: int, *, threads: int, progress: Progress) -> None:
     """A task. Results: families, whose nodes are `rows`; nodes without a parent, or the root of the last stage; at last
     what is to be known of the nodes."""
     stage, builder = job.blocks.stages[number], job.builder()
@@ -24,11 +24,11 @@ def build(job: Job, number: int, *, threads: int, progress: Progress) -> None:
         families, left = builder.advance(pending, stage.region, number, job.plan, progress=progress)
         del pending
         _put_families(job, number, families)
-        statistics = [Statistics.of(families.nodes, families.family == NO_FAMILY)]
+        statistics = [Statistics.of(families.nodes, families.family == NO_FAMILY, job.needed)]
         if stage.region is None:
             root, family = builder.root(left)
             job.store.put(ROOT, {"rows": rows_of(root), "family": np.array([family], np.int64)})
-            statistics.append(Statistics.of(root, np.array([family == NO_FAMILY])))
+            statistics.append(Statistics.of(root, np.array([family == NO_FAMILY]), job.needed))
         else:
             job.store.put(pending_of(number), left.columns)
     counts = np.array([len(families), len(families.family)], np.int64)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,12 +13,12 @@ from ...lod.check import check_visible
 from ...lod.kernels.geometry import find_bounds
 from ...lod.stages.records import Survey
 from ...model.selection import REASONS, Tally
-from ...model.splats import FloatArray, Splats
+from ...model.splats import FloatArray
 from ...model.streams import SceneStream
 from ..checks import check_transformed
 from ..settings import BakeSettings
 from .contracts import Arrays
-from .parts import kept_of
+from .parts import Kept, kept_of
 from .rows import Rows, rows_of, splats_of
 
 #: Ranges of the input that are read for a first look, and splats of each: enough for blocks that differ by a few per
@@ -63,11 +63,13 @@ class Findings:
     statistics: Statistics
 
     @classmethod
-    def of(cls, splats: Splats, tally: Tally, beyond: int, stride: int, threads: int) -> Findings:
-        """Of splats that are kept; every so many of them are the sample."""
+    def of(cls, kept: Kept, stride: int, needed: Collection[str], threads: int) -> Findings:
+        """Of some splats; every so many of those that are kept are the sample."""
+        splats = kept.splats
         low, high, smallest, largest = find_bounds(splats.center, splats.scale, threads)
         sample = rows_of(splats.take(slice(None, None, stride)))
-        return cls(tally, beyond, np.stack([low, high]), np.array([smallest, largest]), sample, Statistics.of(splats))
+        found = Statistics.of(splats, needed=needed)
+        return cls(kept.tally, kept.beyond, np.stack([low, high]), np.array([smallest, largest]), sample, found)
 
     @classmethod
     def merged(cls, parts: Sequence[Findings]) -> Findings:

@@ -118,6 +118,8 @@ def fill(
     tree: LodTree | None,
     palette: FloatArray | None,
     columns: Collection[str],
+    *,
+    thorough: bool = True,
 ) -> NDArray[np.uint32] | None:
     """Decodes a chunk into the rows of `splats` and `tree` that are its own.
 
@@ -127,7 +129,8 @@ def fill(
         splats: as many as the chunk has; columns that are not wanted are left as they are.
         tree: of them, or None.
         palette: of SH that labels point to; None where it is not known, which leaves SH at 0.
-        columns: of `Splats`; the others are unpacked, which finds what is corrupt, but not decoded.
+        columns: of `Splats`; the others are not decoded.
+        thorough: unpack the others, too, which finds what is corrupt.
 
     Returns:
         (N,) labels, where the chunk has some, and no palette was given.
@@ -146,9 +149,12 @@ def fill(
             if tree is not None:
                 getattr(tree, row.column)[:] = packed.values(each, row, count)[:, 0]
         elif row.column == "labels":
+            if not thorough and "sh" not in columns:
+                continue
             labels = packed.values(each, row, count)[:, 0].astype(np.uint32)
         elif row.column not in columns or row.degree > header.max_sh:
-            packed.unpacked(each, row, count)
+            if thorough:
+                packed.unpacked(each, row, count)
         else:
             _fill_column(splats, row, packed.values(each, row, count))
     if labels is not None and palette is not None:

@@ -1,4 +1,4 @@
-"""Levels and cells of the quick builder: the sort keys of splats, and the cells with more than one node."""
+"""Levels and cells of the quick builder: the sort keys of splats, cells with more than one node, and known cells."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 from numba import prange
 
 from ...support.jit import kernel
+from .geometry import CENTER
 from .sort import morton_code
 
 
@@ -83,3 +84,28 @@ def split_cells(nodes, is_first, next_node):
         cells += 1
         i = j
     return members[:used], first[: groups + 1], survivors[:cells]
+
+
+@kernel()
+def split_box(nodes, geometry, below, above):
+    """Separates nodes whose centres lie between two corners from the others.
+
+    Args:
+        nodes: (n,) uint32 rows of geometry.
+        geometry: rows of `geometry.py`.
+        below, above: (3,) float32; centres between them on all axes are inside.
+
+    Returns:
+        inside, outside: uint32, the nodes in their order.
+    """
+    inside, outside = np.empty(len(nodes), np.uint32), np.empty(len(nodes), np.uint32)
+    n = m = 0
+    for i in range(len(nodes)):
+        x, y, z = geometry[nodes[i], CENTER], geometry[nodes[i], CENTER + 1], geometry[nodes[i], CENTER + 2]
+        if below[0] < x < above[0] and below[1] < y < above[1] and below[2] < z < above[2]:
+            inside[n] = nodes[i]
+            n += 1
+        else:
+            outside[m] = nodes[i]
+            m += 1
+    return inside[:n], outside[:m].copy()

@@ -82,11 +82,11 @@ def find_parents(child_count, child_start):
     Returns:
         parent: (N,) int32, the last node that has it as a child; -1 if none has, or none of the MAX_LINKS per node that
             are followed.
-        references: (N,) int64, the number of nodes that have it as a child.
+        references: (N,) int32, the number of nodes that have it as a child.
     """
     count = len(child_count)
     parent = np.full(count, -1, np.int32)
-    references = np.zeros(count + 1, np.int64)  # at first: ranges of children that begin here, less those that end
+    references = np.zeros(count + 1, np.int32)  # at first: ranges of children that begin here, less those that end
     steps = 0
     for node in range(count):
         start = np.int64(child_start[node])
@@ -105,29 +105,25 @@ def find_parents(child_count, child_start):
 
 
 @kernel()
-def mean_child_sizes(parent, size, scale, opacity):
-    """The mean size of each node's children, weighted with opacity times surface area.
+def add_child_sizes(parent, size, scale, opacity, sums, weights):
+    """Adds some nodes to the sums of their parents' children, weighted with opacity times surface area.
+
+    Nodes count that have a parent, a positive opacity and a positive, finite size. The mean size of a node's children
+    is `sums` over `weights`; as sums grow in the order of nodes, blocks of nodes give what all nodes at once give.
 
     Args:
-        parent: (N,) int32, of `find_parents`.
-        size: (N,) of each node, any unit.
-        scale: (N, 3) float32.
-        opacity: (N,) float32, linear.
-
-    Returns:
-        (N,) float64; 0 where no child has a positive opacity and a positive, finite size.
+        parent: (n,) int32, of `find_parents`.
+        size: (n,) of each node, any unit.
+        scale: (n, 3) float32.
+        opacity: (n,) float32, linear.
+        sums, weights: (N,) float64 of all nodes.
     """
-    means, weights = np.zeros(len(parent)), np.zeros(len(parent))
     for node in range(len(parent)):
         if parent[node] >= 0 and opacity[node] > 0 and 0 < size[node] < np.inf:
             area = ellipsoid_area(scale[node, 0], scale[node, 1], scale[node, 2])
             weight = opacity[node] * max(area, LEAST_AREA)
             weights[parent[node]] += weight
-            means[parent[node]] += weight * size[node]
-    for node in range(len(parent)):
-        if weights[node] > 0:
-            means[node] /= weights[node]
-    return means
+            sums[parent[node]] += weight * size[node]
 
 
 @kernel()

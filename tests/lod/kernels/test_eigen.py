@@ -48,3 +48,15 @@ def test_eigenvalues_and_axes_make_the_matrix_again(name: str) -> None:
     assert np.abs(again - matrix).max() <= bound * size
     assert np.abs(np.sort(values) - np.linalg.eigvalsh(matrix)).max() <= bound * size
     assert np.isnan(work[:, len(matrix) :]).all()  # columns beyond the count are left alone
+
+
+def test_the_matrices_beside_it_do_not_change_a_bit_of_a_matrix() -> None:
+    matrix = np.concatenate(list(matrices().values()))
+    rows = np.zeros((ROWS, len(matrix)))
+    rows[:6] = [matrix[:, i, j] for i, j in [(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]]
+    together = rows.copy()
+    decompose(together, len(matrix))
+    for i in range(len(matrix)):
+        alone = rows[:, i : i + 1].copy()
+        decompose(alone, 1)
+        assert alone.tobytes() == together[:, i].tobytes()

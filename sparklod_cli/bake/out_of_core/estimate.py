@@ -1,0 +1,107 @@
+"""How much memory and room on a disk a bake takes, before it begins.
+
+Coefficients are peaks of processes (VmHWM), as `benchmarks/bench_memory.py` measures them, with some room to spare.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ...model.sh import COEFFICIENTS
+from ...support import machine
+
+#: Part of the memory available that a bake may take unless told otherwise: other programs need some, and figures for it
+#: are estimates. Chosen.
+MEMORY_SHARE = 0.75
+
+#: Bytes of a process with numba and all kernels, before it has read anything.
+PROCESS = 350_000_000
+
+#: Most and least splats of a block. More make a block no faster, and fewer make its margins too large a part of it.
+MOST_BLOCK_SPLATS, LEAST_BLOCK_SPLATS = 1 << 21, 1 << 16
+
+
+@dataclass(frozen=True)
+class _Bytes:
+    """What a splat takes at the peak.
+
+    Attributes:
+        fixed: without spherical harmonics.
+        each: for each of their coefficients.
+    """
+
+    fixed: int
+    each: int
+
+    def of(self, splats: int, sh_degree: int) -> int:
+        """So many splats."""
+        return splats * (self.fixed + self.each * COEFFICIENTS[sh_degree])
+
+
+#: In memory, a splat of the input; by method.
+IN_MEMORY = {"quick": _Bytes(220, 40), "quality": _Bytes(380, 40)}
+
+#: Out of core, a splat of a block; by method.
+OF_BLOCK = {"quick": _Bytes(300, 50), "quality": _Bytes(480, 50)}
+
+#: Out of core, a splat of the whole scene: the order of its families.
+OF_ORDER = 16
+
+#: In the scratch folder, a splat of the input; by method. Those of blocks are removed when their nodes are made.
+IN_SCRATCH = {"quick": _Bytes(160, 26), "quality": _Bytes(200, 30)}
+
+
+def default_memory() -> int | None:
+    """Bytes that a bake may take unless told otherwise; None where the system does not say what is available."""
+    available = machine.available_memory()
+    return None if available is None else int(MEMORY_SHARE * available)
+
+
+def in_memory_bytes(method: str, splats: int, sh_degree: int) -> int:
+    """Bytes that a bake in memory takes at its peak.
+
+    Args:
+        method: of `lod.builders.BUILDERS`.
+        splats, sh_degree: of the input.
+    """
+    return PROCESS + IN_MEMORY[method].of(splats, sh_degree)
+
+
+def out_of_core_bytes(method: str, splats: int, sh_degree: int, block_splats: int) -> int:
+    """Bytes that a bake out of core takes at its peak.
+
+    Args:
+        method: of `lod.builders.BUILDERS`.
+        splats, sh_degree: of the input; `sh_degree` as far as it is kept.
+        block_splats: of a block.
+    """
+    return PROCESS + OF_ORDER * splats + OF_BLOCK[method].of(min(splats, block_splats), sh_degree)
+
+
+def scratch_bytes(method: str, splats: int, sh_degree: int) -> int:
+    """Bytes that the scratch folder takes at its peak, without what is unpacked of the input.
+
+    Args:
+        method: of `lod.builders.BUILDERS`.
+        splats, sh_degree: of the input; `sh_degree` as far as it is kept.
+    """
+    return IN_SCRATCH[method].of(splats, sh_degree)
+
+
+def block_splats_within(memory: int | None, method: str, splats: int, sh_degree: int) -> int | None:
+    """The splats of a block, a power of two, so that nearly the same memory gives the same blocks.
+
+    Args:
+        memory: bytes that a bake may take; None for any number.
+        method: of `lod.builders.BUILDERS`.
+        splats, sh_degree: of the input; `sh_degree` as far as it is kept.
+
+    Returns:
+        None where the memory is too little for blocks of `LEAST_BLOCK_SPLATS`.
+    """
+    size = MOST_BLOCK_SPLATS
+    while memory is not None and out_of_core_bytes(method, splats, sh_degree, size) > memory:
+        size //= 2
+        if size < LEAST_BLOCK_SPLATS:
+            return None
+    return size

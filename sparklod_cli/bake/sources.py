@@ -1,0 +1,99 @@
+"""What is baked: a file, or several that are merged into one scene."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ..io import PlacedFile, open_stream, open_streams, read_scene
+from ..model.instances import Instance
+from ..model.scene import Scene
+from ..model.streams import SceneStream, collected
+from ..model.transforms import Transform
+from ..support.addresses import Place
+from ..support.progress import Progress, silent
+from ..support.units import count_of
+
+
+@dataclass(frozen=True, eq=False)
+class Merged:
+    """Several files that are one scene.
+
+    Attributes:
+        files: where each stands; one may be named more than once.
+    """
+
+    files: tuple[PlacedFile, ...]
+
+    @classmethod
+    def of(cls, places: Sequence[Place]) -> Merged:
+        """Files where their own coordinates put them."""
+        return cls(tuple(PlacedFile(place) for place in places))
+
+    @classmethod
+    def of_instances(cls, instances: Sequence[Instance]) -> Merged:
+        """The files of instances, where these stand."""
+        return cls(tuple(PlacedFile(each.file, each.transform) for each in instances if each.file is not None))
+
+    def __str__(self) -> str:
+        return count_of(len(self.files), "file")
+
+
+#: A file, which may be standard input (-), or several.
+Source = Place | Merged
+
+
+def places_of(source: Source) -> list[Place]:
+    """The files of a source, in order."""
+    return [each.file for each in source.files] if isinstance(source, Merged) else [source]
+
+
+def placement_of(source: Source) -> dict[str, Any]:
+    """Where the files of a source stand, as a recipe has it; nothing for a single file."""
+    if not isinstance(source, Merged):
+        return {}
+    return {"merged": [_numbers(each.transform) for each in source.files]}
+
+
+def _numbers(transform: Transform) -> list[float]:
+    """The rotation row by row, the scale, the translation."""
+    return [float(each) for each in (*transform.rotation.flat, transform.scale, *transform.translation)]
+
+
+def read_source(source: Source, *, threads: int = 1, progress: Progress = silent) -> Scene:
+    """All of a source in memory; several files take no more of it than their splats and a block.
+
+    Raises:
+        HasTreeError: one of several files is a tree; names it.
+        FormatError: see `io.read_scene`; names the file where there are several.
+    """
+    if not isinstance(source, Merged):
+        return read_scene(source, threads=threads, progress=progress)
+    with open_streams(source.files, threads=threads) as stream:
+        return collected(stream, progress)
+
+
+@contextlib.contextmanager
+def opened_source(
+    source: Source, *, scratch: Path | None = None, threads: int = 1, progress: Progress = silent
+) -> Iterator[SceneStream]:
+    """A source as a stream.
+
+    Args:
+        source: without a tree.
+        scratch: folder in which what is unpacked stays, so that other processes find it; None for one that is removed.
+        threads, progress: see `io.open_stream`.
+
+    Raises:
+        HasTreeError, FormatError: as `read_source`.
+    """
+    keep = scratch is not None
+    if isinstance(source, Merged):
+        opened = open_streams(source.files, scratch=scratch, keep=keep, threads=threads, progress=progress)
+    else:
+        opened = open_stream(source, scratch=scratch, keep=keep, threads=threads, progress=progress)
+    with opened as stream:
+        yield stream

@@ -1,0 +1,129 @@
+"""Percentiles of numbers that pass by block by block, in memory that does not depend on how many there are."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..model.splats import FloatArray
+
+#: Bits of a number that a pass settles, from the highest on.
+DIGIT_BITS = 16
+
+#: As many numbers are kept and sorted, which takes less time. Chosen.
+KEPT = 1 << 18
+
+
+class Percentiles:
+    """Exact percentiles, as numpy's are (linear between two numbers), and the mean.
+
+    More than `KEPT` numbers pass once for each 16 of their bits, 2 times as float32 and 4 times as float64: a pass
+    counts the next digit of those numbers whose digits before are those of a number that is looked for (radix
+    selection). Fewer pass once.
+
+    Args:
+        levels: percentiles, 0 to 100.
+        dtype: of the numbers, float32 or float64.
+
+    Attributes:
+        count: of numbers.
+        passes: that are still to come.
+    """
+
+    def __init__(self, levels: Sequence[float], dtype: Any) -> None:
+        self._shares = np.asarray(levels, np.float64) / 100
+        self._float: np.dtype[np.floating[Any]] = np.dtype(dtype)
+        self._key = np.dtype(f"u{self._float.itemsize}")
+        self.count, self._sum = 0, 0.0
+        self.passes = 8 * self._float.itemsize // DIGIT_BITS
+        self._first = True
+        self._kept: list[FloatArray] | None = []  # in the first pass, as long as they are few
+        self._prefixes = np.zeros(1, self._key)  # what begins the keys of numbers that are looked for
+        self._counts = np.zeros((1, 1 << DIGIT_BITS), np.int64)
+        self._ranks = np.zeros(0, np.int64)  # places of these numbers among all in order
+        self._places = np.zeros(0, np.int64)  # the same, among those with the same prefix
+        self._found = np.zeros(0, self._key)  # prefix of each
+
+    def add(self, values: FloatArray) -> None:
+        """Adds some numbers; all finite, and the same in every pass."""
+        if not self.passes or not len(values):
+            return
+        if self._first:
+            self.count += len(values)
+            self._sum += float(values.sum(dtype=np.float64))
+        if self._kept is None:
+            self._tally(values)
+            return
+        self._kept.append(values)
+        if self.count > KEPT:
+            for each in self._kept:
+                self._tally(each)
+            self._kept = None
+
+    def _tally(self, values: FloatArray) -> None:
+        keys = _keys(values, self._key)
+        shift = self._key.type(DIGIT_BITS * (self.passes - 1))
+        for row, prefix in enumerate(self._prefixes):
+            some = keys if self._first else keys[keys >> shift >> self._key.type(DIGIT_BITS) == prefix]
+            digits = (some >> shift & self._key.type((1 << DIGIT_BITS) - 1)).astype(np.int64)
+            self._counts[row] += np.bincount(digits, minlength=1 << DIGIT_BITS)
+
+    def end_pass(self) -> None:
+        """Ends a pass over all numbers."""
+        if not self.passes:
+            return
+        if self._first:
+            self._first = False
+            if not self.count:
+                self.passes = 0
+                return
+            low = np.floor((self.count - 1) * self._shares).astype(np.int64)
+            self._ranks = np.unique(np.concatenate([low, np.minimum(low + 1, self.count - 1)]))
+            self._places, self._found = self._ranks.copy(), np.zeros(len(self._ranks), self._key)
+        if self._kept is not None:
+            self._found = np.sort(_keys(np.concatenate(self._kept), self._key))[self._ranks]
+            self._kept, self.passes = None, 0
+            return
+        sums = np.cumsum(self._counts, axis=1)
+        for at, row in enumerate(np.searchsorted(self._prefixes, self._found)):
+            digit = int(np.searchsorted(sums[row], self._places[at], side="right"))
+            self._places[at] -= sums[row, digit - 1] if digit else 0
+            self._found[at] = (int(self._found[at]) << DIGIT_BITS) | digit
+        self._prefixes = np.unique(self._found)
+        self._counts = np.zeros((len(self._prefixes), 1 << DIGIT_BITS), np.int64)
+        self.passes -= 1
+
+    def values(self) -> NDArray[np.float64]:
+        """The percentiles, after the last pass; there must be numbers."""
+        numbers = _floats(self._found, self._float).astype(np.float64)
+        virtual = (self.count - 1) * self._shares
+        low = np.floor(virtual).astype(np.int64)
+        share = virtual - low
+        below = numbers[np.searchsorted(self._ranks, low)]
+        above = numbers[np.searchsorted(self._ranks, np.minimum(low + 1, self.count - 1))]
+        # From the nearer end, as numpy does.
+        found: NDArray[np.float64] = np.where(
+            share >= 0.5, above - (above - below) * (1 - share), below + (above - below) * share
+        )
+        return found
+
+    @property
+    def mean(self) -> float:
+        """Mean of the numbers; there must be some."""
+        return self._sum / self.count
+
+
+def _keys(values: FloatArray, kind: np.dtype[np.unsignedinteger]) -> NDArray[np.unsignedinteger]:
+    """Whole numbers in the order of floats."""
+    bits = (values + values.dtype.type(0)).view(kind)  # -0 becomes 0
+    sign = kind.type(1 << (8 * kind.itemsize - 1))
+    return np.where(bits & sign, ~bits, bits | sign)
+
+
+def _floats(keys: NDArray[np.unsignedinteger], kind: np.dtype[np.floating]) -> FloatArray:
+    """The floats of `_keys`."""
+    sign = keys.dtype.type(1 << (8 * keys.dtype.itemsize - 1))
+    return np.where(keys & sign, keys ^ sign, ~keys).view(kind)
