@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import heapq
+import itertools
 import json
 import math
 from collections.abc import Sequence
@@ -54,6 +55,20 @@ def table(runs: dict[str, Any]) -> str:
             cells += [f"{run['written'] / 1e9:.1f}", f"{run['read'] / 1e9:.1f}"]
             cells += [f"{run['report']['nodes']:,}", f"{run['bytes'] / 1e9:.2f}"]
         lines.append("| " + " | ".join(map(str, cells)) + " |")
+    return "\n".join(lines)
+
+
+def looks(runs: dict[str, Any]) -> str:
+    """A Markdown table of the commands that looked at the trees."""
+    lines = ["| tree | nodes | command | s | peak GB | bytes a node | read GB |", "|---|---|---|---|---|---|---|"]
+    for name, run in runs.items():
+        for command, found in run.get("looks", {}).items():
+            nodes = run["report"]["nodes"]
+            cells = [name.rpartition(" ")[0], f"{nodes:,}", f"`{command}`", found.get("error")]
+            if "error" not in found:
+                cells[3:] = [f"{found['seconds']:.1f}", f"{found['peak'] / 1e9:.2f}"]
+                cells += [f"{found['peak'] / nodes:.0f}", f"{found['read'] / 1e9:.2f}"]
+            lines.append("| " + " | ".join(map(str, cells)) + " |")
     return "\n".join(lines)
 
 
@@ -120,7 +135,8 @@ def model(runs: dict[str, Any]) -> str:
             continue
         inside = sum(task["seconds"] for task in run["tasks"])
         outside = run["seconds"] - inside
-        times = [outside + makespan(run["tasks"], each) for each in WORKERS]
+        rounds = [list(each) for _, each in itertools.groupby(run["tasks"], lambda task: task["round"])]
+        times = [outside + sum(makespan(each, workers) for each in rounds) for workers in WORKERS]
         cells = [name, f"{inside:.0f}", f"{outside:.0f}"]
         cells += [f"{each:.0f} ({times[0] / each:.1f}x)" for each in times]
         lines.append("| " + " | ".join(cells) + " |")
@@ -163,7 +179,7 @@ def main() -> None:
     arguments = parser.parse_args()
     results = json.loads(arguments.results.read_text())
     print(f"Machine: {results['machine']}.\n")
-    for part in (table, growth, model):
+    for part in (table, growth, looks, model):
         print(part(results["runs"]) + "\n")
     if arguments.plot is not None:
         plot(arguments.plot, results["runs"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +14,7 @@ from ..model.instances import Instance
 from ..model.scene import Scene
 from ..model.streams import SceneStream, collected
 from ..model.transforms import Transform
-from ..support.addresses import Place
+from ..support.addresses import Place, absolute
 from ..support.progress import Progress, silent
 from ..support.units import count_of
 
@@ -49,6 +50,13 @@ Source = Place | Merged
 def places_of(source: Source) -> list[Place]:
     """The files of a source, in order."""
     return [each.file for each in source.files] if isinstance(source, Merged) else [source]
+
+
+def absolute_source(source: Source) -> Source:
+    """The same source for processes whose working folders are others."""
+    if not isinstance(source, Merged):
+        return absolute(source)
+    return Merged(tuple(dataclasses.replace(each, file=absolute(each.file)) for each in source.files))
 
 
 def placement_of(source: Source) -> dict[str, Any]:
