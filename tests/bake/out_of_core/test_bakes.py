@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sparklod_cli.bake import BakeSettings, Baked, bake
+from sparklod_cli.bake import Baked, BakeSettings, bake
 from sparklod_cli.bake.resources import Resources
 from sparklod_cli.codecs import ply
 from sparklod_cli.io import read_scene
