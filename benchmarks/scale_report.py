@@ -63,9 +63,7 @@ def goals(runs: dict[str, Any]) -> str:
     lines = ["| goal | reached |", "|---|---|"]
 
     def add(goal: str, limit: float, figures: dict[str, float]) -> None:
-        told = [
-            f"{name}: {text.format(value)}{'' if value <= limit else ' **missed**'}" for name, value in figures.items()
-        ]
+        told = [f"{name}: {value:.2f}{'' if value <= limit else ' **missed**'}" for name, value in figures.items()]
         lines.append(f"| {goal} | {'; '.join(told) or 'not measured'} |")
 
     ended = {parts_of(name): run for name, run in runs.items() if "error" not in run}
