@@ -1,6 +1,6 @@
 """Measures what `bake.out_of_core.estimate` estimates: peaks of memory and of scratch, in bytes a splat.
 
-    python benchmarks/bench_memory.py scene.ply --splats 1000000
+python benchmarks/bench_memory.py scene.ply --splats 1000000
 """
 
 from __future__ import annotations

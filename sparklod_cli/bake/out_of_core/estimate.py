@@ -15,7 +15,7 @@ from ...support import machine
 MEMORY_SHARE = 0.75
 
 #: Bytes of a process with numba and all kernels, before it has read anything.
-PROCESS = 350_000_000
+PROCESS = 200_000_000
 
 #: Most and least splats of a block. More make a block no faster, and fewer make its margins too large a part of it.
 MOST_BLOCK_SPLATS, LEAST_BLOCK_SPLATS = 1 << 21, 1 << 16
@@ -39,16 +39,19 @@ class _Bytes:
 
 
 #: In memory, a splat of the input; by method.
-IN_MEMORY = {"quick": _Bytes(220, 40), "quality": _Bytes(380, 40)}
+IN_MEMORY = {"quick": _Bytes(220, 27), "quality": _Bytes(250, 30)}
 
 #: Out of core, a splat of a block; by method.
-OF_BLOCK = {"quick": _Bytes(300, 50), "quality": _Bytes(480, 50)}
+OF_BLOCK = {"quick": _Bytes(300, 50), "quality": _Bytes(350, 50)}
+
+#: Out of core, a node of those that are read, gathered or encoded at once, and how many these are.
+OF_WINDOW, WINDOW = _Bytes(230, 50), 1 << 19
 
 #: Out of core, a splat of the whole scene: the order of its families.
 OF_ORDER = 16
 
 #: In the scratch folder, a splat of the input; by method. Those of blocks are removed when their nodes are made.
-IN_SCRATCH = {"quick": _Bytes(160, 26), "quality": _Bytes(200, 30)}
+IN_SCRATCH = {"quick": _Bytes(190, 32), "quality": _Bytes(200, 34)}
 
 
 def default_memory() -> int | None:
@@ -75,7 +78,9 @@ def out_of_core_bytes(method: str, splats: int, sh_degree: int, block_splats: in
         splats, sh_degree: of the input; `sh_degree` as far as it is kept.
         block_splats: of a block.
     """
-    return PROCESS + OF_ORDER * splats + OF_BLOCK[method].of(min(splats, block_splats), sh_degree)
+    window = OF_WINDOW.of(min(2 * splats, WINDOW), sh_degree)
+    block = OF_BLOCK[method].of(min(splats, block_splats), sh_degree)
+    return PROCESS + OF_ORDER * splats + max(window, block)
 
 
 def scratch_bytes(method: str, splats: int, sh_degree: int) -> int:
