@@ -83,7 +83,7 @@ def main() -> None:
 def report(found: dict[str, float], method: str, degree: int, suffix: str, count: int, size: int) -> None:
     """Prints a line."""
     if size:
-        guess = estimate.out_of_core_bytes(method, count, degree, size)
+        guess = estimate.out_of_core_bytes(method, count, degree, size, in_chunks=suffix == ".rad")
     else:
         guess = estimate.in_memory_bytes(method, count, degree)
     each = (found["peak"] - estimate.PROCESS) / (size or count)
