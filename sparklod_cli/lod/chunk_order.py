@@ -21,6 +21,7 @@ from ..model.nodes import CHUNK_NODES
 from ..model.splats import FloatArray, Splats
 from ..support.jit import threads_for
 from ..support.progress import Progress, silent
+from .chunk_parts import Index, parts_of
 from .foveation import set_foveation
 from .kernels.chunk_demand import fill_demand
 from .kernels.chunk_inside import sort_within_chunks
@@ -49,8 +50,11 @@ LEAST_BUDGET = 1 / 16
 #: Bases of the Halton sequences that viewpoints are made of.
 PRIMES = (2, 3, 5, 7, 11, 13, 17)
 
+#: Families that a bake out of core puts in order at a time, and the bytes that each takes on two threads. Chosen: 1.3
+#: GB, for the families of some 15 million splats.
+MOST_FAMILIES, FAMILY_BYTES = 1 << 22, 300
+
 Matrix = NDArray[np.float64]
-Index = NDArray[np.int32]
 
 
 def arrange(splats: Splats, tree: LodTree, *, progress: Progress = silent) -> tuple[Splats, LodTree]:
@@ -100,6 +104,7 @@ def family_order(
     center: FloatArray,
     size: FloatArray,
     *,
+    most: int | None = None,
     progress: Progress = silent,
 ) -> Index:
     """The order of families of which `arrange` speaks.
@@ -110,18 +115,34 @@ def family_order(
         count: (F,) number of its children.
         center: (F, 3) its centre, world units.
         size: (F,) its feature size, world units.
+        most: how many families are put in order at a time, each of which takes `FAMILY_BYTES`; None for all. Parts, see
+            `chunk_parts.parts_of`, are each put in order as if they were a tree, one after the other.
         progress: called with the number of nodes that have a chunk.
 
     Returns:
         (F,) int32 places here, in the order in which the children are written.
     """
-    total = 1 + int(count.sum(dtype=np.int64))
-    with threads_for(len(parent)) as threads:
-        size = np.fmax(size, np.float32(0))
-        _, limit = find_limits(parent, size)
-        largest = _largest_first(limit, threads)
-        families = _families(parent, count, center, size, largest, threads)
-        return largest[_sequence(families, total, progress)].astype(np.int32)
+    total, filled, found = 1 + int(count.sum(dtype=np.int64)), 1, []
+    size = np.fmax(size, np.float32(0))
+    _, limit = find_limits(parent, size)
+    for members in parts_of(parent, center, limit, most or len(parent)):
+        with threads_for(len(members)) as threads:
+            at = slice(None) if len(members) == len(parent) else members  # all of them without a copy
+            largest = _largest_first(limit[at], threads)
+            part = _part(parent, members), count[at], center[at], size[at]
+            families = _families(*part, largest, threads)
+            found.append(members[largest[_sequence(families, filled, total, progress)]])
+        filled += int(families.count.sum(dtype=np.int64))
+    return np.concatenate(found)
+
+
+def _part(parent: Index, members: Index) -> Index:
+    """For each member the place among members, which are ascending, of its parent; -1 where that is none of them."""
+    if len(members) == len(parent):
+        return parent
+    above = parent[members]
+    at = np.minimum(np.searchsorted(members, above), len(members) - 1).astype(np.int32)
+    return np.where(members[at] == above, at, np.int32(-1))
 
 
 def _largest_first(limit: FloatArray, threads: int) -> NDArray[np.uint32]:
@@ -161,20 +182,23 @@ def _families(
     return Families(parent, counts.astype(np.int32), rank, demand)
 
 
-def _sequence(families: Families, total: int, progress: Progress) -> Index:
+def _sequence(families: Families, filled: int, total: int, progress: Progress) -> Index:
     """(F,) the families in the order in which they are written.
 
     Args:
-        families: F at least 1.
-        total: number of nodes: those of the families, and the root.
+        families: of a part, F at least 1.
+        filled: number of nodes that come before.
+        total: number of nodes of the tree.
         progress: of `arrange`.
     """
-    length = len(families.count)
+    length, own = len(families.count), int(families.count.sum(dtype=np.int64))
     sequence = np.arange(length, dtype=np.int32)
     set_of, root, spare = (np.full(length, -1, np.int32) for _ in range(3))
     weight = np.empty(length, np.int64)
-    # Where a set begins, where it ends, its nodes, and for the first one how many of its nodes fit beside the root.
-    sets, ends, used = [(0, length, total - 1, CHUNK_NODES - 1)], [0], 0
+    # Where a set begins, where it ends, its nodes, and for the first one how many of its nodes fit into the chunk that
+    # was begun: beside the root, or behind the part before.
+    room = -filled % CHUNK_NODES
+    sets, ends, used = ([(0, length, own, room)] if room or own > CHUNK_NODES else []), [0, length], 0
     while sets:
         rows = [
             (begin, end, used + number, CHUNK_NODES, -(-nodes // CHUNK_NODES), room)
@@ -185,11 +209,11 @@ def _sequence(families: Families, total: int, progress: Progress) -> Index:
         used += len(sets)
         parts = []
         for (begin, end, nodes, _), first in zip(sets, lengths.tolist(), strict=True):
-            filled = int(families.count[sequence[begin : begin + first]].sum(dtype=np.int64))
-            parts += [(begin, begin + first, filled, 0), (begin + first, end, nodes - filled, 0)]
+            inside = int(families.count[sequence[begin : begin + first]].sum(dtype=np.int64))
+            parts += [(begin, begin + first, inside, 0), (begin + first, end, nodes - inside, 0)]
         ends += [end for _, end, nodes, _ in parts if nodes <= CHUNK_NODES]
         sets = [part for part in parts if part[2] > CHUNK_NODES]
-        progress("arranging", total - sum(nodes for _, _, nodes, _ in sets), total, "node")
+        progress("arranging", filled + own - sum(nodes for _, _, nodes, _ in sets), total, "node")
     bits = (length - 1).bit_length()
     sort_within_chunks(np.unique(ends), families.parent, families.rank, bits, sequence, set_of, root)
     return sequence

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ...lod.chunk_order import family_order
+from ...lod.chunk_order import MOST_FAMILIES, family_order
 from ...lod.kernels.family_links import find_limits
 from ...lod.stages.records import NO_FAMILY, STAGE_BITS
 from ...model.nodes import CHUNK_NODES
@@ -135,7 +135,7 @@ def _arranged(
     levels = int(depth.max()) + 2
     del depth
     center = _of_all(job, "center")[by_place]
-    order = family_order(parent, links.count[by_place], center, size, progress=progress)
+    order = family_order(parent, links.count[by_place], center, size, most=MOST_FAMILIES, progress=progress)
     return levels, by_place[order].astype(np.uint32)
 
 
