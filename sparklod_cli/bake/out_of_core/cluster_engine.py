@@ -37,6 +37,7 @@ class ClusterEngine:
     def __init__(self, connection: Connection, *, threads: int, memory: int | None = None) -> None:
         """Takes the connection to a cluster, and what `threads` and `memory` say."""
         self._connection, self.threads, self.memory = connection, threads, memory
+        self._checked: tuple[str, frozenset[str]] | None = None
 
     def run(self, stage: str, tasks: Sequence[Task], job: Any, progress: Progress) -> None:
         """See `Engine.run`."""
@@ -47,7 +48,10 @@ class ClusterEngine:
         progress(stage, done, total, "splat")
         if not left:
             return
-        self.check(store)
+        here = str(store), frozenset(self._connection.workers())
+        if here != self._checked:  # other workers may have come
+            self.check(store)
+            self._checked = here
         packed = pickle.dumps(job)
         needs = {name: {need for need in task.needs if need in left} for name, (_, task) in left.items()}
         heirs: dict[str, list[str]] = {}

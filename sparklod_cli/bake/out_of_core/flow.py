@@ -146,7 +146,7 @@ def scattered(job: Job, engine: Engine, block_splats: int, progress: Progress) -
         InvalidSplatsError: no tree can be made of them.
     """
     store, settings = job.store, job.settings
-    center, share = first_look(job.stream, settings)
+    center, share = first_look(job.stream, settings, -(-job.stream.count // block_splats))
     blocks = cut_into_blocks(center, math.ceil(share * job.stream.count), block_splats)
     job = dataclasses.replace(job, blocks=blocks)
     while True:

@@ -40,7 +40,7 @@ def encode(job: Job, window: int, *, threads: int, progress: Progress) -> None:
     encoder = job.encoder
     start = window * WINDOW_NODES
     stop = min(start + WINDOW_NODES, encoder.count)
-    splats, tree = _read(job.store, width_of(job.sh_degree), start, stop)
+    splats, tree = _read(job.store, width_of(job.sh_degree), start, stop, threads)
 
     def encoded(part: slice) -> dict[str, NDArray[np.generic]]:
         return encoder.encode(*rows_of(splats, tree, part), start + part.start)
@@ -58,7 +58,7 @@ def encoded_chunk(store: Store, number: int, name: str) -> NDArray[np.generic]:
     return store.get(encoded_of(window), [key])[key]
 
 
-def _read(store: Store, width: int, start: int, stop: int) -> tuple[Splats, LodTree]:
+def _read(store: Store, width: int, start: int, stop: int, threads: int = 1) -> tuple[Splats, LodTree]:
     """As `NodeStream.read`, of nodes whose rows have this width."""
     parts = []
     for window in range(start // WINDOW_NODES, -(-stop // WINDOW_NODES)):
@@ -67,7 +67,7 @@ def _read(store: Store, width: int, start: int, stop: int) -> tuple[Splats, LodT
         here = slice(max(start - first, 0), stop - first)
         parts.append((rows[here], tree.child_count[here], tree.child_start[here]))
     rows, count, child_start = parts[0] if len(parts) == 1 else map(np.concatenate, zip(*parts, strict=True))
-    return splats_of(rows), LodTree(count.copy(), child_start.copy())
+    return splats_of(rows, threads), LodTree(count.copy(), child_start.copy())
 
 
 def _read_window(store: Store, width: int, window: int) -> tuple[Rows, LodTree]:

@@ -21,17 +21,26 @@ from .contracts import Arrays
 from .parts import Kept, kept_of
 from .rows import Rows, rows_of, splats_of
 
-#: Ranges of the input that are read for a first look, and splats of each: enough for blocks that differ by a few per
-#: cent in their splats, where neighbours in the file are neighbours in space, too. Chosen.
-RANGES, RANGE_SPLATS = 512, 256
+#: Ranges of the input that are read for a first look: for each block, at least, and at most; and splats of each. Blocks
+#: differ by a few per cent in their splats then, even where neighbours in the file are neighbours in space. Chosen.
+RANGES_OF_BLOCK, MIN_RANGES, MAX_RANGES, RANGE_SPLATS = 32, 64, 512, 256
 
 #: Splats of the survey's sample, or a few more. Chosen.
 SAMPLE_SPLATS = 1 << 18
 
 
-def first_look(stream: SceneStream, settings: BakeSettings) -> tuple[FloatArray, float]:
-    """(n, 3) centres of splats that are kept, from ranges all over the input, and the share of splats that are kept."""
-    starts = np.linspace(0, max(0, stream.count - RANGE_SPLATS), RANGES).astype(np.int64).tolist()
+def first_look(stream: SceneStream, settings: BakeSettings, blocks: int) -> tuple[FloatArray, float]:
+    """(n, 3) centres of splats that are kept, from ranges all over the input, and the share of splats that are kept.
+
+    Args:
+        stream: the input.
+        settings: of the bake.
+        blocks: that the scene will be cut into, about; for a single one nothing is read.
+    """
+    if blocks == 1:
+        return np.empty((0, 3), np.float32), 1.0
+    ranges = min(max(blocks * RANGES_OF_BLOCK, MIN_RANGES), MAX_RANGES)
+    starts = np.linspace(0, max(0, stream.count - RANGE_SPLATS), ranges).astype(np.int64).tolist()
     centers, seen, end = [np.empty((0, 3), np.float32)], 0, 0
     for start in starts:
         begin, end = max(start, end), min(start + RANGE_SPLATS, stream.count)
