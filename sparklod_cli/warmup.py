@@ -94,7 +94,7 @@ JOBS = {
     "palette": Job(
         (
             *("chunk_demand.fill_demand", "chunk_inside.sort_within_chunks", "chunk_sets.split_sets", "sort.sort_pass"),
-            *("tree_links.find_depths", "tree_links.find_parents", "row_hash.hash_rows", "cells.halve_cells"),
+            *("family_links.find_limits", "tree_links.find_parents", "row_hash.hash_rows", "cells.halve_cells"),
             *("cells.average_cells", "nearest.find_neighbours", "nearest.choose_codes"),
         ),
         ("build-lod shiny.spz --format rad --cluster-sh 4 -o palette.rad",),
