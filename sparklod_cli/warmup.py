@@ -48,7 +48,7 @@ JOBS = {
         (
             *("geometry.find_bounds", "geometry.gather_rows", "group.level_keys", "group.split_cells"),
             *("merge.merge_groups", "final_order.fill_geometry", "final_order.fill_leaves", "final_order.merge_colors"),
-            *("final_order.final_indices", "sort.cell_words", "sort.sort_pass"),
+            *("sort.cell_words", "sort.sort_pass"),
         ),
         ("build-lod scene.ply -o quick.spz",),
     ),
