@@ -199,6 +199,6 @@ def _work(
 
 
 def _opened(source: Source, folder: Place, threads: int) -> contextlib.AbstractContextManager[SceneStream]:
-    """The input, which other processes can open, too, where the scratch folder is one of this machine."""
+    """The input, which other processes can open, too; they unpack it themselves where they share no folder."""
     scratch = folder / UNPACKED if isinstance(folder, Path) else None
-    return opened_source(source, scratch=scratch, threads=threads)
+    return opened_source(source, scratch=scratch, keep=True, threads=threads)

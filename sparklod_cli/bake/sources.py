@@ -78,19 +78,22 @@ def read_source(source: Source, *, threads: int = 1, progress: Progress = silent
 
 @contextlib.contextmanager
 def opened_source(
-    source: Source, *, scratch: Path | None = None, threads: int = 1, progress: Progress = silent
+    source: Source,
+    *,
+    scratch: Path | None = None,
+    keep: bool = False,
+    threads: int = 1,
+    progress: Progress = silent,
 ) -> Iterator[SceneStream]:
     """A source as a stream.
 
     Args:
         source: without a tree.
-        scratch: folder in which what is unpacked stays, so that other processes find it; None for one that is removed.
-        threads, progress: see `io.open_stream`.
+        scratch, keep, threads, progress: see `io.open_stream`.
 
     Raises:
         HasTreeError, FormatError: as `read_source`.
     """
-    keep = scratch is not None
     if isinstance(source, Merged):
         opened = open_streams(source.files, scratch=scratch, keep=keep, threads=threads, progress=progress)
     else:
