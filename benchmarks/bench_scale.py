@@ -38,6 +38,13 @@ WAYS = {
     "dask-2": {"threads": 2, "workers": 2},
 }
 
+#: Commands that look at what was baked out of core, and their options.
+LOOKS = {
+    "inspect": ["--check", "--json"],
+    "traverse": ["--orbit", "8", "--budget", "1M", "--json"],
+    "render": ["--budget", "1M", "--overwrite", "--quiet", "-o", "picture.png"],
+}
+
 #: Seconds between looks at the memory of processes and the size of the scratch folder.
 PERIOD = 0.25
 
@@ -116,9 +123,21 @@ def bake(scene: Path, folder: Path, method: str, way: str, limit: int, hours: fl
         result |= figures | {"report": report, "bytes": output.stat().st_size}
         result["peaks"] = sorted(watch.peaks.values(), reverse=True)
         result["scratch"] = watch.scratch
+        if way == "scratch":
+            result["looks"] = {name: look(output, name) for name in LOOKS}
     shutil.rmtree(scratch)
     output.unlink(missing_ok=True)
     return result
+
+
+def look(tree: Path, command: str) -> dict[str, Any]:
+    """What a command on a tree took; only its nodes that are read take memory, though it asks for room for all."""
+    arguments = [sys.executable, str(HERE / "scale_child.py"), "0", command, str(tree), *LOOKS[command]]
+    done = subprocess.run(arguments, capture_output=True, text=True, check=False, cwd=tree.parent)
+    if done.returncode:
+        return {"error": done.stderr.strip().splitlines()[-1:]}
+    figures = json.loads(done.stdout.splitlines()[-1])
+    return {name: figures[name] for name in ("code", "seconds", "peak", "read")}
 
 
 def scenes_of(arguments: argparse.Namespace, source: Splats) -> Iterator[tuple[str, Path]]:

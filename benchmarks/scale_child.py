@@ -1,4 +1,6 @@
-"""Runs `sparklod` within a limit, for `bench_scale.py`: `scale_child.py BYTES [ARGUMENT]...`, 0 for no limit.
+"""Runs `sparklod` out of core and within a limit, for `bench_scale.py`: `scale_child.py BYTES [ARGUMENT]...`.
+
+With 0 bytes there is no limit, and it bakes as it likes.
 
 The last line of standard output is JSON: what the process took, and how long each task of a bake out of core was.
 """
@@ -6,6 +8,7 @@ The last line of standard output is JSON: what the process took, and how long ea
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 import re
 import resource
@@ -17,22 +20,23 @@ from typing import Any
 
 
 def record_tasks(tasks: list[dict[str, Any]]) -> None:
-    """Has the engine of this process note how long each task takes."""
+    """Has the engine of this process note how long each task takes; those of a round wait for all of the one before."""
     from sparklod_cli.bake.out_of_core.engine import LocalEngine
 
-    run = LocalEngine.run
+    run, rounds = LocalEngine.run, itertools.count()
 
-    def timed(task: Any) -> Any:
+    def timed(task: Any, number: int) -> Any:
         def work(*arguments: Any, **named: Any) -> None:
             start = time.perf_counter()
             task.run(*arguments, **named)
             seconds = round(time.perf_counter() - start, 4)
-            tasks.append({"name": task.name, "needs": list(task.needs), "seconds": seconds})
+            tasks.append({"name": task.name, "needs": list(task.needs), "seconds": seconds, "round": number})
 
         return dataclasses.replace(task, run=work)
 
-    def recorded(self: Any, stage: str, given: Sequence[Any], *rest: Any) -> None:
-        run(self, stage, [timed(task) for task in given], *rest)
+    def recorded(self: Any, stage: str, given: Sequence[Any], *rest: Any, **named: Any) -> None:
+        number = next(rounds)
+        run(self, stage, [timed(task, number) for task in given], *rest, **named)
 
     LocalEngine.run = recorded  # type: ignore[method-assign]
 
@@ -51,7 +55,11 @@ def main() -> None:
         # Memory that the process asks for, not what it maps of files: a limit on address space would count those, too.
         resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
     tasks: list[dict[str, Any]] = []
-    record_tasks(tasks)
+    if limit:
+        from sparklod_cli.bake.out_of_core import estimate
+
+        estimate.in_memory_bytes = lambda *_: 1 << 62  # out of core, also where that is not needed
+        record_tasks(tasks)
     from sparklod_cli.cli import run
 
     start = time.perf_counter()

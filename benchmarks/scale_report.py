@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import heapq
+import itertools
 import json
 import math
 from collections.abc import Sequence
@@ -54,6 +55,57 @@ def table(runs: dict[str, Any]) -> str:
             cells += [f"{run['written'] / 1e9:.1f}", f"{run['read'] / 1e9:.1f}"]
             cells += [f"{run['report']['nodes']:,}", f"{run['bytes'] / 1e9:.2f}"]
         lines.append("| " + " | ".join(map(str, cells)) + " |")
+    return "\n".join(lines)
+
+
+def goals(runs: dict[str, Any]) -> str:
+    """A Markdown table of the goals, and what was reached of each."""
+    lines = ["| goal | reached |", "|---|---|"]
+
+    def add(goal: str, limit: float, figures: dict[str, float]) -> None:
+        told = [f"{name}: {value:.2f}{'' if value <= limit else ' **missed**'}" for name, value in figures.items()]
+        lines.append(f"| {goal} | {'; '.join(told) or 'not measured'} |")
+
+    ended = {parts_of(name): run for name, run in runs.items() if "error" not in run}
+    within = {
+        f"SH {degree}, {method}": max(run["peaks"]) / run["limit"]
+        for (millions, degree, method, way), run in ended.items()
+        if millions == 30 and way == "scratch"
+    }
+    add("30 million splats within the limit on memory (peak over limit)", 1, within)
+    add("out of core within 2.5 times the time in memory, 10 million", 2.5, _ratios(ended, "scratch", "memory", 10))
+    add("one Dask worker within 1.15 times the time of one process", 1.15, _ratios(ended, "dask-1", "scratch"))
+    for method, most in (("quick", 2.5), ("quality", 3.5)):
+        slopes = {}
+        for (degree, of, way), series in series_of(runs).items():
+            (few, first), (many, last) = series[0], series[-1]
+            if (of, way) == (method, "memory") and many > few:
+                each = (last["peaks"][0] - first["peaks"][0]) / (many - few) / 1e6
+                slopes[f"SH {degree}, {few:g} to {many:g} million"] = each / (4 * (14 + 3 * ((degree + 1) ** 2 - 1)))
+        add(f"{method} in memory: a splat more takes at most {most} times its decoded bytes", most, slopes)
+    return "\n".join(lines)
+
+
+def _ratios(ended: dict[Any, Any], one: str, other: str, millions: float | None = None) -> dict[str, float]:
+    """Seconds of one way over those of another, of the scenes that have both."""
+    return {
+        f"{key[0]:g} million, SH {key[1]}, {key[2]}": run["seconds"] / ended[(*key[:3], other)]["seconds"]
+        for key, run in sorted(ended.items())
+        if key[3] == one and (*key[:3], other) in ended and millions in (None, key[0])
+    }
+
+
+def looks(runs: dict[str, Any]) -> str:
+    """A Markdown table of the commands that looked at the trees."""
+    lines = ["| tree | nodes | command | s | peak GB | bytes a node | read GB |", "|---|---|---|---|---|---|---|"]
+    for name, run in runs.items():
+        for command, found in run.get("looks", {}).items():
+            nodes = run["report"]["nodes"]
+            cells = [name.rpartition(" ")[0], f"{nodes:,}", f"`{command}`", found.get("error")]
+            if "error" not in found:
+                cells[3:] = [f"{found['seconds']:.1f}", f"{found['peak'] / 1e9:.2f}"]
+                cells += [f"{found['peak'] / nodes:.0f}", f"{found['read'] / 1e9:.2f}"]
+            lines.append("| " + " | ".join(map(str, cells)) + " |")
     return "\n".join(lines)
 
 
@@ -120,7 +172,8 @@ def model(runs: dict[str, Any]) -> str:
             continue
         inside = sum(task["seconds"] for task in run["tasks"])
         outside = run["seconds"] - inside
-        times = [outside + makespan(run["tasks"], each) for each in WORKERS]
+        rounds = [list(each) for _, each in itertools.groupby(run["tasks"], lambda task: task["round"])]
+        times = [outside + sum(makespan(each, workers) for each in rounds) for workers in WORKERS]
         cells = [name, f"{inside:.0f}", f"{outside:.0f}"]
         cells += [f"{each:.0f} ({times[0] / each:.1f}x)" for each in times]
         lines.append("| " + " | ".join(cells) + " |")
@@ -163,7 +216,7 @@ def main() -> None:
     arguments = parser.parse_args()
     results = json.loads(arguments.results.read_text())
     print(f"Machine: {results['machine']}.\n")
-    for part in (table, growth, model):
+    for part in (goals, table, growth, looks, model):
         print(part(results["runs"]) + "\n")
     if arguments.plot is not None:
         plot(arguments.plot, results["runs"])

@@ -75,7 +75,7 @@ JOBS = {
     "rad": Job(
         (
             *("chunk_demand.fill_demand", "chunk_inside.sort_within_chunks", "chunk_sets.split_sets", "sort.sort_pass"),
-            *("tree_links.find_depths", "tree_links.find_parents"),
+            *("family_links.find_limits", "tree_links.find_parents"),
         ),
         ("build-lod tree.spz --format rad -o tree.rad",),
     ),

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Protocol
 
 from ..codecs import clamps
 from ..codecs.clamps import Clamp, Range
-from ..codecs.encoder import CLAMPED, Encoder, Get, Kept, results, windows_of
+from ..codecs.encoder import CLAMPED, Encoder, Get, windows_of
 from ..codecs.formats import WRITABLE, Format
 from ..codecs.gpu import dump
 from ..codecs.options import WriteOptions
@@ -90,17 +89,6 @@ class Output(Protocol):
     def write_windows(self, encoder: Encoder, get: Get, threads: int, progress: Progress) -> WrittenTree:
         """Writes a tree whose windows are encoded; `get` reads their results."""
 
-    def write_stream(
-        self, nodes: NodeStream, found: Statistics, scratch: Path, threads: int, progress: Progress
-    ) -> WrittenTree:
-        """Writes a tree in little memory, on this machine.
-
-        Args:
-            nodes, found: as for `encoder`.
-            scratch: folder for a temporary file of encoded windows.
-            threads, progress: as for `write`.
-        """
-
 
 def output_of(target: Place, settings: BakeSettings, *, overwrite: bool) -> Output:
     """The output that settings ask for; fails now if it cannot be written later.
@@ -162,13 +150,6 @@ class _Arrays:
         """There are none."""
         raise AssertionError
 
-    def write_stream(
-        self, nodes: NodeStream, found: Statistics, scratch: Path, threads: int, progress: Progress
-    ) -> WrittenTree:
-        """They cannot."""
-        self.check_statistics(found)
-        raise AssertionError
-
 
 @dataclass(frozen=True)
 class _File:
@@ -221,16 +202,6 @@ class _File:
         tallies = [get(number, CLAMPED) for number in range(len(windows_of(encoder.count)))]
         beyond = clamps.clamps_of(clamps.merged(tallies), encoder.ranges)
         return self._written(encoder.options, size, encoder.count, encoder.sh_degree, beyond)
-
-    def write_stream(
-        self, nodes: NodeStream, found: Statistics, scratch: Path, threads: int, progress: Progress
-    ) -> WrittenTree:
-        """Writes it."""
-        encoder = self.encoder(nodes, found, threads, progress)
-        with Kept(scratch) as kept:
-            for result in results(encoder, nodes, threads, progress, "encoding"):
-                kept.put(result)
-            return self.write_windows(encoder, kept.get, threads, progress)
 
     def _held(self, options: WriteOptions, sh_degree: int) -> Sequence[Range]:
         """The values that are not clamped."""

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import shutil
-from collections.abc import Callable
+import tempfile
+import uuid
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from ..model.streams import SceneStream
-from ..support.addresses import Place
-from ..support.errors import HasTreeError, OutOfMemoryError, ScratchError
+from ..support.addresses import Place, absolute
+from ..support.errors import FormatError, HasTreeError, OutOfMemoryError, ScratchError
 from ..support.progress import Progress
 from ..support.stdin import name_of
 from ..support.units import count_of, format_size
 from .out_of_core import estimate
+from .out_of_core.cluster_engine import ClusterEngine
 from .out_of_core.contracts import Engine
 from .out_of_core.engine import LocalEngine
 from .out_of_core.flow import BakedOutOfCore, bake_out_of_core
@@ -25,7 +29,7 @@ from .output import Output
 from .recipe import Recipe, recipe_of
 from .resources import Resources
 from .settings import BakeSettings
-from .sources import Merged, Source, opened_source, placement_of, places_of
+from .sources import Merged, Source, absolute_source, opened_source, placement_of, places_of
 
 #: The folder in the scratch folder for what is unpacked of an input.
 UNPACKED = "input"
@@ -93,6 +97,8 @@ def bake_scaled(
     memory = estimate.default_memory() if resources.memory is None else resources.memory
     recipe = recipe_of(places_of(source), settings, **placement_of(source))
     folder = scratch_folder(target, recipe, resources.scratch_dir)
+    if engine is not None:
+        folder = absolute(folder)  # other processes work in folders of their own
     store = store_of(folder)
     left = bool(store.names())
     why = _reason(size, settings, memory, resources, engine, is_left=left)
@@ -105,7 +111,9 @@ def bake_scaled(
                 pass
         return None
     degree = min(size.sh_degree, settings.max_sh)
-    block_splats = resources.block_splats or _block_splats(size.splats, degree, settings.method, memory)
+    block_splats = resources.block_splats or _block_splats(
+        size.splats, degree, settings.method, memory, in_chunks=output.in_chunks
+    )
     needed = estimate.scratch_bytes(settings.method, size.splats, degree)
     if isinstance(folder, Path):
         _check_room(folder, needed)
@@ -115,12 +123,12 @@ def bake_scaled(
     )
     with (
         _work(store, recipe, block_splats, resources, overwrite, say) as block_splats,
-        _opened(source, folder, threads) as stream,
+        _opened(source, folder, threads, engine) as stream,
     ):
         baked = bake_out_of_core(
             stream,
             output,
-            settings,
+            dataclasses.replace(settings, rgba=settings.rgba and settings.rgba.absolute()),
             store=store,
             engine=engine or LocalEngine(threads),
             block_splats=block_splats,
@@ -129,6 +137,22 @@ def bake_scaled(
         )
         written, read = store.traffic.written, store.traffic.read
         return Scaled(baked, stream.format, stream.notes, stream.count, degree, written, read)
+
+
+def fits_in_memory(source: Source, settings: BakeSettings, memory: int | None) -> bool:
+    """Whether an input can be baked in so much memory; one that cannot be read fits, as whoever bakes it will say why.
+
+    Args:
+        source, settings: as for `bake`.
+        memory: bytes; None for any number.
+    """
+    try:
+        size = _size_of(source)
+    except FormatError:
+        return True
+    if size is None or memory is None:
+        return True
+    return estimate.in_memory_bytes(settings.method, size.splats, size.sh_degree) <= memory
 
 
 def _size_of(source: Source) -> _Size | None:
@@ -163,14 +187,14 @@ def _reason(
     return "blocks were asked for" if resources.block_splats else None
 
 
-def _block_splats(splats: int, sh_degree: int, method: str, memory: int | None) -> int:
+def _block_splats(splats: int, sh_degree: int, method: str, memory: int | None, *, in_chunks: bool) -> int:
     """The splats of a block; `OutOfMemoryError` where there is too little memory for the least ones."""
-    found = estimate.block_splats_within(memory, method, splats, sh_degree)
+    found = estimate.block_splats_within(memory, method, splats, sh_degree, in_chunks=in_chunks)
     if found is None:
-        least = estimate.out_of_core_bytes(method, splats, sh_degree, estimate.LEAST_BLOCK_SPLATS)
+        least = estimate.out_of_core_bytes(method, splats, sh_degree, estimate.LEAST_BLOCK_SPLATS, in_chunks=in_chunks)
         raise OutOfMemoryError(
-            f"{format_size(memory or 0)} of memory is too little even out of core; give --memory {format_size(least)}"
-            " or more"
+            f"{format_size(memory or 0)} of memory is too little even out of core; give --memory"
+            f" {format_size(1.02 * least)} or more"
         )
     return found
 
@@ -198,7 +222,19 @@ def _work(
     return at_work(store, recipe, block_splats, resume=resources.resume, overwrite=overwrite, forget=forget, say=say)
 
 
-def _opened(source: Source, folder: Place, threads: int) -> contextlib.AbstractContextManager[SceneStream]:
-    """The input, which other processes can open, too; they unpack it themselves where they share no folder."""
-    scratch = folder / UNPACKED if isinstance(folder, Path) else None
-    return opened_source(source, scratch=scratch, keep=True, threads=threads)
+@contextlib.contextmanager
+def _opened(source: Source, folder: Place, threads: int, engine: Engine | None) -> Iterator[SceneStream]:
+    """The input, which the processes of an engine can open, too, whatever folders they work in."""
+    if isinstance(folder, Path):
+        with opened_source(absolute_source(source), scratch=folder.absolute() / UNPACKED, threads=threads) as stream:
+            yield stream
+    elif isinstance(engine, ClusterEngine):
+        own = Path(tempfile.gettempdir()) / f"sparklod-{uuid.uuid4().hex}"  # each machine unpacks what it needs
+        try:
+            with opened_source(absolute_source(source), scratch=own, threads=threads) as stream:
+                yield stream
+        finally:
+            engine.remove(own)
+    else:
+        with opened_source(source, threads=threads) as stream:
+            yield stream

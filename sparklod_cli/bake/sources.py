@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +14,7 @@ from ..model.instances import Instance
 from ..model.scene import Scene
 from ..model.streams import SceneStream, collected
 from ..model.transforms import Transform
-from ..support.addresses import Place
+from ..support.addresses import Place, absolute
 from ..support.progress import Progress, silent
 from ..support.units import count_of
 
@@ -51,6 +52,13 @@ def places_of(source: Source) -> list[Place]:
     return [each.file for each in source.files] if isinstance(source, Merged) else [source]
 
 
+def absolute_source(source: Source) -> Source:
+    """The same source for processes whose working folders are others."""
+    if not isinstance(source, Merged):
+        return absolute(source)
+    return Merged(tuple(dataclasses.replace(each, file=absolute(each.file)) for each in source.files))
+
+
 def placement_of(source: Source) -> dict[str, Any]:
     """Where the files of a source stand, as a recipe has it; nothing for a single file."""
     if not isinstance(source, Merged):
@@ -78,22 +86,19 @@ def read_source(source: Source, *, threads: int = 1, progress: Progress = silent
 
 @contextlib.contextmanager
 def opened_source(
-    source: Source,
-    *,
-    scratch: Path | None = None,
-    keep: bool = False,
-    threads: int = 1,
-    progress: Progress = silent,
+    source: Source, *, scratch: Path | None = None, threads: int = 1, progress: Progress = silent
 ) -> Iterator[SceneStream]:
     """A source as a stream.
 
     Args:
         source: without a tree.
-        scratch, keep, threads, progress: see `io.open_stream`.
+        scratch: folder in which what is unpacked stays, so that other processes find it; None for one that is removed.
+        threads, progress: see `io.open_stream`.
 
     Raises:
         HasTreeError, FormatError: as `read_source`.
     """
+    keep = scratch is not None
     if isinstance(source, Merged):
         opened = open_streams(source.files, scratch=scratch, keep=keep, threads=threads, progress=progress)
     else:

@@ -3,31 +3,25 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import json
-from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
-from ..codecs.rad.names import SUFFIX as RAD
 from ..support.errors import SparklodError
 from ..support.printable import MOST, shortened
 from ..support.stdin import DASH, name_of
 from .build_lod_inputs import Inputs, check_inputs, input_options, record_of
+from .build_lod_jobs import job_of
 from .build_lod_outputs import Outputs, check_formats
 from .command import COMMON, Command, option
-from .options.baking import bake_settings, baking_options, check_method, write_options
+from .options.baking import baking_options, check_method
+from .options.cluster import OF_CLUSTERS, check_cluster, cluster_of, cluster_options
 from .options.common import General, common_options, output_option, overwrite_option
-from .options.resources import OF_BAKES, resources_of, resources_options
+from .options.resources import OF_BAKES, resources_options
 from .paths import OutputPath, claim_stdout, keep_apart, with_chunks
-from .reports import report_baked, report_extracted
 from .usage import exclude, options_of
-
-if TYPE_CHECKING:
-    from ..api.bake_jobs import Baked, Extracted
-    from .console import Console
 
 EXAMPLES = """
 \b
@@ -36,8 +30,10 @@ Examples:
   sparklod build-lod scene.ply --up -y                  # y up, as viewers want it
   sparklod build-lod scene.ply --method quality         # for publishing
   sparklod build-lod scans/*.ply --output-dir web -f --skip-existing
+  sparklod build-lod scans/*.ply --output-dir web --workers 4
   sparklod build-lod tiles/*.ply --merge -o city-lod.rad
   sparklod build-lod city.ply -o city-lod.rad --memory 4G --scratch-dir /fast
+  sparklod build-lod s3://bucket/city.ply --scheduler tcp://host:8786 --scratch-dir s3://bucket/scratch
   cat scene.ply | sparklod build-lod - -o - | aws s3 cp - s3://bucket/scene-lod.spz
   sparklod build-lod scene.ply --within 0,1,0,25 --min-opacity 0.02
   sparklod build-lod scene.ply --json | jq .nodes
@@ -81,6 +77,7 @@ Examples:
 )
 @baking_options
 @resources_options
+@cluster_options
 @common_options
 @click.pass_context
 def build_lod(ctx: click.Context, /, **_: Any) -> None:
@@ -93,30 +90,30 @@ def build_lod(ctx: click.Context, /, **_: Any) -> None:
     The axes of the input are kept unless --up or --rotate turns them. Selection goes by the coordinates of the input;
     of merged inputs, by those at which they stand together.
 
-    An input that fails does not stop the others; the exit status is 1 if any did.
+    INPUT, FILE and DIR may be addresses such as s3://bucket/scan.ply (pip install 'sparklod[cloud]').
+
+    An input that fails does not stop the others; the exit status is 1 if any did. With --workers or --scheduler,
+    several inputs are baked side by side (pip install 'sparklod[cluster]').
     """
     general, given, outputs = options_of(ctx, General), options_of(ctx, Inputs), options_of(ctx, Outputs)
     check_inputs(ctx, given, outputs)
     instances = given.instances()
     _check(ctx, given, [each.file for each in instances if each.file is not None], outputs, general)
     failed = False
-    with general.console() as console:
-        make, report = _job(ctx, outputs, console)
-        shared = {"overwrite": outputs.overwrite, "threads": general.threads, "progress": console.progress}
-        for source, target in given.jobs(instances, outputs, console.say):
-            try:
-                result = make(source, target, **shared)
-                if result is None:
-                    console.say(f"{name_of(source)}  ->  {target}  is there already")
-                else:
-                    report(console, source, target, result)
-            except SparklodError as error:
+    with general.console() as console, cluster_of(ctx, general, console) as engine:
+        make, report = job_of(ctx, outputs, general, console, engine)
+        pairs = list(given.jobs(instances, outputs, console.say))
+        for (source, target), outcome in zip(pairs, make(pairs), strict=True):
+            if isinstance(outcome, SparklodError):
                 failed = True
-                console.error(f"{name_of(source)}: {error}")
-                record = {**record_of(source), "error": shortened(str(error), MOST)}
+                console.error(f"{name_of(source)}: {outcome}")
+                record = {**record_of(source), "error": shortened(str(outcome), MOST)}
+            elif outcome is None:
+                console.say(f"{name_of(source)}  ->  {target}  is there already")
+                record = {**record_of(source), "output": str(target), "skipped": True}
             else:
-                made = {"skipped": True} if result is None else dataclasses.asdict(result)
-                record = {**record_of(source), "output": str(target), **made}
+                report(console, source, target, outcome)
+                record = {**record_of(source), "output": str(target), **dataclasses.asdict(outcome)}
             if general.as_json:
                 click.echo(json.dumps(record))
     if failed:
@@ -143,23 +140,10 @@ def _check(ctx: click.Context, given: Inputs, named: list[Path], outputs: Output
     if ctx.params["skip_existing"] and outputs.output == DASH:
         raise click.UsageError("--skip-existing needs an output that can be there already; name a file")
     check_formats(ctx, outputs)
+    check_cluster(ctx)
     if outputs.unlod:
-        exclude(ctx, (*OF_BAKES, "skip_existing"), "--unlod")
+        exclude(ctx, (*OF_BAKES, *OF_CLUSTERS, "skip_existing"), "--unlod")
     else:
         check_method(ctx)
-
-
-def _job(
-    ctx: click.Context, outputs: Outputs, console: Console
-) -> tuple[Callable[..., Baked | Extracted | None], Callable[..., None]]:
-    """What makes an output of an input, and what reports it; the point where numpy and numba are loaded."""
-    from ..api.bake_jobs import bake, bake_unless_there, extract_leaves
-
-    if outputs.unlod:
-        leaves = functools.partial(extract_leaves, suffix=outputs.suffix, options=write_options(ctx))
-        return leaves, report_extracted
-    settings = bake_settings(ctx, suffix=outputs.suffix, raw=outputs.is_raw, converts=outputs.format_is_asked_for)
-    more = [] if outputs.suffix != RAD else ["rad"] if settings.options.rad.sh_codes is None else ["rad", "palette"]
-    console.announce_compiling(settings.method, *more)
-    make = bake_unless_there if ctx.params["skip_existing"] else bake
-    return functools.partial(make, settings=settings, resources=resources_of(ctx), say=console.say), report_baked
+    if DASH in inputs:
+        exclude(ctx, OF_CLUSTERS, "standard input, which workers cannot read; save it to a file first")

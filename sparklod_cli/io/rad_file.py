@@ -51,11 +51,7 @@ class RadFile:
             if found is None:
                 return None
             chunks = ByChunk.of(*found)
-        header = chunks.header
-        about = {"version": 1, "chunks": len(header.chunks), "chunk_size": header.chunk_size}
-        about |= {"header_bytes": header.bytes, "chunked": int(header.chunked)}
-        about |= {} if chunks.palette is None else {"sh_codes": len(chunks.palette)}
-        return cls(path, header, about, chunks)
+        return cls(path, chunks.header, chunks.facts, chunks)
 
     @property
     def format(self) -> str:

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import atexit
 import contextlib
 import dataclasses
 import functools
 import hashlib
-import shutil
 import tempfile
 import threading
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
@@ -51,8 +49,7 @@ def open_stream(
         path: as for `io.read_scene`.
         scratch: folder for what is unpacked; None for one of the system's temporary files.
         keep: leave what is unpacked in `scratch`, where the same file is found unpacked the next time, by other
-            processes, too; whoever owns the folder removes it. Without a folder, each process unpacks a file once, and
-            removes that at its end. The stream can be pickled then, if `progress` can.
+            processes, too; whoever owns the folder removes it. The stream can be pickled then, if `progress` can.
         threads: to decode with.
         progress: told of what is unpacked.
 
@@ -60,8 +57,11 @@ def open_stream(
         HasTreeError: the file is a tree.
         FormatError: as `io.read_scene`. What is wrong behind the header is raised by reading; so is `OutputError`,
             where there is no room for what is unpacked.
+        ValueError: `keep` without `scratch`.
     """
-    store: _Store = _Folder(scratch) if keep else _Unnamed(scratch)
+    if keep and scratch is None:
+        raise ValueError("keep needs a scratch folder")
+    store: _Store = _Folder(scratch) if keep and scratch is not None else _Unnamed(scratch)
     try:
         source = _Source(path, store, threads, progress)
         with source.borrowed() as stream:
@@ -103,7 +103,7 @@ def open_streams(
         scratch, keep, threads, progress: as for `open_stream`. Unless `keep` is set, a file is unpacked for each read.
 
     Raises:
-        HasTreeError, FormatError: as `open_stream`; names the file.
+        HasTreeError, FormatError, ValueError: as `open_stream`; names the file.
     """
     names = dict.fromkeys(each.file for each in files)
     streams = {file: _again(file, scratch, keep, threads, progress) for file in names}
@@ -179,20 +179,16 @@ _LOCKS: dict[Path, threading.Lock] = {}
 
 @dataclass(frozen=True)
 class _Folder:
-    """A folder of such files, each named after what it was unpacked from, which appear whole or not at all.
+    """A folder of such files, each named after what it was unpacked from, which appear whole or not at all."""
 
-    Attributes:
-        folder: None for one of this process.
-    """
-
-    folder: Path | None
+    folder: Path
 
     @property
     def name(self) -> Hashable:
         return self.folder
 
     def file(self, path: Place, pieces: Pieces) -> contextlib.AbstractContextManager[BinaryIO]:
-        target = (self.folder or _own_folder()) / f"{_digest(path)}.unpacked"
+        target = self.folder / f"{_digest(path)}.unpacked"
         with _LOCKS.setdefault(target, threading.Lock()), _room(self.folder):
             if not target.exists():
                 target.parent.mkdir(parents=True, exist_ok=True)
@@ -201,14 +197,6 @@ class _Folder:
 
     def close(self) -> None:
         pass
-
-
-@functools.lru_cache(1)
-def _own_folder() -> Path:
-    """A folder that is removed when this process ends."""
-    folder = tempfile.mkdtemp(prefix="sparklod-")
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    return Path(folder)
 
 
 def _digest(path: Place) -> str:

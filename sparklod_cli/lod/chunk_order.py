@@ -21,13 +21,15 @@ from ..model.nodes import CHUNK_NODES
 from ..model.splats import FloatArray, Splats
 from ..support.jit import threads_for
 from ..support.progress import Progress, silent
+from .chunk_parts import Index, parts_of
 from .foveation import set_foveation
 from .kernels.chunk_demand import fill_demand
 from .kernels.chunk_inside import sort_within_chunks
 from .kernels.chunk_sets import Families, split_sets
+from .kernels.family_links import find_limits
 from .kernels.pixel_scale import NODE, VIEW
 from .kernels.sort import sort_by_key
-from .kernels.tree_links import find_depths, find_parents
+from .kernels.tree_links import find_parents
 
 #: Viewpoints: half outside of the scene looking at it, a quarter anywhere inside, a quarter near a node. Chosen: 16
 #: are as good for large trees, not for those of four chunks (docs/decisions/2026-11-22-chunk-order.md).
@@ -48,8 +50,11 @@ LEAST_BUDGET = 1 / 16
 #: Bases of the Halton sequences that viewpoints are made of.
 PRIMES = (2, 3, 5, 7, 11, 13, 17)
 
+#: Families that a bake out of core puts in order at a time, and the bytes that each takes on two threads. Chosen: 1.3
+#: GB, for the families of some 15 million splats.
+MOST_FAMILIES, FAMILY_BYTES = 1 << 22, 300
+
 Matrix = NDArray[np.float64]
-Index = NDArray[np.int32]
 
 
 def arrange(splats: Splats, tree: LodTree, *, progress: Progress = silent) -> tuple[Splats, LodTree]:
@@ -74,16 +79,16 @@ def chunk_order(
     """The order of `arrange`: (M,) uint32 the node at each place, and (M,) uint32 the `child_start` of each place."""
     total = len(tree)
     order, child_start = np.zeros(total, np.uint32), np.zeros(total, np.uint32)
-    inner = int(np.count_nonzero(tree.child_count))
-    if not inner:
+    nodes = np.flatnonzero(tree.child_count).astype(np.uint32)
+    if not len(nodes):
         return order, child_start
-    with threads_for(inner) as threads:
-        size = np.fmax(spark_size(splats), np.float32(0))
-        _, limit = find_depths(tree.child_count, tree.child_start, size)
-        nodes = _largest_first(tree, limit, threads)
-        families = _families(splats.center, size, tree, nodes, threads)
-        sequence = _sequence(families, total, progress)
-    parents = nodes[sequence]
+    number = np.full(total, -1, np.int32)
+    number[nodes] = np.arange(len(nodes), dtype=np.int32)
+    above, _ = find_parents(tree.child_count, tree.child_start)
+    parent = np.where(above[nodes] < 0, np.int32(-1), number[above[nodes]])
+    del number, above
+    size = spark_size(splats)[nodes]
+    parents = nodes[family_order(parent, tree.child_count[nodes], splats.center[nodes], size, progress=progress)]
     count = tree.child_count[parents].astype(np.int64)
     first = np.cumsum(count) - count
     order[1:] = np.repeat(tree.child_start[parents] - first, count) + np.arange(total - 1)
@@ -93,50 +98,107 @@ def chunk_order(
     return order, child_start
 
 
-def _largest_first(tree: LodTree, limit: FloatArray, threads: int) -> NDArray[np.uint32]:
-    """(F,) the nodes with children, parents first: by descending limit, the least size from the root to the node."""
-    nodes = np.flatnonzero(tree.child_count).astype(np.uint32)
-    keys = np.uint64(0x7FFFFFFF) - limit[nodes].view(np.uint32).astype(np.uint64)
-    return sort_by_key(keys, nodes, 31, threads)[1]
+def family_order(
+    parent: NDArray[np.int32],
+    count: NDArray[np.uint16],
+    center: FloatArray,
+    size: FloatArray,
+    *,
+    most: int | None = None,
+    progress: Progress = silent,
+) -> Index:
+    """The order of families of which `arrange` speaks.
+
+    Args:
+        parent: (F,) for each node that has children, in any order in which parents come first, the place here of its
+            parent; -1 for the root.
+        count: (F,) number of its children.
+        center: (F, 3) its centre, world units.
+        size: (F,) its feature size, world units.
+        most: how many families are put in order at a time, each of which takes `FAMILY_BYTES`; None for all. Parts, see
+            `chunk_parts.parts_of`, are each put in order as if they were a tree, one after the other.
+        progress: called with the number of nodes that have a chunk.
+
+    Returns:
+        (F,) int32 places here, in the order in which the children are written.
+    """
+    total, filled, found = 1 + int(count.sum(dtype=np.int64)), 1, []
+    size = np.fmax(size, np.float32(0))
+    _, limit = find_limits(parent, size)
+    for members in parts_of(parent, center, limit, most or len(parent)):
+        with threads_for(len(members)) as threads:
+            at = slice(None) if len(members) == len(parent) else members  # all of them without a copy
+            largest = _largest_first(limit[at], threads)
+            part = _part(parent, members), count[at], center[at], size[at]
+            families = _families(*part, largest, threads)
+            found.append(members[largest[_sequence(families, filled, total, progress)]])
+        filled += int(families.count.sum(dtype=np.int64))
+    return np.concatenate(found)
 
 
-def _families(center: FloatArray, size: FloatArray, tree: LodTree, nodes: NDArray[np.uint32], threads: int) -> Families:
-    """The families of these nodes."""
-    number = np.full(len(tree), -1, np.int32)
-    number[nodes] = np.arange(len(nodes), dtype=np.int32)
-    parent, _ = find_parents(tree.child_count, tree.child_start)
-    parent = np.where(parent[nodes] < 0, np.int32(-1), number[parent[nodes]])
-    centers = center[nodes]
-    rank = np.empty((len(nodes), 3), np.int32)
+def _part(parent: Index, members: Index) -> Index:
+    """For each member the place among members, which are ascending, of its parent; -1 where that is none of them."""
+    if len(members) == len(parent):
+        return parent
+    above = parent[members]
+    at = np.minimum(np.searchsorted(members, above), len(members) - 1).astype(np.int32)
+    return np.where(members[at] == above, at, np.int32(-1))
+
+
+def _largest_first(limit: FloatArray, threads: int) -> NDArray[np.uint32]:
+    """(F,) the families, parents first: by descending limit, the least size from the root to the parent."""
+    keys = np.uint64(0x7FFFFFFF) - limit.view(np.uint32).astype(np.uint64)
+    return sort_by_key(keys, np.arange(len(limit), dtype=np.uint32), 31, threads)[1]
+
+
+def _families(
+    parent: NDArray[np.int32],
+    count: NDArray[np.uint16],
+    center: FloatArray,
+    size: FloatArray,
+    order: NDArray[np.uint32],
+    threads: int,
+) -> Families:
+    """The families in an order."""
+    place = np.empty(len(order), np.int32)
+    place[order] = np.arange(len(order), dtype=np.int32)
+    above = parent[order]
+    parent = np.where(above < 0, np.int32(-1), place[above])
+    centers, counts = center[order], count[order]
+    rank = np.empty((len(order), 3), np.int32)
     for axis in range(3):
         bits = centers[:, axis].view(np.uint32)
         ordered = np.where(bits >> 31, ~bits, bits | np.uint32(1 << 31))  # in the order of the numbers
-        _, by_place = sort_by_key(ordered.astype(np.uint64), np.arange(len(nodes), dtype=np.uint32), 32, threads)
-        rank[by_place, axis] = np.arange(len(nodes), dtype=np.int32)
-    records = np.empty(len(nodes), NODE)
+        _, by_place = sort_by_key(ordered.astype(np.uint64), np.arange(len(order), dtype=np.uint32), 32, threads)
+        rank[by_place, axis] = np.arange(len(order), dtype=np.int32)
+    records = np.empty(len(order), NODE)
     records["x"], records["y"], records["z"] = centers.T
-    records["size"], records["child_count"] = size[nodes], tree.child_count[nodes]
+    records["size"], records["child_count"] = size[order], counts
     records["child_start"] = 0  # not read
-    demand = np.empty((len(nodes), VIEWPOINTS), np.uint8)
-    least = min(len(tree) * LEAST_BUDGET, float(CHUNK_NODES))
-    fill_demand(records, parent, viewpoints(centers), least, float(len(tree)), demand)
-    return Families(parent, tree.child_count[nodes].astype(np.int32), rank, demand)
+    demand = np.empty((len(order), VIEWPOINTS), np.uint8)
+    total = 1 + int(count.sum(dtype=np.int64))
+    least = min(total * LEAST_BUDGET, float(CHUNK_NODES))
+    fill_demand(records, parent, viewpoints(centers), least, float(total), demand)
+    return Families(parent, counts.astype(np.int32), rank, demand)
 
 
-def _sequence(families: Families, total: int, progress: Progress) -> Index:
+def _sequence(families: Families, filled: int, total: int, progress: Progress) -> Index:
     """(F,) the families in the order in which they are written.
 
     Args:
-        families: F at least 1.
-        total: number of nodes: those of the families, and the root.
+        families: of a part, F at least 1.
+        filled: number of nodes that come before.
+        total: number of nodes of the tree.
         progress: of `arrange`.
     """
-    length = len(families.count)
+    length, own = len(families.count), int(families.count.sum(dtype=np.int64))
     sequence = np.arange(length, dtype=np.int32)
     set_of, root, spare = (np.full(length, -1, np.int32) for _ in range(3))
     weight = np.empty(length, np.int64)
-    # Where a set begins, where it ends, its nodes, and for the first one how many of its nodes fit beside the root.
-    sets, ends, used = [(0, length, total - 1, CHUNK_NODES - 1)], [0], 0
+    # Where a set begins, where it ends, its nodes, and for the first one how many of its nodes fit into the chunk that
+    # was begun: beside the root, or behind the part before.
+    room = -filled % CHUNK_NODES
+    sets, ends, used = ([(0, length, own, room)] if room or own > CHUNK_NODES else []), [0, length], 0
     while sets:
         rows = [
             (begin, end, used + number, CHUNK_NODES, -(-nodes // CHUNK_NODES), room)
@@ -147,11 +209,11 @@ def _sequence(families: Families, total: int, progress: Progress) -> Index:
         used += len(sets)
         parts = []
         for (begin, end, nodes, _), first in zip(sets, lengths.tolist(), strict=True):
-            filled = int(families.count[sequence[begin : begin + first]].sum(dtype=np.int64))
-            parts += [(begin, begin + first, filled, 0), (begin + first, end, nodes - filled, 0)]
+            inside = int(families.count[sequence[begin : begin + first]].sum(dtype=np.int64))
+            parts += [(begin, begin + first, inside, 0), (begin + first, end, nodes - inside, 0)]
         ends += [end for _, end, nodes, _ in parts if nodes <= CHUNK_NODES]
         sets = [part for part in parts if part[2] > CHUNK_NODES]
-        progress("arranging", total - sum(nodes for _, _, nodes, _ in sets), total, "node")
+        progress("arranging", filled + own - sum(nodes for _, _, nodes, _ in sets), total, "node")
     bits = (length - 1).bit_length()
     sort_within_chunks(np.unique(ends), families.parent, families.rank, bits, sequence, set_of, root)
     return sequence

@@ -227,6 +227,11 @@ def place_of(text: str) -> Place:
     return Address(text)
 
 
+def absolute(place: Place) -> Place:
+    """The same file for a process whose working folder is another one."""
+    return place if isinstance(place, Address) else place.absolute()
+
+
 def size_of(place: Place) -> int:
     """Bytes of a file, wherever it is."""
     return place.size() if isinstance(place, Address) else place.stat().st_size

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from sparklod_cli.bake.output import WrittenTree, output_of
+from sparklod_cli.bake.output import Output, WrittenTree, output_of
 from sparklod_cli.bake.settings import BakeSettings
 from sparklod_cli.codecs import encoder
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
 from sparklod_cli.codecs.statistics import Statistics
 from sparklod_cli.lod import quick
 from sparklod_cli.model.scene import Scene
-from sparklod_cli.support.errors import FormatError
+from sparklod_cli.support.errors import FormatError, OutputError
 from sparklod_cli.support.progress import silent
 from tests.node_streams import node_stream
 from tests.scenes import random_splats
@@ -39,6 +38,16 @@ def files_of(folder: Path) -> dict[str, bytes]:
     return {each.name: each.read_bytes() for each in folder.iterdir()}
 
 
+def streamed(output: Output, scene: Scene, found: Statistics, scratch: Path) -> WrittenTree:
+    """Writes a tree window by window."""
+    nodes = node_stream(scene)
+    made = output.encoder(nodes, found, 2, silent)
+    with encoder.Kept(scratch) as kept:
+        for result in encoder.results(made, nodes, 2, silent, "encoding"):
+            kept.put(result)
+        return output.write_windows(made, kept.get, 2, silent)
+
+
 @pytest.mark.parametrize("name", SETTINGS)
 def test_a_stream_is_written_as_the_scene(
     name: str, scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -58,25 +67,28 @@ def test_a_stream_is_written_as_the_scene(
         leaf = scene.tree.is_leaf
         found = Statistics.merged([Statistics.of(scene.splats.take(at), leaf[at], output.needed) for at in parts])
         output.check_statistics(found)
-        said.append(output.write_stream(node_stream(scene), found, scratch, 2, silent))
+        said.append(streamed(output, scene, found, scratch))
     assert said[0] == said[1] and said[0].clamped
-    whole, streamed = files_of(tmp_path / "scene"), files_of(tmp_path / "stream")
+    whole = files_of(tmp_path / "scene")
     assert len(whole) == (1 if name != "rad-chunked" else 1 + -(-len(scene) // 900))
-    assert streamed == whole
+    assert files_of(tmp_path / "stream") == whole
     assert not list(scratch.iterdir())
 
 
-def test_a_stream_that_fails_leaves_no_output(scene: Scene, tmp_path: Path) -> None:
-    nodes = node_stream(scene)
+def test_windows_that_cannot_be_read_leave_no_output(scene: Scene, tmp_path: Path) -> None:
+    def gone(number: int, name: str) -> np.ndarray:
+        if number:
+            raise OSError("gone")
+        return encoded[name]
 
-    def fails(start: int, stop: int) -> None:
-        raise OSError("gone")
-
-    for name in ("spz", "rad-chunked"):
-        output = output_of(tmp_path / "out" / f"town{SETTINGS[name].suffix}", SETTINGS[name], overwrite=False)
-        found = Statistics.of_scene(scene, output.needed)
-        with pytest.raises(OSError, match="gone"):
-            output.write_stream(dataclasses.replace(nodes, read=fails), found, tmp_path, 1, silent)
+    for name in ("spz", "rad", "rad-chunked"):
+        output = output_of(tmp_path / f"{name}{SETTINGS[name].suffix}", SETTINGS[name], overwrite=False)
+        nodes = node_stream(scene)
+        made = output.encoder(nodes, Statistics.of_scene(scene, output.needed), 1, silent)
+        encoded = made.encode(*nodes.read(0, len(scene)), 0)
+        with pytest.MonkeyPatch.context() as patch, pytest.raises(OutputError, match="gone"):
+            patch.setattr(encoder, "CHUNK_NODES", 900)
+            output.write_windows(made, gone, 1, silent)
     assert not list(tmp_path.iterdir())
 
 
@@ -87,5 +99,5 @@ def test_arrays_are_packed_in_memory_only(scene: Scene, tmp_path: Path) -> None:
     with pytest.raises(FormatError, match=r"--encoding are packed in memory.*give more --memory"):
         output.check_statistics(found)
     with pytest.raises(FormatError, match="--encoding are packed in memory"):
-        output.write_stream(node_stream(scene), found, tmp_path, 1, silent)
+        output.encoder(node_stream(scene), found, 1, silent)
     assert not list(tmp_path.iterdir())

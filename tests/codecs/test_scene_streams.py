@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import pickle
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +18,7 @@ from sparklod_cli.model.transforms import Transform
 from sparklod_cli.support.errors import FormatError, HasTreeError, OutputError, UnreadableError
 from tests.codecs.test_round_trip import CASES, star
 from tests.codecs.writers import WRITERS, put
-from tests.conftest import FIXTURES, ROOT
+from tests.conftest import FIXTURES
 from tests.scenes import random_splats
 
 COUNT = 2600  # no multiple of a block, a chunk of compressed PLY, or a chunk of the RAD by hand
@@ -93,22 +91,9 @@ def test_a_file_that_changes_is_noticed(tmp_path: Path) -> None:
             list(stream.blocks())
 
 
-def test_a_process_without_a_shared_folder_unpacks_once_and_removes_that_at_its_end(tmp_path: Path) -> None:
-    path = put(WRITERS["SPZ"]["3"].write(Scene(random_splats(99))), tmp_path, "SPZ")
-    with open_stream(path, keep=True) as stream:
-        (tmp_path / "stream").write_bytes(pickle.dumps(stream))
-    code = (
-        "import pathlib, pickle, sys, tempfile; tempfile.tempdir = sys.argv[2]\n"
-        "stream = pickle.loads(pathlib.Path(sys.argv[1]).read_bytes())\n"
-        "for _ in range(2): print(sum(map(len, stream.read(9, 99))), end=' ')\n"
-        "print(len(list(pathlib.Path(sys.argv[2]).rglob('*.unpacked'))))"
-    )
-    temporary = tmp_path / "temporary"
-    temporary.mkdir()
-    command = [sys.executable, "-c", code, str(tmp_path / "stream"), str(temporary)]
-    run = subprocess.run(command, capture_output=True, check=False, cwd=ROOT)
-    assert run.stdout.split() == [b"90", b"90", b"1"], run.stderr
-    assert not list(temporary.iterdir())
+def test_keeping_needs_a_folder(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="keep needs a scratch folder"), open_stream(tmp_path / "x", keep=True):
+        pass
 
 
 def test_several_files_are_one_scene_and_one_that_is_named_twice_is_read_twice(tmp_path: Path) -> None:

@@ -15,8 +15,10 @@ from typing import Any
 from ...support import machine
 from ...support.errors import SparklodError
 from ...support.optional import optional_import
+from ...support.threads import thread_count
 from .cluster_engine import ClusterEngine
 from .cluster_pool import Connection
+from .estimate import default_memory
 
 #: Seconds that a scheduler, or the workers of a cluster, are waited for.
 PATIENCE = 30
@@ -26,6 +28,9 @@ LOSSES = 2
 
 #: Part of the machine's free memory beyond which a worker of our own is ended, before the system ends something else.
 MEMORY_SHARE = 0.9
+
+#: Part of the memory of a worker of a cluster that runs that its tasks take: Dask ends it at 0.95, and pauses at 0.8.
+TASK_SHARE = 0.7
 
 #: Bytes that a process takes before it has read anything: Python, Dask, numba and compiled kernels.
 LEAST_MEMORY = 500_000_000
@@ -54,7 +59,7 @@ class ClusterSettings:
     Attributes:
         scheduler: address of one that runs, as tcp://host:8786; None starts one on this machine.
         workers: processes of the latter.
-        threads: of a task; None for those of its worker.
+        threads: of a task of a cluster that runs; those that the processes of a new one share.
     """
 
     scheduler: str | None = None
@@ -66,7 +71,6 @@ class ClusterSettings:
 def cluster(
     settings: ClusterSettings,
     *,
-    threads: int = 1,
     memory: int | None = None,
     scratch: Path | None = None,
     say: Callable[[str], None] = lambda text: None,
@@ -75,8 +79,8 @@ def cluster(
 
     Args:
         settings: which cluster.
-        threads: of this machine, which workers of our own share.
-        memory: bytes that workers of our own share, as --memory; they get more only where the machine has it.
+        memory: bytes that workers of our own share, or that a task of a cluster that runs may take; None for the part
+            of what is available, or of the memory of a worker, that is usual.
         scratch: folder for files of workers of our own; one for temporary files unless given.
         say: is told the address of the dashboard, and of workers that are lost.
 
@@ -88,15 +92,18 @@ def cluster(
     with contextlib.ExitStack() as stack:
         stack.enter_context(_quiet())
         if settings.scheduler is None:
+            threads = max(1, thread_count(settings.threads) // settings.workers)
             client = stack.enter_context(_started(settings.workers, threads, memory, scratch))
-            own = max(1, threads // settings.workers)
+            shared = default_memory() if memory is None else memory
+            limit = None if shared is None else shared // settings.workers
         else:
+            threads = settings.threads or 1
             client = stack.enter_context(_connected(settings.scheduler))
-            own = settings.threads or 1
+            limit = _least_memory(client, memory)
         if importlib.util.find_spec("bokeh") is not None or settings.scheduler is not None:
             say(f"the cluster's dashboard is at {client.dashboard_link}")
         with Connection(client, say) as connection:
-            yield ClusterEngine(connection, threads=own)
+            yield ClusterEngine(connection, threads=threads, memory=limit)
 
 
 @contextlib.contextmanager
@@ -141,7 +148,7 @@ def _started(workers: int, threads: int, memory: int | None, scratch: Path | Non
                 dashboard_address=f"{LOOPBACK}:8787",
                 memory_limit=_memory_limit(workers, memory),
                 local_directory=folder,
-                env={"NUMBA_NUM_THREADS": str(max(1, threads // workers))},
+                env={"NUMBA_NUM_THREADS": str(threads)},
                 preload=["sparklod_cli.bake.out_of_core.cluster_worker"],
                 scheduler_kwargs={"allowed_failures": LOSSES},
                 silence_logs=SILENT,
@@ -163,6 +170,13 @@ def _end(own: Any) -> None:
                 own.sync(process.kill)
     with contextlib.suppress(Exception):
         own.close(timeout=5)
+
+
+def _least_memory(client: Any, memory: int | None) -> int | None:
+    """Bytes that a task may take on each worker of a cluster that runs, and by --memory; None without a limit."""
+    workers = client.scheduler_info()["workers"].values()
+    limits = [each["memory_limit"] // each["nthreads"] for each in workers if each["memory_limit"]]
+    return min([int(TASK_SHARE * limit) for limit in limits] + ([] if memory is None else [memory]), default=None)
 
 
 def _memory_limit(workers: int, memory: int | None) -> int:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import pickle
+import shutil
 import uuid
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ... import __version__
+from ...support.addresses import Place
 from ...support.errors import SparklodError
 from ...support.progress import Progress
 from .cluster_pool import Connection, Pool
@@ -25,11 +28,16 @@ class ClusterEngine:
 
     The client holds the graph: a task is submitted when all that it needs is done. Workers return two numbers, so that
     one which is lost takes no result with it: what it had put is in the store.
+
+    Attributes:
+        threads: that a task works on.
+        memory: bytes that a task may take; None where nobody knows.
     """
 
-    def __init__(self, connection: Connection, *, threads: int) -> None:
-        """Takes the connection to a cluster, and the number of threads that a task works on."""
-        self._connection, self._threads = connection, threads
+    def __init__(self, connection: Connection, *, threads: int, memory: int | None = None) -> None:
+        """Takes the connection to a cluster, and what `threads` and `memory` say."""
+        self._connection, self.threads, self.memory = connection, threads, memory
+        self._checked: tuple[str, frozenset[str]] | None = None
 
     def run(self, stage: str, tasks: Sequence[Task], job: Any, progress: Progress) -> None:
         """See `Engine.run`."""
@@ -40,7 +48,10 @@ class ClusterEngine:
         progress(stage, done, total, "splat")
         if not left:
             return
-        self.check(store)
+        here = str(store), frozenset(self._connection.workers())
+        if here != self._checked:  # other workers may have come
+            self.check(store)
+            self._checked = here
         packed = pickle.dumps(job)
         needs = {name: {need for need in task.needs if need in left} for name, (_, task) in left.items()}
         heirs: dict[str, list[str]] = {}
@@ -51,7 +62,7 @@ class ClusterEngine:
 
             def submit(name: str) -> None:
                 place, task = left[name]
-                pool.submit(name, place, run_task, packed, task, self._threads)
+                pool.submit(name, place, run_task, packed, task, self.threads)
 
             for name in [name for name, wanted in needs.items() if not wanted]:
                 submit(name)
@@ -69,48 +80,67 @@ class ClusterEngine:
                     if not needs[heir]:
                         submit(heir)
 
-    def each(self, stage: str, call: Callable[..., Any], arguments: Iterable[tuple[Any, ...]]) -> Iterator[Any]:
-        """Calls a function with each tuple of arguments, side by side; yields what came of it, in their order.
-
-        Where a call fails with a `SparklodError`, that is what is yielded.
+    @contextlib.contextmanager
+    def each(
+        self, stage: str, call: Callable[..., Any], arguments: Sequence[tuple[Any, ...]], progress: Progress, unit: str
+    ) -> Iterator[Iterator[Any]]:
+        """Calls a function with each tuple of arguments, side by side, until the context ends.
 
         Args:
             stage: word for what is done.
-            call: a function of a module that returns something small.
+            call: a function of a module that takes `threads` besides, and returns something small.
             arguments: small, and can be pickled.
+            progress: told how many calls ended.
+            unit: what a call is called.
+
+        Yields:
+            what came of each call, in their order: a `SparklodError` where it failed with one.
         """
         with Pool(self._connection, stage) as pool:
-            count, outcomes = 0, dict[str, Any]()
             for place, each in enumerate(arguments):
-                pool.submit(str(place), place, run_call, call, each)
-                count += 1
-            for wanted in map(str, range(count)):
-                while wanted not in outcomes:
-                    name, result, error = pool.next()
-                    if error is not None and not isinstance(error, SparklodError):
-                        raise error
-                    outcomes[name] = result if error is None else error
-                yield outcomes.pop(wanted)
+                pool.submit(str(place), place, run_call, call, each, self.threads)
+            yield self._outcomes(pool, stage, len(arguments), progress, unit)
 
-    def check(self, store: Store, files: Sequence[Path] = ()) -> None:
+    def _outcomes(self, pool: Pool, stage: str, count: int, progress: Progress, unit: str) -> Iterator[Any]:
+        outcomes = dict[str, Any]()
+        for place in range(count):
+            while str(place) not in outcomes:
+                progress(stage, place + len(outcomes), count, unit)
+                name, result, error = pool.next()
+                if error is not None and not isinstance(error, SparklodError):
+                    raise error
+                outcomes[name] = result if error is None else error
+            yield outcomes.pop(str(place))
+
+    def check(self, store: Store | None, files: Sequence[Place] = ()) -> None:
         """Raises a `SparklodError` where a worker cannot do its share: another sparklod, or a folder it does not see.
 
         Args:
-            store: of the bake.
-            files: that tasks read.
+            store: of the bake, if it has one.
+            files: that tasks read; those that are not here are left to the tasks.
         """
+        here = [file for file in files if isinstance(file, Path) and file.exists()]
         name = f"{PROBE}/{uuid.uuid4().hex}"
-        store.put(name, {PROBE: np.arange(2)})
+        if store is not None:
+            store.put(name, {PROBE: np.arange(2)})
         try:
             with self._connection.guarded():
-                found = self._connection.client.run(probe, store, name, files, on_error="return")
+                found = self._connection.client.run(probe, store, name, here, on_error="return")
         finally:
-            store.remove(name)
+            if store is not None:
+                store.remove(name)
         for worker, answer in found.items():
             _check_answer(worker, answer, store)
 
+    def remove(self, folder: Path) -> None:
+        """Removes a folder on the machines of all workers, and on this one."""
+        shutil.rmtree(folder, ignore_errors=True)
+        if self._connection.alive:
+            with contextlib.suppress(SparklodError), self._connection.guarded():
+                self._connection.client.run(shutil.rmtree, folder, ignore_errors=True)
 
-def _check_answer(worker: str, answer: Any, store: Store) -> None:
+
+def _check_answer(worker: str, answer: Any, store: Store | None) -> None:
     """Raises a `SparklodError` for what a worker said of itself."""
     if not isinstance(answer, Probed):  # an error: it has no sparklod, or one that knows no such question
         raise SparklodError(f"worker {worker} does not run sparklod {__version__} ({answer}): {_INSTALL}")

@@ -42,24 +42,26 @@ class Probed:
     missing: tuple[str, ...]
 
 
-def probe(store: Store, name: str, files: Sequence[Path]) -> Probed:
+def probe(store: Store | None, name: str, files: Sequence[Path]) -> Probed:
     """Tries whether this worker can do its share: read what others wrote, and write what they read.
 
     Args:
-        store: of the bake.
+        store: of the bake, if it has one.
         name: of a result that the client wrote.
         files: that tasks read.
     """
-    writes, mine = "", f"{name}-{uuid.uuid4().hex}"
-    try:
-        store.put(mine, {PROBE: np.arange(2)})
-        store.remove(mine)
-    except Exception as error:
-        writes = f"{type(error).__name__}: {error}"
-    try:
-        reads = store.has(name) and len(store.get(name)[PROBE]) > 0
-    except Exception:
-        reads = False
+    reads, writes = True, ""
+    if store is not None:
+        mine = f"{name}-{uuid.uuid4().hex}"
+        try:
+            store.put(mine, {PROBE: np.arange(2)})
+            store.remove(mine)
+        except Exception as error:
+            writes = f"{type(error).__name__}: {error}"
+        try:
+            reads = store.has(name) and len(store.get(name)[PROBE]) > 0
+        except Exception:
+            reads = False
     missing = tuple(str(path) for path in files if not path.exists())
     return Probed(__version__, socket.gethostname(), reads, writes, missing)
 
@@ -82,9 +84,9 @@ def run_task(packed: bytes, task: Task, threads: int) -> tuple[int, int]:
     return job.store.traffic.written, job.store.traffic.read
 
 
-def run_call(call: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
+def run_call(call: Callable[..., Any], arguments: tuple[Any, ...], threads: int) -> Any:
     """Calls a function that returns something small."""
-    return call(*arguments)
+    return call(*arguments, threads=threads)
 
 
 def dask_setup(worker: Any) -> None:

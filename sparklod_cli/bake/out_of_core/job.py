@@ -6,12 +6,16 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any
 
+from ...codecs.encoder import Encoder
 from ...lod.builders import BUILDERS
 from ...lod.stages.records import StagedBuilder
 from ...model.streams import SceneStream
 from ..settings import BakeSettings
 from .blocks import Blocks
 from .contracts import Store
+
+#: Those of a scene that is not cut yet.
+NO_BLOCKS = Blocks((), ())
 
 
 @dataclass(frozen=True)
@@ -22,23 +26,29 @@ class Job:
         store: of the results.
         stream: the input; can be pickled, too.
         settings: how to bake.
+        needed: statistics by which the output is settled.
+        in_chunks: the output has the order for streaming.
         parts: where each part of the input begins, and at last the count.
-        blocks: that the scene is cut into.
+        blocks: that the scene is cut into; none before that is known.
         round: how often it was cut before.
         kept: how many splats of the parts before each part are kept; empty before that is known.
         plan: of the builder; None before it is known.
         families: how many each stage made, by its number; empty before they are known.
+        encoder: of the output; None before the statistics of all nodes are known.
     """
 
     store: Store
     stream: SceneStream
     settings: BakeSettings
+    needed: frozenset[str]
+    in_chunks: bool
     parts: tuple[int, ...]
-    blocks: Blocks
+    blocks: Blocks = NO_BLOCKS
     round: int = 0
     kept: tuple[int, ...] = ()
     plan: Any = None
     families: tuple[int, ...] = ()
+    encoder: Encoder | None = None
 
     @property
     def sh_degree(self) -> int:
@@ -73,24 +83,40 @@ def pending_of(number: int) -> str:
     return f"pending/{number}"
 
 
+def window_of(number: int) -> str:
+    """The name of what a window of nodes is gathered by."""
+    return f"order/{number}"
+
+
+def encoded_of(number: int) -> str:
+    """The name of a window of nodes as it is written."""
+    return f"encoded/{number}"
+
+
 def clean_of(group: int) -> str:
     """The name of the mark that the splats of a group of blocks were removed."""
     return f"clean/{group}"
 
 
-#: Names of the root, and of the order of all nodes.
+#: Names of the root, and of what is known of all nodes when they are in order.
 ROOT, ORDER = "root", "order"
 
 
 def forget(store: Store, damaged: Collection[str]) -> None:
     """Removes results that are damaged, and whatever has to be made again for them; stages that are whole are kept."""
     names = set(damaged)
-    if names - {ORDER}:
+    if any(name.startswith("order") for name in damaged):
         names |= {ORDER}
-        names |= {name for name in store.names() if name.startswith(("scatter-", "clean/"))}
-        names |= {stage_of(name.partition("/")[2]) for name in damaged if name.startswith(("families/", "pending/"))}
+    numbers = {name.partition("/")[2] for name in damaged if name.startswith(("stage/", "families/", "pending/"))}
     if ROOT in damaged:  # the last stage makes it
-        numbers = [int(name.partition("/")[2]) for name in store.names() if name.startswith("stage/")]
-        names |= {stage_of(max(numbers, default=0))}
+        numbers |= {str(max(_numbers(store, "stage/"), default=0))}
+    if numbers or any(name.startswith("scatter-") for name in damaged):
+        names |= {stage_of(number) for number in numbers}
+        names |= {name for name in store.names() if name.startswith(("scatter-", "clean/"))}
     for name in sorted(names):
         store.remove(name)
+
+
+def _numbers(store: Store, prefix: str) -> list[int]:
+    """The numbers of the results whose names begin like this."""
+    return [int(name.removeprefix(prefix)) for name in store.names() if name.startswith(prefix)]

@@ -2,91 +2,102 @@
 
 from __future__ import annotations
 
-import bisect
-from collections.abc import Iterator
+import functools
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...lod.stages.records import NO_FAMILY
+from ...codecs.encoder import rows_of, windows_of
 from ...model.lod_tree import LodTree
 from ...model.splats import Splats
 from ...model.streams import NodeStream
+from ...support.parallel import ordered_map
+from ...support.progress import Progress
 from .contracts import Store
-from .job import ROOT, Job, families_of
-from .order import Order
-from .rows import splats_of, width_of
+from .job import ROOT, Job, encoded_of, families_of, window_of
+from .order import WINDOW_NODES
+from .rows import Rows, splats_of, width_of
 
 #: Rows that are not wanted and read with those around them, rather than in another go. Chosen: some 10 KB.
 GAP = 128
 
 
-class Gathered:
-    """Reads nodes in their final order.
+def node_stream(job: Job, count: int, leaves: int) -> NodeStream:
+    """The nodes of a tree that is in order.
 
-    Attributes:
-        store: of the stages' results.
-        order: of the families.
-        width: numbers of a row.
+    Args:
+        job: the job.
+        count: of the nodes.
+        leaves: of these.
     """
-
-    def __init__(self, job: Job, order: Order) -> None:
-        self.store: Store = job.store
-        self.order = order
-        self.width = width_of(job.sh_degree)
-        self._root = job.store.get(ROOT)
-
-    def read(self, start: int, stop: int) -> tuple[Splats, LodTree]:
-        """As `NodeStream.read`."""
-        rows, family = np.empty((stop - start, self.width), np.float32), np.empty(stop - start, np.int64)
-        if start == 0 < stop:
-            rows[:1], family[:1] = self._root["rows"], self._root["family"]
-        for stage, number in self._stages(start, stop):
-            self._fill(stage, number, start, rows, family)
-        inner = np.flatnonzero(family != NO_FAMILY)
-        number = self.order.numbers(family[inner])
-        tree = LodTree(np.zeros(len(rows), np.uint16), np.zeros(len(rows), np.uint32))
-        tree.child_count[inner] = self.order.count[number]
-        tree.child_start[inner] = self.order.child_start[number]
-        return splats_of(rows), tree
-
-    def _stages(self, start: int, stop: int) -> Iterator[tuple[int, NDArray[np.int64]]]:
-        """The families that have nodes in a range, ascending, by stage."""
-        order = self.order
-        begin, end = (
-            bisect.bisect_right(order.sequence, place, key=lambda number: int(order.child_start[number]))
-            for place in (start, stop - 1)
-        )
-        number = np.sort(order.sequence[max(0, begin - 1) : end])
-        at = np.searchsorted(number, order.begin)
-        for stage in np.flatnonzero(np.diff(at)).tolist():
-            yield stage, number[at[stage] : at[stage + 1]].astype(np.int64)
-
-    def _fill(
-        self, stage: int, number: NDArray[np.int64], start: int, rows: NDArray[np.float32], family: NDArray[np.int64]
-    ) -> None:
-        """Fills the nodes of some families of a stage, as far as they lie in the range that begins at `start`."""
-        name, order = families_of(stage), self.order
-        count, row = order.count[number].astype(np.int64), order.row[number].astype(np.int64)
-        target = order.child_start[number].astype(np.int64) - start
-        # What lies before the range, and beyond its end.
-        before = np.maximum(-target, 0)
-        row, count, target = row + before, count - before, target + before
-        count = np.minimum(count, len(rows) - target)
-        runs = np.flatnonzero(row[1:] > row[:-1] + count[:-1] + GAP) + 1
-        for part in np.split(np.arange(len(row)), runs):
-            first, last = int(row[part[0]]), int(row[part[-1]] + count[part[-1]])
-            some = count[part]
-            step = np.arange(some.sum()) - np.repeat(np.cumsum(some) - some, some)
-            place = np.repeat(target[part], some) + step
-            found, of_nodes = (self.store.rows(name, key, first, last) for key in ("rows", "family"))
-            if len(place) < len(found):
-                wanted = np.repeat(row[part] - first, some) + step
-                found, of_nodes = found[wanted], of_nodes[wanted]
-            rows[place], family[place] = found, of_nodes
+    read = functools.partial(_read, job.store, width_of(job.sh_degree))
+    return NodeStream(count, leaves, job.sh_degree, job.stream.antialiased, read)
 
 
-def node_stream(job: Job, order: Order, leaves: int, *, antialiased: bool) -> NodeStream:
-    """The nodes of a tree, all of whose stages are done."""
-    count = 1 + int(order.count.sum(dtype=np.int64))
-    return NodeStream(count, leaves, job.sh_degree, antialiased, Gathered(job, order).read)
+def encode(job: Job, window: int, *, threads: int, progress: Progress) -> None:
+    """A task. Result: what the encoder of the output makes of the chunks of a window, by their numbers."""
+    assert job.encoder is not None
+    encoder = job.encoder
+    start = window * WINDOW_NODES
+    stop = min(start + WINDOW_NODES, encoder.count)
+    splats, tree = _read(job.store, width_of(job.sh_degree), start, stop, threads)
+
+    def encoded(part: slice) -> dict[str, NDArray[np.generic]]:
+        return encoder.encode(*rows_of(splats, tree, part), start + part.start)
+
+    arrays: dict[str, NDArray[np.generic]] = {}
+    for number, found in enumerate(ordered_map(encoded, windows_of(stop - start), threads)):
+        arrays |= {f"{number}.{name}": array for name, array in found.items()}
+    job.store.put(encoded_of(window), arrays)
+
+
+def encoded_chunk(store: Store, number: int, name: str) -> NDArray[np.generic]:
+    """What `encode` made of a chunk: the array of this name."""
+    window, place = divmod(number, len(windows_of(WINDOW_NODES)))
+    key = f"{place}.{name}"
+    return store.get(encoded_of(window), [key])[key]
+
+
+def _read(store: Store, width: int, start: int, stop: int, threads: int = 1) -> tuple[Splats, LodTree]:
+    """As `NodeStream.read`, of nodes whose rows have this width."""
+    parts = []
+    for window in range(start // WINDOW_NODES, -(-stop // WINDOW_NODES)):
+        first = window * WINDOW_NODES
+        rows, tree = _read_window(store, width, window)
+        here = slice(max(start - first, 0), stop - first)
+        parts.append((rows[here], tree.child_count[here], tree.child_start[here]))
+    rows, count, child_start = parts[0] if len(parts) == 1 else map(np.concatenate, zip(*parts, strict=True))
+    return splats_of(rows, threads), LodTree(count.copy(), child_start.copy())
+
+
+def _read_window(store: Store, width: int, window: int) -> tuple[Rows, LodTree]:
+    """The nodes of a window, see `order.put_order`."""
+    plan = store.get(window_of(window))
+    count = plan["count"].astype(np.int64)
+    total = int(count.sum()) + (window == 0)
+    rows: Rows = np.empty((total, width), np.float32)
+    if window == 0:
+        rows[0] = store.get(ROOT, ["rows"])["rows"][0]
+    row, target = (plan[name].astype(np.int64) for name in ("row", "target"))
+    ends = plan["stages"]
+    for stage in np.flatnonzero(np.diff(ends)).tolist():
+        here = slice(ends[stage], ends[stage + 1])
+        _fill(store, families_of(stage), row[here], count[here], target[here], rows)
+    tree = LodTree(np.zeros(total, np.uint16), np.zeros(total, np.uint32))
+    tree.child_count[plan["owner"]] = plan["child_count"]
+    tree.child_start[plan["owner"]] = plan["child_start"]
+    return rows, tree
+
+
+def _fill(
+    store: Store, name: str, row: NDArray[np.int64], count: NDArray[np.int64], target: NDArray[np.int64], rows: Rows
+) -> None:
+    """Fills rows with the children of some families of a stage: of each `count` of them, from `row` on, at `target`."""
+    cuts = np.flatnonzero(row[1:] > row[:-1] + count[:-1] + GAP) + 1
+    for first, last in zip([0, *cuts.tolist()], [*cuts.tolist(), len(row)], strict=True):
+        begin, end, some = row[first], row[last - 1] + count[last - 1], count[first:last]
+        step = np.arange(some.sum()) - np.repeat(np.cumsum(some) - some, some)
+        found = store.rows(name, "rows", int(begin), int(end))
+        if len(step) < len(found):
+            found = found[np.repeat(row[first:last] - begin, some) + step]
+        rows[np.repeat(target[first:last], some) + step] = found

@@ -1,149 +1,186 @@
-"""The order of all families of a tree: by batch, and then by key."""
+"""The order of the nodes of a tree, and where each of its windows finds them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import bisect
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ...lod.chunk_order import MOST_FAMILIES, family_order
+from ...lod.kernels.family_links import find_limits
 from ...lod.stages.records import NO_FAMILY, STAGE_BITS
+from ...model.nodes import CHUNK_NODES
+from ...model.splats import FloatArray
+from ...support.parallel import blocks_of
 from ...support.progress import Progress
-from .contracts import Arrays, Store
-from .job import ORDER, Job, families_of
+from ...support.threads import on_threads
+from .job import ORDER, Job, families_of, window_of
+from .merging import Run, merged, runs_of
 
-#: Families whose keys are in memory at once: some 100 MB. Chosen.
-MERGED = 1 << 22
-
-#: Keys of a stage that are looked at to cut its families in ranges of about as many. Chosen.
-PROBES = 256
-
-#: Where a range of families of a stage is: the stage, the first one and the end.
-Run = tuple[int, int, int]
+#: Nodes of a window that is gathered in one go, whole chunks: 30 MB without SH, 120 MB with SH of degree 3. Chosen.
+WINDOW_NODES = 8 * CHUNK_NODES
 
 
 @dataclass(frozen=True, eq=False)
-class Order:
-    """Where each of F families is; they are numbered stage by stage.
+class _Links:
+    """What is known of F families, which are numbered stage by stage.
 
     Attributes:
-        begin: (stages + 1,) int64 number of the first family of each stage, and F.
-        count: (F,) uint16 children.
-        row: (F,) uint32 the first child's place among the nodes of its stage.
-        sequence: (F,) uint32 the families in the order of the tree.
-        child_start: (F,) uint32 the first child's place in the tree.
-        levels: 1 and the depth of the tree.
+        begin: (stages + 1,) number of the first family of each stage, and F.
+        count: (F,) children.
+        row: (F,) place of the first child among the nodes of its stage.
+        parent: (F,) family of the node whose children they are; -1 for the children of the root.
+        offset: (F,) place of that node in its family.
+        runs: of each stage, by batch.
     """
 
     begin: NDArray[np.int64]
     count: NDArray[np.uint16]
     row: NDArray[np.uint32]
-    sequence: NDArray[np.uint32]
-    child_start: NDArray[np.uint32]
-    levels: int
+    parent: NDArray[np.int32]
+    offset: NDArray[np.uint16]
+    runs: list[dict[int, Run]]
 
-    def arrays(self) -> Arrays:
-        """As arrays, of which `from_arrays` makes it again."""
-        return {**vars(self), "levels": np.array([self.levels], np.int64)}
+    @property
+    def nodes(self) -> int:
+        """The root, and all children."""
+        return 1 + int(self.count.sum(dtype=np.int64))
 
-    @classmethod
-    def from_arrays(cls, arrays: dict[str, NDArray[Any]]) -> Order:
-        """The order of `arrays`."""
-        return cls(**{**arrays, "levels": int(arrays["levels"][0])})  # type: ignore[arg-type]
+    def starts(self, sequence: NDArray[np.uint32]) -> NDArray[np.uint32]:
+        """(F,) where the children of each family are, if families are in this order."""
+        start = np.empty(len(sequence), np.uint32)
+        ordered = self.count[sequence].astype(np.uint32)
+        start[sequence] = np.cumsum(ordered, dtype=np.uint32) - ordered + np.uint32(1)
+        return start
 
-    def numbers(self, family: NDArray[np.int64]) -> NDArray[np.int64]:
-        """The numbers here of families that have numbers as `Families.family` has them."""
-        return self.begin[family >> STAGE_BITS] + (family & ((1 << STAGE_BITS) - 1))
+    def families_at(self, start: NDArray[np.uint32]) -> NDArray[np.int32]:
+        """(nodes,) the family of the children of each node, if families begin there; -1 for a leaf."""
+        at = np.full(self.nodes, -1, np.int32)
+        place = start[self.parent]
+        place += self.offset
+        place[self.parent < 0] = 0
+        at[place] = np.arange(len(start), dtype=np.int32)
+        return at
 
 
 def put_order(job: Job, *, threads: int, progress: Progress) -> None:
-    """A task. Result: the order."""
-    begin = np.cumsum([0, *job.families])
-    total = int(begin[-1])
-    count, row = np.empty(total, np.uint16), np.empty(total, np.uint32)
-    parent = np.full(total, -1, np.int32)
-    batches = {}
-    for stage, length in enumerate(job.families):
-        here = slice(begin[stage], begin[stage + 1])
-        found = job.store.get(families_of(stage), ["batch", "count", "family"])
-        count[here] = found["count"]
-        row[here] = np.cumsum(found["count"], dtype=np.int64) - found["count"]
-        batches[stage] = _runs(stage, found["batch"], length)
-        family = found["family"]
-        inner = np.flatnonzero(family != NO_FAMILY)
-        child = begin[family[inner] >> STAGE_BITS] + (family[inner] & ((1 << STAGE_BITS) - 1))
-        parent[child] = begin[stage] + np.searchsorted(row[here], inner, "right") - 1
-        progress("ordering", int(begin[stage + 1]), 2 * total, "family")
-    sequence, done = np.empty(total, np.uint32), 0
-    for some in _pieces(job.store, batches, begin):
+    """A task. Results: what each window is read by, see `nodes`; at last the number of nodes and of levels."""
+    links = _links(job)
+    sequence, done = np.empty(len(links.count), np.uint32), 0
+    for some in merged(job.store, links.runs, links.begin):
         sequence[done : done + len(some)] = some
         done += len(some)
-        progress("ordering", total + done, 2 * total, "family")
-    order = Order(begin, count, row, sequence, starts_of(sequence, count), _levels(parent))
-    job.store.put(ORDER, order.arrays())
+        progress("ordering", done, 2 * len(sequence), "family")
+    start = links.starts(sequence)
+    at = links.families_at(start)
+    levels = 1
+    if len(sequence):
+        by_place = at[at >= 0]
+        with on_threads(threads):
+            levels, arranged = _arranged(job, links, by_place, progress)
+        if arranged is not None:
+            sequence = arranged
+            start = links.starts(sequence)
+            at = links.families_at(start)
+    for window, part in enumerate(blocks_of(links.nodes, WINDOW_NODES)):
+        _put_window(job, window, part, links, sequence, start, at)
+        progress("ordering", links.nodes + part.stop, 2 * links.nodes, "node")
+    job.store.put(ORDER, {"counts": np.array([links.nodes, levels], np.int64)})
 
 
-def starts_of(sequence: NDArray[np.uint32], count: NDArray[np.uint16]) -> NDArray[np.uint32]:
-    """(F,) where the children of each family are in the tree, after the root."""
-    start = np.empty(len(sequence), np.uint32)
-    ordered = count[sequence].astype(np.uint32)
-    start[sequence] = np.cumsum(ordered, dtype=np.uint32) - ordered + 1
-    return start
+def _links(job: Job) -> _Links:
+    """Reads the families of all stages."""
+    begin = np.cumsum([0, *job.families])
+    total = int(begin[-1])
+    count, row, offset = np.empty(total, np.uint16), np.empty(total, np.uint32), np.zeros(total, np.uint16)
+    parent, runs = np.full(total, -1, np.int32), []
+    for stage, length in enumerate(job.families):
+        found = job.store.get(families_of(stage), ["batch", "count", "family"])
+        here = slice(begin[stage], begin[stage + 1])
+        count[here] = found["count"]
+        row[here] = np.cumsum(found["count"], dtype=np.int64) - found["count"]
+        runs.append(runs_of(stage, found["batch"]))
+        inner = np.flatnonzero(found["family"] != NO_FAMILY)
+        family = found["family"][inner]
+        child = begin[family >> STAGE_BITS] + (family & ((1 << STAGE_BITS) - 1))
+        mine = np.repeat(np.arange(length, dtype=np.int32), found["count"])[inner]
+        parent[child] = begin[stage] + mine
+        offset[child] = inner - row[here][mine]
+    return _Links(begin, count, row, parent, offset, runs)
 
 
-def _runs(stage: int, batch: NDArray[np.int32], length: int) -> dict[int, Run]:
-    """The families of each batch of a stage."""
-    first = np.flatnonzero(np.diff(batch, prepend=batch[0] - 1)) if length else np.empty(0, np.int64)
-    ends = [*first[1:].tolist(), length]
-    return {int(batch[a]): (stage, a, b) for a, b in zip(first.tolist(), ends, strict=False)}
+def _arranged(
+    job: Job, links: _Links, by_place: NDArray[np.int32], progress: Progress
+) -> tuple[int, NDArray[np.uint32] | None]:
+    """The levels of the tree, and the order of its families for streaming, if the output has that one.
+
+    Args:
+        job: the job.
+        links: of the families.
+        by_place: (F,) the families in the order of the nodes whose children they are.
+        progress: of the task.
+    """
+    place = np.empty(len(by_place), np.int32)
+    place[by_place] = np.arange(len(by_place), dtype=np.int32)
+    above = links.parent[by_place]
+    parent = np.where(above < 0, np.int32(-1), place[above])
+    del place, above
+    if not job.in_chunks:
+        depth, _ = find_limits(parent, np.zeros(len(parent), np.float32))
+        return int(depth.max()) + 2, None
+    size = _of_all(job, "size")[by_place]
+    depth, _ = find_limits(parent, size)
+    levels = int(depth.max()) + 2
+    del depth
+    center = _of_all(job, "center")[by_place]
+    order = family_order(parent, links.count[by_place], center, size, most=MOST_FAMILIES, progress=progress)
+    return levels, by_place[order].astype(np.uint32)
 
 
-def _pieces(store: Store, batches: dict[int, dict[int, Run]], begin: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:
-    """The numbers of all families in the order of the tree, some at a time."""
-    for batch in sorted({batch for runs in batches.values() for batch in runs}):
-        runs = [batches[stage][batch] for stage in sorted(batches) if batch in batches[stage]]
-        for some in _ranges(store, runs):
-            keys = [store.rows(families_of(stage), "key", start, stop) for stage, start, stop in some]
-            words = max(key.shape[1] for key in keys)
-            key = np.concatenate([np.pad(each, ((0, 0), (words - each.shape[1], 0))) for each in keys])
-            number = np.concatenate([np.arange(start, stop) + begin[stage] for stage, start, stop in some])
-            yield number[np.lexsort(key.T[::-1])]
+def _of_all(job: Job, key: str) -> FloatArray:
+    """A column of the families of all stages."""
+    parts = [job.store.get(families_of(stage), [key])[key] for stage in range(len(job.families))]
+    return np.concatenate(parts)
 
 
-def _ranges(store: Store, runs: list[Run]) -> Iterator[list[Run]]:
-    """Runs cut at the same keys, so that each range is small enough to be sorted at once."""
-    pieces = -(-sum(stop - start for _, start, stop in runs) // MERGED)
-    if pieces == 1:
-        yield runs
-        return
-    words = max(store.shape(families_of(stage), "key")[1] for stage, _, _ in runs)
-    first = [_first_words(store, run, words) for run in runs]
-    # Of each run as many as its share; families with the same first word stay together.
-    probes = np.sort(np.concatenate([each[:: max(1, MERGED // PROBES)] for each in first]))
-    pivots = np.unique(probes[[len(probes) * piece // pieces for piece in range(1, pieces)]])
-    cuts = [[0, *np.searchsorted(each, pivots).tolist(), len(each)] for each in first]
-    for piece in range(len(pivots) + 1):
-        parts = [
-            (stage, start + cut[piece], start + cut[piece + 1])
-            for (stage, start, _), cut in zip(runs, cuts, strict=True)
-        ]
-        yield [part for part in parts if part[1] < part[2]]
+def _put_window(
+    job: Job,
+    window: int,
+    part: slice,
+    links: _Links,
+    sequence: NDArray[np.uint32],
+    start: NDArray[np.uint32],
+    at: NDArray[np.int32],
+) -> None:
+    """Puts what a window is read by.
 
-
-def _first_words(store: Store, run: Run, words: int) -> NDArray[np.uint64]:
-    """The first of so many words of the keys of a run."""
-    stage, start, stop = run
-    key = store.rows(families_of(stage), "key", start, stop)
-    return key[:, 0] if key.shape[1] == words else np.zeros(len(key), np.uint64)
-
-
-def _levels(parent: NDArray[np.int32]) -> int:
-    """The number of levels of a tree whose families have these parents, -1 for that of the root."""
-    depth, above = (parent >= 0).astype(np.int32), parent.copy()
-    while (below := np.flatnonzero(above >= 0)).size:  # each round goes twice as far up
-        ancestor = above[below]
-        depth[below] += depth[ancestor]
-        above[below] = above[ancestor]
-    return int(depth.max(initial=-1)) + 2
+    Families whose children are in it, as far as they are, stage by stage: `stages`, where those of each stage begin,
+    `row`, `count` and `target`, the first one's place in the window. Its nodes with children: `owner`, places in the
+    window, `child_start`, `child_count`.
+    """
+    begin, end = (
+        bisect.bisect_right(sequence, place, key=lambda number: int(start[number]))
+        for place in (part.start, part.stop - 1)
+    )
+    number = np.sort(sequence[max(0, begin - 1) : end])
+    row, count, target = (column[number].astype(np.int64) for column in (links.row, links.count, start))
+    target -= part.start
+    before = np.maximum(-target, 0)
+    row, count, target = row + before, count - before, target + before
+    count = np.minimum(count, part.stop - part.start - target)
+    mine = at[part]
+    owner = np.flatnonzero(mine >= 0)
+    job.store.put(
+        window_of(window),
+        {
+            "stages": np.searchsorted(number, links.begin),
+            "row": row.astype(np.uint32),
+            "count": count.astype(np.uint16),
+            "target": target.astype(np.uint32),
+            "owner": owner.astype(np.uint32),
+            "child_start": start[mine[owner]],
+            "child_count": links.count[mine[owner]],
+        },
+    )

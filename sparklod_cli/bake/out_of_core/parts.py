@@ -15,8 +15,9 @@ from ...model.streams import SceneStream
 from ...support.parallel import blocks_of
 from ..settings import BakeSettings
 
-#: The most splats of a part: enough for the rows of a block in it to be read in one go. Chosen.
-PART_SPLATS = 1 << 19
+#: Splats of a part, unless blocks are smaller, and the most parts: their splats of all blocks are pieces of files, of
+#: which there should not be too many. Chosen.
+PART_SPLATS, MAX_PARTS = 1 << 19, 256
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +37,8 @@ class Kept:
 
 def parts_of(count: int, block_splats: int) -> tuple[int, ...]:
     """Where each part begins, and at last the count; an empty input has no part."""
-    return (0, *(part.stop for part in blocks_of(count, min(block_splats, PART_SPLATS))))
+    length = max(min(block_splats, PART_SPLATS), -(-count // MAX_PARTS))
+    return (0, *(part.stop for part in blocks_of(count, length)))
 
 
 def kept_of(stream: SceneStream, start: int, stop: int, settings: BakeSettings) -> Iterator[Kept]:

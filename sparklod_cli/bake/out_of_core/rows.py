@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from ...model.sh import COEFFICIENTS, degree_of
 from ...model.splats import COLUMNS, Splats
+from ...support.parallel import for_blocks
 
 #: (N, `width_of`) float32: centre, scale, rotation, opacity, rgb and SH of a splat, in the order of `COLUMNS`.
 Rows = NDArray[np.float32]
@@ -19,25 +20,39 @@ def width_of(sh_degree: int) -> int:
     return 14 + 3 * COEFFICIENTS[sh_degree]
 
 
-def rows_of(splats: Splats) -> Rows:
+def rows_of(splats: Splats, threads: int = 1) -> Rows:
     """The rows of splats."""
     rows = np.empty((len(splats), width_of(splats.sh_degree)), np.float32)
-    fill_rows(splats, rows)
+    fill_rows(splats, rows, threads)
     return rows
 
 
-def fill_rows(splats: Splats, rows: Rows) -> None:
+def fill_rows(splats: Splats, rows: Rows, threads: int = 1) -> None:
     """Fills rows with splats."""
-    for part, column in _places(splats):
-        rows[:, part] = column
+    places = _places(splats)
+
+    def fill(block: slice) -> None:
+        for part, column in places:
+            rows[block, part] = column[block]
+
+    for_blocks(fill, len(rows), threads, _nothing)
 
 
-def splats_of(rows: Rows) -> Splats:
+def splats_of(rows: Rows, threads: int = 1) -> Splats:
     """The splats of rows."""
     splats = Splats.empty(len(rows), degree_of((rows.shape[1] - width_of(0)) // 3))
-    for part, column in _places(splats):
-        column[...] = rows[:, part]
+    places = _places(splats)
+
+    def fill(block: slice) -> None:
+        for part, column in places:
+            column[block] = rows[block, part]
+
+    for_blocks(fill, len(rows), threads, _nothing)
     return splats
+
+
+def _nothing(done: int) -> None:
+    """Nobody is told."""
 
 
 def _places(splats: Splats) -> list[tuple[slice, Rows]]:

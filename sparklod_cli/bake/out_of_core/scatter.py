@@ -8,7 +8,7 @@ from ...model.selection import Tally
 from ...support.progress import Progress
 from ...support.threads import on_threads
 from .job import Job
-from .parts import kept_of
+from .parts import Kept, kept_of
 from .rows import fill_rows, splats_of, width_of
 from .survey import SAMPLE_SPLATS, Findings
 
@@ -20,7 +20,7 @@ def scatter(job: Job, number: int, *, threads: int, progress: Progress) -> None:
     rows = np.empty((stop - start, width_of(job.sh_degree)), np.float32)
     used, tally, beyond = 0, Tally(), 0
     for kept in kept_of(job.stream, start, stop, job.settings):
-        fill_rows(kept.splats, rows[used : used + len(kept.splats)])
+        fill_rows(kept.splats, rows[used : used + len(kept.splats)], threads)
         used += len(kept.splats)
         tally, beyond = tally.then(kept.tally), beyond + kept.beyond
         progress("reading", tally.count, stop - start, "splat")
@@ -32,5 +32,5 @@ def scatter(job: Job, number: int, *, threads: int, progress: Progress) -> None:
         job.store.put(job.splats(number, group), {"rows": rows[some], "index": some.astype(np.int32)})
     stride = max(1, job.stream.count // SAMPLE_SPLATS)
     with on_threads(threads):
-        findings = Findings.of(splats_of(rows), tally, beyond, stride, threads)
+        findings = Findings.of(Kept(splats_of(rows, threads), tally, beyond), stride, job.needed, threads)
     job.store.put(job.part(number), {**findings.arrays(), "first": first})

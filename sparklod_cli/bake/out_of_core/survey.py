@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,25 +13,34 @@ from ...lod.check import check_visible
 from ...lod.kernels.geometry import find_bounds
 from ...lod.stages.records import Survey
 from ...model.selection import REASONS, Tally
-from ...model.splats import FloatArray, Splats
+from ...model.splats import FloatArray
 from ...model.streams import SceneStream
 from ..checks import check_transformed
 from ..settings import BakeSettings
 from .contracts import Arrays
-from .parts import kept_of
+from .parts import Kept, kept_of
 from .rows import Rows, rows_of, splats_of
 
-#: Ranges of the input that are read for a first look, and splats of each: enough for blocks that differ by a few per
-#: cent in their splats, where neighbours in the file are neighbours in space, too. Chosen.
-RANGES, RANGE_SPLATS = 512, 256
+#: Ranges of the input that are read for a first look: for each block, at least, and at most; and splats of each. Blocks
+#: differ by a few per cent in their splats then, even where neighbours in the file are neighbours in space. Chosen.
+RANGES_OF_BLOCK, MIN_RANGES, MAX_RANGES, RANGE_SPLATS = 32, 64, 512, 256
 
 #: Splats of the survey's sample, or a few more. Chosen.
 SAMPLE_SPLATS = 1 << 18
 
 
-def first_look(stream: SceneStream, settings: BakeSettings) -> tuple[FloatArray, float]:
-    """(n, 3) centres of splats that are kept, from ranges all over the input, and the share of splats that are kept."""
-    starts = np.linspace(0, max(0, stream.count - RANGE_SPLATS), RANGES).astype(np.int64).tolist()
+def first_look(stream: SceneStream, settings: BakeSettings, blocks: int) -> tuple[FloatArray, float]:
+    """(n, 3) centres of splats that are kept, from ranges all over the input, and the share of splats that are kept.
+
+    Args:
+        stream: the input.
+        settings: of the bake.
+        blocks: that the scene will be cut into, about; for a single one nothing is read.
+    """
+    if blocks == 1:
+        return np.empty((0, 3), np.float32), 1.0
+    ranges = min(max(blocks * RANGES_OF_BLOCK, MIN_RANGES), MAX_RANGES)
+    starts = np.linspace(0, max(0, stream.count - RANGE_SPLATS), ranges).astype(np.int64).tolist()
     centers, seen, end = [np.empty((0, 3), np.float32)], 0, 0
     for start in starts:
         begin, end = max(start, end), min(start + RANGE_SPLATS, stream.count)
@@ -63,11 +72,13 @@ class Findings:
     statistics: Statistics
 
     @classmethod
-    def of(cls, splats: Splats, tally: Tally, beyond: int, stride: int, threads: int) -> Findings:
-        """Of splats that are kept; every so many of them are the sample."""
+    def of(cls, kept: Kept, stride: int, needed: Collection[str], threads: int) -> Findings:
+        """Of some splats; every so many of those that are kept are the sample."""
+        splats = kept.splats
         low, high, smallest, largest = find_bounds(splats.center, splats.scale, threads)
         sample = rows_of(splats.take(slice(None, None, stride)))
-        return cls(tally, beyond, np.stack([low, high]), np.array([smallest, largest]), sample, Statistics.of(splats))
+        found = Statistics.of(splats, needed=needed)
+        return cls(kept.tally, kept.beyond, np.stack([low, high]), np.array([smallest, largest]), sample, found)
 
     @classmethod
     def merged(cls, parts: Sequence[Findings]) -> Findings:

@@ -12,12 +12,9 @@ from ...model.lod_tree import LodTree
 from ...model.sh import COEFFICIENTS
 from ...model.splats import FloatArray, Splats
 from ...support.parallel import ordered_map
-from .. import compression
-from ..stream import size_of
-from . import promises
-from .decoding import Packed, fill
-from .header import read_header
-from .places import Beside, bytes_of, file_of, size_beside
+from .decoding import Packed
+from .places import Beside
+from .reading import checked_header, chunks_of, facts_of, fill_known
 from .records import RadHeader
 
 
@@ -43,15 +40,16 @@ class ByChunk:
         """Reads the header of a file, and its palette.
 
         Raises:
-            FormatError: see `codec.examine`.
+            FormatError: see `reading.examine`.
         """
-        size = size_of(file)
-        header = read_header(file)
-        files = {name: size_beside(name, beside) for name in header.filenames}
-        promises.check(promises.violations(header, size, files))
-        compression.check_promise(bytes_decoded(header), size + sum(files.values()))
-        plain = cls(header, None)
-        return cls(header, plain._packed(file, beside, 0).palette(header)) if header.chunks else plain
+        header = checked_header(file, beside)
+        first = next(chunks_of(file, header, beside, range(min(1, len(header.chunks)))), None)
+        return cls(header, None if first is None else first.palette(header))
+
+    @property
+    def facts(self) -> dict[str, int]:
+        """As `Scene.header`."""
+        return facts_of(self.header, self.palette)
 
     def read(
         self, number: int, file: BinaryIO, beside: Beside | None, columns: Collection[str], *, thorough: bool = True
@@ -68,7 +66,8 @@ class ByChunk:
         Raises:
             FormatError: the chunk is cut short, corrupt, or not the one that the header means.
         """
-        return self._decoded(self._packed(file, beside, number), columns, thorough=thorough)
+        (packed,) = chunks_of(file, self.header, beside, range(number, number + 1))
+        return self._decoded(packed, columns, thorough=thorough)
 
     def read_all(
         self, file: BinaryIO, beside: Beside | None, columns: Collection[str], *, thorough: bool, threads: int
@@ -79,21 +78,12 @@ class ByChunk:
             return packed.header.base, *self._decoded(packed, columns, thorough=thorough)
 
         numbers = range(len(self.header.chunks))
-        return ordered_map(decoded, (self._packed(file, beside, number) for number in numbers), threads)
-
-    def _packed(self, file: BinaryIO, beside: Beside | None, number: int) -> Packed:
-        entry = self.header.chunks[number]
-        with file_of(entry, file, beside) as source:
-            data = bytes_of(entry, self.header, source)
-        return Packed.of(data, number, self.header)
+        return ordered_map(decoded, chunks_of(file, self.header, beside, numbers), threads)
 
     def _decoded(self, packed: Packed, columns: Collection[str], *, thorough: bool) -> tuple[Splats, LodTree | None]:
         count = packed.header.count
         splats, tree = Splats.zeros(count, self.header.max_sh), None
         if self.header.lod_tree:
             tree = LodTree(np.empty(count, np.uint16), np.empty(count, np.uint32))
-        labels = fill(packed, self.header, splats, tree, self.palette, columns, thorough=thorough)
-        if labels is not None:
-            text = f"chunk {packed.number:,} has labels of SH, but there is no palette"
-            raise promises.error_of("rad.palette", text)
+        fill_known(packed, self.header, splats, tree, self.palette, columns, thorough=thorough)
         return splats, tree

@@ -61,19 +61,19 @@ def examine(
     Raises:
         FormatError: as `decode`, but not for a broken tree.
     """
-    header = _checked_header(file, beside)
+    header = checked_header(file, beside)
     make = Splats.empty if set(COLUMNS) <= set(columns) else Splats.zeros
     splats, tree = make(header.count, header.max_sh), None
     if header.lod_tree:
         tree = LodTree(np.empty(header.count, np.uint16), np.empty(header.count, np.uint32))
-    chunks = _chunks(file, header, beside, range(len(header.chunks)))
+    chunks = chunks_of(file, header, beside, range(len(header.chunks)))
     first = next(chunks, None)
     palette = first.palette(header) if first is not None else None
 
     def run(packed: Packed) -> int:
         part = slice(packed.header.base, packed.header.base + packed.header.count)
         nodes = None if tree is None else LodTree(tree.child_count[part], tree.child_start[part])
-        _fill(packed, header, rows_in(splats, part), nodes, palette, columns)
+        fill_known(packed, header, rows_in(splats, part), nodes, palette, columns)
         return part.stop
 
     def all_chunks() -> Iterator[Packed]:
@@ -84,7 +84,7 @@ def examine(
     for done in ordered_map(run, all_chunks(), threads):
         progress("reading", done, header.count, "splat")
     sizes = tuple(entry.bytes for entry in header.chunks)
-    facts = _facts(header, palette)
+    facts = facts_of(header, palette)
     return Scene(splats, tree, header.antialiased, name_of(header), header=facts, chunk_bytes=sizes)
 
 
@@ -102,29 +102,29 @@ def stream(
         HasTreeError: it has a tree.
         FormatError: as `decode`; what is wrong with a chunk, when it is read.
     """
-    header = _checked_header(file, beside)
+    header = checked_header(file, beside)
     if header.lod_tree:
         raise HasTreeError(HAS_TREE)
-    first = next(_chunks(file, header, beside, range(min(1, len(header.chunks)))), None)
+    first = next(chunks_of(file, header, beside, range(min(1, len(header.chunks)))), None)
     palette = first.palette(header) if first is not None else None
 
     def read(start: int, stop: int) -> Iterator[Splats]:
         def run(packed: Packed) -> Splats:
             base, count = packed.header.base, packed.header.count
             splats = Splats.empty(count, header.max_sh)
-            _fill(packed, header, splats, None, palette, COLUMNS)
+            fill_known(packed, header, splats, None, palette, COLUMNS)
             part = slice(max(start - base, 0), min(stop - base, count))
             return splats if part == slice(0, count) else splats.take(part)
 
         if start < stop:
             numbers = range(start // header.chunk_size, -(-stop // header.chunk_size))
-            yield from ordered_map(run, _chunks(file, header, beside, numbers), threads)
+            yield from ordered_map(run, chunks_of(file, header, beside, numbers), threads)
 
-    facts = _facts(header, palette)
+    facts = facts_of(header, palette)
     return SceneStream(header.count, header.max_sh, read, header.antialiased, name_of(header), header=facts)
 
 
-def _checked_header(file: BinaryIO, beside: Beside | None) -> RadHeader:
+def checked_header(file: BinaryIO, beside: Beside | None) -> RadHeader:
     """The header of a file that keeps the promises of its header, as far as they are fatal."""
     size = size_of(file)
     header = read_header(file)
@@ -134,23 +134,25 @@ def _checked_header(file: BinaryIO, beside: Beside | None) -> RadHeader:
     return header
 
 
-def _facts(header: RadHeader, palette: FloatArray | None) -> dict[str, int]:
+def facts_of(header: RadHeader, palette: FloatArray | None) -> dict[str, int]:
     """What `Scene.header` has of a file."""
     facts = {"version": 1, "chunks": len(header.chunks), "chunk_size": header.chunk_size}
     facts |= {"header_bytes": header.bytes, "chunked": int(header.chunked)}
     return facts | ({"sh_codes": len(palette)} if palette is not None else {})
 
 
-def _fill(
+def fill_known(
     packed: Packed,
     header: RadHeader,
     splats: Splats,
     tree: LodTree | None,
     palette: FloatArray | None,
     columns: Collection[str],
+    *,
+    thorough: bool = True,
 ) -> None:
-    """Decodes a chunk of a file that is read from its beginning: as `decoding.fill`, but labels need a palette."""
-    if fill(packed, header, splats, tree, palette, columns) is not None:
+    """Decodes a chunk of a file whose palette is known, if it has one: as `decoding.fill`, but labels need one."""
+    if fill(packed, header, splats, tree, palette, columns, thorough=thorough) is not None:
         text = f"chunk {packed.number:,} has labels of SH, but there is no palette"
         raise promises.error_of("rad.palette", text)
 
@@ -210,7 +212,7 @@ def read_chunk(file: BinaryIO, entry: RadChunkEntry, header: RadHeader, palette:
     return RadChunk(packed.header, splats, tree, own, labels)
 
 
-def _chunks(file: BinaryIO, header: RadHeader, beside: Beside | None, numbers: range) -> Iterator[Packed]:
+def chunks_of(file: BinaryIO, header: RadHeader, beside: Beside | None, numbers: range) -> Iterator[Packed]:
     """Chunks in order, read when they are asked for."""
     for number in numbers:
         entry = header.chunks[number]

@@ -26,9 +26,8 @@ class Wanted:
     Attributes:
         most: number of merged nodes.
         splats: number of splats of the scene under the tree's leaves.
-        is_whole: whether its last node is the root of the scene. Otherwise the nodes without a parent get one later.
-            They are dropped last of all, unless others then had more than MOST_CHILDREN; their children are left
-            without a parent.
+        is_whole: whether its last node is the root of the scene. Otherwise the nodes without a parent get one later; if
+            one is dropped, its children are left without a parent.
         highest: ln(size) of rank 0, in units; None for the root's.
         latest: (N,) ranks that the parents of leaves must be below; empty for any.
     """
@@ -89,7 +88,7 @@ def in_final_order(
     del rank
     slots = inner - np.uint32(n)
     rows = binary.rows[binary.row[slots]]
-    binary.rows = rows  # frees the rows of what was dropped
+    binary.rows, binary.spare = rows, np.empty(0, np.uint32)  # frees the rows of what was dropped
     binary.row[slots] = np.arange(len(inner), dtype=np.uint32)
     total = n + len(inner) + hidden
     progress("ordering", 0, total, "node")
@@ -104,11 +103,11 @@ def in_final_order(
         fill_leaves(order, index, getattr(splats, name).reshape(n, -1), getattr(out, name).reshape(total, -1))
     geometry = (column[hidden:] for column in (out.center, out.scale, out.quat_xyzw, out.opacity))
     node_rows.fill_merged_splats(order[hidden:], n, binary.row, rows, curve.space, *geometry)
-    weights = np.empty(binary.used, np.float64)
-    weights[:n] = binary.weight
-    weights[inner] = rows[:, pair_cost.WEIGHT]
+    of_merged = rows[:, pair_cost.WEIGHT].copy()
     if wanted.is_whole:
         binary.rows = rows = rows[:0].copy()
+    weights = np.empty(binary.used, np.float64)
+    weights[:n], weights[inner] = binary.weight, of_merged
     ends = np.concatenate([np.flatnonzero(np.diff(ranks, prepend=ranks[:1] - 1)), [len(inner)]])
     for begin, end in zip(ends[-2::-1], ends[:0:-1], strict=True):
         with threads_for(int(end - begin)) as threads:

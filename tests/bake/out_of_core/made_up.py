@@ -80,11 +80,9 @@ def tree_of(count: int, *, seconds: float = 0.0) -> list[Task]:
     return tasks
 
 
-def call(number: int, *, failing: int = -1) -> int:
-    """Twice a number, later the smaller it is."""
-    return refuse(number) if number == failing else number * 2
-
-
-def refuse(number: int) -> int:
-    """Fails."""
-    raise ScratchError(f"no {number}")
+def twice(number: int, *, threads: int) -> int:
+    """Twice a number; small numbers take longer, and 3 is refused."""
+    time.sleep(0.1 / (1 + number))
+    if number == 3:
+        raise ScratchError("no 3")
+    return number * 2

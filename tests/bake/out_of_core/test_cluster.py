@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import pickle
 from collections.abc import Iterator
 from pathlib import Path
@@ -28,7 +29,7 @@ SAID: list[str] = []
 @pytest.fixture(scope="module")
 def engine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ClusterEngine]:
     scratch = tmp_path_factory.mktemp("workers")
-    with cluster(ClusterSettings(workers=2), threads=2, scratch=scratch, say=SAID.append) as started:
+    with cluster(ClusterSettings(workers=2, threads=2), scratch=scratch, say=SAID.append) as started:
         assert list(scratch.iterdir())
         yield started
     assert not list(scratch.iterdir())
@@ -97,25 +98,30 @@ def test_other_errors_come_through_for_those_who_mend_them(engine: ClusterEngine
 
 
 def test_calls_side_by_side_give_results_and_failures_in_order(engine: ClusterEngine) -> None:
-    found = list(engine.each("baking", made_up.call, [(number,) for number in range(4)]))
-    assert found == [0, 2, 4, 6]
-    results = list(engine.each("baking", made_up.refuse, [(1,), (2,)]))
-    assert [str(each) for each in results] == ["no 1", "no 2"]
-    assert all(isinstance(each, SparklodError) for each in results)
+    told: list[tuple[str, int, int, str]] = []
+    arguments = [(number,) for number in range(6)]
+    with engine.each("baking", made_up.twice, arguments, lambda *args: told.append(args), "scene") as outcomes:
+        found = list(outcomes)
+    assert [each if isinstance(each, int) else str(each) for each in found] == [0, 2, 4, "no 3", 8, 10]
+    assert isinstance(found[3], ScratchError)
+    assert told[0] == ("baking", 0, 6, "scene") and [each[1] for each in told] == sorted(each[1] for each in told)
 
 
-def test_calls_that_nobody_waits_for_are_cancelled(engine: ClusterEngine, job: Job) -> None:
-    results = engine.each("baking", made_up.call, [(number,) for number in range(50)])
-    assert next(results) == 0
-    results.close()
-    assert list(engine.each("baking", made_up.call, [(21,)])) == [42]
+def test_calls_that_nobody_waits_for_are_cancelled(engine: ClusterEngine) -> None:
+    with engine.each("baking", made_up.twice, [(0,)] * 100, silent, "scene") as outcomes:
+        assert next(outcomes) == 0
+    with engine.each("baking", made_up.twice, [(21,)], silent, "scene") as outcomes:
+        assert list(outcomes) == [42]
 
 
 def test_workers_that_do_not_fit_are_refused(
     engine: ClusterEngine, job: Job, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    with pytest.raises(SparklodError, match=r"does not see .*missing.ply: put inputs into a folder that all"):
-        engine.check(job.store, [tmp_path / "missing.ply"])
+    engine.check(None, [tmp_path, tmp_path / "missing.ply"])  # which is nowhere, as its task will say
+    here_alone = Path(f"/proc/self/task/{os.getpid()}")
+    if here_alone.exists():
+        with pytest.raises(SparklodError, match=r"does not see /proc/self/task/.*: put inputs into a folder that all"):
+            engine.check(None, [here_alone])
     with monkeypatch.context() as patch:
         patch.setattr(cluster_engine, "__version__", "9.9")
         with pytest.raises(SparklodError, match=r"has sparklod .*, not 9\.9 as here: pip install"):

@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 from sparklod_cli.bake import BakeSettings
 from sparklod_cli.bake.clock import Clock
-from sparklod_cli.bake.out_of_core.flow import Staged, build_in_store
+from sparklod_cli.bake.out_of_core import flow, merging, nodes, order
+from sparklod_cli.bake.out_of_core.flow import Built
+from sparklod_cli.bake.out_of_core.job import Job
+from sparklod_cli.bake.out_of_core.parts import parts_of
+from sparklod_cli.codecs.statistics import ALL
 from sparklod_cli.lod import quick
+from sparklod_cli.lod.chunk_order import arrange
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
@@ -21,21 +28,28 @@ from tests.bake.out_of_core.plain import Loop, PlainStore, stream_of
 from tests.scenes import random_splats
 
 #: Without shrinking, which takes minutes, as any scene will do.
-LAW = settings(max_examples=40, deadline=None, phases=[Phase.explicit, Phase.reuse, Phase.generate])
+LAW = settings(max_examples=30, deadline=None, phases=[Phase.explicit, Phase.reuse, Phase.generate])
+
+BLOCKS = st.sampled_from([7, 40, 200, 1000])
 
 
-def staged(folder: str | Path, scene: Scene, how: BakeSettings, block: int, engine: Loop | None = None) -> Staged:
+@pytest.fixture(scope="module", autouse=True)
+def _small_windows() -> Iterator[None]:
+    """Windows, and ranges of keys, of which a small scene has several."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(order, "WINDOW_NODES", 64)
+        patch.setattr(nodes, "WINDOW_NODES", 64)
+        patch.setattr(nodes, "GAP", 5)
+        patch.setattr(merging, "MERGED", 20)
+        patch.setattr(merging, "PROBES", 5)
+        yield
+
+
+def built(folder: str, splats: Splats, how: BakeSettings, block: int, engine: Loop, *, in_chunks: bool) -> Built:
     """A tree in a store, of blocks of about so many splats."""
-    return build_in_store(
-        stream_of(scene),
-        how,
-        store=PlainStore(Path(folder)),
-        engine=engine or Loop(),
-        block_splats=block,
-        check=lambda statistics: None,
-        clock=Clock(),
-        progress=silent,
-    )
+    stream = stream_of(Scene(splats))
+    job = Job(PlainStore(Path(folder)), stream, how, ALL, in_chunks, parts_of(len(splats), block))
+    return flow.build(*flow.scattered(job, engine, block, silent), engine, Clock(), silent)
 
 
 def same(found: tuple[Splats, LodTree], expected: tuple[Splats, LodTree]) -> None:
@@ -49,15 +63,28 @@ def same(found: tuple[Splats, LodTree], expected: tuple[Splats, LodTree]) -> Non
 @given(
     st.integers(1, 600),
     st.integers(0, 2**32 - 1),
-    st.sampled_from([7, 40, 200, 1000]),
+    BLOCKS,
     st.sampled_from([0, 0, 1, 2]),
     st.sampled_from([1.1, 1.5, 2.0]),
+    st.booleans(),
 )
 @LAW
-def test_quick_makes_the_tree_of_a_bake_in_memory(count: int, seed: int, block: int, degree: int, base: float) -> None:
+def test_quick_makes_the_tree_of_a_bake_in_memory(
+    count: int, seed: int, block: int, degree: int, base: float, in_chunks: bool
+) -> None:
     splats = random_splats(count, seed=seed, sh_degree=degree)
+    rng = np.random.default_rng(seed)
+    expected = quick.build(splats, base)
+    if in_chunks:
+        expected = arrange(*expected)
     with tempfile.TemporaryDirectory() as folder:
-        found = staged(folder, Scene(splats), BakeSettings(base=base), block, Loop(np.random.default_rng(seed)))
-        nodes, tree = quick.build(splats, base)
-        same(found.nodes.read(0, found.nodes.count), (nodes, tree))
-        assert found.order.levels == tree.depths().max() + 1
+        found = built(folder, splats, BakeSettings(base=base), block, Loop(rng), in_chunks=in_chunks)
+        total = found.nodes.count
+        same(found.nodes.read(0, total), expected)
+        start, stop = np.sort(rng.integers(0, total + 1, 2)).tolist()
+        if start < stop:
+            window = slice(start, stop)
+            tree = LodTree(expected[1].child_count[window], expected[1].child_start[window])
+            same(found.nodes.read(start, stop), (expected[0].take(window), tree))
+    assert found.levels == expected[1].depths().max() + 1
+    assert found.nodes.leaves == count

@@ -84,7 +84,7 @@ def test_merged_splats_beyond_the_leaves_lower_the_fractional_bits(
     splats.center[:] *= 1e5  # so that it is the extent that bounds the bits
     far = tmp_path / "far.spz"
     far.write_bytes(b"".join(spz.encode(Scene(splats))))
-    most = spz_options.largest_fractional_bits(read_scene(far).splats.center)
+    most = spz_options.largest_fractional_bits(float(np.abs(read_scene(far).splats.center).max()))
     assert build(far, "-o", tmp_path / "out.spz", "--method", "quality", "--json") == 0
     assert json.loads(capsys.readouterr().out)["fractional_bits"] < most
 

@@ -1,0 +1,79 @@
+"""Several scenes on a cluster: each that a worker can hold is one task, and larger ones are baked by blocks."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from ..support.addresses import Place, absolute
+from ..support.errors import SparklodError
+from ..support.progress import Progress, silent
+from .baking import Baked, bake
+from .out_of_core.cluster_engine import ClusterEngine
+from .resources import Resources
+from .scaling import fits_in_memory
+from .settings import BakeSettings
+from .sources import Source, absolute_source, places_of
+
+
+def bake_side_by_side(
+    pairs: Sequence[tuple[Source, Place]],
+    *,
+    settings: BakeSettings,
+    engine: ClusterEngine,
+    resources: Resources,
+    bake_large: Callable[[Source, Place], Any],
+    make: Callable[..., Baked | None] = bake,
+    overwrite: bool = False,
+    progress: Progress = silent,
+) -> Iterator[Any]:
+    """Bakes scenes; yields what came of each, a `Baked` or a `SparklodError`, in their order as soon as it is known.
+
+    Args:
+        pairs: inputs and outputs, which all workers see.
+        settings: how.
+        engine: of the cluster.
+        resources: of a worker; a scene that its memory holds is one task.
+        bake_large: bakes one that none can, and returns what came of it.
+        make: bakes one; a function of a module.
+        overwrite: replace files that exist.
+        progress: told how many scenes are done.
+    """
+    small = [fits_in_memory(source, settings, resources.memory) for source, _ in pairs]
+    settings = dataclasses.replace(settings, rgba=settings.rgba and settings.rgba.absolute())
+    whole = [
+        (absolute_source(source), absolute(target)) for source, target in pairs
+    ]  # workers have folders of their own
+    calls = [
+        (make, *pair, settings, overwrite, resources) for pair, is_small in zip(whole, small, strict=True) if is_small
+    ]
+    engine.check(None, [place for source, _ in whole for place in places_of(source)])
+    with engine.each("baking", _bake_small, calls, progress, "scene") as outcomes:
+        for pair, is_small in zip(pairs, small, strict=True):
+            yield _found(next(outcomes), pair[1]) if is_small else bake_large(*pair)
+
+
+def _found(outcome: Any, target: Place) -> Any:
+    """What came of a scene; a `SparklodError` where its output is on a machine that this one does not see."""
+    if isinstance(outcome, Baked) and isinstance(target, Path) and not target.exists():
+        return SparklodError(
+            f"a worker wrote {target} into a folder that is not seen here: give --output-dir a folder that all machines"
+            " share, or a URL"
+        )
+    return outcome
+
+
+def _bake_small(
+    make: Callable[..., Baked | None],
+    source: Source,
+    target: Place,
+    settings: BakeSettings,
+    overwrite: bool,
+    resources: Resources,
+    *,
+    threads: int,
+) -> Baked | None:
+    """What a worker does."""
+    return make(source, target, settings, overwrite=overwrite, threads=threads, resources=resources)

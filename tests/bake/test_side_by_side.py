@@ -1,0 +1,63 @@
+"""Several scenes on a cluster: those that fit a worker there, and larger ones here."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sparklod_cli.bake import BakeSettings, side_by_side
+from sparklod_cli.bake.out_of_core.estimate import in_memory_bytes
+from sparklod_cli.bake.resources import Resources
+from sparklod_cli.bake.side_by_side import bake_side_by_side
+from sparklod_cli.support.errors import OutputError, SparklodError
+from tests.conftest import FIXTURES
+
+#: Splats and SH degree of the largest scene that a worker of these tests holds.
+HELD = 1000, 1
+
+
+class Engine:
+    """An engine whose workers are here."""
+
+    def __init__(self) -> None:
+        self.checked: list[Path] = []
+
+    def check(self, store: None, files: list[Path]) -> None:
+        self.checked += files
+
+    @contextlib.contextmanager
+    def each(self, stage: str, call: Any, arguments: list[Any], progress: Any, unit: str) -> Iterator[Iterator[Any]]:
+        yield (call(*each, threads=1) for each in arguments)
+
+
+def test_large_scenes_are_baked_here_in_their_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    engine, large = Engine(), OutputError("too large for words")
+    names = ("sh0.ply", "demo.ply", "sh1.ply")
+    pairs = [(FIXTURES / name, Path(name).with_suffix(".spz")) for name in names]
+    outcomes = bake_side_by_side(
+        pairs,
+        settings=BakeSettings(),
+        engine=engine,  # type: ignore[arg-type]
+        resources=Resources(memory=in_memory_bytes("quick", *HELD)),
+        bake_large=lambda source, target: large if (source, target) == pairs[1] else None,
+    )
+    found = list(outcomes)
+    assert found[1] is large
+    assert [each.splats > 0 for each in (found[0], found[2])] == [True, True]
+    assert engine.checked == [source for source, _ in pairs]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["sh0.spz", "sh1.spz"]
+
+
+def test_an_output_that_is_nowhere_to_be_seen_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    baked = side_by_side.bake(FIXTURES / "one.ply", tmp_path / "there.spz", BakeSettings())
+    monkeypatch.setattr(side_by_side, "_bake_small", lambda *_, **__: baked)
+    pair = (FIXTURES / "one.ply", tmp_path / "one.spz")
+    how = {"settings": BakeSettings(), "engine": Engine(), "resources": Resources(), "bake_large": None}
+    (found,) = bake_side_by_side([pair], **how)  # type: ignore[arg-type]
+    assert isinstance(found, SparklodError)
+    assert "wrote" in str(found) and "give --output-dir a folder that all machines share, or a URL" in str(found)

@@ -1,0 +1,136 @@
+"""`sparklod build-lod --memory`, `--scratch-dir`, `--resume` and `--skip-existing`."""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+from sparklod_cli.bake.out_of_core import estimate
+from sparklod_cli.bake.out_of_core.manifest import SUFFIX
+from tests.commands.build_lod.runs import build
+from tests.conftest import FIXTURES
+
+DEMO = FIXTURES / "demo.ply"
+
+
+@pytest.fixture
+def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A process and blocks so small that little scenes do not fit into the memory that is given."""
+    monkeypatch.setattr(estimate, "PROCESS", 0)
+    monkeypatch.setattr(estimate, "LEAST_BLOCK_SPLATS", 1 << 12)
+
+
+@pytest.mark.parametrize("suffix", [".spz", ".rad"])
+@pytest.mark.usefixtures("small_blocks")
+def test_what_does_not_fit_goes_out_of_core_and_gives_the_same_bytes(
+    tmp_path: Path, suffix: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole, pieces, scratch = (tmp_path / name for name in (f"a{suffix}", f"b{suffix}", "scratch"))
+    assert build(DEMO, "-o", whole, "--json") == 0
+    record = json.loads(capsys.readouterr().out)
+    assert (record["blocks"], record["scratch_bytes_written"], record["scratch_bytes_read"]) == (None, None, None)
+    assert build(DEMO, "-o", pieces, "--memory", "3M", "--scratch-dir", scratch, "--json", "-v") == 0
+    out, err = capsys.readouterr()
+    record = json.loads(out)
+    assert record["blocks"] > 1
+    assert record["scratch_bytes_written"] > pieces.stat().st_size
+    assert record["scratch_bytes_read"] > 0
+    assert set(record["seconds"]) >= {"read", "build", "order", "write"}
+    assert re.search(
+        r"demo\.ply: goes out of core, as it would take about .* MB of memory and --memory gives it 3\.0 MB;"
+        r" 27,800 splats in blocks of up to 8,192, scratch of about .* MB in .*scratch",
+        err,
+    )
+    assert re.search(rf"out of core in {record['blocks']} blocks; scratch: .* MB written, .* MB read", err)
+    assert whole.read_bytes() == pieces.read_bytes()
+    assert list(scratch.iterdir()) == []
+
+
+@pytest.mark.usefixtures("small_blocks")
+def test_the_default_memory_is_a_share_of_what_is_available(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sparklod_cli.support.machine.available_memory", lambda: 4_000_000)
+    assert build(DEMO, "-o", tmp_path / "a.spz") == 0
+    assert "of memory and may take 3.0 MB" in capsys.readouterr().err
+    monkeypatch.setattr("sparklod_cli.support.machine.available_memory", lambda: None)
+    assert build(DEMO, "-o", tmp_path / "b.spz") == 0
+    assert "out of core" not in capsys.readouterr().err
+
+
+def test_too_little_memory_is_an_error_that_says_how_much_is_enough(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert build(DEMO, "-o", tmp_path / "a.spz", "--memory", "20M") == 1
+    words = r"20 MB of memory is too little even out of core; give --memory (.*) or more"
+    found = re.search(words, capsys.readouterr().err)
+    assert found is not None
+    assert build(DEMO, "-o", tmp_path / "a.spz", "--memory", found[1]) == 0
+    assert list(tmp_path.iterdir()) == [tmp_path / "a.spz"]
+
+
+@pytest.mark.usefixtures("small_blocks")
+def test_arrays_and_trees_go_on_in_memory(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert build(DEMO, "-o", tmp_path / "a.npz", "--encoding", "ext", "--memory", "3M") == 0
+    assert "goes on in memory, although it would take about" in capsys.readouterr().err
+    assert build(FIXTURES / "golden" / "tree-v3.spz", "-o", tmp_path / "a.rad", "--memory", "1k") == 0
+
+
+@pytest.mark.usefixtures("small_blocks")
+def test_standard_input_is_baked_out_of_core(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsysbinary: pytest.CaptureFixture[bytes]
+) -> None:
+    assert build(DEMO, "-o", tmp_path / "a.spz", "-q") == 0
+    with DEMO.open("rb") as file:
+        monkeypatch.setattr("sys.stdin", io.TextIOWrapper(file))
+        assert build("-", "-o", "-", "--memory", "3M", "--scratch-dir", tmp_path / "scratch") == 0
+    out, err = capsysbinary.readouterr()
+    assert b"standard input: goes out of core" in err
+    assert out == (tmp_path / "a.spz").read_bytes()
+    assert list((tmp_path / "scratch").iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--memory", "much"], "'much' is not a size"),
+        (["--memory", "0"], "'0' is no memory to work in"),
+        (["--unlod", "--memory", "1G"], "--memory cannot be used with --unlod"),
+        (["--unlod", "--resume"], "--resume cannot be used with --unlod"),
+        (["--unlod", "--skip-existing"], "--skip-existing cannot be used with --unlod"),
+        (["-o", "-", "--skip-existing"], "--skip-existing needs an output that can be there already"),
+        (["--scratch-dir", "-"], "it cannot go to standard output"),
+    ],
+)
+def test_contradictions_are_wrong_usage(
+    arguments: list[str], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert build(DEMO, *([] if "-o" in arguments else ["--output-dir", tmp_path]), *arguments) == 2
+    assert words in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_resume_without_a_bake_to_go_on_with_begins(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert build(DEMO, "--output-dir", tmp_path, "--resume") == 0
+    assert "goes on" not in capsys.readouterr().err
+
+
+def test_scenes_that_are_there_are_skipped(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scenes = [tmp_path / f"{name}.ply" for name in "ab"]
+    for path in scenes:
+        path.write_bytes((FIXTURES / "sh2.ply").read_bytes())
+    line = [*scenes, "--output-dir", tmp_path / "web", "--skip-existing", "--json", "-f"]
+    assert build(*line) == 0
+    assert [json.loads(text).get("skipped") for text in capsys.readouterr().out.splitlines()] == [None, None]
+    scenes[1].write_bytes((FIXTURES / "sh3.ply").read_bytes())
+    assert build(*line) == 0
+    out, err = capsys.readouterr()
+    first, second = map(json.loads, out.splitlines())
+    assert first == {"input": str(scenes[0]), "output": str(tmp_path / "web" / "a-lod.spz"), "skipped": True}
+    assert second["sh_degree"] == 3
+    assert f"{scenes[0]}  ->  {tmp_path / 'web' / 'a-lod.spz'}  is there already" in err
+    assert not list(tmp_path.rglob(f"*{SUFFIX}"))

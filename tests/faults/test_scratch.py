@@ -1,0 +1,178 @@
+"""Bakes out of core that are killed, interrupted or run out of disk: what is done is kept, and --resume ends with the
+same bytes."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from sparklod_cli.bake import BakeSettings, Resources, bake
+from sparklod_cli.bake.out_of_core.manifest import SUFFIX
+from sparklod_cli.support.errors import InvalidSplatsError, ScratchError
+from tests.faults.runs import DEMO, ENVIRONMENT, mounted
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="there is no kill -9 on Windows")
+
+#: Small enough for the demo to be several blocks.
+BLOCK_SPLATS = 5000
+
+#: Bakes out of core; kills itself halfway through the result of this number, or waits there for a signal.
+SCRIPT = """
+import os, signal, sys, time
+from pathlib import Path
+from sparklod_cli.bake import BakeSettings, Resources, bake
+from sparklod_cli.bake.out_of_core.store import FolderStore
+from sparklod_cli.support import interrupts
+
+source, target, scratch, method, suffix, moment, how = sys.argv[1:]
+left, write = int(moment), FolderStore._write
+
+def end():
+    if how == "kill":
+        os.kill(os.getpid(), signal.SIGKILL)
+    print("waits", flush=True)
+    time.sleep(60)
+
+def halfway(pieces):
+    for number, piece in enumerate(pieces):
+        if number == 2:
+            end()
+        yield piece
+
+def failing(self, name, pieces):
+    global left
+    left -= 1
+    return write(self, name, halfway(pieces) if left == 0 else pieces)
+
+FolderStore._write = failing
+interrupts.handle()
+try:
+    bake(Path(source), Path(target), BakeSettings(method=method, suffix=suffix), say=print,
+         resources=Resources(scratch_dir=Path(scratch), block_splats=int(os.environ["BLOCK_SPLATS"])))
+except KeyboardInterrupt:
+    sys.exit(130)
+"""
+
+
+def begun(target: Path, scratch: Path, method: str, moment: int, how: str) -> subprocess.Popen[str]:
+    """A process that bakes the demo, and ends at some moment."""
+    words = [DEMO, target, scratch, method, target.suffix, moment, how]
+    return subprocess.Popen(
+        [sys.executable, "-c", SCRIPT, *map(str, words)],
+        env={**ENVIRONMENT, "BLOCK_SPLATS": str(BLOCK_SPLATS)},
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+
+
+def baked(target: Path, scratch: Path, method: str = "quick", **how: bool) -> list[str]:
+    """Bakes the demo in this process; what was said."""
+    said: list[str] = []
+    resources = Resources(scratch_dir=scratch, block_splats=BLOCK_SPLATS, resume=how.pop("resume", False))
+    bake(DEMO, target, BakeSettings(method=method, suffix=target.suffix), resources=resources, say=said.append, **how)
+    return said
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, str], bytes]:
+    """The outputs of bakes that nothing interrupts, by method and suffix."""
+    folder, found = tmp_path_factory.mktemp("whole"), {}
+    for method, suffix in (("quick", ".rad"), ("quality", ".spz")):
+        target = folder / f"{method}{suffix}"
+        baked(target, folder / "scratch", method)
+        assert list((folder / "scratch").iterdir()) == []
+        found[method, suffix] = target.read_bytes()
+    return found
+
+
+#: While parts of the input are read, while blocks are built, and while they are joined.
+@pytest.mark.parametrize(
+    ("method", "suffix", "moment"),
+    [("quick", ".rad", 9), ("quality", ".spz", 15), ("quick", ".rad", 23)],
+)
+def test_a_killed_bake_goes_on_and_ends_with_the_same_bytes(
+    method: str, suffix: str, moment: int, tmp_path: Path, whole: dict[tuple[str, str], bytes]
+) -> None:
+    target, scratch = tmp_path / f"out{suffix}", tmp_path / "scratch"
+    process = begun(target, scratch, method, moment, "kill")
+    process.communicate()
+    assert process.returncode == -signal.SIGKILL
+    assert not target.exists()
+    (folder,) = scratch.iterdir()
+    assert folder.name.endswith(SUFFIX)
+    said = baked(target, scratch, method, resume=True)
+    assert any("goes on with" in line for line in said)
+    assert target.read_bytes() == whole[method, suffix]
+    assert list(scratch.iterdir()) == []
+
+
+def test_an_interrupted_bake_says_what_is_left_and_is_refused_or_begun_anew(
+    tmp_path: Path, whole: dict[tuple[str, str], bytes]
+) -> None:
+    target, scratch = tmp_path / "out.rad", tmp_path / "scratch"
+    process = begun(target, scratch, "quick", 20, "wait")
+    assert process.stdout is not None
+    while process.stdout.readline() != "waits\n":
+        assert process.poll() is None
+    with pytest.raises(ScratchError, match="another run is at work"):
+        baked(target, scratch)
+    process.send_signal(signal.SIGINT)
+    out, _ = process.communicate()
+    assert process.returncode == 130
+    (folder,) = scratch.iterdir()
+    assert f"what is done stays in {folder}; run it again with --resume" in out
+    with pytest.raises(ScratchError, match="an interrupted bake left"):
+        baked(target, scratch)
+    with pytest.raises(ScratchError, match=r"results of another bake: .*method was 'quick' and is 'quality'"):
+        baked(target, scratch, "quality", resume=True)
+    for path in (folder / "families").glob("*.result"):  # as if power had failed
+        os.truncate(path, path.stat().st_size - 7)
+    assert "that a failure damaged" in "".join(baked(target, scratch, resume=True))
+    assert target.read_bytes() == whole["quick", ".rad"]
+    assert list(scratch.iterdir()) == []
+
+
+def test_leftover_results_are_refused_or_removed_by_a_bake_in_memory_too(tmp_path: Path) -> None:
+    target = tmp_path / "out.rad"
+    begun(target, tmp_path, "quick", 12, "kill").communicate()
+    settings, resources = BakeSettings(suffix=".rad"), Resources(scratch_dir=tmp_path)
+    with pytest.raises(ScratchError, match="an interrupted bake left"):
+        bake(DEMO, target, settings, resources=resources)
+    assert bake(DEMO, target, settings, resources=resources, overwrite=True).blocks is None
+    assert [path.name for path in tmp_path.iterdir()] == ["out.rad"]
+
+
+def test_a_full_scratch_disk_is_one_error_and_room_lets_it_go_on(
+    tmp_path: Path, whole: dict[tuple[str, str], bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from sparklod_cli.bake.out_of_core import estimate
+
+    target = tmp_path / "out.rad"
+    with mounted(tmp_path / "disk", "size=4m") as disk:
+        with pytest.raises(ScratchError, match=r"will take about .* MB are free there; .*--scratch-dir"):
+            baked(target, disk)
+        assert list(disk.iterdir()) == []
+        monkeypatch.setattr(estimate, "scratch_bytes", lambda *_: 0)
+        with pytest.raises(ScratchError, match=r"no room left in the scratch folder .*: no space left .*--resume"):
+            baked(target, disk)
+        assert not target.exists()
+        subprocess.run(["mount", "-o", "remount,size=64m", disk], check=True)
+        baked(target, disk, resume=True)
+        assert target.read_bytes() == whole["quick", ".rad"]
+        assert list(disk.iterdir()) == []
+
+
+def test_an_input_that_cannot_be_baked_leaves_no_scratch(tmp_path: Path) -> None:
+    source = tmp_path / "cut.ply"
+    data = bytearray(DEMO.read_bytes())
+    data[-100_000:] = b"\xff" * 100_000  # not finite
+    source.write_bytes(data)
+    resources = Resources(scratch_dir=tmp_path / "scratch", block_splats=BLOCK_SPLATS)
+    with pytest.raises(InvalidSplatsError, match="--on-invalid drop"):
+        bake(source, tmp_path / "out.spz", BakeSettings(), resources=resources)
+    assert list((tmp_path / "scratch").iterdir()) == []
