@@ -10,24 +10,6 @@ from .geometry import CENTER, OPACITY, QUAT, SCALE
 
 
 @kernel(parallel=True)
-def final_indices(order, leaves):
-    """The final index of each merged node.
-
-    Args:
-        order: (M,) uint32, the node of each final index.
-        leaves: number of leaves; they are the nodes below it.
-
-    Returns:
-        (M - leaves,) uint32, of node `leaves` onwards.
-    """
-    index = np.empty(len(order) - leaves, np.uint32)
-    for i in prange(len(order)):
-        if order[i] >= leaves:
-            index[order[i] - leaves] = i
-    return index
-
-
-@kernel(parallel=True)
 def fill_geometry(order, geometry, leaves, shrink, center, scale, quat, opacity):
     """Fills the geometry of splats in final order: splat i from geometry[order[i]].
 

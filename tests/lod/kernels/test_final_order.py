@@ -4,12 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sparklod_cli.lod.kernels.final_order import final_indices, merge_colors
-
-
-def test_merged_nodes_are_found_in_the_final_order() -> None:
-    order = np.random.default_rng(2).permutation(500).astype(np.uint32)
-    assert np.array_equal(order[final_indices(order, 300)], np.arange(300, 500))
+from sparklod_cli.lod.kernels.final_order import merge_colors
 
 
 def test_colours_are_weighted_means_of_children() -> None:
