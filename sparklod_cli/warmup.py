@@ -48,7 +48,7 @@ JOBS = {
         (
             *("geometry.find_bounds", "geometry.gather_rows", "group.level_keys", "group.split_cells"),
             *("merge.merge_groups", "final_order.fill_geometry", "final_order.fill_leaves", "final_order.merge_colors"),
-            *("final_order.final_indices", "sort.cell_words", "sort.sort_pass"),
+            *("sort.cell_words", "sort.sort_pass"),
         ),
         ("build-lod scene.ply -o quick.spz",),
     ),
@@ -94,7 +94,7 @@ JOBS = {
     "palette": Job(
         (
             *("chunk_demand.fill_demand", "chunk_inside.sort_within_chunks", "chunk_sets.split_sets", "sort.sort_pass"),
-            *("tree_links.find_depths", "tree_links.find_parents", "row_hash.hash_rows", "cells.halve_cells"),
+            *("family_links.find_limits", "tree_links.find_parents", "row_hash.hash_rows", "cells.halve_cells"),
             *("cells.average_cells", "nearest.find_neighbours", "nearest.choose_codes"),
         ),
         ("build-lod shiny.spz --format rad --cluster-sh 4 -o palette.rad",),

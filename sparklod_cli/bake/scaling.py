@@ -111,7 +111,9 @@ def bake_scaled(
                 pass
         return None
     degree = min(size.sh_degree, settings.max_sh)
-    block_splats = resources.block_splats or _block_splats(size.splats, degree, settings.method, memory)
+    block_splats = resources.block_splats or _block_splats(
+        size.splats, degree, settings.method, memory, in_chunks=output.in_chunks
+    )
     needed = estimate.scratch_bytes(settings.method, size.splats, degree)
     if isinstance(folder, Path):
         _check_room(folder, needed)
@@ -185,14 +187,14 @@ def _reason(
     return "blocks were asked for" if resources.block_splats else None
 
 
-def _block_splats(splats: int, sh_degree: int, method: str, memory: int | None) -> int:
+def _block_splats(splats: int, sh_degree: int, method: str, memory: int | None, *, in_chunks: bool) -> int:
     """The splats of a block; `OutOfMemoryError` where there is too little memory for the least ones."""
-    found = estimate.block_splats_within(memory, method, splats, sh_degree)
+    found = estimate.block_splats_within(memory, method, splats, sh_degree, in_chunks=in_chunks)
     if found is None:
-        least = estimate.out_of_core_bytes(method, splats, sh_degree, estimate.LEAST_BLOCK_SPLATS)
+        least = estimate.out_of_core_bytes(method, splats, sh_degree, estimate.LEAST_BLOCK_SPLATS, in_chunks=in_chunks)
         raise OutOfMemoryError(
-            f"{format_size(memory or 0)} of memory is too little even out of core; give --memory {format_size(least)}"
-            " or more"
+            f"{format_size(memory or 0)} of memory is too little even out of core; give --memory"
+            f" {format_size(1.02 * least)} or more"
         )
     return found
 

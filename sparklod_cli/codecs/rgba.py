@@ -13,10 +13,15 @@ from ..support.units import count_of
 from . import npy
 
 
-def decode(file: BinaryIO, count: int) -> FloatArray:
+def decode(file: BinaryIO, count: int, rows: slice | None = None) -> FloatArray:
     """Colours and opacities for the `count` splats of a scene: (count, 4) float32, 0..1.
 
     The type of a raw file follows from its size.
+
+    Args:
+        file: of all of them.
+        count: of splats.
+        rows: a range of them, from a start to a stop, to read alone; None for all.
 
     Raises:
         FormatError: it is neither, of another length, or has values that are not 0..1; continues a sentence about the
@@ -28,7 +33,10 @@ def decode(file: BinaryIO, count: int) -> FloatArray:
         raise FormatError(f"has {dtype}{list(shape)}, expected uint8 or floats [{count}, 4]")
     if shape[0] != count:
         raise FormatError(f"has colours for {count_of(shape[0], 'splat')}, the scene has {count:,}")
-    values = npy.read_values(file, layout)
+    if rows is not None and not layout.fortran_order:
+        file.seek(rows.start * 4 * dtype.itemsize, os.SEEK_CUR)
+        layout, rows = npy.Layout((rows.stop - rows.start, 4), dtype), None
+    values = npy.read_values(file, layout)[rows or slice(None)]
     most = 255 if values.dtype == np.uint8 else 1
     if not ((values >= 0) & (values <= most)).all():
         raise FormatError("has values that are not 0..1")

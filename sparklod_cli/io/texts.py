@@ -50,8 +50,8 @@ def read_together(path: Path, sets: Collection[Collection[str]], limit: int) -> 
         raise UnreadableError(f"{path} cannot be read: {reason_of(error)}") from None
 
 
-def read_rgba(path: Path, count: int) -> FloatArray:
-    """Colours and opacities for the `count` splats of a scene, see `rgba.decode`: (count, 4) float32, 0..1.
+def read_rgba(path: Path, count: int, rows: slice | None = None) -> FloatArray:
+    """Colours and opacities for the `count` splats of a scene, or for a range of them, see `rgba.decode`.
 
     Raises:
         FormatError: it cannot be read or is not such a file; names it.
@@ -60,7 +60,7 @@ def read_rgba(path: Path, count: int) -> FloatArray:
         if path.exists() and not path.is_file():
             raise FormatError("cannot be read: it is a directory, a pipe or a device")
         with path.open("rb") as file:
-            return rgba.decode(file, count)
+            return rgba.decode(file, count, rows)
     except OSError as error:
         raise FormatError(f"{path} cannot be read: {reason_of(error)}") from None
     except FormatError as error:

@@ -11,19 +11,17 @@ are made in Morton order, writing the levels out backwards gives the final order
 
 from __future__ import annotations
 
-import numpy as np
-
 from ..model.lod_tree import LodTree
 from ..model.splats import Splats
 from ..support.defaults import DEFAULT_BASE, MAX_BASE, MIN_BASE
 from ..support.jit import threads_for
 from ..support.progress import Progress, silent
 from .check import check, check_setting
-from .kernels.geometry import WIDTH, SplatColumns, gather_rows
-from .kernels.sort import sort_by_key
+from .kernels.geometry import SplatColumns
 from .voxel_grid import VoxelGrid
 from .voxel_growth import Arrivals, grow
-from .voxel_tree import VoxelTree, final_order, in_order
+from .voxel_rows import joining, sorted_leaves
+from .voxel_tree import VoxelTree
 
 
 def build(splats: Splats, base: float = DEFAULT_BASE, *, progress: Progress = silent) -> tuple[Splats, LodTree]:
@@ -50,16 +48,12 @@ def build(splats: Splats, base: float = DEFAULT_BASE, *, progress: Progress = si
     bounds = check(splats)
     with threads_for(n) as threads:
         grid = VoxelGrid.of(bounds, base)
-        keys, levels, bits = grid.leaf_keys(splats.center, splats.scale)
-        _, index = sort_by_key(keys, np.arange(n, dtype=np.uint32), bits, threads)
-        arrivals = Arrivals(np.cumsum(np.bincount(levels)))
-        del keys, levels
-        rows, weight = np.empty((2 * n, WIDTH), np.float32), np.empty(2 * n, np.float64)
+        index, joins = sorted_leaves(splats.center, splats.scale, grid, threads)
         columns = SplatColumns(splats.center, splats.scale, splats.quat_xyzw, splats.opacity)
-        gather_rows(index, columns, rows, weight)
+        arrivals = Arrivals(n, joining(index, joins, columns))
         rgb, sh = splats.rgb, splats.sh
         del splats, columns  # the rows have the rest; frees the memory if the caller has no reference
-        tree = VoxelTree(rows, weight, n, n, n)
-        del rows
-        left = grow(tree, grid, arrivals, None, progress)
-        return in_order(tree, final_order(tree, left.nodes), index, rgb, sh)
+        tree = VoxelTree(n, n)
+        ((_, root),) = grow(tree, grid, arrivals, None, progress)
+        final = tree.finish(root, index, rgb, sh)
+    return final.nodes, final.tree

@@ -19,7 +19,7 @@ from .kernels.geometry import CENTER
 from .kernels.sort import Nodes, sort_by_cell
 from .margins import Margins
 from .voxel_grid import VoxelGrid
-from .voxel_tree import Offsets, VoxelTree
+from .voxel_tree import Rows, VoxelTree
 
 #: The last nodes get one parent: no more of them than these, which may be a block of 2 x 2 x 2 cells.
 LAST_NODES = 8
@@ -27,96 +27,64 @@ LAST_NODES = 8
 
 @dataclass(frozen=True, eq=False)
 class Arrivals:
-    """The level from which on each of the given nodes is active.
+    """The nodes that take part, each from some level on. Lists are emptied as they do, so that memory is freed.
 
     Attributes:
-        joins: (L,) where the splats that join at each level end among the rows, which begin with them.
-        waiting: (W,) rows of survivors by the level that they wait for. Each of them has a cell of the level below for
-            itself.
-        waits: where those that wait for each level end in `waiting`.
+        splats: number of splats that join at the level of their size.
+        joining: rows of those splats by level, each along the curve.
+        waiting: rows of other nodes by the level that they wait for; each has a cell of the level below for itself.
     """
 
-    joins: Offsets
-    waiting: Nodes = field(default_factory=lambda: np.empty(0, np.uint32))
-    waits: Offsets = field(default_factory=lambda: np.empty(0, np.int64))
-
-    @property
-    def splats(self) -> int:
-        """The number of splats that join."""
-        return int(self.joins[-1]) if len(self.joins) else 0
-
-    def new(self, level: int) -> Nodes:
-        """The splats that join at a level."""
-        return np.arange(*_part(self.joins, level), dtype=np.uint32)
-
-    def survivors(self, level: int) -> Nodes:
-        """The survivors that wait for a level."""
-        return self.waiting[slice(*_part(self.waits, level))]
+    splats: int
+    joining: dict[int, Rows]
+    waiting: dict[int, Rows] = field(default_factory=dict)
 
 
-def _part(ends: Offsets, level: int) -> tuple[int, int]:
-    """Where the part of a level begins and ends."""
-    if level >= len(ends):
-        return 0, 0
-    return int(ends[level - 1]) if level else 0, int(ends[level])
-
-
-@dataclass(frozen=True, eq=False)
-class Left:
-    """Nodes without a parent.
-
-    Attributes:
-        nodes: rows of the tree.
-        levels: the level that each of them waits for.
-    """
-
-    nodes: Nodes
-    levels: NDArray[np.int32]
-
-
-def grow(tree: VoxelTree, grid: VoxelGrid, arrivals: Arrivals, margins: Margins | None, progress: Progress) -> Left:
+def grow(
+    tree: VoxelTree, grid: VoxelGrid, arrivals: Arrivals, margins: Margins | None, progress: Progress
+) -> list[tuple[int, Rows]]:
     """Merges the nodes of each cell, level by level.
 
     Args:
-        tree: with the given nodes.
+        tree: without nodes.
         grid: of the scene.
-        arrivals: of the given nodes.
+        arrivals: all nodes that are given; it is emptied.
         margins: of the region that they are in, at level 0; None if they are all that there are, and get one root.
         progress: told of the splats that have joined.
+
+    Returns:
+        the nodes without a parent, by the level that they wait for; only the root if there are no margins.
     """
-    active, level, last = np.empty(0, np.uint32), 0, grid.last_level
-    left: list[tuple[int, Nodes]] = []
+    active, level, joined = np.empty(0, np.uint32), 0, 0
+    left: list[tuple[int, Rows]] = []
     while True:
-        came = arrivals.survivors(level)
-        if len(came):
-            active = _by_cell(tree, grid, level - 1, np.concatenate([active, came]))[0]
-        if level > last and level + 1 >= len(arrivals.waits) and _are_last(tree, active, grid.step(level - 1)):
+        if level in arrivals.waiting:
+            active = tree.join(active, arrivals.waiting.pop(level))
+            active = _by_cell(tree, grid, level - 1, active)[0]
+        if level > grid.last_level and not arrivals.waiting and _are_last(tree, active, grid.step(level - 1)):
             break
         if margins is not None:
             margins.widen(level)
             if margins.are_closed:
                 break
-        new = arrivals.new(level)
-        if len(new):
-            active = np.concatenate([active, new])
-            progress("building", int(new[-1]) + 1, arrivals.splats, "splat")
+        if level in arrivals.joining:
+            rows = arrivals.joining.pop(level)
+            joined += len(rows)
+            active = tree.join(active, rows)
+            del rows
+            progress("building", joined, arrivals.splats, "splat")
         if margins is not None:
-            active, waiting = margins.split(active, tree.geometry)
-            left.append((level, waiting))
+            active, outside = margins.split(active, tree.geometry)
+            left.append((level, tree.take(outside)))
         if len(active) > 1:
             with threads_for(len(active)):
+                active = tree.tidy(active)
                 active = tree.merge_cells(level, *_by_cell(tree, grid, level, active))
         level += 1
     if margins is None and len(active) > 1:
-        tree.merge(level, 0, active, np.array([0, len(active)]))
-        active = np.array([tree.used - 1], np.uint32)
-    left.append((level, active))
-    for later in range(level, max(len(arrivals.joins), len(arrivals.waits))):
-        left.append((later, arrivals.new(later)))
-        if later > level:
-            left.append((later, arrivals.survivors(later)))
-    levels = np.repeat(np.array([k for k, _ in left], np.int32), [len(nodes) for _, nodes in left])
-    return Left(np.concatenate([nodes for _, nodes in left]), levels)
+        active = tree.merge(level, 0, active, np.array([0, len(active)]))
+    left.append((level, tree.take(active)))
+    return left + list(arrivals.joining.items()) + list(arrivals.waiting.items())
 
 
 def _by_cell(tree: VoxelTree, grid: VoxelGrid, level: int, nodes: Nodes) -> tuple[Nodes, NDArray[np.bool_]]:

@@ -228,8 +228,8 @@ def place_of(text: str) -> Place:
 
 
 def absolute(place: Place) -> Place:
-    """The same file for a process whose working folder is another one."""
-    return place if isinstance(place, Address) else place.absolute()
+    """The same file for a process whose working folder is another one; - stays what it is."""
+    return place if isinstance(place, Address) or str(place) == "-" else place.absolute()
 
 
 def size_of(place: Place) -> int:

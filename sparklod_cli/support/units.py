@@ -21,7 +21,7 @@ def count_of(count: int, noun: str, plural: str | None = None) -> str:
     return f"{count:,} {noun if count == 1 else plural or noun + 's'}"
 
 
-def format_size(size: int) -> str:
+def format_size(size: float) -> str:
     """ "12.3 GB", "350 MB", "2 kB": bytes in words, of powers of 1000."""
     for name, power in (("GB", 10**9), ("MB", 10**6)):
         if size >= power:

@@ -42,6 +42,9 @@ def test_colours_are_read_from_npy_and_raw_of_bytes_and_floats(suffix: str, kind
     got = read_rgba(save(tmp_path / f"colors{suffix}", values), COUNT)
     assert got.dtype == np.float32
     np.testing.assert_allclose(got, codes / 255, atol=1e-7)
+    for order in ("C", "F") if suffix == ".npy" else ("C",):
+        path = save(tmp_path / f"{order}{suffix}", np.asarray(values, order=order))
+        assert np.array_equal(read_rgba(path, COUNT, slice(3, COUNT - 2)), got[3:-2])
 
 
 def test_colours_replace_those_of_the_splats(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

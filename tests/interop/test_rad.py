@@ -35,6 +35,7 @@ from tests.interop.laws import EXT_DEGREES, HALF, TINY, degrees_between, within
 from tests.interop.spark import Spark
 from tests.interop.ties import Words
 from tests.interop.words import check_ext, check_packed
+from tests.node_streams import node_stream
 from tests.scenes import random_splats
 
 #: Spark's encoding of a chunk that it reads alone: the header that has the file's ranges is not there.
@@ -192,6 +193,15 @@ def width_of(path: Path, name: str) -> float:
         (found,) = (each for each in read_chunk_header(file).properties if each.name == name)
     assert found.min is not None and found.max is not None
     return found.max - found.min
+
+
+def test_spark_reads_a_tree_that_was_written_window_by_window(spark: Spark, tmp_path: Path) -> None:
+    """Two chunks, which come out of a stream of nodes."""
+    scene = Scene(*quick.build(random_splats(60_000, sh_degree=1), 1.5))
+    assert CHUNK_NODES < len(scene) < 2 * CHUNK_NODES
+    path = tmp_path / "streamed.rad"
+    path.write_bytes(b"".join(rad.encode(node_stream(scene), rad.settled(scene, WriteOptions()), scratch=tmp_path)))
+    check_close(spark, path, scene, RadOptions())
 
 
 def check_close(spark: Spark, path: Path, scene: Scene, options: RadOptions) -> None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from ...lod.chunk_order import FAMILY_BYTES, MOST_FAMILIES
 from ...model.sh import COEFFICIENTS
 from ...support import machine
 
@@ -15,7 +16,7 @@ from ...support import machine
 MEMORY_SHARE = 0.75
 
 #: Bytes of a process with numba and all kernels, before it has read anything.
-PROCESS = 350_000_000
+PROCESS = 200_000_000
 
 #: Most and least splats of a block. More make a block no faster, and fewer make its margins too large a part of it.
 MOST_BLOCK_SPLATS, LEAST_BLOCK_SPLATS = 1 << 21, 1 << 16
@@ -39,16 +40,22 @@ class _Bytes:
 
 
 #: In memory, a splat of the input; by method.
-IN_MEMORY = {"quick": _Bytes(220, 40), "quality": _Bytes(380, 40)}
+IN_MEMORY = {"quick": _Bytes(220, 27), "quality": _Bytes(250, 30)}
 
 #: Out of core, a splat of a block; by method.
-OF_BLOCK = {"quick": _Bytes(300, 50), "quality": _Bytes(480, 50)}
+OF_BLOCK = {"quick": _Bytes(300, 50), "quality": _Bytes(350, 50)}
+
+#: Out of core, a node of those that are read, gathered or encoded at once, and how many these are.
+OF_WINDOW, WINDOW = _Bytes(230, 50), 1 << 19
 
 #: Out of core, a splat of the whole scene: the order of its families.
 OF_ORDER = 16
 
+#: Families a splat of the input, and bytes of each outside of the part that is put in an order for streaming.
+FAMILIES, OF_FAMILY = 0.4, 40
+
 #: In the scratch folder, a splat of the input; by method. Those of blocks are removed when their nodes are made.
-IN_SCRATCH = {"quick": _Bytes(160, 26), "quality": _Bytes(200, 30)}
+IN_SCRATCH = {"quick": _Bytes(190, 32), "quality": _Bytes(200, 34)}
 
 
 def default_memory() -> int | None:
@@ -67,15 +74,20 @@ def in_memory_bytes(method: str, splats: int, sh_degree: int) -> int:
     return PROCESS + IN_MEMORY[method].of(splats, sh_degree)
 
 
-def out_of_core_bytes(method: str, splats: int, sh_degree: int, block_splats: int) -> int:
+def out_of_core_bytes(method: str, splats: int, sh_degree: int, block_splats: int, *, in_chunks: bool = False) -> int:
     """Bytes that a bake out of core takes at its peak.
 
     Args:
         method: of `lod.builders.BUILDERS`.
         splats, sh_degree: of the input; `sh_degree` as far as it is kept.
         block_splats: of a block.
+        in_chunks: families are put in an order for streaming at the end.
     """
-    return PROCESS + OF_ORDER * splats + OF_BLOCK[method].of(min(splats, block_splats), sh_degree)
+    window = OF_WINDOW.of(min(2 * splats, WINDOW), sh_degree)
+    block = OF_BLOCK[method].of(min(splats, block_splats), sh_degree)
+    families = int(FAMILIES * splats) if in_chunks else 0
+    arranging = FAMILY_BYTES * min(families, MOST_FAMILIES) + OF_FAMILY * families
+    return PROCESS + OF_ORDER * splats + max(window, block, arranging)
 
 
 def scratch_bytes(method: str, splats: int, sh_degree: int) -> int:
@@ -88,19 +100,20 @@ def scratch_bytes(method: str, splats: int, sh_degree: int) -> int:
     return IN_SCRATCH[method].of(splats, sh_degree)
 
 
-def block_splats_within(memory: int | None, method: str, splats: int, sh_degree: int) -> int | None:
+def block_splats_within(
+    memory: int | None, method: str, splats: int, sh_degree: int, *, in_chunks: bool = False
+) -> int | None:
     """The splats of a block, a power of two, so that nearly the same memory gives the same blocks.
 
     Args:
         memory: bytes that a bake may take; None for any number.
-        method: of `lod.builders.BUILDERS`.
-        splats, sh_degree: of the input; `sh_degree` as far as it is kept.
+        method, splats, sh_degree, in_chunks: as for `out_of_core_bytes`.
 
     Returns:
         None where the memory is too little for blocks of `LEAST_BLOCK_SPLATS`.
     """
     size = MOST_BLOCK_SPLATS
-    while memory is not None and out_of_core_bytes(method, splats, sh_degree, size) > memory:
+    while memory is not None and out_of_core_bytes(method, splats, sh_degree, size, in_chunks=in_chunks) > memory:
         size //= 2
         if size < LEAST_BLOCK_SPLATS:
             return None

@@ -68,26 +68,39 @@ class _Links:
 def put_order(job: Job, *, threads: int, progress: Progress) -> None:
     """A task. Results: what each window is read by, see `nodes`; at last the number of nodes and of levels."""
     links = _links(job)
+    levels = 1
+    sequence = _by_key(job, links, progress)
+    if len(sequence):
+        by_place = _by_place(links, sequence)
+        if job.in_chunks:
+            del sequence  # memory for what follows
+        with on_threads(threads):
+            levels, arranged = _arranged(job, links, by_place, progress)
+        del by_place
+        if arranged is not None:
+            sequence = arranged
+    start = links.starts(sequence)
+    at = links.families_at(start)
+    for window, part in enumerate(blocks_of(links.nodes, WINDOW_NODES)):
+        _put_window(job, window, part, links, sequence, start, at)
+        progress("ordering", links.nodes + part.stop, 2 * links.nodes, "node")
+    job.store.put(ORDER, {"counts": np.array([links.nodes, levels], np.int64)})
+
+
+def _by_key(job: Job, links: _Links, progress: Progress) -> NDArray[np.uint32]:
+    """(F,) the families by batch, and then by key."""
     sequence, done = np.empty(len(links.count), np.uint32), 0
     for some in merged(job.store, links.runs, links.begin):
         sequence[done : done + len(some)] = some
         done += len(some)
         progress("ordering", done, 2 * len(sequence), "family")
-    start = links.starts(sequence)
-    at = links.families_at(start)
-    levels = 1
-    if len(sequence):
-        by_place = at[at >= 0]
-        with on_threads(threads):
-            levels, arranged = _arranged(job, links, by_place, progress)
-        if arranged is not None:
-            sequence = arranged
-            start = links.starts(sequence)
-            at = links.families_at(start)
-    for window, part in enumerate(blocks_of(links.nodes, WINDOW_NODES)):
-        _put_window(job, window, part, links, sequence, start, at)
-        progress("ordering", links.nodes + part.stop, 2 * links.nodes, "node")
-    job.store.put(ORDER, {"counts": np.array([links.nodes, levels], np.int64)})
+    return sequence
+
+
+def _by_place(links: _Links, sequence: NDArray[np.uint32]) -> NDArray[np.int32]:
+    """(F,) the families in the order of the nodes whose children they are, in a tree whose families are in this one."""
+    at = links.families_at(links.starts(sequence))
+    return at[at >= 0]
 
 
 def _links(job: Job) -> _Links:

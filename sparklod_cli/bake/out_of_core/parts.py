@@ -46,7 +46,7 @@ def kept_of(stream: SceneStream, start: int, stop: int, settings: BakeSettings) 
     at = start
     for splats in stream.read(start, stop):
         if settings.rgba is not None:
-            values = read_rgba(settings.rgba, stream.count)[at : at + len(splats)]
+            values = read_rgba(settings.rgba, stream.count, slice(at, at + len(splats)))
             splats = dataclasses.replace(splats, rgb=np.ascontiguousarray(values[:, :3]), opacity=values[:, 3].copy())
         at += len(splats)
         splats = splats.with_max_sh(settings.max_sh)

@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from functools import partial
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 from ...model.gaussian import spark_size
-from ...model.lod_tree import LodTree
-from ...model.splats import COLUMNS, Splats
+from ...model.splats import COLUMNS, FloatArray, Splats
 from ...support.defaults import MAX_BASE, MIN_BASE
 from ...support.jit import threads_for
 from ...support.progress import Progress, silent
 from ..check import Bounds, check_setting
-from ..kernels.geometry import CENTER, OPACITY, QUAT, SCALE, WIDTH, SplatColumns, gather_rows
+from ..kernels.geometry import CENTER, OPACITY, QUAT, SCALE, SplatColumns
 from ..kernels.sort import Keys, Nodes, cell_words, sort_by_key
 from ..margins import Margins
 from ..voxel_grid import VoxelGrid
 from ..voxel_growth import Arrivals, grow
-from ..voxel_tree import SHRINK, Batch, VoxelTree, final_order, in_order
+from ..voxel_rows import by_level, joining, rows_of, sorted_leaves
+from ..voxel_tree import MADE, SHRINK, Batch, Final, Offsets, Rows, VoxelTree
 from .records import NO_FAMILY, STAGE_BITS, Families, Pending, Region, Survey
 
 #: Level of splats that have not joined the tree yet: they do so at the level of their size.
@@ -55,38 +59,41 @@ def advance(
 
     Families with the same batch and key come from one stage: a stable sort keeps them as they are.
     """
-    given = pending.columns
-    with threads_for(len(pending)) as threads:
-        pick, arrivals = _arrivals(pending, plan, threads)
-        tree = _rows(pending, pick)
-        left = grow(tree, plan, arrivals, Margins(plan, region.low, region.high) if region else None, progress)
-        rows = tree.geometry[left.nodes]
-        batch, key, count = _places(tree, plan)
-        order = final_order(tree, left.nodes)
-        nodes, links = in_order(tree, order, pick, given["rgb"], given["sh"])
-    parents, family = _families(links, count, len(rows), stage)
-    was_given = order < tree.given
-    family[was_given] = given["family"][pick[order[was_given]]]
-    is_new = left.nodes < arrivals.splats
-    is_new[is_new] = np.searchsorted(arrivals.joins, left.nodes[is_new], "right") == left.levels[is_new]
-    index = np.full(len(rows), -1, np.int64)
-    index[is_new] = given["index"][pick[left.nodes[is_new]]]
-    drawn = nodes.take(parents)
-    made = slice(len(rows), None)
+    given = dict(pending.columns)
+    del pending
+    with threads_for(len(given["level"])) as threads:
+        pick, joins, arrivals, leaves = _arrivals(given, plan, threads)
+        for name in ("center", "scale", "quat_xyzw", "opacity", "weight"):
+            del given[name]  # the rows have them; frees the memory if the caller has no reference
+        tree = VoxelTree(len(pick), leaves, partial(_keys, plan))
+        margins = Margins(plan, region.low, region.high) if region else None
+        left = grow(tree, plan, arrivals, margins, progress)
+        tops = Rows.concat([rows for _, rows in left])
+        final = tree.finish(tops, pick, given["rgb"], given["sh"])
+    waits = np.repeat(np.array([level for level, _ in left], np.int32), [len(rows) for _, rows in left])
+    was_given = tops.count == 0
+    family = np.full(len(final.tree), NO_FAMILY, np.int64)
+    is_given = final.number != MADE
+    family[is_given] = given["family"][pick[final.number[is_given]]]
+    family[final.parents] = (np.int64(stage) << STAGE_BITS) | np.arange(len(final.parents))
+    # A splat that waits for the level of its own size has not joined.
+    is_new = was_given & (tops.number < arrivals.splats)
+    is_new[is_new] = np.searchsorted(joins, tops.number[is_new], "right") == waits[is_new]
+    index = np.full(len(tops), -1, np.int64)
+    index[is_new] = given["index"][pick[tops.number[is_new]]]
     handed_on = {
-        "center": rows[:, CENTER:SCALE].copy(),
-        "scale": rows[:, SCALE:QUAT].copy(),
-        "quat_xyzw": rows[:, QUAT:OPACITY].copy(),
-        "opacity": rows[:, OPACITY].copy(),
-        "rgb": nodes.rgb[: len(rows)].copy(),
-        "sh": nodes.sh[: len(rows)].copy(),
-        "weight": tree.weight[left.nodes],
-        "level": np.where(is_new, np.int32(NEW), left.levels),
+        "center": tops.geometry[:, CENTER:SCALE].copy(),
+        "scale": tops.geometry[:, SCALE:QUAT].copy(),
+        "quat_xyzw": tops.geometry[:, QUAT:OPACITY].copy(),
+        "opacity": tops.geometry[:, OPACITY].copy(),
+        "rgb": final.nodes.rgb[: len(tops)].copy(),
+        "sh": final.nodes.sh[: len(tops)].copy(),
+        "weight": tops.weight,
+        "level": np.where(is_new, np.int32(NEW), waits),
         "index": index,
-        "family": family[: len(rows)].copy(),
+        "family": family[: len(tops)].copy(),
     }
-    families = Families(batch, key, count, nodes.take(made), family[made], drawn.center, spark_size(drawn))
-    return families, Pending(handed_on)
+    return _families(tree, final, family, len(tops), plan.words(0)), Pending(handed_on)
 
 
 def root(pending: Pending) -> tuple[Splats, int]:
@@ -98,52 +105,39 @@ def root(pending: Pending) -> tuple[Splats, int]:
     return Splats(**columns), family
 
 
-def _arrivals(pending: Pending, grid: VoxelGrid, threads: int) -> tuple[Nodes, Arrivals]:
-    """(n,) the pending node of each row, and when the rows take part.
+def _arrivals(given: Mapping[str, NDArray[Any]], grid: VoxelGrid, threads: int) -> tuple[Nodes, Offsets, Arrivals, int]:
+    """What takes part: the pending node of each number, where each level ends among the new splats, and the rows.
 
-    New splats come first, by level, curve and index, as in memory; then other splats; then merged ones.
+    New splats have the first numbers, by level, curve and index, as in memory; then come other splats, then merged
+    ones. The last value is the number of the first of these.
     """
-    given = pending.columns
     is_new = given["level"] == NEW
-    new = np.flatnonzero(is_new).astype(np.uint32)
-    index = given["index"][new]
-    if len(index) and (np.diff(index) < 0).any():
-        new = sort_by_key(index.astype(np.uint64), new, int(index.max()).bit_length(), threads)[1]
-    keys, levels, bits = grid.leaf_keys(given["center"][new], given["scale"][new])
-    new = sort_by_key(keys, new, bits, threads)[1]
-    old = np.flatnonzero(~is_new).astype(np.uint32)
+    new, old = (np.flatnonzero(mask).astype(np.uint32) for mask in (is_new, ~is_new))
+    columns = SplatColumns(given["center"], given["scale"], given["quat_xyzw"], given["opacity"])
+    index, order = given["index"][new], None
+    if (np.diff(index) < 0).any():
+        order = np.arange(len(new), dtype=np.uint32)
+        order = sort_by_key(index.astype(np.uint64), order, int(index.max()).bit_length(), threads)[1]
+    every = len(old) == 0
+    center, scale = (column if every else column[new] for column in (given["center"], given["scale"]))
+    order, joins = sorted_leaves(center, scale, grid, threads, order)
+    new = new[order]
     is_merged = given["family"][old] != NO_FAMILY
     old = np.concatenate([old[~is_merged], old[is_merged]])
-    waits_for = given["level"][old]
-    waiting = (np.argsort(waits_for, kind="stable") + len(new)).astype(np.uint32)
-    arrivals = Arrivals(np.cumsum(np.bincount(levels)), waiting, np.cumsum(np.bincount(waits_for)))
-    return np.concatenate([new, old]), arrivals
+    survivors = rows_of(old, len(new), columns)
+    merged = len(old) - int(np.count_nonzero(is_merged))
+    survivors.weight[merged:] = given["weight"][old[merged:]]  # not that of the rounded opacity
+    waiting = {level: survivors.take(at) for level, at in by_level(given["level"][old])}
+    arrivals = Arrivals(len(new), joining(new, joins, columns), waiting)
+    return np.concatenate([new, old]), joins, arrivals, len(new) + merged
 
 
-def _rows(pending: Pending, pick: Nodes) -> VoxelTree:
-    """A tree with the picked nodes."""
-    given, n = pending.columns, len(pending)
-    geometry, weight = np.empty((2 * n, WIDTH), np.float32), np.empty(2 * n, np.float64)
-    columns = SplatColumns(given["center"], given["scale"], given["quat_xyzw"], given["opacity"])
-    gather_rows(pick, columns, geometry, weight)
-    merged = int(np.count_nonzero(given["family"] != NO_FAMILY))
-    weight[n - merged : n] = given["weight"][pick[n - merged :]]  # not that of the rounded opacity
-    return VoxelTree(geometry, weight, n - merged, n, n)
-
-
-def _places(tree: VoxelTree, grid: VoxelGrid) -> tuple[NDArray[np.int32], Keys, NDArray[np.uint16]]:
-    """Batch, key and number of children of each family, in their order."""
-    words = grid.words(0)
-    batches = [np.empty(0, np.int32)]
-    keys, counts = [np.empty((0, words), np.uint64)], [np.empty(0, np.uint16)]
-    for batch in reversed(tree.batches):
-        made = np.arange(batch.row, batch.row + len(batch.first) - 1, dtype=np.uint32)
-        step, low_cell, _ = grid.cells(batch.level)
-        each = [cell_words(tree.geometry, made, step, low_cell, word) for word in reversed(range(words))]
-        batches.append(np.full(len(made), _number(batch), np.int32))
-        keys.append(np.stack(each, axis=1))
-        counts.append(np.diff(batch.first).astype(np.uint16))
-    return np.concatenate(batches), np.concatenate(keys), np.concatenate(counts)
+def _keys(grid: VoxelGrid, level: int, rows: FloatArray) -> Keys:
+    """Morton codes of the cells of a level that rows are in, the highest word first."""
+    step, low_cell, _ = grid.cells(level)
+    nodes = np.arange(len(rows), dtype=np.uint32)
+    words = [cell_words(rows, nodes, step, low_cell, word) for word in reversed(range(grid.words(0)))]
+    return np.stack(words, axis=1)
 
 
 def _number(batch: Batch) -> int:
@@ -151,17 +145,17 @@ def _number(batch: Batch) -> int:
     return (LEVELS - batch.level) * FOLDS + (FOLDS - batch.fold if batch.fold else 0)
 
 
-def _families(
-    links: LodTree, count: NDArray[np.uint16], tops: int, stage: int
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """The parent of each family of a stage, and the number of the family of each node; `NO_FAMILY` for the others."""
-    starts = np.cumsum(count, dtype=np.int64) - count + tops
-    place = np.empty(len(links) + 1, np.int64)
-    place[starts] = np.arange(len(count))
-    inner = np.flatnonzero(links.child_count)
-    mine = place[links.child_start[inner]]
-    parents = np.empty(len(count), np.int64)
-    parents[mine] = inner
-    family = np.full(len(links), NO_FAMILY, np.int64)
-    family[inner] = (np.int64(stage) << STAGE_BITS) | mine
-    return parents, family
+def _families(tree: VoxelTree, final: Final, family: NDArray[np.int64], tops: int, words: int) -> Families:
+    """The families of a stage, from its nodes and the number of the family of each; the first are without a parent."""
+    batches = tree.batches[::-1]
+    number = np.array([_number(batch) for batch in batches], np.int32)
+    parents = final.nodes.take(final.parents)
+    return Families(
+        batch=np.repeat(number, [batch.families for batch in batches]),
+        key=np.concatenate([*(batch.keys for batch in batches), np.empty((0, words), np.uint64)]),
+        count=final.tree.child_count[final.parents],
+        nodes=final.nodes.take(slice(tops, None)),
+        family=family[tops:],
+        center=parents.center,
+        size=spark_size(parents),
+    )

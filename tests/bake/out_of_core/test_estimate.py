@@ -1,0 +1,44 @@
+"""Blocks are as large as the memory allows, and nearly the same memory gives the same ones."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sparklod_cli.bake.out_of_core import estimate
+from sparklod_cli.lod.builders import METHODS
+from sparklod_cli.support import machine
+from sparklod_cli.support.defaults import MAX_SH_DEGREE
+
+CASES = (st.sampled_from(METHODS), st.integers(1, 10**9), st.integers(0, MAX_SH_DEGREE))
+
+
+@given(*CASES, st.integers(0, 1 << 40))
+def test_a_block_is_the_largest_power_of_two_that_fits(method: str, splats: int, degree: int, memory: int) -> None:
+    size = estimate.block_splats_within(memory, method, splats, degree)
+    if size is None:
+        least = estimate.out_of_core_bytes(method, splats, degree, estimate.LEAST_BLOCK_SPLATS)
+        assert least > memory
+        assert estimate.block_splats_within(least, method, splats, degree) is not None
+        return
+    assert size & (size - 1) == 0
+    assert estimate.LEAST_BLOCK_SPLATS <= size <= estimate.MOST_BLOCK_SPLATS
+    assert estimate.out_of_core_bytes(method, splats, degree, size) <= memory
+    if size < estimate.MOST_BLOCK_SPLATS:
+        assert estimate.out_of_core_bytes(method, splats, degree, 2 * size) > memory
+
+
+@given(*CASES)
+def test_more_splats_and_more_coefficients_take_more(method: str, splats: int, degree: int) -> None:
+    for of in (estimate.in_memory_bytes, estimate.scratch_bytes):
+        assert of(method, splats, degree) <= of(method, splats + 1, degree)
+        assert of(method, splats, degree) <= of(method, splats, MAX_SH_DEGREE)
+    assert estimate.block_splats_within(None, method, splats, degree) == estimate.MOST_BLOCK_SPLATS
+
+
+def test_by_default_a_bake_takes_a_share_of_what_is_available(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(machine, "available_memory", lambda: 8_000_000_000)
+    assert estimate.default_memory() == 6_000_000_000
+    monkeypatch.setattr(machine, "available_memory", lambda: None)
+    assert estimate.default_memory() is None
