@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -11,11 +12,12 @@ from PIL import Image
 
 from sparklod_cli.commands.inspect_text import finding_line
 from sparklod_cli.inspection import report
-from sparklod_cli.io import read_scene
+from sparklod_cli.io import open_stream, read_scene
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.selection import Selection
-from sparklod_cli.model.splats import COLUMNS
-from sparklod_cli.support.errors import FormatError, InvalidSplatsError
+from sparklod_cli.model.splats import COLUMNS, Splats
+from sparklod_cli.model.streams import collected
+from sparklod_cli.support.errors import FormatError, HasTreeError, InvalidSplatsError
 
 from .case import LawError
 from .oracle import stderr_fault
@@ -38,6 +40,34 @@ def check_scene(scene: Scene) -> None:
         raise LawError("negative scales are left after --on-invalid drop")
     if not (kept.opacity >= 0).all():
         raise LawError("negative opacities are left after --on-invalid drop")
+
+
+def check_stream(path: Path, threads: int) -> None:
+    """Checks that a stream fails with the words of the reader of the whole file, or gives the same splats."""
+    whole = _outcome(lambda: read_scene(path, threads=threads).splats)
+    found = _outcome(lambda: _streamed(path, threads))
+    if found is None:
+        return
+    if isinstance(whole, str) or isinstance(found, str):
+        if whole != found:
+            raise LawError(f"as a stream: {found!r:.200}; as a whole: {whole!r:.200}", "stream")
+    elif any(getattr(whole, name).tobytes() != getattr(found, name).tobytes() for name in COLUMNS):
+        raise LawError("a stream gives other splats than the reader of the whole file", "stream")
+
+
+def _streamed(path: Path, threads: int) -> Splats:
+    with open_stream(path, threads=threads) as stream:
+        return collected(stream).splats
+
+
+def _outcome(make: Callable[[], Splats]) -> Splats | str | None:
+    """The splats, or what is wrong; None for a tree, which has no stream."""
+    try:
+        return make()
+    except HasTreeError:
+        return None
+    except FormatError as error:
+        return str(error)
 
 
 def check_report(path: Path) -> None:

@@ -35,8 +35,9 @@ def make(rng: Rng) -> Case:
 
 
 def check(case: Case, folder: Path) -> None:
-    """The file has a report; the readers return a scene that can be drawn, or refuse it with an error."""
+    """The file has a report; the readers return a scene that can be drawn, or refuse it; a stream does the same."""
     path, threads = Path(case.run["path"]), case.run["threads"]
     laws.check_report(path)
+    laws.check_stream(path, threads)
     examine_scene(path, columns=("center", "scale"), threads=threads)
     laws.check_scene(read_scene(path, threads=threads))

@@ -17,7 +17,8 @@ class Format:
 
     Attributes:
         name: for display.
-        module: in this package; has `decode(file, *, threads, progress) -> Scene`.
+        module: in this package; has `decode(file, *, threads, progress) -> Scene`, and for files without a tree
+            `stream(file, *, scratch, threads, progress) -> SceneStream`, see `content`.
         writable: its module also has `encode(scene, options, *, threads, progress) -> Iterator[bytes]`, and
             `settled(scene, options) -> WriteOptions`, the options with nothing left open, which raises `FormatError`
             if the scene cannot be written.
@@ -27,7 +28,8 @@ class Format:
         suffixes: lower case, with the dot.
         beginning: a regular expression that the first bytes of its files match; None if any bytes are possible, so that
             only the suffix decides.
-        companions: its files refer to others beside them; `decode` takes another argument, `beside`, which opens those.
+        companions: its files refer to others beside them; `decode` and `stream` take another argument, `beside`, which
+            opens those.
         selective: its module also has `examine(file, *, columns, threads, progress) -> Scene`, which decodes only some
             columns and accepts a broken tree; `beside`, too, where it has companions.
     """

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from collections import deque
 from collections.abc import Collection, Iterator
 from typing import Any, BinaryIO
 
@@ -83,6 +84,8 @@ def stream(file: BinaryIO, *, scratch: Scratch, threads: int = 1, progress: Prog
     layout, rows, header = _opened(file)
     if layout.flags & LOD:
         raise HasTreeError(HAS_TREE)
+    if not layout.count:  # there is nothing to read, but what follows may be wrong
+        deque(rows, maxlen=0)
 
     def unpacked() -> Iterator[bytes]:
         done = 0

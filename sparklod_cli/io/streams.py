@@ -8,10 +8,10 @@ import functools
 import hashlib
 import tempfile
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, BinaryIO, Protocol
+from typing import Any, BinaryIO, NamedTuple, Protocol
 
 from ..model.merged import Placed, merged
 from ..model.splats import Splats
@@ -22,6 +22,7 @@ from ..support.addresses import Address, Place
 from ..support.errors import FormatError, OutputError, SparklodError
 from ..support.progress import Progress, silent
 from ..support.stdin import DASH, name_of
+from .idle import Opened, borrowed, close_idle
 from .names import reason_of
 from .reading import opened, readable
 
@@ -40,13 +41,13 @@ def open_stream(
 ) -> Iterator[SceneStream]:
     """The splats of a file of any known format without a tree, block by block.
 
-    Only its header is read now. Each read of the stream opens the file anew, so that it may be read by several threads.
+    Only its header is read now. Each read of the stream has the file for itself, so that several threads may read.
     Columns that lie one after the other (SPZ, SOG), and text, are unpacked once, when splats are first read; see
     docs/formats.md for the room that takes.
 
     Args:
         path: as for `io.read_scene`.
-        scratch: folder for what is unpacked; None for that of the system's temporary files.
+        scratch: folder for what is unpacked; None for one of the system's temporary files.
         keep: leave what is unpacked in `scratch`, where the same file is found unpacked the next time, by other
             processes, too; whoever owns the folder removes it. The stream can be pickled then, if `progress` can.
         threads: to decode with.
@@ -63,10 +64,11 @@ def open_stream(
     store: _Store = _Folder(scratch) if keep and scratch is not None else _Unnamed(scratch)
     try:
         source = _Source(path, store, threads, progress)
-        with source.opened() as stream:
+        with source.borrowed() as stream:
             found = stream
         yield dataclasses.replace(found, read=_Read(source, found.count, found.sh_degree))
     finally:
+        close_idle(lambda key: isinstance(key, _Key) and (key.store, key.path) == (store.name, path))
         store.close()
 
 
@@ -126,7 +128,14 @@ def _read_once(
 
 
 class _Store(Protocol):
-    """Where the one file is that is unpacked."""
+    """Where the one file is that is unpacked.
+
+    Attributes:
+        name: tells it from others.
+    """
+
+    @property
+    def name(self) -> Hashable: ...
 
     def file(self, path: Place, pieces: Pieces) -> contextlib.AbstractContextManager[BinaryIO]:
         """What has been unpacked of a file; `pieces` are written first if they have not been."""
@@ -142,6 +151,10 @@ class _Unnamed:
     folder: Path | None
     _file: BinaryIO | None = None
     _lock: threading.Lock = field(default_factory=threading.Lock)
+
+    @property
+    def name(self) -> Hashable:
+        return id(self)
 
     def file(self, path: Place, pieces: Pieces) -> contextlib.AbstractContextManager[BinaryIO]:
         with self._lock:
@@ -169,6 +182,10 @@ class _Folder:
     """A folder of such files, each named after what it was unpacked from, which appear whole or not at all."""
 
     folder: Path
+
+    @property
+    def name(self) -> Hashable:
+        return self.folder
 
     def file(self, path: Place, pieces: Pieces) -> contextlib.AbstractContextManager[BinaryIO]:
         target = self.folder / f"{_digest(path)}.unpacked"
@@ -202,6 +219,16 @@ def _room(folder: Path | None) -> Iterator[None]:
         raise OutputError(f"cannot write to the scratch folder {where}: {reason_of(error)}") from None
 
 
+class _Key(NamedTuple):
+    """What tells an opened file from others, see `idle.borrowed`."""
+
+    store: Hashable
+    path: Place
+    version: str
+    threads: int
+    progress: Progress
+
+
 @dataclass(frozen=True)
 class _Source:
     """A file, and what opens it."""
@@ -212,26 +239,33 @@ class _Source:
     progress: Progress
 
     @contextlib.contextmanager
-    def opened(self) -> Iterator[SceneStream]:
-        """The stream of the file, which is open as long as the body runs."""
+    def borrowed(self) -> Iterator[SceneStream]:
+        """The stream of the file, which nobody else reads as long as the body runs."""
+        with readable():
+            key = _Key(self.store.name, self.path, _digest(self.path), self.threads, self.progress)
+            with borrowed(key, self._opened) as stream:
+                yield stream
+
+    def _opened(self) -> Opened:
+        unpacked: list[BinaryIO] = []
+
+        def scratch(pieces: Pieces) -> BinaryIO:
+            def readable_pieces() -> Iterator[bytes]:
+                with readable():
+                    yield from pieces()
+
+            if not unpacked:
+                unpacked.append(closing.enter_context(self.store.file(self.path, readable_pieces)))
+            return unpacked[0]
+
         with contextlib.ExitStack() as stack:
-            unpacked: list[BinaryIO] = []
-
-            def scratch(pieces: Pieces) -> BinaryIO:
-                def readable_pieces() -> Iterator[bytes]:
-                    with readable():
-                        yield from pieces()
-
-                if not unpacked:
-                    unpacked.append(stack.enter_context(self.store.file(self.path, readable_pieces)))
-                return unpacked[0]
-
             file, form, more = stack.enter_context(opened(self.path))
             codec: Any = form.codec()
             stream: SceneStream = codec.stream(
                 file, scratch=scratch, threads=self.threads, progress=self.progress, **more
             )
-            yield stream
+            closing = stack.pop_all()
+        return closing, stream
 
 
 @dataclass(frozen=True)
@@ -243,7 +277,7 @@ class _Read:
     sh_degree: int
 
     def __call__(self, start: int, stop: int) -> Iterator[Splats]:
-        with self.source.opened() as stream:
+        with self.source.borrowed() as stream:
             if (stream.count, stream.sh_degree) != (self.count, self.sh_degree):
                 raise FormatError("it was changed while it was read; start again")
             yield from stream.read(start, stop)

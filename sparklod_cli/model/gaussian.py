@@ -144,6 +144,7 @@ def size_factor(lod_opacity: FloatArray, out: FloatArray | None = None) -> Float
     return factor
 
 
+@np.errstate(over="ignore", invalid="ignore")  # reports ask for that of scales that are not finite, too
 def spark_size(splats: Splats) -> FloatArray:
     """(N,) feature size, 2 * mean(scale) * (1 + 0.7 * max(0, D - 1)): what Spark 2.2.0 writes into its nodes.
 

@@ -1,0 +1,83 @@
+"""Damaged bytes: a stream and the decoder of the whole file fail with the same words, or give the same splats."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Iterable
+from typing import Any, BinaryIO
+
+import numpy as np
+import pytest
+
+from sparklod_cli.model import streams
+from sparklod_cli.model.splats import COLUMNS, Splats
+from sparklod_cli.support.errors import FormatError, HasTreeError
+from tests.codecs.test_damaged import FILES, WORDS, content, format_of, header, insides
+
+TRIES = 40
+
+pytestmark = pytest.mark.filterwarnings("error")
+
+
+def in_memory(pieces: Callable[[], Iterable[bytes]]) -> BinaryIO:
+    return io.BytesIO(b"".join(pieces()))
+
+
+def outcome(make: Callable[[], Splats]) -> Splats | str | None:
+    """The splats, or what is wrong; None for a tree."""
+    try:
+        return make()
+    except HasTreeError:
+        return None
+    except FormatError as error:
+        return f"{type(error).__name__}: {error}"
+
+
+def compare(name: str, data: bytes) -> str:
+    """What came of both: "tree", "splats" or the error's text."""
+    form = format_of(name, data)
+    if form is None:
+        return "unknown"
+    codec: Any = form.codec()
+
+    def streamed() -> Splats:
+        stream = codec.stream(io.BytesIO(data), scratch=in_memory)
+        return Splats.concat([Splats.empty(0, stream.sh_degree), *stream.blocks()])
+
+    whole, found = outcome(lambda: codec.decode(io.BytesIO(data)).splats), outcome(streamed)
+    if found is None:
+        return "tree"
+    if isinstance(whole, Splats) and isinstance(found, Splats):
+        for column in COLUMNS:
+            np.testing.assert_array_equal(getattr(found, column), getattr(whole, column), column)
+        return "splats"
+    assert found == whole
+    return str(found)
+
+
+def damaged(name: str, rng: np.random.Generator) -> Iterable[bytes]:
+    """The bytes of a file as they are, cut short, with other bits, and with words in between."""
+    data, packed = insides(name)[0]  # of SOG, meta.json
+    yield packed(data)
+    for raw, rest in ((content(name), bytes), (data, packed)):
+        places = header(name, raw) if raw is not data or rest is bytes else list(range(len(raw)))
+        for kind in range(TRIES):
+            changed = bytearray(raw)
+            at = int(rng.choice(places)) if kind % 2 else int(rng.integers(len(raw)))
+            at = min(at, len(raw) - 1)
+            if kind % 4 == 0:
+                del changed[at:]
+            elif kind % 4 == 1:
+                changed[at:at] = WORDS[rng.integers(len(WORDS))]
+            else:
+                changed[at] ^= 1 << int(rng.integers(8))
+            yield rest(bytes(changed))
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_a_stream_of_damaged_bytes_fails_as_the_decoder_does(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(streams, "BLOCK_SPLATS", 20)
+    rng = np.random.default_rng([17, len(name)])
+    found = [compare(name, data) for data in damaged(name, rng)]
+    assert found[0] == ("tree" if "tree" in name else "splats")
+    assert name.endswith(".splat") or any(text not in ("tree", "splats", "unknown") for text in found)
