@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import pickle
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from sparklod_cli.io import PlacedFile, open_stream, open_streams, read_scene
+from sparklod_cli.codecs import sog
+from sparklod_cli.io import PlacedFile, idle, open_stream, open_streams, read_scene
 from sparklod_cli.model import streams
 from sparklod_cli.model.merged import Placed, merged
 from sparklod_cli.model.scene import Scene
@@ -135,3 +137,25 @@ def test_a_scratch_folder_without_room_is_named(tmp_path: Path) -> None:
     for keep in (False, True):
         with open_stream(path, scratch=path, keep=keep) as stream, pytest.raises(OutputError, match="scratch folder"):
             list(stream.blocks())
+
+
+def test_short_reads_decode_the_palette_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = []
+    read = sog._read_palette
+    monkeypatch.setattr(sog, "_read_palette", lambda *given: calls.append(given) or read(*given))
+    path = put(WRITERS["SOG"]["2"].write(Scene(random_splats(99, sh_degree=1))), tmp_path, "SOG")
+    with open_stream(path) as stream:
+        for start in range(9):
+            assert len(next(stream.read(start, start + 9))) == 9
+    assert len(calls) == 1
+
+
+def test_files_that_wait_are_few_and_closed_at_the_end(tmp_path: Path) -> None:
+    idle.close_idle()
+    with contextlib.ExitStack() as stack:
+        for number in range(idle.MOST + 3):
+            path = tmp_path / f"{number}.ply"
+            path.write_bytes((FIXTURES / "one.ply").read_bytes())
+            next(stack.enter_context(open_stream(path)).read(0, 1))
+        assert len(idle._IDLE) == idle.MOST
+    assert not idle._IDLE

@@ -45,3 +45,10 @@ def test_kernels_have_the_opacities_of_numpy() -> None:
     np.testing.assert_allclose(back, gaussian.linear_opacity(d), rtol=1e-6)
     found = [profile.lod_opacity_above_1(float(value), 1.0, np.e) for value in opacity]
     np.testing.assert_allclose(found, d, rtol=1e-6)
+
+
+@pytest.mark.filterwarnings("error")
+def test_sizes_of_splats_that_are_not_finite_are_no_warning() -> None:
+    splats = random_splats(3)
+    splats.scale[:2] = [[np.inf, -np.inf, 1], [3e38, 3e38, 3e38]]
+    assert np.isfinite(gaussian.spark_size(splats)).tolist() == [False, False, True]

@@ -99,13 +99,14 @@ def in_final_order(
     parents = prune.lay_out_children(np.concatenate([root, inner]), n, parent, saved, *columns)[hidden:]
     del parent, saved
     out = Splats.empty(total, degree_of(splats.sh.shape[1]))
+    geometry = out.center, out.scale, out.quat_xyzw, out.opacity
+    places = (column[hidden:] for column in geometry)
+    node_rows.fill_merged_splats(order[hidden:], n, binary.row, rows, curve.space, *places)
+    of_merged = rows[:, pair_cost.WEIGHT].copy()
+    if wanted.is_whole:  # frees the rows before memory for colours is touched
+        binary.rows = rows = rows[:0].copy()
     for name in COLUMNS:
         fill_leaves(order, index, getattr(splats, name).reshape(n, -1), getattr(out, name).reshape(total, -1))
-    geometry = (column[hidden:] for column in (out.center, out.scale, out.quat_xyzw, out.opacity))
-    node_rows.fill_merged_splats(order[hidden:], n, binary.row, rows, curve.space, *geometry)
-    of_merged = rows[:, pair_cost.WEIGHT].copy()
-    if wanted.is_whole:
-        binary.rows = rows = rows[:0].copy()
     weights = np.empty(binary.used, np.float64)
     weights[:n], weights[inner] = binary.weight, of_merged
     ends = np.concatenate([np.flatnonzero(np.diff(ranks, prepend=ranks[:1] - 1)), [len(inner)]])
