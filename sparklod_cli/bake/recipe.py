@@ -14,6 +14,7 @@ import numpy as np
 from .. import __version__
 from ..io import files_of, identity_of
 from ..support.addresses import Place
+from ..support.errors import UnreadableError
 from ..support.untrusted import parse_json, quoted_value
 from .settings import BakeSettings
 
@@ -91,10 +92,12 @@ def recipe_of(sources: Iterable[Place], settings: BakeSettings, **more: Any) -> 
     Raises:
         UnreadableError: an input cannot be read.
     """
-    files = [file for source in sources for file in files_of(source)]
+    found = [identity_of(file) for source in sources for file in files_of(source)]
     if settings.rgba is not None:
-        files.append(settings.rgba)
-    found = [identity_of(file) for file in files]
+        try:
+            found.append(identity_of(settings.rgba))
+        except UnreadableError as error:
+            raise UnreadableError(f"{settings.rgba} {error}") from None
     inputs = tuple(f"{each.bytes} {each.modified} {each.sample}" for each in found)
     return Recipe(inputs, tuple(each.name for each in found), settings_of(settings) | more)
 

@@ -19,6 +19,7 @@ from .command import COMMON, Command, option
 from .options.baking import baking_options, check_method
 from .options.cluster import OF_CLUSTERS, check_cluster, cluster_of, cluster_options
 from .options.common import General, common_options, output_option, overwrite_option
+from .options.resources import HEADING as LARGE
 from .options.resources import OF_BAKES, resources_options
 from .paths import OutputPath, claim_stdout, keep_apart, with_chunks
 from .usage import exclude, options_of
@@ -63,7 +64,7 @@ Examples:
 @overwrite_option
 @option(
     "--skip-existing",
-    heading=COMMON,
+    heading=LARGE,
     is_flag=True,
     help="Bake nothing whose output is there already, of the same inputs and settings; a small file beside each output,"
     " NAME.sparklod.json, tells of what it is.",

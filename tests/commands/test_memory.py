@@ -115,16 +115,16 @@ def test_one_file_that_is_too_large_does_not_stop_the_others(
 ) -> None:
     from sparklod_cli.inspection import tree
 
-    examine = tree.examine
+    examine_blocks = tree.examine_blocks
     calls = iter([MemoryError(), None])
 
     def full_once(*args: object, **kwargs: object) -> object:
         error = next(calls)
         if error:
             raise error
-        return examine(*args, **kwargs)  # type: ignore[arg-type]
+        return examine_blocks(*args, **kwargs)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(tree, "examine", full_once)
+    monkeypatch.setattr(tree, "examine_blocks", full_once)
     assert run(["inspect", str(TREE), str(TREE), "--check"]) == 1
     first, second = capsys.readouterr().err.splitlines()
     assert first.startswith(f"error: {TREE}: it does not fit into memory")

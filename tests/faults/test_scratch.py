@@ -15,6 +15,7 @@ from sparklod_cli.bake import BakeSettings, Resources, bake
 from sparklod_cli.bake.out_of_core.manifest import SUFFIX
 from sparklod_cli.support.errors import InvalidSplatsError, ScratchError
 from tests.faults.runs import DEMO, ENVIRONMENT, mounted
+from tests.signals import heed_signals
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="there is no kill -9 on Windows")
 
@@ -67,6 +68,7 @@ def begun(target: Path, scratch: Path, method: str, moment: int, how: str) -> su
         env={**ENVIRONMENT, "BLOCK_SPLATS": str(BLOCK_SPLATS)},
         stdout=subprocess.PIPE,
         text=True,
+        preexec_fn=heed_signals,
     )
 
 

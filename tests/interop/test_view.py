@@ -30,7 +30,7 @@ from tests.interop import npm
 from tests.interop.conftest import PAGE
 from tests.interop.node import Node
 from tests.interop.pictures import psnr
-from tests.view.signals import heed_signals
+from tests.signals import heed_signals
 
 PROGRAM = Path(__file__).with_name("view_page.mjs")
 

@@ -196,8 +196,12 @@ def test_a_part_swept_before_it_is_locked_is_made_again(tmp_path: Path, monkeypa
     assert (tmp_path / "out").read_bytes() == b"x"
 
 
-#: Modules that write files, and what: outputs (whole or to a device), the cache of kernels, what Open3D's process says.
-WRITERS = {"io/writing.py", "support/atomic.py", "support/atomic_set.py", "render/open3d/process.py"}
+#: Modules that write files, and what: outputs (whole, or to a device or an address), the cache of kernels, what the
+#: process of Open3D says.
+WRITERS = {
+    *("io/writing.py", "support/addresses.py", "support/atomic.py", "support/atomic_set.py"),
+    "render/open3d/process.py",
+}
 
 
 def writes(call: ast.Call) -> bool:

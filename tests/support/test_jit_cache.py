@@ -109,7 +109,7 @@ def test_a_folder_that_was_removed_is_made_again(tmp_path: Path) -> None:
 
 
 def test_a_full_disk_leaves_no_part_of_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(file: object, pieces: object) -> int:
+    def full(file: object, pieces: object, **_: object) -> int:
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(atomic, "fill", full)

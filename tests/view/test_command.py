@@ -16,8 +16,8 @@ from pathlib import Path
 import pytest
 
 from sparklod_cli.cli import run
+from tests.signals import heed_signals
 from tests.view.conftest import CHUNKED, TREE
-from tests.view.signals import heed_signals
 
 
 @contextlib.contextmanager

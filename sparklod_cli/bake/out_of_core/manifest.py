@@ -26,6 +26,9 @@ from .store import FileStore
 #: How the names of scratch folders end.
 SUFFIX = ".sparklod-scratch"
 
+#: Bytes of an output's name up to which that of its scratch folder has it.
+NAME_BYTES = 200
+
 #: The name of the result that has the recipe.
 RECIPE = "recipe"
 
@@ -50,10 +53,18 @@ def scratch_folder(target: Place, recipe: Recipe, parent: Place | None) -> Place
     if target == DASH:
         return (parent or Path(tempfile.gettempdir())) / f"standard-output-{recipe.digest[:8]}{SUFFIX}"
     if parent is None:
-        return target.parent / f"{target.name}{SUFFIX}"
+        return target.parent / f"{_shortened(target.name)}{SUFFIX}"
     name = os.path.realpath(target) if isinstance(target, Path) else target.url
-    place = hashlib.blake2b(os.fsencode(name), digest_size=4).hexdigest()
-    return parent / f"{target.name}-{place}{SUFFIX}"
+    return parent / f"{_shortened(target.name)}-{_digest(name)}{SUFFIX}"
+
+
+def _shortened(name: str) -> str:
+    """A name to which more can be added: file systems allow 255 bytes."""
+    return name if len(os.fsencode(name)) <= NAME_BYTES else f"output-{_digest(name)}"
+
+
+def _digest(text: str) -> str:
+    return hashlib.blake2b(os.fsencode(text), digest_size=4).hexdigest()
 
 
 @dataclass(frozen=True)
