@@ -140,6 +140,7 @@ class _Elsewhere(FolderStore):
 
 def test_a_worker_without_sparklod_is_told_what_to_do(engine: ClusterEngine, job: Job) -> None:
     client = engine._connection.client
+    client.wait_for_workers(2, timeout=60)  # one that another test killed may only now be replaced
     client.run(_hide, cluster_worker.__name__)
     try:
         with pytest.raises(SparklodError, match=r"does not run sparklod .*: pip install 'sparklod\[cluster\]=="):
@@ -158,8 +159,7 @@ def _hide(module: str) -> None:
 def _show(module: str) -> None:
     import sys
 
-    if "hidden" in sys.modules:  # not in a worker that began meanwhile, in place of one that another test had killed
-        sys.modules[module] = sys.modules.pop("hidden")
+    sys.modules[module] = sys.modules.pop("hidden")
 
 
 def test_a_block_that_does_not_fit_into_memory_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
