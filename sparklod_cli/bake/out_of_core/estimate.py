@@ -49,7 +49,7 @@ OF_BLOCK = {"quick": _Bytes(300, 50), "quality": _Bytes(350, 50)}
 OF_WINDOW, WINDOW = _Bytes(230, 50), 1 << 19
 
 #: Out of core, a splat of the whole scene: the order of its families.
-OF_ORDER = 16
+OF_ORDER = 20
 
 #: Families a splat of the input, and bytes of each outside of the part that is put in an order for streaming.
 FAMILIES, OF_FAMILY = 0.4, 40
