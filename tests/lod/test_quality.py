@@ -35,8 +35,7 @@ from sparklod_cli.scenes.finder import view_of
 from sparklod_cli.support import jit
 from sparklod_cli.support.errors import InvalidSplatsError
 from tests.conftest import real_scene
-from tests.lod.trees import check_threads, check_tree, children, coincident, hard_cases, parents
-from tests.references import gaussians
+from tests.lod.trees import check_colours, check_threads, check_tree, children, coincident, hard_cases, parents
 from tests.scenes import random_splats
 
 GROWTHS = [1.05, 1.4, 2.0]
@@ -129,14 +128,7 @@ def test_a_prefix_of_a_quality_tree_is_a_coarser_scene(growth: float) -> None:
 @pytest.mark.parametrize("sh_degree", [0, 3])
 def test_colours_are_means_of_the_leaves_by_what_they_cover(growth: float, sh_degree: int) -> None:
     nodes, tree = quality.build(random_splats(2_000, sh_degree=sh_degree, seed=8), growth)
-    parent = parents(tree)
-    color = np.concatenate([nodes.rgb, nodes.sh.reshape(len(nodes), -1)], axis=1).astype(np.float64)
-    weight = np.where(tree.is_leaf, nodes.opacity.astype(np.float64) * gaussians.ellipsoid_area(nodes.scale), 0)
-    total = weight[:, None] * color
-    for node in range(len(tree) - 1, 0, -1):
-        weight[parent[node]] += weight[node]
-        total[parent[node]] += total[node]
-    np.testing.assert_allclose(color, total / weight[:, None], atol=2e-5)
+    check_colours(nodes, tree)
 
 
 def test_merged_nodes_are_where_their_leaves_are() -> None:

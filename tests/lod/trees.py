@@ -11,6 +11,7 @@ from sparklod_cli.model.gaussian import MAX_OPACITY, MIN_OPACITY
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.support import jit
+from tests.references import gaussians
 from tests.scenes import random_splats
 
 
@@ -92,3 +93,15 @@ def hard_cases() -> dict[str, Splats]:
         "faint": dataclasses.replace(plain, opacity=np.full_like(plain.opacity, 1e-30)),
         "opaque": dataclasses.replace(plain, opacity=np.ones_like(plain.opacity)),
     }
+
+
+def check_colours(nodes: Splats, tree: LodTree) -> None:
+    """Asserts that the colours of a quality tree are means of those of its leaves, weighted by what these cover."""
+    parent = parents(tree)
+    color = np.concatenate([nodes.rgb, nodes.sh.reshape(len(nodes), -1)], axis=1).astype(np.float64)
+    weight = np.where(tree.is_leaf, nodes.opacity.astype(np.float64) * gaussians.ellipsoid_area(nodes.scale), 0)
+    total = weight[:, None] * color
+    for node in range(len(tree) - 1, 0, -1):
+        weight[parent[node]] += weight[node]
+        total[parent[node]] += total[node]
+    np.testing.assert_allclose(color, total / weight[:, None], atol=2e-5)

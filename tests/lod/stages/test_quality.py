@@ -18,8 +18,7 @@ from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.support.progress import silent
 from tests.lod.stages.assembled import Splits, build_in_stages, check_families, run_stages, survey_of
-from tests.lod.trees import check_threads, check_tree, coincident, hard_cases, parents
-from tests.references import gaussians
+from tests.lod.trees import check_colours, check_threads, check_tree, coincident, hard_cases
 from tests.scenes import random_splats
 
 GROWTHS = [1.05, 1.4, 2.0]
@@ -121,14 +120,7 @@ def test_the_order_of_tasks_does_not_change_a_bit() -> None:
 @pytest.mark.parametrize("splits", SPLITS)
 def test_colours_are_means_of_the_leaves_by_what_they_cover(splits: Splits) -> None:
     nodes, tree = build_in_stages(stages, random_splats(2_000, sh_degree=1, seed=8), 1.4, splits)
-    parent = parents(tree)
-    color = np.concatenate([nodes.rgb, nodes.sh.reshape(len(nodes), -1)], axis=1).astype(np.float64)
-    weight = np.where(tree.is_leaf, nodes.opacity.astype(np.float64) * gaussians.ellipsoid_area(nodes.scale), 0)
-    total = weight[:, None] * color
-    for node in range(len(tree) - 1, 0, -1):
-        weight[parent[node]] += weight[node]
-        total[parent[node]] += total[node]
-    np.testing.assert_allclose(color, total / weight[:, None], atol=2e-5)
+    check_colours(nodes, tree)
 
 
 def test_empty_blocks_hand_on_nothing() -> None:
