@@ -60,7 +60,8 @@ def cli() -> None:
 def run(arguments: list[str] | None = None) -> int:
     """Runs the command line and returns its exit code; arguments are those of the process unless given."""
     with stdout.guarded():
-        return _run(arguments)
+        code = _run(arguments)
+    return interrupts.INTERRUPTED if code and interrupts.came() else code
 
 
 def _run(arguments: list[str] | None) -> int:
@@ -94,6 +95,9 @@ def _failed(error: BaseException, verbosity: Verbosity) -> int:
 
     This is the last guard: whatever gets here is ours to mend, but a person has no use for a traceback.
     """
+    if interrupts.came():
+        say("interrupted")
+        return interrupts.INTERRUPTED
     if verbosity.verbose:
         import traceback
 

@@ -10,6 +10,6 @@ def heed_signals() -> None:
 
     An ignored signal stays ignored in `sparklod`, as under nohup, so that it would serve for ever.
     """
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_SETMASK, [])

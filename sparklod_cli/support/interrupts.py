@@ -8,6 +8,7 @@ import signal
 import sys
 import threading
 import time
+from collections.abc import Callable
 from types import FrameType
 
 #: The signals that end a run, if the system has them.
@@ -23,6 +24,12 @@ COMPILERS = ("numba", "llvmlite")
 #: Seconds to wait for another thread to write the message.
 FAREWELL = 0.1
 
+#: What is written to the pipe of signals for an interruption that was lost, and the seconds until it is raised again.
+LOST, PATIENCE = 0, 0.02
+
+#: Set when a signal has interrupted the run.
+_came = threading.Event()
+
 #: The main thread and the watching thread may both end the process; only one of them writes the message.
 _leaving = threading.Lock()
 
@@ -32,12 +39,14 @@ def handle() -> None:
 
     Ending at once loses nothing: outputs and the kernel cache are consistent at all times.
     """
+    _came.clear()
     handled = [
         number for number in ENDING if signal.getsignal(number) != signal.SIG_IGN
     ]  # an ignored signal stays ignored, as under nohup
 
     def interrupt(signum: int, frame: FrameType | None) -> None:
         _leave_if_compiling()
+        _came.set()
         for number in handled:
             signal.signal(number, signal.SIG_DFL)  # a second signal ends the process during the clean-up
         raise KeyboardInterrupt
@@ -48,7 +57,17 @@ def handle() -> None:
         reader, writer = os.pipe()
         os.set_blocking(writer, False)
         signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
+        _raise_again_where_lost(interrupt, handled[0], writer)
         threading.Thread(target=_watch, args=(reader, handled), daemon=True).start()
+
+
+def came() -> bool:
+    """Whether a signal has interrupted the run.
+
+    A failure after that is a consequence: libraries turn a `KeyboardInterrupt` into errors of their own, as the import
+    of numpy's C modules does.
+    """
+    return _came.is_set()
 
 
 def ignore() -> None:
@@ -57,10 +76,33 @@ def ignore() -> None:
         signal.signal(number, signal.SIG_IGN)
 
 
+def _raise_again_where_lost(interrupt: Callable[[int, FrameType | None], None], number: int, writer: int) -> None:
+    """Has an interruption raised again that came inside `__del__` or a callback of a weak reference, as imports use.
+
+    Python prints what is raised there and goes on.
+    """
+    otherwise = sys.unraisablehook
+
+    def hook(lost: sys.UnraisableHookArgs) -> None:
+        if lost.exc_type is not KeyboardInterrupt:
+            otherwise(lost)
+            return
+        signal.signal(number, interrupt)
+        os.write(writer, bytes([LOST]))
+
+    sys.unraisablehook = hook
+
+
 def _watch(reader: int, handled: list[signal.Signals]) -> None:
     """Runs in its own thread and ends the process while the main thread is inside LLVM."""
+    main = threading.main_thread().ident
+    assert main is not None
     while True:
-        if any(number in handled for number in os.read(reader, 64)):
+        read = os.read(reader, 64)
+        if LOST in read:
+            time.sleep(PATIENCE)  # until the callback is left that lost it
+            signal.pthread_kill(main, handled[0])
+        if any(number in handled for number in read):
             _leave_if_compiling()
 
 

@@ -14,6 +14,7 @@ import pytest
 from sparklod_cli.support.jit_cache import SUFFIX, is_whole
 from sparklod_cli.warmup import JOBS
 from tests.conftest import FIXTURES, ROOT
+from tests.signals import heed_signals
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
 
@@ -51,3 +52,64 @@ def test_a_signal_ends_a_compilation_at_once_and_leaves_a_whole_cache(
     kept = list(cache.rglob(f"*{SUFFIX}"))
     assert len(kept) < len(JOBS["quality"].kernels) / 2  # it did not go on to the end
     assert all(is_whole(path.read_bytes()) for path in kept)
+
+
+#: What imports of C modules do: a `KeyboardInterrupt` inside of them becomes an error of another kind.
+SWALLOW = """
+import os, signal, sys
+from sparklod_cli import cli
+from sparklod_cli.io import reading
+from sparklod_cli.support import interrupts
+
+def fail(*args, **kwargs):
+    try:
+        os.kill(os.getpid(), signal.SIGHUP)
+        signal.pause()
+    except KeyboardInterrupt:
+        raise {error} from None
+
+reading.opened = fail
+interrupts.handle()
+sys.exit(cli.run(["inspect", "fixtures/one.ply"]))
+"""
+
+
+@pytest.mark.parametrize("error", ["ImportError('numpy')", "OSError(5, 'of a library')", "KeyboardInterrupt"])
+def test_an_error_that_a_library_makes_of_an_interruption_is_one(error: str) -> None:
+    code = SWALLOW.format(error=error)
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, preexec_fn=heed_signals, check=False
+    )
+    assert done.returncode == 130
+    assert "please report" not in done.stderr
+
+
+#: An object that is interrupted while it is deleted, where Python prints exceptions and goes on.
+LOSE = """
+import os, signal, sys, time
+from sparklod_cli import cli
+from sparklod_cli.io import reading
+from sparklod_cli.support import interrupts
+
+class Deleted:
+    def __del__(self):
+        os.kill(os.getpid(), signal.SIGHUP)
+        time.sleep(60)
+
+def work(*args, **kwargs):
+    item = Deleted()
+    del item
+    time.sleep(60)
+
+reading.opened = work
+interrupts.handle()
+sys.exit(cli.run(["inspect", "fixtures/one.ply"]))
+"""
+
+
+def test_an_interruption_that_python_forgets_is_raised_again() -> None:
+    command = [sys.executable, "-c", LOSE]
+    done = subprocess.run(
+        command, cwd=ROOT, capture_output=True, text=True, preexec_fn=heed_signals, check=False, timeout=30
+    )
+    assert (done.returncode, done.stderr.strip()) == (130, "interrupted")

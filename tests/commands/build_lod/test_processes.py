@@ -14,6 +14,7 @@ import pytest
 from sparklod_cli.io import read_scene
 from tests.commands.build_lod.runs import SMALL, sparklod
 from tests.conftest import FIXTURES, ROOT
+from tests.signals import heed_signals
 
 
 def test_a_closed_standard_output_is_an_error_and_a_closed_standard_error_is_none(tmp_path: Path) -> None:
@@ -46,11 +47,11 @@ def test_an_interruption_leaves_nothing_behind(tmp_path: Path, how: signal.Signa
     command = [sys.executable, "-m", "sparklod_cli", "build-lod", str(source), "--output-dir", str(tmp_path), "-q"]
     # Wherever it is caught: while it imports, reads, compiles, builds or writes.
     for delay in (0.4, 0.7, 1.0):
-        process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE)
+        process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, preexec_fn=heed_signals)
         time.sleep(delay)
         process.send_signal(how)
         _, err = process.communicate()
-        assert process.returncode in (0, 130, -how)  # -how: before Python came to us, or while it left
+        assert process.returncode in (0, 130, -how), err  # -how: before Python came to us, or while it left
         left = list(tmp_path.iterdir())
         if left:  # it was done before, or all but done
             assert [path.name for path in left] == ["demo-lod.spz"]
