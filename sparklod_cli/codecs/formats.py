@@ -67,7 +67,7 @@ FORMATS = (
     # RADC begins a chunk, which the codec refuses with what to give instead.
     Format("RAD", "rad.codec", (".rad",), rb"RAD[0C]", writable=True, trees=True, companions=True, selective=True),
     # A zip, or its meta.json unpacked.
-    Format("SOG", "sog", (".sog", ".json"), rb"PK\x03\x04|\s*\{\s*\"\w+\"\s*:", companions=True),
+    Format("SOG", "sog.codec", (".sog", ".json"), rb"PK\x03\x04|\s*\{\s*\"\w+\"\s*:", companions=True),
     Format("KSPLAT", "ksplat", (".ksplat",), rb"\0[\x01-\xff]\0\0"),  # version 0.1 on; as a float it would be denormal
     Format("SPLAT", "splat", (".splat",), None, writable=True),
 )

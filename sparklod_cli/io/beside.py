@@ -9,7 +9,7 @@ from typing import BinaryIO
 
 from ..codecs.formats import HEAD
 from ..codecs.rad import header as rad_header
-from ..codecs.sog_files import MAX_META, META, names_beside
+from ..codecs.sog.files import MAX_META, META, names_beside
 from ..support.addresses import Place
 from ..support.errors import FormatError, UnreadableError
 from ..support.stdin import DASH

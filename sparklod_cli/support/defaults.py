@@ -58,3 +58,7 @@ FARTHEST = 1e37
 
 #: Axes that may point up in an input; the splats are rotated so that y does.
 UP_AXES = ("y", "-y", "z", "-z")
+
+#: Streamed SOG, as the tools of its makers write it: splats of a chunk file, the longest side of a region in world
+#: units, and the splats below which a region is not divided.
+DETAIL_CHUNK_SPLATS, DETAIL_EXTENT, DETAIL_MIN_SPLATS = 524_288, 16.0, 8_192

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sparklod_cli.codecs import sog
+from sparklod_cli.codecs.sog import reading as sog
 from sparklod_cli.io import PlacedFile, idle, open_stream, open_streams, read_scene
 from sparklod_cli.model import streams
 from sparklod_cli.model.merged import Placed, merged

@@ -18,8 +18,8 @@ from sparklod_cli.codecs.rad import codec as rad
 from sparklod_cli.codecs.rad.header import read_header
 from sparklod_cli.codecs.rad.layout import RANGES
 from sparklod_cli.support.errors import FormatError, PromiseError
+from tests.codecs.sog.test_damaged import VALUES, places_of, replaced
 from tests.codecs.test_damaged import attempt, content
-from tests.codecs.test_damaged_sog import VALUES, places_of, replaced
 from tests.conftest import FIXTURES
 
 WHOLE = "golden/sh1-tree.rad"

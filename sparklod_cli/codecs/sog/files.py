@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL.WebPImagePlugin import WebPImageFile
 
-from ..support.errors import ChecksumError, FormatError, NotSplatsError
-from ..support.units import count_of
-from ..support.untrusted import ZIP_ERRORS, parse_json, quoted, quoted_value
-from .compression import check_promise
-from .stream import size_of
+from ...support.errors import ChecksumError, FormatError, NotSplatsError
+from ...support.units import count_of
+from ...support.untrusted import ZIP_ERRORS, parse_json, quoted, quoted_value
+from ..compression import check_promise
+from ..stream import size_of
 
 Texels = NDArray[np.uint8]
 

@@ -1,7 +1,4 @@
-"""PlayCanvas's SOG: splats as WebP images with a texel per splat, and a meta.json that defines their values.
-
-A scene is a zip (.sog) or an unpacked folder. Version 2 maps bytes to values by codebooks, version 1 by ranges.
-"""
+"""Reads SOG, whole or as a stream."""
 
 from __future__ import annotations
 
@@ -12,18 +9,18 @@ from typing import BinaryIO
 
 import numpy as np
 
-from ..model.scene import Scene
-from ..model.sh import COEFFICIENTS
-from ..model.splats import FloatArray, Splats
-from ..model.streams import SceneStream
-from ..support.errors import FormatError, VersionError
-from ..support.parallel import blocks_of, for_blocks
-from ..support.progress import Progress, silent
-from . import quantize
-from .compression import check_promise
-from .content import Content, Scratch, rows_in
-from .sog_files import Files, Meta, Texels
-from .stream import Positioned
+from ...model.scene import Scene
+from ...model.sh import COEFFICIENTS
+from ...model.splats import FloatArray, Splats
+from ...model.streams import SceneStream
+from ...support.errors import FormatError, VersionError
+from ...support.parallel import blocks_of, for_blocks
+from ...support.progress import Progress, silent
+from .. import quantize
+from ..compression import check_promise
+from ..content import Content, Scratch, rows_in
+from ..stream import Positioned
+from .files import Files, Meta, Texels
 
 #: Entries in a row of the image of SH centroids.
 PALETTE_WIDTH = 64

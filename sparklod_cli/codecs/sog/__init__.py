@@ -1,0 +1,1 @@
+"""SOG, the file of PlayCanvas: `codec` reads and writes it, the others are its parts."""
