@@ -86,8 +86,10 @@ def _streamed_sog(streamed: dict[str, Any]) -> Iterator[str]:
     yield _row("regions", f"{regions} in a tree of depth {streamed['depth']}")
     yield _row("", f"{splats['min']:,.0f} to {splats['max']:,.0f} splats of level 0 each, median {splats['p50']:,.0f}")
     yield _row("", f"{edge['min']:.4g} to {edge['max']:.4g} world units long, median {edge['p50']:.4g}")
-    head = f"{'splats':>12} {'share':>8} {'regions':>8} {'files':>6} {'bytes':>13}"
-    yield _row("levels", f"{head} {'error p25':>10} {'p50':>10} {'p75':>10}")
+    head = [f"{'splats':>12} {'share':>8} {'regions':>8} {'files':>6} {'bytes':>13}"]
+    if any(level["errors"] for level in streamed["levels"]):
+        head.append(f"{'error p25':>10} {'p50':>10} {'p75':>10}")
+    yield _row("levels", " ".join(head))
     for number, level in enumerate(streamed["levels"]):
         share = "" if level["share"] is None else f"{100 * level['share']:.1f} %"
         errors = [f"{level['errors'][name]:>10.3g}" for name in ("p25", "p50", "p75")] if level["errors"] else []

@@ -180,7 +180,8 @@ def inspect(
         scene = examine_scene(path, columns=columns, threads=threads, progress=progress)
     except FormatError as error:
         found = surveyed.findings if surveyed is not None and settings.check else []
-        return Report(str(path), size, findings=[*found, Finding(error.code, str(error))]), None
+        known = any(each.code == error.code for each in found)
+        return Report(str(path), size, findings=[*found, *([] if known else [Finding(error.code, str(error))])]), None
     return _of_blocks(path, Blocks.of(scene), size, settings, surveyed), scene
 
 

@@ -17,6 +17,7 @@ from ..codecs.streamed_sog.survey import survey_file, survey_splats
 from ..io import opened
 from ..support.printable import MOST, printable
 from ..support.progress import Progress, silent
+from ..support.untrusted import LARGEST
 from .findings import Finding, findings_of
 from .rad import ChunkBytes
 from .surveys import Head
@@ -177,7 +178,7 @@ def _facts(manifest: Manifest, chunks: Mapping[str, Chunk], size: int) -> Stream
     asset = manifest.head.get("asset")
     generator = asset.get("generator") if isinstance(asset, dict) else None
     regions = [node for _, node in manifest.regions()]
-    edges = [max(b - a for a, b in zip(*node.bound, strict=True)) for node in regions if node.bound is not None]
+    edges = [max(map(_edge, *node.bound)) for node in regions if node.bound is not None]
     full = [node.runs[0].count if node.runs and 0 in node.runs else 0 for node in regions]
     bound = manifest.nodes[0].bound
     assert bound is not None
@@ -223,6 +224,11 @@ def _depth(manifest: Manifest) -> int:
     return max(depths)
 
 
+def _edge(low: float, high: float) -> float:
+    """The length between two numbers, which are finite but may be as large as numbers are."""
+    return min(max(high - low, -LARGEST), LARGEST)
+
+
 def _quantiles(values: Sequence[float], weights: Sequence[float] | None = None) -> dict[str, float]:
     """The quantiles of values, each of them one of these, and their mean.
 
@@ -236,5 +242,5 @@ def _quantiles(values: Sequence[float], weights: Sequence[float] | None = None) 
     below = np.cumsum(weighed[order])
     places = np.searchsorted(below, [share * below[-1] for share in QUANTILES.values()])
     found = numbers[order][places]
-    mean = float(np.average(numbers, weights=weighed))
+    mean = float(numbers @ (weighed / below[-1]))
     return {name: float(f"{each:.6g}") for name, each in [*zip(QUANTILES, found, strict=True), ("mean", mean)]}

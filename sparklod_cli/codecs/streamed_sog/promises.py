@@ -6,12 +6,13 @@ import itertools
 import math
 from collections import Counter
 from collections.abc import Iterator, Mapping
+from typing import Any
 
 from ...support.units import count_of
 from ...support.untrusted import quoted_value
 from ..promises import Violation
 from .chunks import Chunk
-from .manifest import Bound, Manifest, ManifestNode
+from .manifest import Bound, Manifest, ManifestNode, Run
 
 #: What is wrong with each promise, by its code; the text of a violation has the values. Values of the wrong kind, which
 #: the parser refuses, have the codes "container.corrupt" and "container.version", as in other formats.
@@ -48,6 +49,16 @@ def broken(code: str, text: str, *, fatal: bool = True) -> Violation:
     return Violation(f"streamed-sog.{code}", text, fatal)
 
 
+def regions_of(manifest: Manifest) -> Iterator[tuple[int, Mapping[int, Run], ManifestNode]]:
+    """The number of each region, its runs, and its node; not the leaves of a broken tree that have no runs."""
+    return ((number, node.runs, node) for number, node in manifest.regions() if node.runs is not None)
+
+
+def is_box(bound: Bound) -> bool:
+    """Whether no end of a bound is below its beginning."""
+    return all(low <= high for low, high in zip(*bound, strict=True))
+
+
 def violations(manifest: Manifest) -> Iterator[Violation]:
     """The broken promises of a manifest."""
     yield from _nodes(manifest)
@@ -67,8 +78,8 @@ def file_violations(manifest: Manifest, files: Mapping[str, Chunk | str]) -> Ite
         files: by its name, what the meta.json of each says, or why it cannot be read.
     """
     ends = [0] * len(manifest.filenames)
-    for _, node in manifest.regions():
-        for run in (node.runs or {}).values():
+    for _, runs, _ in regions_of(manifest):
+        for run in runs.values():
             ends[run.file] = max(ends[run.file], run.offset + run.count)
     first: Chunk | None = None
     for name, end in zip(manifest.filenames, ends, strict=True):
@@ -106,7 +117,7 @@ def _nodes(manifest: Manifest) -> Iterator[Violation]:
             yield broken("nodes", text)
         if node.bound is None:
             yield broken("bounds", f"{place} has no bound of six finite numbers")
-        elif any(low > high for low, high in zip(*node.bound, strict=True)):
+        elif not is_box(node.bound):
             yield broken("bounds", f"the bound of {place} is {_text(node.bound)}, the wrong way round", fatal=False)
 
 
@@ -125,8 +136,8 @@ def _names(manifest: Manifest) -> Iterator[Violation]:
 def _runs(manifest: Manifest) -> Iterator[Violation]:
     """Of the runs in each chunk file, which hold one level and lie end to end."""
     by_file: list[list[tuple[int, int, int, int]]] = [[] for _ in manifest.filenames]
-    for number, node in manifest.regions():
-        for level, run in (node.runs or {}).items():
+    for number, held, _ in regions_of(manifest):
+        for level, run in held.items():
             if run.count:
                 by_file[run.file].append((run.offset, run.count, level, number))
     for name, runs in zip(manifest.filenames, by_file, strict=True):
@@ -166,16 +177,16 @@ def _counts(manifest: Manifest) -> Iterator[Violation]:
 def level_counts(manifest: Manifest) -> list[int]:
     """Splats of each level: the sums of the runs."""
     held = [0] * manifest.levels
-    for _, node in manifest.regions():
-        for level, run in (node.runs or {}).items():
+    for _, runs, _ in regions_of(manifest):
+        for level, run in runs.items():
             held[level] += run.count
     return held
 
 
 def _details(manifest: Manifest) -> Iterator[Violation]:
     """Of the levels that each region has."""
-    for number, node in manifest.regions():
-        held = {level for level, run in (node.runs or {}).items() if run.count}
+    for number, runs, _ in regions_of(manifest):
+        held = {level for level, run in runs.items() if run.count}
         if 0 not in held:
             yield broken("full-detail", f"{manifest.place(number)} has no splats at level 0", fatal=False)
         last = manifest.levels - 1
@@ -186,7 +197,7 @@ def _details(manifest: Manifest) -> Iterator[Violation]:
 def _unions(manifest: Manifest) -> Iterator[Violation]:
     for number, node in enumerate(manifest.nodes):
         below = [bound for child in node.children if (bound := manifest.nodes[child].bound) is not None]
-        if node.bound is None or not below or len(below) != len(node.children):
+        if node.bound is None or not below or len(below) != len(node.children) or not all(map(is_box, below)):
             continue
         low = [min(bound[0][axis] for bound in below) for axis in range(3)]
         high = [max(bound[1][axis] for bound in below) for axis in range(3)]
@@ -205,13 +216,13 @@ def _text(bound: Bound) -> str:
 
 
 def _errors(manifest: Manifest) -> Iterator[Violation]:
-    regions = list(manifest.regions())
-    for number, node in regions:
-        if node.errors is not None and (wrong := _wrong_errors(node, manifest.levels)) is not None:
+    regions = list(regions_of(manifest))
+    for number, runs, node in regions:
+        if node.errors is not None and (wrong := _wrong_errors(node.errors, runs, manifest.levels)) is not None:
             text, fatal = wrong
             place = f"{manifest.place(number)}.errors is {quoted_value(node.errors)}"
             yield broken("errors", f"{place}, {text}", fatal=fatal)
-    having = sum(node.errors is not None for _, node in regions)
+    having = sum(node.errors is not None for _, _, node in regions)
     says = manifest.head.get("lodErrors")
     if 0 < having < len(regions):
         text = f"{having:,} of {count_of(len(regions), 'region')} have errors"
@@ -221,14 +232,13 @@ def _errors(manifest: Manifest) -> Iterator[Violation]:
         yield broken("lod-errors", text, fatal=False)
 
 
-def _wrong_errors(node: ManifestNode, levels: int) -> tuple[str, bool] | None:
+def _wrong_errors(errors: Any, runs: Mapping[int, Run], levels: int) -> tuple[str, bool] | None:
     """What is wrong with the errors of a region, and whether that is fatal. Levels without splats do not count."""
-    errors = node.errors
     if not isinstance(errors, list) or len(errors) != levels:
         return f"not one for each of {count_of(levels, 'level')}", True
     if not all(type(each) in (int, float) and math.isfinite(each) and each >= 0 for each in errors):
         return "not finite numbers from 0 on", True
     if errors[0]:
         return "not 0 at level 0", False
-    held = [errors[level] for level, run in sorted((node.runs or {}).items()) if run.count]
+    held = [errors[level] for level, run in sorted(runs.items()) if run.count]
     return ("which decrease", False) if held != sorted(held) else None

@@ -16,11 +16,13 @@ from ...support.errors import FormatError
 from ...support.progress import Progress, silent
 from ...support.untrusted import quoted_value
 from ..content import Scratch
+from ..promises import check
 from ..stream import size_of
 from .chunks import Beside, Chunk, Piece, check_count, filled, open_chunk
 from .layout import Layout, layout_of
 from .manifest import MAX_MANIFEST, VERSION, parse
 from .names import MANIFEST
+from .promises import violations
 
 
 def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent, beside: Beside | None = None) -> Scene:
@@ -149,7 +151,9 @@ class _Opened:
 def _open(file: BinaryIO, beside: Beside | None, *, full_detail: bool) -> _Opened:
     """A manifest and its chunks: those of level 0, or all."""
     size = size_of(file)
-    layout = layout_of(parse(file.read(MAX_MANIFEST + 1)))
+    parsed = parse(file.read(MAX_MANIFEST + 1))
+    check(violations(parsed))
+    layout = layout_of(parsed)
     runs, manifest = layout.runs, layout.manifest
     wanted = runs.level == 0 if full_detail else np.ones(len(runs.level), np.bool_)
     rows = np.cumsum(runs.count * wanted) - runs.count if full_detail else layout.starts()

@@ -19,7 +19,7 @@ from ...support.untrusted import quoted_value
 from ..promises import Violation
 from .chunks import Beside, Chunk, filled, open_chunk
 from .manifest import MAX_MANIFEST, Manifest, Run, parse
-from .promises import broken, file_violations, violations
+from .promises import broken, file_violations, is_box, leads_away, regions_of, violations
 
 #: By how much a splat may lie outside of its bound: a share of its own extent, by which codes of 8 bits change it; a
 #: share of the bound; and, for codes of logarithms of 16 bits, a share of the distance from the origin plus 1.
@@ -47,6 +47,8 @@ def survey_file(file: BinaryIO, beside: Beside) -> tuple[Manifest, dict[str, Chu
     found = list(violations(manifest))
     files: dict[str, Chunk | str] = {}
     for name in manifest.names():
+        if leads_away(name):
+            continue  # a violation says so
         files[name] = _chunk_or_reason(beside, name)
     return manifest, files, [*found, *file_violations(manifest, files)]
 
@@ -79,8 +81,8 @@ def survey_splats(
     total = sum(chunk.count for chunk in files.values() if isinstance(chunk, Chunk))
     done = 0
     runs: list[list[tuple[int, int, Run]]] = [[] for _ in manifest.filenames]
-    for number, node in manifest.regions():
-        for level, run in (node.runs or {}).items():
+    for number, held, _ in regions_of(manifest):
+        for level, run in held.items():
             runs[run.file].append((number, level, run))
     for name, here in zip(manifest.filenames, runs, strict=True):
         chunk = files.get(name)
@@ -100,8 +102,7 @@ def survey_splats(
             part = splats.take(slice(run.offset, run.offset + run.count))
             what = f"{manifest.place(number)} at level {level}"
             bound = manifest.nodes[number].bound
-            assert bound is not None
-            outside = _outside(part, np.array(bound))
+            outside = _outside(part, np.array(bound)) if bound is not None and is_box(bound) else 0
             if outside:
                 yield broken("extents", f"{count_of(outside, 'splat')} of {what} lie outside of its bound", fatal=False)
             descents = _descents(part.center)
