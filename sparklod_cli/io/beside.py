@@ -9,7 +9,8 @@ from typing import BinaryIO
 
 from ..codecs.formats import HEAD
 from ..codecs.rad import header as rad_header
-from ..codecs.sog.files import MAX_META, META, names_beside
+from ..codecs.sog.files import MAX_META, names_beside
+from ..codecs.sog.names import META
 from ..support.addresses import Place
 from ..support.errors import FormatError, UnreadableError
 from ..support.stdin import DASH
