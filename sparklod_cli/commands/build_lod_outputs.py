@@ -70,7 +70,7 @@ class Outputs:
     @property
     def is_folder(self) -> bool:
         """Whether the output is the first of several files in its folder."""
-        return self.suffix in WRITABLE and self.suffix == WRITABLE[self.suffix].folder
+        return self.suffix in WRITABLE and self.suffix == WRITABLE[self.suffix].unbundled
 
     @property
     def format_is_asked_for(self) -> bool:

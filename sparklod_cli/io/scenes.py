@@ -42,7 +42,7 @@ class SceneSink:
         if self.whole is not None:
             return self.whole(codec.encode(scene, options, threads=threads, progress=progress))
         assert self.together is not None
-        if self.form.folder is not None:
+        if self.form.unbundled is not None:
             files = codec.encode_files(scene, options, threads=threads, progress=progress)
             return self.together((name, (content,)) for name, content in files)
         return self.together(codec.encode_chunked(scene, options, self.stem, threads=threads, progress=progress))
@@ -70,7 +70,7 @@ def scene_sink(path: Place, form: Format, *, chunked: bool = False, overwrite: b
 
     Args:
         path: of the file, or of the header where `chunked`; - is standard output, for one file. One that is called as
-            the `folder` of the format has the other files beside it.
+            the `unbundled` of the format has the other files beside it.
         form: that is written.
         chunked: with each chunk in a file of its own, beside the header; of RAD.
         overwrite: replace files that exist.
@@ -79,6 +79,6 @@ def scene_sink(path: Place, form: Format, *, chunked: bool = False, overwrite: b
         OutputError: see `sink` and `sink_together`. Writing raises that, too, and what the codec raises.
     """
     stem = path.stem if isinstance(path, Address) else Path(os.path.realpath(path)).stem
-    if chunked or path.name.lower() == form.folder:
+    if chunked or path.name.lower() == form.unbundled:
         return SceneSink(form, None, sink_together(path, overwrite=overwrite), stem)
     return SceneSink(form, sink(path, overwrite=overwrite), None, stem)
