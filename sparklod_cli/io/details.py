@@ -9,8 +9,9 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from ..codecs.sog.files import MAX_META, names_beside
+from ..codecs.sog.names import META
 from ..codecs.streamed_sog.manifest import MAX_MANIFEST, parse
-from ..codecs.streamed_sog.names import META, chunk_name, folders_of, is_folder, is_ours
+from ..codecs.streamed_sog.names import chunk_name, folders_of, is_folder, is_ours
 from ..support import atomic_set
 from ..support.addresses import Address, Place
 from ..support.errors import FormatError, OutputError
