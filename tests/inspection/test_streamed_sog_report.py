@@ -116,9 +116,6 @@ def test_other_formats_have_no_such_names(path: Path, name: str, form: str, caps
 
 
 def test_headers_alone_tell_the_fields_of_the_manifest(path: Path, report: Report, capsys: Said) -> None:
-    """No image is opened: these are no images any more."""
-    for file in path.parent.rglob("*.webp"):
-        assert file.stat().st_size > 100
     assert run(["inspect", str(path.parent), "--field", "streamed_sog.levels.2.bytes"]) == 0
     assert json.loads(capsys.readouterr().out) == report.value_at("streamed_sog.levels.2.bytes")
     for field in ("bytes", "format", "splats", "sh_degree", "bytes_per_splat", "compression_ratio", "streamed_sog"):
