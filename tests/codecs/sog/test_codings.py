@@ -22,7 +22,6 @@ def test_rotations_come_back_within_the_stated_error() -> None:
     given = quats()
     back = codings.decode_quat(codings.encode_quat(given))
     assert rotation_degrees(back, given).max() <= stated_degrees(codings.decode_quat)
-    assert rotation_degrees(back[20_000:20_008], given[20_000:20_008]).max() < 0.4  # 0 is no code: 127.5
 
 
 def test_a_rotation_and_its_opposite_have_the_same_code() -> None:

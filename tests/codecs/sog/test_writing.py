@@ -177,7 +177,7 @@ def test_a_palette_has_as_many_codes_as_suit_or_as_are_asked_for(codes: int | No
     assert sog.settled(scene, how).sog.sh_codes == (codes or 1024)
     assert meta_of(scene, options=how)["shN"]["count"] == expected
     error = np.abs(back(scene, options=how).sh - scene.splats.sh).max()
-    assert (error < 0.02) == (expected >= 1100)
+    assert (error < 0.05) == (expected >= 1100)
 
 
 def test_palettes_are_as_large_as_those_of_splat_transform() -> None:
