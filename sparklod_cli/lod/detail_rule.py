@@ -21,6 +21,8 @@ class DetailRule:
         shrink: 0..1, by how much of what it has more than the median the bound of a region is smaller when its distance
             is measured. `lodDistanceShrink`.
         finest, coarsest: the levels that may be chosen. `lodRangeMin`, `lodRangeMax`.
+        underfill: levels by which a region may be coarser than chosen while the file of its level loads.
+            `lodUnderfillLimit`.
 
     Raises:
         ValueError: a number is out of its range.
@@ -33,6 +35,7 @@ class DetailRule:
     shrink: float = defaults.DETAIL_SHRINK
     finest: int = 0
     coarsest: int = 99
+    underfill: int = 0
 
     def __post_init__(self) -> None:
         if self.mode not in defaults.BUDGET_MODES:
@@ -48,3 +51,5 @@ class DetailRule:
             raise ValueError(f"shrink is {self.shrink}; give 0 to 1")
         if not 0 <= self.finest <= self.coarsest:
             raise ValueError(f"levels {self.finest} to {self.coarsest} are no range; give 0 <= finest <= coarsest")
+        if self.underfill < 0:
+            raise ValueError(f"underfill is {self.underfill}; give 0 or more")

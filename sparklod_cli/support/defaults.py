@@ -40,6 +40,7 @@ PRESETS = {
     "preview-desktop": 1_500_000,
     "mobile": 500_000,
 }
+DEFAULT_PRESET = "desktop"
 
 #: Precision of the nodes: that of the file, or the float16 in which Spark's traversal stores them.
 PRECISIONS = ("float32", "float16")

@@ -54,7 +54,7 @@ class Streaming:
 
         if self.bandwidth is None:
             return StreamingSettings(chunk_cache=self.chunk_cache)
-        network = Network(self.bandwidth, self.latency or 0.0, self.fetchers or defaults.FETCHERS)
+        network = Network(self.bandwidth, self.latency or 0.0, self.fetchers)
         return StreamingSettings(network, self.chunk_cache)
 
 
@@ -118,6 +118,7 @@ def streaming_options(command: Command, *, pictures: bool = False) -> Command:
             "--fetchers",
             metavar="N",
             type=click.IntRange(1, 1000),
-            help=f"Number of chunks that are fetched at a time.  [default: {defaults.FETCHERS}]",
+            help="Number of chunks that are fetched at a time."
+            f"  [default: {defaults.FETCHERS}; {defaults.DETAIL_FETCHERS} of Streamed SOG]",
         ),
     )
