@@ -13,6 +13,7 @@ import numpy as np
 from ..cameras.camera import Camera
 from ..cameras.path import CameraPath
 from ..images import metrics
+from ..lod import detail_rule
 from ..lod.budget import LARGEST, Budget, parse_budget
 from ..lod.settings import LodSettings
 from ..model.detail import DetailScene
@@ -26,7 +27,7 @@ from ..scenes.finder import CutFinder, FixedCut
 from ..scenes.loaded import Cut, Scenes
 from ..scenes.loaded_scene import UNNAMED
 from ..scenes.reading import read_scenes
-from ..support.defaults import BLEND, DETAIL_BUDGET, PRECISIONS
+from ..support.defaults import BLEND, PRECISIONS
 from ..support.errors import FormatError, memory_errors_translated
 from ..support.threads import on_threads, thread_count
 from ..tables.comparison import COLUMNS as OF_COMPARISON
@@ -274,7 +275,8 @@ def _trees(viewed: Viewed, threads: int, precision: str) -> Scenes:
 def _lod(
     scenes: Scenes, budget: BudgetLike | None, settings: LodSettings | None, continuous: bool | float
 ) -> LodSettings:
-    settings = settings or LodSettings(**{"budget": DETAIL_BUDGET} if scenes.details else {})
+    if settings is None:
+        settings = LodSettings(detail_rule.BUDGET) if scenes.details else LodSettings()
     if budget is not None:
         settings = replace(settings, budget=_budget(budget).of(scenes.leaves))
     if continuous:

@@ -156,7 +156,7 @@ def _draw(ctx: click.Context, asked: RenderOptions) -> None:
             unused = detail.without_effect(ctx, scenes, (*cut.CUTS, *streaming.OF_LOADING))
             if unused:
                 unused_flags = ", ".join(unused)
-                notes.append(f"no file is a Level-of-Detail tree or Streamed SOG, so all splats are drawn; no effect: {unused_flags}")
+                notes.append(f"no file has levels to choose, so all splats are drawn; no effect: {unused_flags}")
             for note in notes:
                 console.say(note)
             console.detail(f"  read in {time.perf_counter() - start:.2f} s")

@@ -91,9 +91,7 @@ def loading(
     return Loading(drawn, priority)
 
 
-def _desired(
-    chains: Chains, files: DetailFiles, chosen: Levels, resident: NDArray[np.bool_], underfill: int
-) -> Levels:
+def _desired(chains: Chains, files: DetailFiles, chosen: Levels, resident: NDArray[np.bool_], underfill: int) -> Levels:
     """(R,) the chosen level, or while its file is missing one that is at most `underfill` levels coarser.
 
     That is the finest whose file is there, and where none is, the coarsest that has a file.

@@ -4,7 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ..support import defaults
+#: What a viewer makes of a budget: it spends all of it, or only keeps within it what distances ask for.
+BUDGET_MODES = ("target", "limit")
+
+#: PlayCanvas's budget of splats, and the chunk files that it loads at a time, unless it is told otherwise.
+BUDGET, FETCHERS = 1_000_000, 2
+
+#: Its defaults for distances: world units, and factors; and the least that it takes.
+BASE_DISTANCE, LEAST_BASE_DISTANCE = 5.0, 0.1
+MULTIPLIER, LEAST_MULTIPLIER = 3.0, 1.2
+BEHIND_PENALTY, SHRINK = 1.5, 0.75
 
 
 @dataclass(frozen=True)
@@ -28,21 +37,21 @@ class DetailRule:
         ValueError: a number is out of its range.
     """
 
-    mode: str = defaults.BUDGET_MODES[0]
-    base_distance: float = defaults.DETAIL_BASE_DISTANCE
-    multiplier: float = defaults.DETAIL_MULTIPLIER
-    behind_penalty: float = defaults.DETAIL_BEHIND_PENALTY
-    shrink: float = defaults.DETAIL_SHRINK
+    mode: str = BUDGET_MODES[0]
+    base_distance: float = BASE_DISTANCE
+    multiplier: float = MULTIPLIER
+    behind_penalty: float = BEHIND_PENALTY
+    shrink: float = SHRINK
     finest: int = 0
     coarsest: int = 99
     underfill: int = 0
 
     def __post_init__(self) -> None:
-        if self.mode not in defaults.BUDGET_MODES:
-            raise ValueError(f"there is no budget mode {self.mode!r}; give one of {', '.join(defaults.BUDGET_MODES)}")
+        if self.mode not in BUDGET_MODES:
+            raise ValueError(f"there is no budget mode {self.mode!r}; give one of {', '.join(BUDGET_MODES)}")
         for name, least in (
-            ("base_distance", defaults.LEAST_BASE_DISTANCE),
-            ("multiplier", defaults.LEAST_MULTIPLIER),
+            ("base_distance", LEAST_BASE_DISTANCE),
+            ("multiplier", LEAST_MULTIPLIER),
             ("behind_penalty", 1.0),
         ):
             if not least <= getattr(self, name) < float("inf"):

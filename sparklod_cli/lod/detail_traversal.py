@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 from ..model.detail import DetailScene
 from ..model.gaussian import spark_size
 from ..model.splats import Splats
-from ..support.defaults import LEAST_BASE_DISTANCE
 from .detail_choice import Chains, Distant, Levels, choose
 from .detail_distance import RegionBounds
 from .detail_loading import DetailFiles, Loading, loading
-from .detail_rule import DetailRule
+from .detail_rule import LEAST_BASE_DISTANCE, DetailRule
 from .kernels import pixel_scale
 from .traversal import Forest, TreeCut, TreeInstance, View, views_of
 
@@ -33,9 +32,7 @@ class DetailForest(Forest):
         files: of each, where its splats are.
     """
 
-    def __init__(
-        self, scenes: Sequence[DetailScene], splats: Sequence[Splats], files: Sequence[DetailFiles]
-    ) -> None:
+    def __init__(self, scenes: Sequence[DetailScene], splats: Sequence[Splats], files: Sequence[DetailFiles]) -> None:
         self.scenes, self.files, self._splats = scenes, files, splats
         self.node_base = np.cumsum([0, *map(len, splats)]).astype(np.int64)
         self.chunk_base = np.cumsum([0, *(len(each.sizes) for each in files)]).astype(np.int64)

@@ -26,7 +26,7 @@ class Instance:
     """A scene and where it stands.
 
     Attributes:
-        source: a splat file (a path, which may be a string), or a scene in memory, also one at several detail levels.
+        source: a splat file (a path, which may be a string), or a scene in memory, of one level or more.
         name: its name in messages and tables; unique among the instances of a run.
         object_to_world: (4, 4) rotation, uniform scale and translation.
         lod_scale: multiplies the pixel scales of its nodes, or the distances at which its detail levels are due; above 1

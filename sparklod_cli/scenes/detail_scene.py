@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from ..io import LevelFiles
 from ..lod.detail_loading import DetailFiles
 from ..model.detail import DetailScene
 from ..model.scene import Scene
@@ -68,8 +69,20 @@ def whole_scene(detail: DetailScene) -> Scene:
     return Scene(splats, None, detail.antialiased, detail.format, detail.notes, detail.header)
 
 
+def files_of(found: LevelFiles) -> DetailFiles:
+    """The chunk files of a manifest; regions are in its order."""
+    manifest = found.manifest
+    of_run = np.full((sum(1 for _ in manifest.regions()), manifest.levels), -1, np.int64)
+    for row, (_, node) in zip(of_run, manifest.regions(), strict=True):
+        for level, run in (node.runs or {}).items():
+            if run.count:
+                row[level] = run.file
+    environment = None if manifest.environment is None else len(manifest.filenames)
+    return DetailFiles(of_run, np.array(found.sizes, np.int64), environment, found.bytes)
+
+
 def files_in_memory(detail: DetailScene) -> DetailFiles:
-    """Files of a scene that none was read from: one for each level, of the bytes of its columns, and the environment."""
+    """Files of a scene that was in memory: one for each level, of the bytes of its columns, and the environment."""
     of_run = np.where(detail.counts > 0, np.arange(detail.levels), -1)
     sizes = [_bytes_of(detail.splats) * int(count) // max(1, len(detail.splats)) for count in detail.counts.sum(axis=0)]
     if detail.environment is None:

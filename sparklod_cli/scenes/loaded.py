@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ..lod import detail_rule
 from ..lod.budget import Budget
 from ..lod.continuous import faded
 from ..lod.detail_traversal import DetailForest, DetailTraversal
@@ -21,7 +22,7 @@ from ..model.instances import Instance, Matrix
 from ..model.nodes import Nodes
 from ..model.scene import Scene
 from ..model.splats import Splats
-from ..support.defaults import DETAIL_BUDGET, PRECISIONS
+from ..support.defaults import PRECISIONS
 from ..support.units import count_of
 from .detail_scene import LoadedDetail
 from .loaded_scene import Index, LoadedScene, depth_of, nodes_of
@@ -162,7 +163,7 @@ class Scenes:
     def splats_of(self, budget: Budget) -> int:
         """The splats of a budget, of which some are shares of the leaves."""
         if budget.by_default and self.details:
-            budget = replace(budget, count=DETAIL_BUDGET)
+            budget = replace(budget, count=detail_rule.BUDGET)
         return budget.of(self.leaves if budget.share is not None else 0)
 
     @functools.cached_property
@@ -238,7 +239,9 @@ class Scenes:
             raise ValueError(f"{self.details[0].name} is Streamed SOG; continuous cuts are of trees alone")
         for at, loaded in zip(self.instances, self.of_instance, strict=True):
             if loaded.has_cuts and at.foveation is not None:
-                raise ValueError(f"{at.name} is Streamed SOG, and has a foveation, which is for trees alone; leave it out")
+                raise ValueError(
+                    f"{at.name} is Streamed SOG, and has a foveation, which is for trees alone; leave it out"
+                )
 
     def full(self) -> Cut:
         """Full detail: all leaves, and all splats of scenes without trees."""

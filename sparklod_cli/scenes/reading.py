@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from ..codecs.rounding import after
-from ..io import RadFile, examine_scene, read_levels, size_of_input
+from ..io import RadFile, examine_scene, has_levels, read_level_files, read_levels, size_of_input
 from ..model.detail import DetailScene
 from ..model.instances import Instance
 from ..model.nodes import CHUNK_NODES
@@ -19,8 +19,7 @@ from ..support.defaults import PRECISIONS
 from ..support.errors import FormatError, InvalidSplatsError, SparklodError, TreeError, memory_errors_translated
 from ..support.progress import Progress, silent
 from ..support.stdin import DASH
-from .detail_files import detail_files, has_levels
-from .detail_scene import LoadedDetail, files_in_memory, whole_scene
+from .detail_scene import LoadedDetail, files_in_memory, files_of, whole_scene
 from .loaded import Scenes
 from .loaded_scene import UNNAMED, LoadedScene, nodes_of
 from .paged_scene import PagedScene, empty_scene
@@ -125,7 +124,7 @@ def _loaded_detail(
     scene = whole_scene(detail)
     if not len(scene.splats):
         raise InvalidSplatsError(f"{file or UNNAMED}: it has no splats")
-    files = files_in_memory(detail) if file is None else detail_files(file)
+    files = files_in_memory(detail) if file is None else files_of(read_level_files(file))
     drawn = after(through, file or Path(UNNAMED), scene, threads)
     return LoadedDetail(file, int(files.sizes.sum()) + files.manifest, scene, drawn, chunks, detail=detail, files=files)
 

@@ -43,7 +43,13 @@ COLUMNS = (
     ),
     Column("pixel_scale_min", float, ".6g", "", "pixel scale down to which all nodes have been refined"),
     Column("frontier", int, "", "splats", "of the cut, nodes still waiting to be refined when the search stops"),
-    Column("level_min", int, "", "", "smallest depth of a node of the cut, edges from the root; of Streamed SOG the finest detail level"),
+    Column(
+        "level_min",
+        int,
+        "",
+        "",
+        "smallest depth of a node of the cut, edges from the root; of Streamed SOG the finest detail level",
+    ),
     Column("level_mean", float, ".3f", "", "mean depth of the nodes of the cut, or detail level of its splats"),
     Column("level_max", int, "", "", "largest depth of a node of the cut, or detail level"),
     Column("in_frustum", int, "", "splats", "of the cut, splats inside the frustum: their centre is in the image"),
@@ -72,7 +78,7 @@ COLUMNS = (
         int,
         "",
         "bytes",
-        "bytes that arrived since the previous frame: chunks and header of RAD, or chunk files and manifest of Streamed "
+        "bytes that arrived since the previous frame: chunks and header of RAD, chunk files and manifest of Streamed "
         "SOG; of SPZ, which has no chunks, as if the file were cut evenly",
     ),
     Column("chunks_resident", int, "", "chunks", "chunks in the cache after this frame"),

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cameras.camera import Camera
+from ..lod import detail_rule
 from ..lod.settings import LodSettings
 from ..lod.traversal import TreeCut
 from ..scenes.finder import CutFinder, view_of
 from ..scenes.loaded import Cut, Scenes
-from ..support.defaults import DETAIL_FETCHERS
 from ..tables.columns import Row
 from .chunk_cache import Chunks, header_answers
 from .columns import LOADING
@@ -113,8 +113,8 @@ class Loader:
         counts = np.zeros(len(self._chunks), np.int64)
         scenes = [loaded for loaded in self.scenes.of_instance if loaded.has_cuts]
         for loaded, view, nodes in zip(scenes, cut.views, cut.indices(), strict=True):
-            chunks, splats = np.unique(loaded.chunk_of(nodes) - loaded.first_chunk, return_counts=True)
-            counts[int(view["chunk_base"]) + chunks.astype(np.int64)] += splats
+            chunks, splats = np.unique(loaded.chunk_of(nodes.astype(np.int64)) - loaded.first_chunk, return_counts=True)
+            counts[int(view["chunk_base"]) + chunks] += splats
         return counts
 
 
@@ -148,7 +148,7 @@ def chunks_of(scenes: Scenes) -> Chunks:
     if scenes.details:
         manifests = [[loaded.files.manifest] if loaded.files.manifest else [] for loaded in scenes.details]
         sizes = [loaded.chunk_bytes() for loaded in scenes.details]
-        return Chunks(sizes, manifests, rooted=False, fetchers=DETAIL_FETCHERS)
+        return Chunks(sizes, manifests, rooted=False, fetchers=detail_rule.FETCHERS)
     return Chunks(
         [tree.chunk_bytes() for tree in scenes.trees],
         [header_answers(tree.header_bytes, tree.bytes) for tree in scenes.trees],

@@ -19,7 +19,7 @@ class Network:
     Attributes:
         bandwidth: bytes/s, shared equally by all transfers under way.
         latency: seconds from the request for a chunk to its first byte, during which it uses no bandwidth.
-        fetchers: maximum number of concurrent requests; None for that of the viewer: 3 in Spark, its `numFetchers`, and 2
+        fetchers: maximum number of concurrent requests; None for that of the viewer: 3 in Spark (`numFetchers`), 2
             in PlayCanvas, which shows Streamed SOG.
 
     Raises:

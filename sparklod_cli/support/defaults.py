@@ -40,7 +40,6 @@ PRESETS = {
     "preview-desktop": 1_500_000,
     "mobile": 500_000,
 }
-DEFAULT_PRESET = "desktop"
 
 #: Precision of the nodes: that of the file, or the float16 in which Spark's traversal stores them.
 PRECISIONS = ("float32", "float16")
@@ -63,14 +62,3 @@ UP_AXES = ("y", "-y", "z", "-z")
 #: Streamed SOG, as the tools of its makers write it: splats of a chunk file, the longest side of a region in world
 #: units, and the splats below which a region is not divided.
 DETAIL_CHUNK_SPLATS, DETAIL_EXTENT, DETAIL_MIN_SPLATS = 524_288, 16.0, 8_192
-
-#: How PlayCanvas chooses the detail levels of Streamed SOG unless told otherwise, and the least that it takes: splats,
-#: world units, a ratio of distances, factors of distances, and files that it loads at a time.
-DETAIL_BUDGET = 1_000_000
-DETAIL_BASE_DISTANCE, LEAST_BASE_DISTANCE = 5.0, 0.1
-DETAIL_MULTIPLIER, LEAST_MULTIPLIER = 3.0, 1.2
-DETAIL_BEHIND_PENALTY, DETAIL_SHRINK = 1.5, 0.75
-DETAIL_FETCHERS = 2
-
-#: What a viewer of Streamed SOG makes of a budget: it spends all of it, or only keeps within it what distances ask for.
-BUDGET_MODES = ("target", "limit")

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from ...lod import detail_rule
 from ...support import defaults
 from ..command import COMMON, option, with_options
 from ..usage import exclude, flag_of, require
@@ -21,6 +22,9 @@ if TYPE_CHECKING:
     from ...model.foveation import Foveation
 
 HEADING = "Cut"
+
+#: A key of `defaults.PRESETS`.
+DEFAULT_PRESET = "desktop"
 
 #: The options of `cut_options` that have no effect where full detail is drawn.
 CUTS = (
@@ -109,7 +113,7 @@ class Cut:
         if self.budget:
             budget = self.budget[0]
         else:
-            count = defaults.PRESETS[self.preset or defaults.DEFAULT_PRESET]
+            count = defaults.PRESETS[self.preset or DEFAULT_PRESET]
             budget = replace(Budget.of_count(count), by_default=self.preset is None)
         scaled = budget.scaled(self.lod_splat_scale)
         if scaled.count is not None and not scaled.count * scaled.scale <= LARGEST:
@@ -212,7 +216,7 @@ def cut_options(command: Command, *, pictures: bool = False) -> Command:
             "--preset",
             type=click.Choice(list(defaults.PRESETS)),
             help="Budget of a device: Spark 2's, or that of Spark's LoD design with preview-desktop and mobile."
-            f"  [default: {defaults.DEFAULT_PRESET}; for Streamed SOG PlayCanvas's, {defaults.DETAIL_BUDGET:,} splats]",
+            f"  [default: {DEFAULT_PRESET}; for Streamed SOG PlayCanvas's, {detail_rule.BUDGET:,} splats]",
         ),
         add(
             "--lod-splat-scale",

@@ -8,14 +8,13 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ...support import defaults
+from ...lod import detail_rule
 from ..command import option, with_options
 from ..usage import given, refuse, require
 from .common import Command
 from .types import Real
 
 if TYPE_CHECKING:
-    from ...lod.detail_rule import DetailRule
     from ...scenes.loaded import Scenes
 
 HEADING = "Streamed SOG"
@@ -36,7 +35,7 @@ class Detail:
     """The values of the options of `detail_options`.
 
     Attributes:
-        budget_mode: one of `defaults.BUDGET_MODES`.
+        budget_mode: one of `detail_rule.BUDGET_MODES`.
         lod_base_distance: world units; None for the default.
         lod_multiplier: of distances, from level to level.
         lod_behind_penalty: factor of distances.
@@ -57,13 +56,11 @@ class Detail:
         if ctx.params["bandwidth"] is None:
             require(ctx, ["lod_underfill"], "--bandwidth")
 
-    def rule(self) -> DetailRule:
+    def rule(self) -> detail_rule.DetailRule:
         """How levels are chosen."""
-        from ...lod.detail_rule import DetailRule
-
-        return DetailRule(
+        return detail_rule.DetailRule(
             mode=self.budget_mode,
-            base_distance=self.lod_base_distance or defaults.DETAIL_BASE_DISTANCE,
+            base_distance=self.lod_base_distance or detail_rule.BASE_DISTANCE,
             multiplier=self.lod_multiplier,
             behind_penalty=self.lod_behind_penalty,
             underfill=self.lod_underfill or 0,
@@ -71,7 +68,7 @@ class Detail:
 
 
 def check_scenes(ctx: click.Context, scenes: Scenes) -> None:
-    """Raises a `click.UsageError` where an option is for trees, and the files are Streamed SOG, or the other way round."""
+    """Raises a `click.UsageError` where an option is for trees and the files are Streamed SOG, or the reverse."""
     if scenes.details:
         streamed = "is for trees; use --budget, --budget-mode and --lod-multiplier for Streamed SOG"
         refuse(ctx, [name for name in OF_TREES if name in ctx.params], streamed)
@@ -91,30 +88,30 @@ def detail_options(command: Command) -> Command:
         command,
         add(
             "--budget-mode",
-            type=click.Choice(defaults.BUDGET_MODES),
-            default=defaults.BUDGET_MODES[0],
+            type=click.Choice(detail_rule.BUDGET_MODES),
+            default=detail_rule.BUDGET_MODES[0],
             help="Spend the whole budget, or take the levels that distances ask for, and coarser ones only where those"
             " exceed it.",
         ),
         add(
             "--lod-base-distance",
             metavar="X",
-            type=Real(defaults.LEAST_BASE_DISTANCE),
+            type=Real(detail_rule.LEAST_BASE_DISTANCE),
             help="Distance at which level 1 replaces full detail, in world units; with --budget-mode limit."
-            f"  [default: {defaults.DETAIL_BASE_DISTANCE:g}]",
+            f"  [default: {detail_rule.BASE_DISTANCE:g}]",
         ),
         add(
             "--lod-multiplier",
             metavar="X",
-            type=Real(defaults.LEAST_MULTIPLIER),
-            default=defaults.DETAIL_MULTIPLIER,
+            type=Real(detail_rule.LEAST_MULTIPLIER),
+            default=detail_rule.MULTIPLIER,
             help="Ratio of the distances at which successive levels begin.",
         ),
         add(
             "--lod-behind-penalty",
             metavar="X",
             type=Real(1),
-            default=defaults.DETAIL_BEHIND_PENALTY,
+            default=detail_rule.BEHIND_PENALTY,
             help="Factor of the distance of regions straight behind the camera.",
         ),
         add(

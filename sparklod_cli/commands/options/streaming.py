@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from ...lod import detail_rule
 from ...support import defaults
 from ...support.units import parse_bandwidth, parse_latency
 from ..command import option, with_options
@@ -119,6 +120,6 @@ def streaming_options(command: Command, *, pictures: bool = False) -> Command:
             metavar="N",
             type=click.IntRange(1, 1000),
             help="Number of chunks that are fetched at a time."
-            f"  [default: {defaults.FETCHERS}; {defaults.DETAIL_FETCHERS} of Streamed SOG]",
+            f"  [default: {defaults.FETCHERS}; {detail_rule.FETCHERS} of Streamed SOG]",
         ),
     )
