@@ -29,7 +29,7 @@ class Instance:
         source: a splat file (a path, which may be a string), or a scene in memory, of one level or more.
         name: its name in messages and tables; unique among the instances of a run.
         object_to_world: (4, 4) rotation, uniform scale and translation.
-        lod_scale: multiplies the pixel scales of its nodes, or the distances at which its detail levels are due; above 1
+        lod_scale: multiplies the pixel scales of its nodes, or the distances at which its detail levels begin; above 1
             it gets more of the budget than others.
         foveation: its own; None for that of the viewer.
 
