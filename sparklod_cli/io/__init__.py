@@ -2,6 +2,7 @@
 
 from .beside import companions
 from .chunks import read_rad_chunk, read_rad_header
+from .details import detail_files, detail_sink
 from .identity import Identity, content_of, files_of, identity_of
 from .level_files import LevelFiles, has_levels, read_level_files
 from .names import is_file_name
@@ -26,6 +27,8 @@ __all__ = [
     "chunk_files",
     "companions",
     "content_of",
+    "detail_files",
+    "detail_sink",
     "examine_scene",
     "files_of",
     "has_levels",
