@@ -99,8 +99,7 @@ def test_a_visitor_who_waits_gets_the_manifest_the_environment_and_coarse_levels
     assert files.environment is not None
     arrivals = list(Loader(row, CUT, StreamingSettings(Network(1e6, 0.1, 1))).arrivals(camera))
     order = [
-        int(np.flatnonzero(after.resident & ~before.resident)[0])
-        for before, after in itertools.pairwise(arrivals)
+        int(np.flatnonzero(after.resident & ~before.resident)[0]) for before, after in itertools.pairwise(arrivals)
     ]
     (part,) = CutFinder(row, CUT).cut(camera).parts
     assert set(order) == set(scene.chunk_of(part.index).tolist())
