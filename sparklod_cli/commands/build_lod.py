@@ -43,6 +43,7 @@ Examples:
   sparklod build-lod scene-lod.spz --format rad         # the same tree in the other format
   sparklod build-lod scene.sog --encoding ext           # writes scene-lod.npz
   sparklod build-lod scene-lod.spz --unlod -o scene.ply
+  sparklod build-lod scene-lod.spz --unlod -o scene.sog # for PlayCanvas
 """
 
 
@@ -73,8 +74,8 @@ Examples:
     "--unlod",
     heading=COMMON,
     is_flag=True,
-    help="Write the original splats of Level-of-Detail files instead, as SPZ or, by the name of FILE, .rad, .ply or"
-    " .splat.",
+    help="Write the original splats of Level-of-Detail files instead, as SPZ or, by the name of FILE, .rad, .ply,"
+    " .sog, DIR/meta.json (an unpacked SOG) or .splat.",
 )
 @baking_options
 @resources_options
@@ -132,7 +133,7 @@ def _check(ctx: click.Context, given: Inputs, named: list[Path], outputs: Output
     elif DASH in inputs:
         raise click.UsageError("standard input has no name to derive one from; give --output")
     targets = [outputs.output] if outputs.output is not None else [outputs.target(source) for source in inputs]
-    if outputs.is_chunked:
+    if outputs.is_chunked or outputs.is_folder:
         targets = with_chunks(targets)
     keep_apart(ctx, {"output" if outputs.output_dir is None else "output_dir": targets, "scene": named})
     claim_stdout(ctx, "output", as_json=general.as_json, binary=True)

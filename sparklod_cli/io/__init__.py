@@ -2,10 +2,11 @@
 
 from .beside import companions
 from .chunks import read_rad_chunk, read_rad_header
+from .details import detail_files, detail_sink
 from .identity import Identity, content_of, files_of, identity_of
 from .names import is_file_name
 from .rad_file import RadFile
-from .reading import examine_scene, opened, read_arrays, read_scene, size_of_input
+from .reading import examine_scene, opened, read_arrays, read_levels, read_scene, size_of_input
 from .scenes import SceneSink, scene_sink
 from .streams import PlacedFile, open_stream, open_streams
 from .texts import MAX_TEXT, read_rgba, read_text, read_together
@@ -24,6 +25,8 @@ __all__ = [
     "chunk_files",
     "companions",
     "content_of",
+    "detail_files",
+    "detail_sink",
     "examine_scene",
     "files_of",
     "identity_of",
@@ -32,6 +35,7 @@ __all__ = [
     "open_streams",
     "opened",
     "read_arrays",
+    "read_levels",
     "read_rad_chunk",
     "read_rad_header",
     "read_rgba",
