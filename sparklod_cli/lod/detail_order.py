@@ -20,8 +20,8 @@ SIBLINGS = 15
 #: Weight of opacity beside each of red, green and blue, as pictures may have any background. Chosen.
 ALPHA_WEIGHT = 1.0
 
-#: Pairs whose overlap is computed at a time, so that their columns stay in the cache. Chosen.
-BLOCK = 1 << 15
+#: Splats or pairs that are worked on at a time, so that their columns stay in the cache. Chosen.
+BLOCK = 1 << 14
 
 Column = NDArray[np.float64]
 
@@ -39,7 +39,7 @@ def losses(nodes: Splats, tree: LodTree, parent: NDArray[np.int32]) -> Column:
         tree: of them.
         parent: (M,) of each node, -1 of the root.
     """
-    with np.errstate(all="ignore"):
+    with np.errstate(over="ignore", invalid="ignore"):
         size = spark_size(nodes).astype(np.float64)
         loss = np.sqrt(picture_errors(with_plain_opacity(nodes), parent)) * size
     leaves = tree.is_leaf.astype(np.float64)
@@ -61,7 +61,10 @@ def picture_errors(splats: Splats, parent: NDArray[np.int32]) -> Column:
         parent: (M,) of each, whose children are consecutive; -1 of the root.
     """
     count = len(splats)
-    shape = covariance(splats.scale, splats.quat_xyzw)
+    shape = np.empty((count, 6))
+    for begin in range(0, count, BLOCK):
+        some = slice(begin, begin + BLOCK)
+        shape[some] = covariance(splats.scale[some], splats.quat_xyzw[some])
     node = np.arange(1, count)
     above = parent[1:].astype(np.int64)
     alone = _shared(splats, shape, np.arange(count), np.arange(count))
@@ -76,6 +79,7 @@ def picture_errors(splats: Splats, parent: NDArray[np.int32]) -> Column:
     return np.where(inner, np.maximum(error + alone, 0), 0.0)
 
 
+@np.errstate(divide="ignore", over="ignore", invalid="ignore")  # where splats have no extent, or are too far apart
 def _shared(splats: Splats, shape: Column, first: NDArray[np.int64], second: NDArray[np.int64]) -> Column:
     """(n,) integrals of the product of two splats' pictures, in all channels; mean of the planes, divided by pi."""
     found = np.empty(len(first))
