@@ -287,5 +287,7 @@ assert all(np.array_equal(cluster(sh, 64).codes, each.codes) for sh, each in zip
 def test_palettes_are_made_on_several_threads_at_once_whoever_runs_the_kernels() -> None:
     """numba's own layer ends the process where two threads call kernels at once."""
     environment = {**os.environ, "NUMBA_THREADING_LAYER": "workqueue"}
-    done = subprocess.run([sys.executable, "-c", TOGETHER], env=environment, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", TOGETHER], env=environment, capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr

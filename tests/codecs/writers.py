@@ -248,7 +248,7 @@ def written_sog_precision(source: Scene) -> Precision:
     sh = 0.0
     if splats.sh_degree:
         codes = sog.settled(source, WriteOptions()).sog.sh_codes
-        palette = sh_palette.cluster(splats.sh, codes or 0)
+        palette = sh_palette.cluster(splats.sh, codes or 0, weight=sh_palette.visible_weight(splats))
         sh = float(np.abs(palette.expand() - splats.sh).max()) + largest_half_step(palette.codes)
     return dataclasses.replace(
         found,

@@ -91,7 +91,8 @@ def encode_files(
     }
     if splats.sh_degree:
         assert options.sog.sh_codes is not None
-        palette = sh_palette.cluster(splats.sh, options.sog.sh_codes, threads=threads, progress=progress)
+        weight = sh_palette.visible_weight(splats)
+        palette = sh_palette.cluster(splats.sh, options.sog.sh_codes, weight=weight, threads=threads, progress=progress)
         makers["shN"] = functools.partial(_sh, palette, splats.sh_degree, order)
 
     meta: dict[str, Any] = {"version": 2, "asset": {"generator": GENERATOR + __version__}, "count": len(splats)}
