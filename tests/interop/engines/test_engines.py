@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import sys
 import textwrap
 from pathlib import Path
 
@@ -11,17 +10,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sparklod_cli.render.rasterizer import draw
-from sparklod_cli.render.settings import RasterSettings
-from sparklod_cli.render.shading import shade
 from tests.conftest import ROOT
 from tests.interop.engines import PACKAGES, recipes
-from tests.interop.engines.browser import FAR, NEAR, Browser, Request, Shown
+from tests.interop.engines.browser import Browser, Request, Shown
 from tests.interop.engines.conftest import Shot, counts_of
-from tests.interop.pictures import psnr
-
-#: The blur of PlayCanvas's engine and of Babylon.js, pixels squared: they add 0.3 to the covariance in half pixels.
-BLUR = 0.3 / 4
+from tests.interop.engines.likeness import likeness, our_picture
 
 #: Least PSNR in dB, of red, green and blue of all pixels. PlayCanvas is set to draw as we do, but for its falloff and a
 #: sort of few bits; SuperSplat's viewer and Babylon.js are as they are, so that opacity does not make up for the blur.
@@ -34,22 +27,14 @@ WRONG = 20
 @pytest.fixture(scope="module")
 def ours(shot: Shot) -> NDArray[np.float32]:
     """Our picture of level 0, with the engines' blur."""
-    rasterizer = sys.modules[draw.__module__]
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(rasterizer, "BLUR", BLUR)
-        shaded = shade([(shot.splats, np.eye(4))], shot.camera)
-        return np.clip(draw(shaded, shot.camera, RasterSettings(near=NEAR, far=FAR)), 0, 1)
+    return our_picture(shot.splats, shot.camera)
 
 
 def check(shown: Shown, ours: NDArray[np.float32], least: float) -> None:
-    """Asserts that a picture is ours, and that it would be noticed if it were turned by 180 degrees or mirrored."""
-
-    def likeness(theirs: NDArray[np.float64]) -> float:
-        return psnr((theirs - ours)[..., :3])
-
+    """Asserts that a picture is ours, and that it would be noticed if it were turned by half a turn or mirrored."""
     rgba = shown.rgba
-    assert likeness(rgba) >= least, f"{likeness(rgba):.2f} dB"
-    assert max(map(likeness, (rgba[::-1], rgba[:, ::-1], rgba[::-1, ::-1]))) < WRONG
+    assert likeness(rgba, ours) >= least, f"{likeness(rgba, ours):.2f} dB"
+    assert max(likeness(wrong, ours) for wrong in (rgba[::-1], rgba[:, ::-1], rgba[::-1, ::-1])) < WRONG
 
 
 def levels_of(requests: list[Request]) -> list[int]:
@@ -97,7 +82,7 @@ def test_babylon_streams_it(browser: Browser, shot: Shot, ours: NDArray[np.float
 def test_babylon_lays_what_it_streams_on_its_side(browser: Browser, shot: Shot, ours: NDArray[np.float32]) -> None:
     """Why its page has a line about it: once this fails, Babylon.js has changed."""
     shown = browser.babylon(shot.file, shot.camera, {"stream.rotation.x = 0;": ""})
-    assert psnr((shown.rgba - ours)[..., :3]) < WRONG
+    assert likeness(shown.rgba, ours) < WRONG
 
 
 def test_babylon_shows_sog_upright(
