@@ -15,7 +15,7 @@ import click
 
 from ..images.defaults import THUMBNAIL_SIZE, THUMBNAIL_SUPERSAMPLE
 from .command import COMMON, Command
-from .options import appearance, cameras, comparison, cut, detail, inputs, pictures, streaming
+from .options import appearance, cameras, comparison, cut, inputs, pictures, streamed_sog, streaming
 from .options.camera_options import camera_options
 from .options.common import General, common_options
 from .paths import claim_stdout, keep_apart
@@ -46,7 +46,7 @@ Examples:
 """
 
 HEADINGS = (
-    *(COMMON, inputs.HEADING, cameras.HEADING, cut.HEADING, detail.HEADING, streaming.HEADING),
+    *(COMMON, inputs.HEADING, cameras.HEADING, cut.HEADING, streamed_sog.HEADING, streaming.HEADING),
     *(appearance.HEADING, comparison.HEADING, pictures.HEADING),
 )
 
@@ -58,7 +58,7 @@ class RenderOptions:
     inputs: inputs.Inputs
     cameras: cameras.PictureCameras
     cut: cut.PictureCut
-    detail: detail.Detail
+    detail: streamed_sog.Detail
     streaming: streaming.PictureStreaming
     appearance: appearance.Appearance
     comparison: comparison.Comparison
@@ -76,7 +76,7 @@ class RenderOptions:
             options_of(ctx, inputs.Inputs),
             options_of(ctx, cameras.PictureCameras),
             options_of(ctx, cut.PictureCut),
-            options_of(ctx, detail.Detail),
+            options_of(ctx, streamed_sog.Detail),
             options_of(ctx, streaming.PictureStreaming),
             options_of(ctx, appearance.Appearance),
             options_of(ctx, comparison.Comparison),
@@ -89,7 +89,7 @@ class RenderOptions:
         asked.cut.check(ctx)
         asked.detail.check(ctx)
         if asked.cut.full:
-            exclude(ctx, detail.OPTIONS, "--full")
+            exclude(ctx, streamed_sog.OPTIONS, "--full")
         asked.streaming.check(ctx)
         if asked.streaming.after is not None:
             exclude(ctx, ["full", "continuous", "compare"], "--after")
@@ -107,7 +107,7 @@ class RenderOptions:
 @inputs.input_options
 @functools.partial(camera_options, still=True)
 @functools.partial(cut.cut_options, pictures=True)
-@detail.detail_options
+@streamed_sog.detail_options
 @functools.partial(streaming.streaming_options, pictures=True)
 @appearance.appearance_options
 @comparison.comparison_options
@@ -152,8 +152,8 @@ def _draw(ctx: click.Context, asked: RenderOptions) -> None:
 
         def ready(path: CameraPath, scenes: Scenes) -> None:
             notes = [*path.notes, *scenes.notes, *_upside_down(asked, scenes)]
-            detail.check_scenes(ctx, scenes)
-            unused = detail.without_effect(ctx, scenes, (*cut.CUTS, *streaming.OF_LOADING))
+            streamed_sog.check_scenes(ctx, scenes)
+            unused = streamed_sog.without_effect(ctx, scenes, (*cut.CUTS, *streaming.OF_LOADING))
             if unused:
                 unused_flags = ", ".join(unused)
                 notes.append(f"no file has levels to choose, so all splats are drawn; no effect: {unused_flags}")

@@ -14,7 +14,7 @@ import click
 from ..support.stdin import DASH
 from .console import Console, count_of, for_screen, is_terminal
 from .options.common import table_form
-from .options.detail import check_scenes
+from .options.streamed_sog import check_scenes
 from .paths import keep_apart
 
 if TYPE_CHECKING:

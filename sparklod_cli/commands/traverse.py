@@ -12,7 +12,7 @@ import click
 
 from .command import COMMON, Command
 from .console import Console, for_screen, is_terminal
-from .options import cameras, cut, detail, inputs, streaming
+from .options import cameras, cut, inputs, streamed_sog, streaming
 from .options import table as tables
 from .options.camera_options import camera_options
 from .options.common import General, common_options
@@ -39,7 +39,7 @@ Examples:
 """
 
 HEADINGS = (
-    *(COMMON, inputs.HEADING, cameras.HEADING, cut.HEADING, detail.HEADING),
+    *(COMMON, inputs.HEADING, cameras.HEADING, cut.HEADING, streamed_sog.HEADING),
     *(streaming.HEADING, tables.HEADING),
 )
 
@@ -49,7 +49,7 @@ HEADINGS = (
 @inputs.input_options
 @camera_options
 @cut.cut_options
-@detail.detail_options
+@streamed_sog.detail_options
 @streaming.streaming_options
 @functools.partial(
     common_options, json="Print the summary as one JSON object on standard output; write a table only to --output."
@@ -72,7 +72,7 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
         options_of(ctx, tables.Table),
         options_of(ctx, General),
     )
-    levels = options_of(ctx, detail.Detail)
+    levels = options_of(ctx, streamed_sog.Detail)
     for group in (where, lod, levels, network):
         group.check(ctx)
     place.check(ctx, as_json=general.as_json)
@@ -91,7 +91,7 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
         def ready(path: CameraPath, scenes: Scenes) -> None:
             for note in path.notes:
                 console.say(note)
-            detail.check_scenes(ctx, scenes)
+            streamed_sog.check_scenes(ctx, scenes)
             keep_apart(ctx, {**besides, "indices_out": outputs.index_files(path.numbers, len(instances))})
 
         console.announce_compiling("traverse")
