@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from .codecs.rad.records import RadChunkEntry, RadChunkHeader, RadHeader
     from .codecs.splat_encoding import SplatEncoding
     from .inspection.report import Report
+    from .lod.detail_settings import DetailSettings
     from .lod.settings import LodSettings
     from .model.foveation import Cones, Frustum
     from .model.instances import Instance
@@ -70,6 +71,7 @@ _MODULES = {
     "codecs.rad.records": ("RadChunkEntry", "RadChunkHeader", "RadHeader"),
     "codecs.splat_encoding": ("SplatEncoding",),
     "inspection.report": ("Report",),
+    "lod.detail_settings": ("DetailSettings",),
     "lod.settings": ("LodSettings",),
     "model.foveation": ("Cones", "Frustum"),
     "model.instances": ("Instance",),
@@ -99,6 +101,7 @@ __all__ = [
     "ComparisonTable",
     "Cones",
     "Cut",
+    "DetailSettings",
     "FormatError",
     "Frames",
     "Frustum",

@@ -7,8 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sparklod_cli.bake.output import Output, WrittenTree, output_of
+from sparklod_cli.bake.clock import Clock
+from sparklod_cli.bake.output import Output, output_of
 from sparklod_cli.bake.settings import BakeSettings
+from sparklod_cli.bake.written import WrittenTree
 from sparklod_cli.codecs import encoder
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
 from sparklod_cli.codecs.statistics import Statistics
@@ -61,7 +63,7 @@ def test_a_stream_is_written_as_the_scene(
         target.parent.mkdir()
         output = output_of(target, settings, overwrite=False)
         if folder == "scene":
-            said.append(output.write(scene, 2, silent))
+            said.append(output.write(scene, None, Clock(), 2, silent))
             continue
         parts = np.array_split(np.arange(len(scene)), 3)
         leaf = scene.tree.is_leaf
