@@ -30,6 +30,9 @@ class Format:
             only the suffix decides.
         companions: its files refer to others beside them; `decode` and `stream` take another argument, `beside`, which
             opens those.
+        folders: those may be in folders there.
+        detailed: its files have several detail levels, and its module `decode_levels`, which takes what `decode` takes
+            and gives a `DetailScene`.
         selective: its module also has `examine(file, *, columns, threads, progress) -> Scene`, which decodes only some
             columns and accepts a broken tree; `beside`, too, where it has companions.
     """
@@ -41,6 +44,8 @@ class Format:
     writable: bool = False
     trees: bool = False
     companions: bool = False
+    folders: bool = False
+    detailed: bool = False
     selective: bool = False
 
     def codec(self) -> Any:
@@ -66,6 +71,16 @@ FORMATS = (
     Format("SPZ", "spz", (".spz",), rb"\x1f\x8b\x08[\0-\x1f]|NGSP", writable=True, trees=True, selective=True),
     # RADC begins a chunk, which the codec refuses with what to give instead.
     Format("RAD", "rad.codec", (".rad",), rb"RAD[0C]", writable=True, trees=True, companions=True, selective=True),
+    # Its manifest; a meta.json of SOG is JSON, too.
+    Format(
+        "Streamed SOG",
+        "streamed_sog.codec",
+        (".json",),
+        rb"\s*\{.*?\"lodLevels\"\s*:",
+        companions=True,
+        folders=True,
+        detailed=True,
+    ),
     # A zip, or its meta.json unpacked.
     Format("SOG", "sog.codec", (".sog", ".json"), rb"PK\x03\x04|\s*\{\s*\"\w+\"\s*:", companions=True),
     Format("KSPLAT", "ksplat", (".ksplat",), rb"\0[\x01-\xff]\0\0"),  # version 0.1 on; as a float it would be denormal

@@ -8,10 +8,10 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from ..codecs.promises import Violation
 from ..codecs.rad.encodings import LARGEST_F16
 from ..codecs.rad.header import ENCODING_KEYS
 from ..codecs.rad.layout import BY_NAME, PROPERTIES, SIZES
-from ..codecs.rad.promises import Violation
 from ..codecs.rad.records import RadChunkHeader, RadHeader
 from ..codecs.rad.survey import survey_chunks, survey_file
 from ..codecs.splat_encoding import log_scale_table

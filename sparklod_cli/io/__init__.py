@@ -5,7 +5,7 @@ from .chunks import read_rad_chunk, read_rad_header
 from .identity import Identity, content_of, files_of, identity_of
 from .names import is_file_name
 from .rad_file import RadFile
-from .reading import examine_scene, opened, read_arrays, read_scene, size_of_input
+from .reading import examine_scene, opened, read_arrays, read_levels, read_scene, size_of_input
 from .scenes import SceneSink, scene_sink
 from .streams import PlacedFile, open_stream, open_streams
 from .texts import MAX_TEXT, read_rgba, read_text, read_together
@@ -32,6 +32,7 @@ __all__ = [
     "open_streams",
     "opened",
     "read_arrays",
+    "read_levels",
     "read_rad_chunk",
     "read_rad_header",
     "read_rgba",

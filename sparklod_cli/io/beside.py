@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import BinaryIO
 
-from ..codecs.formats import HEAD
+from ..codecs.formats import HEAD, sniff
 from ..codecs.rad import header as rad_header
 from ..codecs.sog.files import MAX_META, META, names_beside
+from ..codecs.streamed_sog.manifest import MAX_MANIFEST, parse
+from ..codecs.streamed_sog.names import MANIFEST
 from ..support.addresses import Place
 from ..support.errors import FormatError, UnreadableError
 from ..support.stdin import DASH
 from ..support.untrusted import quoted_value
 from .names import leads_away, reason_of
+
+#: The splat file that a folder stands for: the first of these that is there.
+IN_FOLDERS = (MANIFEST, META)
 
 
 def companions(path: Path, sets: Collection[Collection[str]]) -> list[Path]:
@@ -26,36 +31,54 @@ def companions(path: Path, sets: Collection[Collection[str]]) -> list[Path]:
     """
     try:
         folder = path if path.is_dir() else path.parent
-        meta = folder / META if path.is_dir() else path
+        first: Path | None = path
         if path.is_dir():
-            names = [META, *itertools.chain(*sets)]
+            first = next((folder / name for name in IN_FOLDERS if (folder / name).is_file()), None)
+            names = [*([] if first is None else [first.name]), *itertools.chain(*sets)]
         else:
             names = list(itertools.chain(*(names for names in sets if path.name in names)))
-        if meta.is_file():
-            names += _named_in(meta)
-        beside = [folder / name for name in names if not leads_away(name)]
-        return [file for file in beside if file.is_file()]
+        files = _beside(folder / MANIFEST, names)
+        if first is not None and first.is_file():
+            files += _named_in(first)
+        return [file for file in files if file.is_file()]
     except (OSError, ValueError, FormatError):
         return []
 
 
-def _named_in(path: Path) -> list[str]:
-    """The names of files that a splat file refers to: images of an unpacked SOG, chunks of a RAD."""
+def _named_in(path: Path) -> list[Path]:
+    """The files that a splat file refers to: images of an unpacked SOG, chunks of a RAD, all those of Streamed SOG."""
     with path.open("rb") as file:
         head = file.read(HEAD)
         file.seek(0)
         if head.startswith(rad_header.MAGIC):
-            return list(rad_header.read_header(file).filenames)
-        if head.lstrip().startswith(b"{") and path.stat().st_size <= MAX_META:
-            return names_beside(file.read())
-    return []
+            return _beside(path, rad_header.read_header(file).filenames)
+        if (form := sniff(head, "")) is not None and form.folders:
+            metas = _beside(path, parse(file.read(MAX_MANIFEST + 1)).names(), folders=True)
+            return [*metas, *itertools.chain(*map(_images_of, metas))]
+    return _images_of(path)
+
+
+def _images_of(path: Path) -> list[Path]:
+    """The images that the meta.json of an unpacked SOG names."""
+    if not path.is_file() or path.stat().st_size > MAX_META:
+        return []
+    data = path.read_bytes()
+    return _beside(path, names_beside(data)) if data.lstrip().startswith(b"{") else []
+
+
+def _beside(path: Path, names: Iterable[str], *, folders: bool = False) -> list[Path]:
+    return [path.parent / name for name in names if not leads_away(name, folders=folders)]
 
 
 def in_folder(folder: Place) -> Place:
-    """The splat file that a folder stands for; `UnreadableError` where it holds no unpacked SOG."""
-    path = folder / META
-    if not path.is_file():
-        raise UnreadableError("cannot be read: is a directory, without the meta.json of an unpacked SOG")
+    """The splat file that a folder stands for: the manifest of Streamed SOG, or else the meta.json of a SOG.
+
+    Raises:
+        UnreadableError: the folder holds neither.
+    """
+    path = next((folder / name for name in IN_FOLDERS if (folder / name).is_file()), None)
+    if path is None:
+        raise UnreadableError(f"cannot be read: is a directory, without the {META} of an unpacked SOG or a {MANIFEST}")
     return path
 
 
@@ -65,11 +88,15 @@ def path_beside(first: Path, name: str) -> Path:
     return first.parent / name
 
 
-def open_beside(first: Place, name: str) -> BinaryIO:
-    """Opens a file that another one names; `FormatError` where the name could lead out of their folder."""
+def open_beside(first: Place, name: str, *, folders: bool = False) -> BinaryIO:
+    """Opens a file that another one names, which may be in folders there if `folders`.
+
+    Raises:
+        FormatError: it cannot be opened, or the name could lead out of the folder of the first.
+    """
     if first == DASH:
         raise FormatError(f"it names {quoted_value(name)}, but standard input has no folder; give the path instead")
-    _check_name(name)
+    _check_name(name, folders=folders)
     path = first.parent / name
     try:
         if path.exists() and not path.is_file():
@@ -79,6 +106,6 @@ def open_beside(first: Place, name: str) -> BinaryIO:
         raise FormatError(f"{quoted_value(name)}, which it names, cannot be read: {reason_of(error)}") from None
 
 
-def _check_name(name: str) -> None:
-    if leads_away(name):
+def _check_name(name: str, *, folders: bool = False) -> None:
+    if leads_away(name, folders=folders):
         raise FormatError(f"it names {quoted_value(name)}, which is not a file beside it")

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
+from ..codecs.promises import check
 from ..codecs.rad import promises
 from ..codecs.rad.codec import RadChunk, read_chunk
 from ..codecs.rad.header import read_header
@@ -63,5 +64,5 @@ def _opened(path: Path) -> Iterator[BinaryIO]:
 
 def _header(file: BinaryIO) -> RadHeader:
     header = read_header(file)
-    promises.check(promises.violations(header))
+    check(promises.violations(header))
     return header

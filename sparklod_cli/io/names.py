@@ -13,8 +13,10 @@ def is_file_name(text: str) -> bool:
         return False
 
 
-def leads_away(name: str) -> bool:
-    """Whether a name could mean something else than a file in the same folder."""
+def leads_away(name: str, *, folders: bool = False) -> bool:
+    """Whether a name could mean something else than a file in the same folder, or in folders there if `folders`."""
+    if folders and "/" in name:
+        return any(leads_away(part) for part in name.split("/"))
     return name in ("", ".", "..") or any(mark in name for mark in "/\\:") or not is_file_name(name)
 
 

@@ -12,6 +12,7 @@ from typing import Any, BinaryIO
 from ..codecs.formats import FORMATS, HEAD, Format, sniff
 from ..codecs.gpu import dump
 from ..codecs.gpu.table import NPZ, RAW_SUFFIXES
+from ..model.detail import DetailScene
 from ..model.scene import Scene
 from ..model.splats import COLUMNS
 from ..support.addresses import Place, size_of
@@ -29,7 +30,7 @@ def read_scene(path: Place, *, threads: int = 1, progress: Progress = silent) ->
     """Reads a splat file of any known format, told by its content, or else by its suffix.
 
     Args:
-        path: of a file, or of a folder that holds an unpacked SOG; - is standard input.
+        path: of a file, or of a folder that holds an unpacked SOG or a Streamed SOG; - is standard input.
         threads: to decode with.
         progress: is told how much is done.
 
@@ -38,6 +39,26 @@ def read_scene(path: Place, *, threads: int = 1, progress: Progress = silent) ->
     """
     with opened(path) as (file, form, more):
         scene: Scene = form.codec().decode(file, threads=threads, progress=progress, **more)
+    return scene
+
+
+def read_levels(path: Place, *, threads: int = 1, progress: Progress = silent) -> DetailScene:
+    """Reads a scene at all its detail levels.
+
+    Args:
+        path: of the lod-meta.json of a Streamed SOG, or of the folder that holds it.
+        threads: to decode with.
+        progress: is told how much is done.
+
+    Raises:
+        UnknownFormatError: its format has no detail levels.
+        FormatError: as `read_scene`.
+    """
+    with opened(path) as (file, form, more):
+        if not form.detailed:
+            known = " and ".join(form.name for form in FORMATS if form.detailed)
+            raise UnknownFormatError(f"{form.name} has no detail levels; {known} has")
+        scene: DetailScene = form.codec().decode_levels(file, threads=threads, progress=progress, **more)
     return scene
 
 
@@ -93,7 +114,8 @@ def opened(path: Place) -> Iterator[tuple[BinaryIO, Format, dict[str, Any]]]:
                     "it holds arrays for a viewer and no scene; use the file that they were made of, or unpack them in"
                     " Python"
                 )
-            yield file, form, {"beside": functools.partial(open_beside, path)} if form.companions else {}
+            beside = functools.partial(open_beside, path, folders=form.folders)
+            yield file, form, {"beside": beside} if form.companions else {}
 
 
 @contextlib.contextmanager

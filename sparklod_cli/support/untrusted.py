@@ -32,16 +32,17 @@ _ESCAPED_SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
 ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, ValueError, struct.error)
 
 
-def parse_json(data: str | bytes, *, keep_surrogates: bool = False) -> Any:
+def parse_json(data: str | bytes, *, keep_surrogates: bool = False, depth: int = MAX_DEPTH) -> Any:
     """The value of a JSON text.
 
     Integers beyond 64 bits become the nearest floats, at most `LARGEST`. NaN and Infinity, which Python writes, and
-    1e999 are accepted, so callers must check that numbers are finite. Nesting is at most `MAX_DEPTH`.
+    1e999 are accepted, so callers must check that numbers are finite.
 
     Args:
         data: the text, or its bytes in UTF-8.
         keep_surrogates: keep lone surrogates, with which Python represents file names that are not UTF-8; otherwise
             they become U+FFFD, so that all texts can be printed and written.
+        depth: most nesting; Python's own parser manages some hundreds.
 
     Raises:
         ValueError: the text is not JSON, or too deeply nested; the message is one line.
@@ -50,9 +51,9 @@ def parse_json(data: str | bytes, *, keep_surrogates: bool = False) -> Any:
         text = data if isinstance(data, str) else str(data, "utf-8-sig")
         value = json.loads(text, parse_int=_whole)
     except RecursionError:
-        raise _too_deep() from None
+        raise _too_deep(depth) from None
     replace_surrogates = not keep_surrogates and (_ESCAPED_SURROGATE.search(text) or _SURROGATE.search(text))
-    return _checked(value, replace_surrogates=bool(replace_surrogates))
+    return _checked(value, depth, replace_surrogates=bool(replace_surrogates))
 
 
 def parse_toml(text: str) -> dict[str, Any]:
@@ -62,9 +63,9 @@ def parse_toml(text: str) -> dict[str, Any]:
     else:
         import tomli as tomllib
     try:
-        table: dict[str, Any] = _checked(tomllib.loads(text), replace_surrogates=False)
+        table: dict[str, Any] = _checked(tomllib.loads(text), MAX_DEPTH, replace_surrogates=False)
     except RecursionError:
-        raise _too_deep() from None
+        raise _too_deep(MAX_DEPTH) from None
     return table
 
 
@@ -74,15 +75,15 @@ def _whole(digits: str) -> int | float:
     return min(max(float(digits), -LARGEST), LARGEST)
 
 
-def _too_deep() -> ValueError:
-    return ValueError(f"it is nested more than {MAX_DEPTH} deep")
+def _too_deep(depth: int) -> ValueError:
+    return ValueError(f"it is nested more than {depth} deep")
 
 
-def _checked(root: Any, *, replace_surrogates: bool) -> Any:
+def _checked(root: Any, depth: int, *, replace_surrogates: bool) -> Any:
     """Checks a parsed value level by level, since recursion would fail on the nesting it guards against."""
     whole = [root]  # in a list, so that every value is an item of a container
     containers: list[Any] = [whole]
-    for _ in range(MAX_DEPTH + 1):
+    for _ in range(depth + 1):
         inner: list[Any] = []
         for container in containers:
             if replace_surrogates and isinstance(container, dict):
@@ -99,7 +100,7 @@ def _checked(root: Any, *, replace_surrogates: bool) -> Any:
         if not inner:
             return whole[0]
         containers = inner
-    raise _too_deep()
+    raise _too_deep(depth)
 
 
 def well_formed(text: str) -> str:

@@ -16,6 +16,7 @@ from ..codecs.formats import FORMATS, HEAD, sniff
 from ..codecs.rad.header import MAGIC, read_header
 from ..codecs.rad.records import RadHeader
 from ..codecs.sog.files import META
+from ..codecs.streamed_sog.names import MANIFEST
 from ..io.beside import in_folder, path_beside
 from ..io.names import reason_of
 from ..io.plain import open_plain
@@ -117,10 +118,10 @@ def _named(path: Path, folder: str) -> ShownFile:
 
 
 def _shown(path: Path, folder: str) -> ShownFile:
-    if path.is_dir():
-        in_folder(path)
-    if path.is_dir() or path.name == META:
+    if (in_folder(path) if path.is_dir() else path).name == META:
         raise NotSplatsError("Spark does not read an unpacked SOG; zip its files into a .sog")
+    if path.is_dir():
+        return _shown(path / MANIFEST, folder)
     if path.exists() and not path.is_file():
         raise UnreadableError("it is a pipe or a device; save it to a file first")
     header = None
@@ -134,6 +135,8 @@ def _shown(path: Path, folder: str) -> ShownFile:
     form = sniff(head, path.suffix)
     if form is None:
         raise UnknownFormatError(f"not a splat file that sparklod reads ({', '.join(form.name for form in FORMATS)})")
+    if form.name not in SPARK_TYPES:
+        raise NotSplatsError(f"Spark does not read {form.name}; bake it first with sparklod build-lod")
     name = f"{folder}/{path.name}"
     files = {name: path.resolve()}
     if header is not None:

@@ -34,6 +34,7 @@ FILES = (
     *(f"golden/tree-v{version}.spz" for version in (2, 3)),
     "golden/sh3-v2.sog",
     "golden/sh2-v1.sog",
+    "golden/sh1-streamed-sog/lod-meta.json",
     *(f"golden/sh2-level{level}.ksplat" for level in (0, 1, 2)),
     "golden/sh0.splat",
     "golden/sh1-tree.rad",
@@ -50,6 +51,13 @@ def content(name: str) -> bytes:
     return (FIXTURES / name).read_bytes()
 
 
+@functools.cache
+def files_of(name: str) -> dict[str, bytes]:
+    """All files of the folder of a manifest, and of the folders there."""
+    folder = (FIXTURES / name).parent
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.glob("*/*")}
+
+
 def format_of(name: str, data: bytes) -> Format | None:
     return sniff(data[:HEAD], Path(name).suffix)
 
@@ -61,9 +69,11 @@ def attempt(name: str, data: bytes, *, files: Mapping[str, bytes] | None = None,
         return "unknown"
 
     def beside(other: str) -> BinaryIO:
-        if other not in (files or {}):
+        if other not in among:
             raise FormatError("there is no such file")
-        return io.BytesIO((files or {})[other])
+        return io.BytesIO(among[other])
+
+    among = files_of(name) if files is None and form.folders else files or {}
 
     more = {"beside": beside} if form.companions else {}
     start = time.perf_counter()
@@ -96,7 +106,7 @@ def header(name: str, data: bytes) -> list[int]:
         return [*range(120), *range(len(data) - 400, len(data))]
     if name.endswith(".rad"):  # the file's, and that of the first chunk
         return list(range(data.index(b"RADC") + 1200))
-    return list(range(min(120, len(data))))
+    return list(range(len(data) if name.endswith(".json") else min(120, len(data))))
 
 
 @pytest.mark.parametrize("name", FILES)
@@ -228,7 +238,7 @@ def test_invalid_numbers_are_passed_on_without_a_warning(name: str, threads: int
 
 MAGICS = (
     *(b"ply\n", b"ply\r", b"ply\nelement chunk 1\nelement vertex 1\nproperty uint packed_position\n"),
-    *(b"\x1f\x8b\x08\0", b"NGSP", b"PK\x03\x04", b'{"means":', b'\n { "version" :2'),
+    *(b"\x1f\x8b\x08\0", b"NGSP", b"PK\x03\x04", b'{"means":', b'\n { "version" :2', b'{"lodLevels":'),
     *(b"\0\1\0\0", b"\0\1\0\0\3" + bytes(4091)),
     *(b"RAD0", b"RAD0\40\0\0\0{", b"RADC"),
 )

@@ -7,11 +7,20 @@ import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fixtures import by_hand, by_hand_compressed_ply, by_hand_ksplat, by_hand_rad, by_hand_sog, by_hand_splat
+from fixtures import (
+    by_hand,
+    by_hand_compressed_ply,
+    by_hand_ksplat,
+    by_hand_rad,
+    by_hand_sog,
+    by_hand_splat,
+    by_hand_streamed_sog,
+)
 from sparklod_cli.codecs import octahedral, ply, quantize, splat, spz
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import codec as rad
@@ -79,6 +88,7 @@ def put(content: Content, directory: Path, form: str) -> Path:
     folder = directory / "scene"
     folder.mkdir()
     for name, data in content.items():
+        (folder / name).parent.mkdir(exist_ok=True)
         (folder / name).write_bytes(data)
     return next((folder / name for name in content if name.endswith(".rad")), folder)
 
@@ -230,6 +240,35 @@ SOG = {
     )
     for version in (1, 2)
     for folder in (False, True)
+}
+
+# --- Streamed SOG -----------------------------------------------------------------------------------------------------
+
+
+def as_streamed_sog(source: Scene, *, around: int = 0, **layout: Any) -> Content:
+    """Three regions at two levels; the last splats are the environment."""
+    values = linear(source)
+    count = len(source) - min(around, len(source) - 1)
+    parts = [part for part in np.array_split(np.arange(count), 3) if len(part)]
+
+    def some(part: NDArray[np.int64]) -> dict[str, Array]:
+        return {name: column[part] for name, column in values.items()}
+
+    return by_hand_streamed_sog.streamed_sog_files(
+        [[some(part), some(part[::4])] for part in parts],
+        by_hand_sog.sog_files,
+        environment=some(np.arange(count, len(source))) if count < len(source) else None,
+        **layout,
+    )
+
+
+STREAMED_SOG = {
+    way: Case("Streamed SOG 1", functools.partial(as_streamed_sog, **how), functools.partial(sog_precision, version=2))
+    for way, how in {
+        "by hand": {"around": 7},
+        "a chunk for each run": {"together": 1},
+        "before versions": {"version": None},
+    }.items()
 }
 
 # --- KSPLAT -----------------------------------------------------------------------------------------------------------
@@ -452,6 +491,7 @@ WRITERS: dict[str, dict[str, Case]] = {
     "compressed PLY": COMPRESSED_PLY,
     "SPZ": SPZ,
     "SOG": SOG,
+    "Streamed SOG": STREAMED_SOG,
     "KSPLAT": KSPLAT,
     "SPLAT": SPLAT,
     "RAD": RAD,

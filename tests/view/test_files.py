@@ -63,8 +63,16 @@ def test_an_unpacked_sog_is_refused_as_spark_does_not_read_it(name: str) -> None
 
 
 def test_a_folder_that_is_no_splat_file_is_not_called_a_sog(tmp_path: Path) -> None:
-    with pytest.raises(FormatError, match=r"is a directory, without the meta\.json of an unpacked SOG$"):
+    with pytest.raises(
+        FormatError, match=r"is a directory, without the meta\.json of an unpacked SOG or a lod-meta\.json$"
+    ):
         shown_files([tmp_path])
+
+
+@pytest.mark.parametrize("name", ["sh1-streamed-sog", "sh1-streamed-sog/lod-meta.json"])
+def test_streamed_sog_is_refused_as_spark_does_not_read_it(name: str) -> None:
+    with pytest.raises(FormatError, match=r"Spark does not read Streamed SOG; bake it first"):
+        shown_files([GOLDEN / name])
 
 
 @pytest.mark.parametrize(

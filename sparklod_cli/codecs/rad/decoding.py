@@ -16,6 +16,7 @@ from ...model.sh import COEFFICIENTS
 from ...model.splats import FloatArray, Splats
 from ...support.errors import FormatError, TooLongError, TruncatedError
 from .. import octahedral
+from ..promises import check, error_of
 from ..quantize import Bytes, quat_of_xyz
 from . import promises
 from .encodings import CODINGS
@@ -49,7 +50,7 @@ class Packed:
             FormatError: its header is broken, or breaks a promise of `promises` that is fatal.
         """
         chunk = read_chunk_header(io.BytesIO(data))
-        promises.check(promises.chunk_violations(header, number, chunk, len(data)))
+        check(promises.chunk_violations(header, number, chunk, len(data)))
         return cls(number, chunk, memoryview(data)[chunk.bytes :])
 
     def property(self, name: str) -> Property | None:
@@ -160,7 +161,7 @@ def fill(
     if labels is not None and palette is not None:
         if labels.max(initial=0) >= len(palette):
             where = f"SH label {labels.max():,} of chunk {packed.number:,}"
-            raise promises.error_of("rad.palette", f"{where} is beyond the {len(palette):,} codes of the palette")
+            raise error_of("rad.palette", f"{where} is beyond the {len(palette):,} codes of the palette")
         if "sh" in columns:
             np.take(palette, labels, axis=0, out=splats.sh)
         return None

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 
 from ...model.nodes import CHUNK_NODES
 from ...support.defaults import MAX_SH_DEGREE
-from ...support.errors import FormatError
 from ...support.untrusted import quoted_value
+from ..promises import Violation
 from ..quantize import LARGEST
 from .header import ALIGNMENT, padding
 from .layout import BY_NAME, PROPERTIES, RANGES, Row
@@ -42,35 +41,6 @@ WARNINGS = {
 
 #: Bytes of a file in which Spark looks for the header at first, and at most.
 FIRST_LOOK, LAST_LOOK = 1 << 16, 1 << 20
-
-
-@dataclass(frozen=True)
-class Violation:
-    """A promise of the container that a file breaks.
-
-    Attributes:
-        code: for `inspect`, "rad...".
-        text: what is wrong, with the values.
-        fatal: Spark, or this reader, cannot read the file, or would read something else than was written.
-    """
-
-    code: str
-    text: str
-    fatal: bool = True
-
-
-def check(broken: Iterator[Violation]) -> None:
-    """Raises a `FormatError` with the code and the text of the first fatal violation."""
-    for violation in broken:
-        if violation.fatal:
-            raise error_of(violation.code, violation.text)
-
-
-def error_of(code: str, text: str) -> FormatError:
-    """The error for a broken promise, which has its code."""
-    error = FormatError(text)
-    error.code = code
-    return error
 
 
 def expected_chunks(header: RadHeader) -> int:

@@ -20,6 +20,7 @@ from ...support.parallel import ordered_map
 from ...support.progress import Progress, silent
 from .. import compression
 from ..content import HAS_TREE, Scratch, rows_in
+from ..promises import check, error_of
 from ..sound import with_sound_tree
 from ..stream import size_of
 from . import promises
@@ -129,7 +130,7 @@ def checked_header(file: BinaryIO, beside: Beside | None) -> RadHeader:
     size = size_of(file)
     header = read_header(file)
     files = {name: size_beside(name, beside) for name in header.filenames}
-    promises.check(promises.violations(header, size, files))
+    check(promises.violations(header, size, files))
     _check_promise(header.count, header, size + sum(files.values()))
     return header
 
@@ -154,7 +155,7 @@ def fill_known(
     """Decodes a chunk of a file whose palette is known, if it has one: as `decoding.fill`, but labels need one."""
     if fill(packed, header, splats, tree, palette, columns, thorough=thorough) is not None:
         text = f"chunk {packed.number:,} has labels of SH, but there is no palette"
-        raise promises.error_of("rad.palette", text)
+        raise error_of("rad.palette", text)
 
 
 def name_of(header: RadHeader) -> str:
@@ -197,7 +198,7 @@ def read_chunk(file: BinaryIO, entry: RadChunkEntry, header: RadHeader, palette:
     room = COEFFICIENTS[min(header.max_sh, MAX_SH_DEGREE)], 3
     if palette is not None and np.shape(palette)[1:] != room:
         raise ValueError(f"the palette has the shape {np.shape(palette)}; that of this file has (codes, {room[0]}, 3)")
-    promises.check(promises.violations(header))
+    check(promises.violations(header))
     packed = Packed.of(bytes_of(entry, header, file), header.chunks.index(entry), header)
     count = packed.header.count
     _check_promise(count, header, entry.bytes)

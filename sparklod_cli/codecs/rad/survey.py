@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from typing import BinaryIO
 
 from ...support.errors import FormatError
+from ..promises import Violation
 from ..stream import size_of
 from .header import padding, read_chunk_header, read_header
 from .places import Beside, file_of, size_beside, start_of
-from .promises import Violation, chunk_violations, violations
+from .promises import chunk_violations, violations
 from .records import RadChunkHeader, RadHeader
 
 

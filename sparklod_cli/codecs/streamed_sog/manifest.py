@@ -1,0 +1,219 @@
+"""The manifest of Streamed SOG, lod-meta.json, as it is read and written.
+
+What reading needs is checked when it is parsed; every other rule of the format is for `promises` to tell of, so that a
+report can be made of a file that breaks it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from ...support.errors import FormatError, VersionError
+from ...support.untrusted import parse_json, quoted_value
+from .names import MANIFEST
+
+#: The version that is read and written. A manifest from before versions has none.
+VERSION = 1
+
+#: Largest manifest, bytes: that of 100,000 regions at some levels.
+MAX_MANIFEST = 1 << 25
+
+#: Deepest nesting of its JSON; a node of the tree takes two.
+MAX_NESTING = 512
+
+#: Most detail levels; tools write up to ten.
+MAX_LEVELS = 32
+
+#: Most splats of a run, and its largest offset: no image of a SOG has more texels.
+MAX_RUN = 1 << 28
+
+#: Most nodes of the tree: twice as many as there are regions of 8,192 splats in 500 million. Chosen.
+MAX_NODES = 1 << 17
+
+Corner = tuple[float, float, float]
+Bound = tuple[Corner, Corner]
+
+
+@dataclass(frozen=True)
+class Run:
+    """Splats of a region at a detail level: `count` of them from `offset` on in a file, by its number."""
+
+    file: int
+    offset: int
+    count: int
+
+
+@dataclass(frozen=True)
+class ManifestNode:
+    """A node of the tree of regions.
+
+    Attributes:
+        bound: lowest and highest corner in world units; None where it is missing, or is not of finite numbers.
+        children: numbers of nodes; two in a tree that keeps the rules, none of a region.
+        runs: of a region, by detail level; None where the node has no `lods`.
+        errors: of a region, as the file has them; None where it has none.
+        parent: number of the node above, -1 of the root.
+    """
+
+    bound: Bound | None
+    children: tuple[int, ...] = ()
+    runs: Mapping[int, Run] | None = None
+    errors: Any = None
+    parent: int = -1
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """A lod-meta.json.
+
+    Attributes:
+        levels: how many detail levels there are.
+        filenames: paths of the meta.json of each chunk, from the folder of the manifest on.
+        nodes: of the tree, root first and depth first; regions are counted in this order.
+        environment: path of the meta.json of the environment.
+        head: everything else at the top level, as the file has it: "version", "asset", "count", "counts", "lodErrors".
+    """
+
+    levels: int
+    filenames: tuple[str, ...]
+    nodes: tuple[ManifestNode, ...]
+    environment: str | None = None
+    head: Mapping[str, Any] = field(default_factory=dict)
+
+    def place(self, number: int) -> str:
+        """Where a node is in the file: "tree.children[0]"."""
+        way = list[str]()
+        while (parent := self.nodes[number].parent) >= 0:
+            way.append(f".children[{self.nodes[parent].children.index(number)}]")
+            number = parent
+        return "tree" + "".join(reversed(way))
+
+    def regions(self) -> Iterator[tuple[int, ManifestNode]]:
+        """The nodes without children, and their numbers."""
+        return ((number, node) for number, node in enumerate(self.nodes) if not node.children)
+
+    def names(self) -> list[str]:
+        """The files that it names."""
+        return [*self.filenames, *([] if self.environment is None else [self.environment])]
+
+
+def parse(data: bytes) -> Manifest:
+    """The manifest of the bytes of a lod-meta.json.
+
+    Raises:
+        VersionError: it is of another version than 1.
+        FormatError: it is not JSON, or lacks what reading needs; names the value and its place.
+    """
+    if len(data) > MAX_MANIFEST:
+        raise FormatError(f"{MANIFEST} has more than {MAX_MANIFEST:,} bytes")
+    try:
+        root = parse_json(data, depth=MAX_NESTING)
+    except ValueError as error:
+        raise FormatError(f"{MANIFEST} is not JSON: {error}") from None
+    if not isinstance(root, dict):
+        raise FormatError(f"{MANIFEST} is not an object")
+    version = root.get("version")
+    if version is not None and (type(version) is not int or version != VERSION):
+        raise VersionError(f"Streamed SOG version {quoted_value(version)} is unknown, only {VERSION} is read")
+    levels = _integer(root.get("lodLevels"), "lodLevels", 1, MAX_LEVELS)
+    filenames = root.get("filenames")
+    if not isinstance(filenames, list) or not all(isinstance(name, str) for name in filenames):
+        raise _wrong("filenames", filenames, "a list of paths")
+    environment = root.get("environment")
+    if environment is not None and not isinstance(environment, str):
+        raise _wrong("environment", environment, "a path")
+    nodes = _nodes(root.get("tree"), levels, len(filenames))
+    head = {key: value for key, value in root.items() if key not in ("lodLevels", "filenames", "environment", "tree")}
+    return Manifest(levels, tuple(filenames), nodes, environment, head)
+
+
+def _nodes(tree: Any, levels: int, files: int) -> tuple[ManifestNode, ...]:
+    """The nodes of a tree, however deep, root first and depth first."""
+    found, children = list[ManifestNode](), list[list[int]]()
+    waiting = [(tree, -1, 0)]  # a value, the number of its parent, and which child it is
+
+    def place(parent: int, ordinal: int) -> str:
+        way = list[int]()
+        while parent >= 0:
+            way.append(ordinal)
+            ordinal, parent = ordinals[parent], found[parent].parent
+        return "tree" + "".join(f".children[{each}]" for each in reversed(way))
+
+    ordinals = list[int]()
+    while waiting:
+        value, parent, ordinal = waiting.pop()
+        number = len(found)
+        if number == MAX_NODES:
+            raise FormatError(f"the tree of {MANIFEST} has more than {MAX_NODES:,} nodes")
+        if not isinstance(value, dict):
+            raise _wrong(place(parent, ordinal), value, "a node")
+        below, lods = value.get("children", []), value.get("lods")
+        if not isinstance(below, list):
+            raise _wrong(f"{place(parent, ordinal)}.children", below, "a list")
+        try:
+            runs = None if lods is None else _runs(lods, levels, files)
+        except _RunError as error:
+            raise _wrong(f"{place(parent, ordinal)}.lods{error.place}", error.value, error.wanted) from None
+        found.append(ManifestNode(_bound(value.get("bound")), (), runs, value.get("errors"), parent))
+        ordinals.append(ordinal)
+        children.append([])
+        if parent >= 0:
+            children[parent].append(number)
+        waiting.extend((child, number, each) for each, child in reversed(list(enumerate(below))))
+    return tuple(dataclasses.replace(node, children=tuple(below)) for node, below in zip(found, children, strict=True))
+
+
+class _RunError(Exception):
+    """A value below `lods` that cannot be: where, what it is, and what it must be."""
+
+    def __init__(self, place: str, value: Any, wanted: str) -> None:
+        super().__init__(place)
+        self.place, self.value, self.wanted = place, value, wanted
+
+
+def _runs(lods: Any, levels: int, files: int) -> dict[int, Run]:
+    """The runs of a region by detail level."""
+    if not isinstance(lods, dict):
+        raise _RunError("", lods, "an object of runs")
+    keys = {str(level): level for level in range(levels)}
+    runs = dict[int, Run]()
+    for key, value in lods.items():
+        if key not in keys:
+            raise _RunError("", key, f"of the levels 0 to {levels - 1}")
+        if not isinstance(value, dict):
+            raise _RunError(f".{key}", value, "a run")
+        for name, most in (("file", files - 1), ("offset", MAX_RUN), ("count", MAX_RUN)):
+            number = value.get(name)
+            if type(number) is not int or not 0 <= number <= most:
+                raise _RunError(f".{key}.{name}", number, f"a whole number from 0 to {most:,}")
+        runs[keys[key]] = Run(value["file"], value["offset"], value["count"])
+    return runs
+
+
+def _bound(value: Any) -> Bound | None:
+    """Two corners of three finite numbers each; None for anything else."""
+    if not isinstance(value, dict):
+        return None
+    low, high = (value.get(name) for name in ("min", "max"))
+    corners = [each for each in (low, high) if isinstance(each, list) and len(each) == 3]
+    numbers = [number for corner in corners for number in corner]
+    if len(numbers) != 6 or not all(type(each) in (int, float) and math.isfinite(each) for each in numbers):
+        return None
+    a, b, c, d, e, f = map(float, numbers)
+    return (a, b, c), (d, e, f)
+
+
+def _integer(value: Any, place: str, least: int, most: int) -> int:
+    if type(value) is not int or not least <= value <= most:
+        raise _wrong(place, value, f"a whole number from {least} to {most:,}")
+    return value
+
+
+def _wrong(place: str, value: Any, wanted: str) -> FormatError:
+    if value is None:
+        return FormatError(f"{MANIFEST} has no {place}, which must be {wanted}")
+    return FormatError(f"{place} of {MANIFEST} is {quoted_value(value)}, not {wanted}")

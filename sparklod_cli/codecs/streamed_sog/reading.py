@@ -1,0 +1,171 @@
+"""Reads Streamed SOG: full detail as a scene, whole or as a stream, or all detail levels."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import BinaryIO
+
+import numpy as np
+
+from ...model.detail import DetailScene
+from ...model.scene import Scene
+from ...model.splats import Splats
+from ...model.streams import BLOCK_SPLATS, SceneStream
+from ...support.errors import FormatError
+from ...support.progress import Progress, silent
+from ...support.untrusted import quoted_value
+from ..content import Scratch
+from ..stream import size_of
+from .chunks import Beside, Chunk, Piece, check_count, filled, open_chunk
+from .layout import Layout, layout_of
+from .manifest import MAX_MANIFEST, VERSION, parse
+from .names import MANIFEST
+
+
+def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent, beside: Beside | None = None) -> Scene:
+    """Reads level 0, chunk after chunk, and then the environment.
+
+    Args:
+        file: the manifest.
+        threads: to decode with.
+        progress: called when a chunk is decoded.
+        beside: opens the files that a manifest names, which may be in folders; None if there are none to open.
+
+    Raises:
+        FormatError: it is no such manifest, a chunk is missing or no SOG, or the runs do not tile the chunks.
+    """
+    opened = _open(file, beside, full_detail=True)
+    splats = filled(beside, opened.chunks, opened.sh_degree, threads, progress)
+    return Scene(splats, None, opened.antialiased, opened.format, (), opened.header)
+
+
+def decode_levels(
+    file: BinaryIO, *, threads: int = 1, progress: Progress = silent, beside: Beside | None = None
+) -> DetailScene:
+    """Reads all detail levels, in whatever order the runs lie in the chunks; arguments as of `decode`.
+
+    Regions are in the order of the tree, depth first.
+
+    Raises:
+        FormatError: as `decode`; also where a region has no bound, errors are no numbers, or the tree is not a binary
+            one.
+    """
+    opened = _open(file, beside, full_detail=False)
+    layout = opened.layout
+    bounds, children, errors = layout.bounds(), layout.children(), layout.errors()
+    splats = filled(beside, opened.chunks, opened.sh_degree, threads, progress)
+    environment = None
+    if layout.manifest.environment is not None:
+        total = int(layout.counts.sum())
+        splats, environment = splats.take(slice(0, total)), splats.take(slice(total, None))
+    return DetailScene(
+        splats,
+        layout.counts,
+        bounds,
+        children,
+        errors,
+        environment,
+        opened.antialiased,
+        opened.format,
+        (),
+        opened.header,
+    )
+
+
+def stream(
+    file: BinaryIO,
+    *,
+    scratch: Scratch,
+    threads: int = 1,
+    progress: Progress = silent,
+    beside: Beside | None = None,
+) -> SceneStream:
+    """The splats of `decode`, block by block; raises as that.
+
+    Nothing is unpacked to `scratch`: one chunk at a time is in memory, until its last splat was read.
+    """
+    opened = _open(file, beside, full_detail=True)
+    kept: dict[int, Splats] = {}
+
+    def decoded(number: int) -> Splats:
+        if number not in kept:
+            kept.clear()
+            chunk = opened.chunks[number]
+            rows = np.cumsum([0, *(piece.count for piece in chunk.pieces)]).tolist()
+            pieces = tuple(replace(piece, row=row) for piece, row in zip(chunk.pieces, rows, strict=False))
+            kept[number] = filled(beside, [replace(chunk, pieces=pieces)], opened.sh_degree, threads, progress)
+        return kept[number]
+
+    def read(start: int, stop: int) -> Iterator[Splats]:
+        end = 0
+        for number, chunk in enumerate(opened.chunks):
+            begin, end = end, end + chunk.rows
+            for first in range(max(start, begin), min(stop, end), BLOCK_SPLATS):
+                yield decoded(number).take(slice(first - begin, min(first + BLOCK_SPLATS, stop, end) - begin))
+            if stop >= end:
+                kept.pop(number, None)
+
+    count = sum(chunk.rows for chunk in opened.chunks)
+    return SceneStream(count, opened.sh_degree, read, opened.antialiased, opened.format, (), opened.header)
+
+
+@dataclass(frozen=True, eq=False)
+class _Opened:
+    """A manifest, and the chunks that are wanted, each of whose meta.json has been read.
+
+    Attributes:
+        layout: of all detail levels.
+        chunks: in the order of the files, the environment last.
+        bytes: of the manifest and all files of these chunks.
+    """
+
+    layout: Layout
+    chunks: tuple[Chunk, ...]
+    bytes: int
+
+    @property
+    def sh_degree(self) -> int:
+        """The highest of the chunks."""
+        return max(chunk.sh_degree for chunk in self.chunks)
+
+    @property
+    def antialiased(self) -> bool:
+        """Whether the chunks are."""
+        return any(chunk.antialiased for chunk in self.chunks)
+
+    @property
+    def format(self) -> str:
+        """For display."""
+        return f"Streamed SOG {VERSION}"
+
+    @property
+    def header(self) -> dict[str, int]:
+        """Numbers of the files for `Scene.header`."""
+        regions, levels = self.layout.counts.shape
+        return {"version": VERSION, "levels": levels, "regions": regions, "bytes": self.bytes}
+
+
+def _open(file: BinaryIO, beside: Beside | None, *, full_detail: bool) -> _Opened:
+    """A manifest and its chunks: those of level 0, or all."""
+    size = size_of(file)
+    layout = layout_of(parse(file.read(MAX_MANIFEST + 1)))
+    runs, manifest = layout.runs, layout.manifest
+    wanted = runs.level == 0 if full_detail else np.ones(len(runs.level), np.bool_)
+    rows = np.cumsum(runs.count * wanted) - runs.count if full_detail else layout.starts()
+    names = [manifest.filenames[number] for number in np.unique(runs.file[wanted])]
+    if not names:
+        raise FormatError(f"{MANIFEST} has no splats of {'level 0' if full_detail else 'any level'}")
+    if twice := next((name for name in names if names.count(name) > 1), None):
+        raise FormatError(f"{MANIFEST} names {quoted_value(twice)} twice")
+    chunks = list[Chunk]()
+    for name, number in zip(names, np.unique(runs.file[wanted]), strict=True):
+        inside = runs.file == number
+        here = np.flatnonzero(inside & wanted)
+        pieces = [Piece(int(runs.offset[run]), int(runs.count[run]), int(rows[run])) for run in here]
+        chunk = open_chunk(beside, name, pieces)
+        check_count(chunk, int(runs.count[inside].sum()))
+        chunks.append(chunk)
+    if manifest.environment is not None:
+        chunks.append(open_chunk(beside, manifest.environment, None, sum(chunk.rows for chunk in chunks)))
+    return _Opened(layout, tuple(chunks), size + sum(chunk.bytes for chunk in chunks))

@@ -1,0 +1,139 @@
+"""Laws of the detail levels of a tree."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sparklod_cli.lod import quality, quick
+from sparklod_cli.lod.detail_cuts import COARSE_ENOUGH, STEP, detail_cuts, shares_of
+from sparklod_cli.lod.detail_levels import make
+from sparklod_cli.lod.detail_settings import DetailSettings
+from sparklod_cli.model.detail import DetailScene
+from sparklod_cli.model.lod_tree import LodTree
+from sparklod_cli.model.splats import COLUMNS, Splats
+from tests.lod.trees import children, hard_cases, sorted_rows
+from tests.scenes import random_splats
+
+SHARES = (0.5, 0.25, 0.12, 0.06)
+
+
+def leaves_under(tree: LodTree) -> list[frozenset[int]]:
+    """The leaves under each node."""
+    under: list[frozenset[int]] = [frozenset()] * len(tree)
+    for node in range(len(tree) - 1, -1, -1):
+        own = range(len(tree))[children(tree, node)]
+        under[node] = frozenset().union(*(under[child] for child in own)) if own else frozenset([node])
+    return under
+
+
+def check_inner_nodes(scene: DetailScene) -> None:
+    """The tree over the regions is a binary one: root first, parents before their children, each region once."""
+    flat = scene.children.ravel().tolist()
+    inner = [number for number in flat if number >= 0]
+    assert sorted(inner) == list(range(1, scene.regions - 1))
+    assert sorted(-1 - number for number in flat if number < 0) == list(range(scene.regions)) * (scene.regions > 1)
+    assert all(number > at for at, pair in enumerate(scene.children.tolist()) for number in pair if number >= 0)
+
+
+def check(splats: Splats, made: DetailScene, shares: tuple[float, ...]) -> None:
+    """What holds for the detail levels of every scene."""
+    assert np.array_equal(sorted_rows(made.splats.take(made.level(0))), sorted_rows(splats))
+    assert made.splats.opacity.max() <= 1
+    assert made.errors is None and (made.counts > 0).all()
+    assert not made.splats.invalid()
+    totals = made.counts.sum(axis=0)
+    for before, total, share in zip(totals, totals[1:], shares, strict=False):
+        assert 1 <= total <= max(round(share * len(splats)), 1)
+        assert total <= before
+    check_inner_nodes(made)
+    for region, level in itertools.product(range(made.regions), range(made.levels)):
+        run = made.splats.take(made.run(region, level))
+        assert (run.center >= made.bounds[region, 0]).all() and (run.center <= made.bounds[region, 1]).all()
+
+
+@pytest.mark.parametrize("growth", [1.2, 2.0])
+@pytest.mark.parametrize("seed", range(3))
+def test_levels_are_nested_cuts_that_stand_for_every_leaf_once(seed: int, growth: float) -> None:
+    nodes, tree = quality.build(random_splats(400, seed=seed), growth)
+    under = leaves_under(tree)
+    cuts = detail_cuts(nodes, tree, SHARES)
+    assert cuts.nodes[0].tolist() == np.flatnonzero(tree.is_leaf).tolist()
+    for some in cuts.nodes:
+        assert sum(len(under[node]) for node in some) == 400
+        assert frozenset().union(*(under[node] for node in some)) == under[0]
+    for fine, coarse in itertools.pairwise(cuts.nodes):
+        assert all(any(under[node] <= under[above] for above in coarse) for node in fine)
+    owners = cuts.owners()
+    for node, place in enumerate(owners):
+        above = [at for at, coarse in enumerate(cuts.coarsest) if under[node] <= under[coarse]]
+        inside = above and len(under[node]) <= len(under[cuts.coarsest[above[0]]])
+        assert place == (above[0] if inside else -1)
+
+
+@pytest.mark.parametrize("growth", [1.4, 2.0])
+def test_a_level_has_its_share_but_for_the_children_of_a_node(growth: float) -> None:
+    nodes, tree = quality.build(random_splats(2_000, seed=4), growth)
+    for share, some in zip(SHARES, detail_cuts(nodes, tree, SHARES).nodes[1:], strict=True):
+        assert share * 2_000 - tree.child_count.max() < len(some) <= share * 2_000
+
+
+def test_regions_stand_for_the_same_leaves_at_every_level() -> None:
+    nodes, tree = quality.build(random_splats(3_000, seed=5), 1.4)
+    under = leaves_under(tree)
+    of_row = {row.tobytes(): node for node, row in enumerate(nodes.center)}
+    assert len(of_row) == len(nodes)
+    made = make(nodes, tree, DetailSettings(SHARES, chunk_splats=700, min_splats=100))
+    assert made.regions > 8 and made.counts.sum(axis=1).max() <= 700
+    seen: set[int] = set()
+    for region in range(made.regions):
+        at_levels = [
+            frozenset().union(*(under[of_row[row.tobytes()]] for row in made.splats.center[made.run(region, level)]))
+            for level in range(made.levels)
+        ]
+        assert len(set(at_levels)) == 1
+        assert not seen & at_levels[0]
+        seen |= at_levels[0]
+    assert len(seen) == 3_000
+
+
+@given(st.integers(1, 300), st.integers(0, 2**32 - 1), st.integers(1, 400), st.floats(0.1, 3), st.integers(1, 100))
+@settings(max_examples=60)
+def test_any_scene_has_detail_levels(count: int, seed: int, chunk: int, extent: float, least: int) -> None:
+    splats = random_splats(count, seed=seed)
+    nodes, tree = quick.build(splats) if seed % 2 else quality.build(splats)
+    check(splats, make(nodes, tree, DetailSettings(SHARES, chunk, extent, least)), SHARES)
+
+
+@pytest.mark.parametrize("name", hard_cases())
+def test_detail_levels_of_hard_scenes(name: str) -> None:
+    splats = hard_cases()[name]
+    nodes, tree = quality.build(splats)
+    with np.errstate(over="ignore"):
+        check(splats, make(nodes, tree, DetailSettings(SHARES, 200, 1.0, 50)), SHARES)
+
+
+def test_nothing_depends_on_the_run() -> None:
+    nodes, tree = quality.build(random_splats(1_000, sh_degree=1, seed=8))
+    first, second = (make(nodes, tree, DetailSettings(SHARES, 300)) for _ in range(2))
+    for name in COLUMNS:
+        assert getattr(first.splats, name).tobytes() == getattr(second.splats, name).tobytes()
+    assert first.counts.tolist() == second.counts.tolist() and first.children.tolist() == second.children.tolist()
+
+
+@pytest.mark.parametrize("leaves", [1, 100, 4 * COARSE_ENOUGH, 4 * COARSE_ENOUGH + 4, 30_000_000])
+def test_shares_that_suit_a_scene_end_with_what_loads_at_once(leaves: int) -> None:
+    shares = shares_of(None, leaves)
+    assert shares == [STEP ** (1 + at) for at in range(len(shares))]
+    assert shares[-1] * leaves <= COARSE_ENOUGH
+    assert len(shares) == 1 or shares[-2] * leaves > COARSE_ENOUGH
+
+
+@pytest.mark.parametrize("shares", [(0.5, 0.5), (0.25, 0.5), (1.0,), (0.5, 0.0), (-0.1,), (float("nan"),)])
+def test_shares_must_descend_between_0_and_1(shares: tuple[float, ...]) -> None:
+    with pytest.raises(ValueError, match="must descend"):
+        shares_of(shares, 100)
