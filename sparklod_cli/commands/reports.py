@@ -51,7 +51,7 @@ def report_baked(console: Console, source: Place, target: Place, baked: Baked) -
         f"{name_of(source)}  {count_of(baked.splats, 'splat')}, SH {baked.sh_degree}  ->  {_name(target)} "
         f" {_made(baked)}, {size_of(baked.bytes)}, {_total(baked.seconds)}"
     )
-    if baked.detail is not None:
+    if baked.detail is not None and len(baked.detail.levels) > 1:
         console.say(f"  {_levels(baked.detail)}")
     if baked.dropped:
         console.say(f"  left out: {describe(baked.dropped)}")

@@ -38,8 +38,7 @@ FORMS = {
     STREAMED_SOG: (".json", False),
 }
 
-#: What builds the tree unless somebody chooses, and how large it may get: the levels of a Streamed SOG are cuts of it,
-#: and the tree itself is not written.
+#: What builds the tree unless somebody chooses, and what builds that which a Streamed SOG is cut from.
 METHOD, METHOD_OF_DETAIL = METHODS[0], "quality"
 
 #: What the properties of RAD are called in --help.
@@ -124,8 +123,9 @@ OPTIONS: tuple[Callable[[Command], Command], ...] = (
         heading=TREE,
         metavar="N",
         type=Real(defaults.MIN_GROWTH, defaults.MAX_GROWTH),
-        default=defaults.DEFAULT_GROWTH,
-        help="Largest number of nodes for each leaf, with --method quality.",
+        help="Largest number of nodes for each leaf, with --method quality. "
+        f" [default: {defaults.DEFAULT_GROWTH:g}; {defaults.DETAIL_GROWTH:g} with --format {STREAMED_SOG}]",
+        show_default=False,
     ),
     option(
         "--min-box",
@@ -261,6 +261,7 @@ def bake_settings(ctx: click.Context, *, suffix: str, raw: bool, streamed_sog: b
     from ...model.transforms import Transform
 
     asked = ctx.params
+    growth = defaults.DETAIL_GROWTH if streamed_sog else defaults.DEFAULT_GROWTH
     try:
         transform = Transform.from_parts(
             up=asked["up"], rotate=asked["rotate"], scale=asked["scale"], translate=asked["translate"]
@@ -270,7 +271,7 @@ def bake_settings(ctx: click.Context, *, suffix: str, raw: bool, streamed_sog: b
     return BakeSettings(
         method=method_of(ctx, streamed_sog=streamed_sog),
         base=asked["base"],
-        growth=asked["growth"],
+        growth=growth if asked["growth"] is None else asked["growth"],
         max_sh=asked["max_sh"],
         selection=Selection(
             drop_invalid=asked["on_invalid"] == "drop",

@@ -113,9 +113,7 @@ def test_the_tree_is_of_quality_unless_another_one_is_asked_for(
     assert made["none"] == made["quality"] != made["quick"]
 
 
-def test_levels_can_be_made_of_an_existing_tree(
-    town: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_levels_can_be_made_of_an_existing_tree(town: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert build(town, "-o", tmp_path / "town-lod.rad", "--method", "quality", "--rad-center", "f32") == 0
     capsys.readouterr()
     assert build(tmp_path / "town-lod.rad", "--format", "streamed-sog", "--json") == 0
@@ -144,7 +142,7 @@ def test_an_environment_is_a_file_or_what_is_far_away(
     assert ", environment of 70 splats" in err
     meta = json.loads((tmp_path / "file" / "env" / "meta.json").read_text())
     lowest = np.sign(meta["means"]["mins"]) * np.expm1(np.abs(meta["means"]["mins"]))
-    np.testing.assert_allclose(lowest, read_scene(sky).splats.center.min(axis=0) + [5, 0, 0], rtol=1e-3)
+    np.testing.assert_allclose(lowest, read_scene(sky).splats.center.min(axis=0) + np.array([5, 0, 0]), rtol=1e-3)
     assert build(town, "-o", tmp_path / "far" / MANIFEST, "--environment-beyond", 20, "--json") == 0
     record, found = record_of(capsys), manifest(tmp_path / "far")
     far = splats_in(tmp_path / "far" / "env")
