@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from .api.writing import Written, write
     from .cameras.camera import Camera
     from .cameras.path import CameraPath
-    from .codecs.options import RadOptions
+    from .codecs.options import RadOptions, SogOptions
     from .codecs.rad.codec import RadChunk
     from .codecs.rad.records import RadChunkEntry, RadChunkHeader, RadHeader
     from .codecs.splat_encoding import SplatEncoding
@@ -66,7 +66,7 @@ _MODULES = {
     "api.writing": ("Written", "write"),
     "cameras.camera": ("Camera",),
     "cameras.path": ("CameraPath",),
-    "codecs.options": ("RadOptions",),
+    "codecs.options": ("RadOptions", "SogOptions"),
     "codecs.rad.codec": ("RadChunk",),
     "codecs.rad.records": ("RadChunkEntry", "RadChunkHeader", "RadHeader"),
     "codecs.splat_encoding": ("SplatEncoding",),
@@ -124,6 +124,7 @@ __all__ = [
     "Report",
     "Scene",
     "Selection",
+    "SogOptions",
     "SparklodError",
     "SplatEncoding",
     "Splats",

@@ -10,8 +10,9 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-# Machines differ by a factor of a hundred in speed, and the first example of a kernel compiles it.
-settings.register_profile("sparklod", deadline=None)
+# Machines differ by a factor of a hundred in speed, and the first example of a kernel compiles it. The fuzzers try many
+# more examples than a run of the tests.
+settings.register_profile("sparklod", deadline=None, max_examples=40)
 settings.load_profile("sparklod")
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -97,7 +97,9 @@ def test_a_file_without_a_tree_is_refused(tmp_path: Path, capsys: pytest.Capture
         (["--growth", "1.2"], "--growth cannot be used with --unlod"),
         (["--rgba", "c.npy"], "--rgba cannot be used with --unlod"),
         (["--encoding", "ext"], "--encoding cannot be used with --unlod"),
-        (["-o", "x.sog"], "--unlod writes .ply, .spz, .rad, .splat, not .sog"),
+        (["-o", "x.ksplat"], "--unlod writes .ply, .spz, .rad, .sog, meta.json, .splat, not .ksplat"),
+        (["-o", "x.json"], "--unlod writes .ply, .spz, .rad, .sog, meta.json, .splat, not .json"),
+        (["-o", "x.ply", "--cluster-sh"], "--cluster-sh is an option of RAD and SOG, not of PLY"),
         (["-o", "x.ply", "--spz-version", "2"], "--spz-version is an option of SPZ, not of .ply"),
     ],
 )

@@ -27,7 +27,7 @@ from .progress import Told, telling
 
 if TYPE_CHECKING:
     from ..bake.detail_output import DetailOutput
-    from ..codecs.options import RadOptions
+    from ..codecs.options import RadOptions, SogOptions
     from ..lod.detail_settings import DetailSettings
     from ..support.progress import Progress
 
@@ -60,6 +60,7 @@ def write(
     compression_level: int = DEFAULT_COMPRESSION,
     chunked: bool = False,
     rad: RadOptions | None = None,
+    sog: SogOptions | None = None,
     encoding: str | None = None,
     detail: DetailSettings | None = None,
     environment: Scene | None = None,
@@ -69,8 +70,9 @@ def write(
     """Writes a scene, or a tree, whole or not at all. Nodes keep their order, see `arrange_chunks`.
 
     Args:
-        path: of the file, whose suffix tells the format: .spz or .rad; for a scene without a tree, .ply or .splat, too;
-            for a tree, lod-meta.json, too, which is a Streamed SOG with folders beside it, all files or none.
+        path: of the file, whose suffix tells the format: .spz or .rad; for a scene without a tree, .ply, .sog or
+            .splat, too. Of several files, it names the first, and all appear or none: meta.json has the images of an
+            unpacked SOG beside it; for a tree, lod-meta.json has the folders of a Streamed SOG.
         scene: what is written.
         overwrite: replace a file that exists.
         spz_version: of SPZ, 2 or 3; None for 3.
@@ -79,6 +81,7 @@ def write(
         chunked: of RAD: write each chunk into a file of its own, NAME-0.radc and so on, beside the header; all files
             appear, or none.
         rad: further options of RAD.
+        sog: options of SOG.
         encoding: write the arrays of "packed", "ext", "lodtree" or "texture" as .npz instead, or as the words alone
             where the path ends in .bin or .raw.
         detail: of a Streamed SOG, which regions and detail levels are made of the tree.
@@ -94,48 +97,56 @@ def write(
         ValueError: an option is out of its range, or is of another format.
     """
     from ..bake.detail_output import DetailOutput
-    from ..codecs.formats import WRITABLE
-    from ..codecs.options import RadOptions, WriteOptions
+    from ..codecs.formats import WRITABLE, ending_of
+    from ..codecs.options import RadOptions, SogOptions, WriteOptions
     from ..codecs.splat_encoding import SplatEncoding
     from ..lod.detail_settings import DetailSettings
 
     path, count = Path(path), thread_count(threads)
-    suffix = path.suffix.lower()
+    form = None if encoding is not None else WRITABLE.get(ending_of(path.name))
+    written = None if form is None else form.name
+    streamed = encoding is None and path.name == MANIFEST
     whole_within("compression_level", compression_level, MIN_COMPRESSION, MAX_COMPRESSION)
     if fractional_bits is not None:
         whole_within("fractional_bits", fractional_bits, 0, MAX_FRACTIONAL_BITS)
-    if (spz_version is not None or fractional_bits is not None) and (encoding is not None or suffix != ".spz"):
+    if (spz_version is not None or fractional_bits is not None) and written != "SPZ":
         raise ValueError(f"{path}: spz_version and fractional_bits are of SPZ; leave them out, or write a .spz")
-    if (rad is not None or chunked) and (encoding is not None or suffix != ".rad"):
+    if (rad is not None or chunked) and written != "RAD":
         raise ValueError(f"{path}: chunked and rad are of RAD; leave them out, or write a .rad")
-    if (detail is not None or environment is not None) and (encoding is not None or path.name != MANIFEST):
+    if sog is not None and written != "SOG" and not streamed:
+        raise ValueError(f"{path}: sog is of SOG; leave it out, or write a .sog")
+    if (detail is not None or environment is not None) and not streamed:
         raise ValueError(f"{path}: detail and environment are of Streamed SOG; leave them out, or write a {MANIFEST}")
     if not isinstance(detail, (DetailSettings, NoneType)):
         raise TypeError(f"detail is {detail!r}; give DetailSettings")
     if not isinstance(rad, (RadOptions, NoneType)):
         raise TypeError(f"rad is {rad!r}; give RadOptions")
+    if not isinstance(sog, (SogOptions, NoneType)):
+        raise TypeError(f"sog is {sog!r}; give SogOptions")
     if rad is not None and not isinstance(rad.ranges, (SplatEncoding, NoneType)):
         raise TypeError(f"ranges is {rad.ranges!r}; give a SplatEncoding")
     if rad is not None and rad.center_bits is not None:
         whole_within("center_bits", rad.center_bits, -MAX_CENTER_BITS, MAX_CENTER_BITS)
     if rad is not None and rad.sh_codes is not None:
         whole_within("sh_codes", rad.sh_codes, MIN_SH_CODES, MAX_SH_CODES)
+    if sog is not None and sog.sh_codes is not None:
+        whole_within("sh_codes", sog.sh_codes, MIN_SH_CODES, MAX_SH_CODES)
     if not len(scene_like(scene).splats):
         raise InvalidSplatsError(f"{path}: the scene has no splats to write")
     with telling(progress) as told, memory_errors_translated():
         if encoding is not None:
             return _write_arrays(path, scene, encoding, overwrite=overwrite, threads=count)
-        if path.name == MANIFEST:
-            output = DetailOutput(detail or DetailSettings(), WriteOptions(), detail_sink(path, overwrite=overwrite))
+        if streamed:
+            options = WriteOptions(sog=sog or SogOptions())
+            output = DetailOutput(detail or DetailSettings(), options, detail_sink(path, overwrite=overwrite))
             return _write_levels(path, scene, environment, output, count, told)
-        form = WRITABLE.get(suffix)
         if form is None or (scene.tree is not None and not form.trees):
-            known = ", ".join(suffix for suffix, each in WRITABLE.items() if each.trees or scene.tree is None)
+            known = ", ".join(ending for ending, each in WRITABLE.items() if each.trees or scene.tree is None)
             what = "a tree" if scene.tree is not None else "a scene"
             raise FormatError(f"{path}: {what} is written as {known}, which the name does not end in")
         rad = rad or RadOptions()
         rad = dataclasses.replace(rad, chunked=rad.chunked or chunked)
-        options = WriteOptions(spz_version, fractional_bits, compression_level, rad)
+        options = WriteOptions(spz_version, fractional_bits, compression_level, rad, sog or SogOptions())
         save = scene_sink(path, form, chunked=rad.chunked, overwrite=overwrite)
         return Written(path, form.name, save(scene, options, threads=count, progress=told))
 

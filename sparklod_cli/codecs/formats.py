@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from importlib import import_module
+from pathlib import PurePath
 from typing import Any
 
 #: Bytes at the beginning of a file by which its format is recognized.
@@ -22,6 +23,9 @@ class Format:
         writable: its module also has `encode(scene, options, *, threads, progress) -> Iterator[bytes]`, and
             `settled(scene, options) -> WriteOptions`, the options with nothing left open, which raises `FormatError`
             if the scene cannot be written.
+        unbundled: the name of the first of the files as which a scene can also be written, all in one folder; None if
+            there is no such way. Its module then has `encode_files(scene, options, *, threads, progress)`, too, which
+            yields the name and the bytes of each, this one last.
         trees: it can be written with a Level-of-Detail tree. Its `encode` then takes a `NodeStream`, too, and
             `scratch`, a folder; its `settled` takes `Statistics`, too, those that `needed(options)` names; and
             `encoder(scene, options, ranges, *, threads, progress)` gives its `encoder.Encoder`.
@@ -43,10 +47,18 @@ class Format:
     beginning: bytes | None
     writable: bool = False
     trees: bool = False
+    unbundled: str | None = None
     companions: bool = False
     folders: bool = False
     detailed: bool = False
     selective: bool = False
+
+    @property
+    def endings(self) -> tuple[str, ...]:
+        """How the name of a file ends that is written in this format: in a suffix, or it is that of `unbundled`."""
+        if self.unbundled is None:
+            return self.suffixes
+        return *(suffix for suffix in self.suffixes if not self.unbundled.endswith(suffix)), self.unbundled
 
     def codec(self) -> Any:
         """The module, imported when it is needed."""
@@ -82,13 +94,27 @@ FORMATS = (
         detailed=True,
     ),
     # A zip, or its meta.json unpacked.
-    Format("SOG", "sog.codec", (".sog", ".json"), rb"PK\x03\x04|\s*\{\s*\"\w+\"\s*:", companions=True),
+    Format(
+        "SOG",
+        "sog.codec",
+        (".sog", ".json"),
+        rb"PK\x03\x04|\s*\{\s*\"\w+\"\s*:",
+        writable=True,
+        unbundled="meta.json",
+        companions=True,
+    ),
     Format("KSPLAT", "ksplat", (".ksplat",), rb"\0[\x01-\xff]\0\0"),  # version 0.1 on; as a float it would be denormal
     Format("SPLAT", "splat", (".splat",), None, writable=True),
 )
 
-#: The formats that can be written, by the suffix of the file.
-WRITABLE = {suffix: form for form in FORMATS if form.writable for suffix in form.suffixes}
+#: The formats that can be written, by how the name of the file ends, see `Format.endings`.
+WRITABLE = {ending: form for form in FORMATS if form.writable for ending in form.endings}
+
+
+def ending_of(name: str) -> str:
+    """How a name ends, as `WRITABLE` knows it, in lower case: "meta.json", or the suffix, which may be none of its."""
+    name = name.lower()
+    return name if any(name == form.unbundled for form in FORMATS) else PurePath(name).suffix
 
 
 def sniff(head: bytes, suffix: str) -> Format | None:

@@ -38,6 +38,18 @@ class RadOptions:
 
 
 @dataclass(frozen=True)
+class SogOptions:
+    """How to write SOG.
+
+    Attributes:
+        sh_codes: the most entries of the palette of spherical harmonics, which a label for each splat points into; None
+            for as many as suit the number of splats, see `sog.options`.
+    """
+
+    sh_codes: int | None = None
+
+
+@dataclass(frozen=True)
 class WriteOptions:
     """How to write a splat file. PLY and .splat leave no such choice, and ignore all of them.
 
@@ -46,12 +58,14 @@ class WriteOptions:
         fractional_bits: of SPZ positions, 0 to 24; None for as many as suit the scene, see `spz_options`.
         compression_level: of SPZ and RAD, 1 (fast) to 9 (small).
         rad: of RAD.
+        sog: of SOG.
     """
 
     spz_version: int | None = None
     fractional_bits: int | None = None
     compression_level: int = DEFAULT_COMPRESSION
     rad: RadOptions = RadOptions()
+    sog: SogOptions = SogOptions()
 
 
 #: What is written where nobody chooses.

@@ -40,7 +40,7 @@ CLAMPS = {
 
 _SQRT_HALF = np.float32(np.sqrt(0.5))
 #: Indices of the three components that remain, by the index of the one that is left out.
-_OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
+OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 
 #: Written in place of an infinite logarithm or logit: in float32 its exponential and sigmoid are exactly those of
 #: infinity, and readers that refuse infinite numbers accept it.
@@ -191,7 +191,7 @@ def encode_quat_smallest_three(quat_xyzw: FloatArray) -> Bytes:
     in units of sqrt(1 / 2) / 511.
     """
     largest = np.abs(quat_xyzw).argmax(axis=1)[:, None]
-    others = np.take_along_axis(quat_xyzw, _OTHERS[largest[:, 0]], axis=1)
+    others = np.take_along_axis(quat_xyzw, OTHERS[largest[:, 0]], axis=1)
     flip = np.take_along_axis(quat_xyzw, largest, axis=1) < 0
     sign = ((others < 0) ^ flip).astype(np.uint32)
     magnitude = np.minimum(np.abs(others) * (511 / _SQRT_HALF) + np.float32(0.5), 511).astype(np.uint32)

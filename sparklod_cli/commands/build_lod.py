@@ -46,6 +46,7 @@ Examples:
   sparklod build-lod scene.ply --format streamed-sog --levels 50%,25%,10%    # scene-lod/lod-meta.json
   sparklod build-lod scene.sog --encoding ext           # writes scene-lod.npz
   sparklod build-lod scene-lod.spz --unlod -o scene.ply
+  sparklod build-lod scene-lod.spz --unlod -o scene.sog # for PlayCanvas
 """
 
 
@@ -77,8 +78,8 @@ Examples:
     "--unlod",
     heading=COMMON,
     is_flag=True,
-    help="Write the original splats of Level-of-Detail files instead, as SPZ or, by the name of FILE, .rad, .ply or"
-    " .splat.",
+    help="Write the original splats of Level-of-Detail files instead, as SPZ or, by the name of FILE, .rad, .ply,"
+    " .sog, DIR/meta.json (an unpacked SOG) or .splat.",
 )
 @baking_options
 @resources_options
@@ -137,7 +138,7 @@ def _check(ctx: click.Context, given: Inputs, named: list[Path], outputs: Output
     elif DASH in inputs:
         raise click.UsageError("standard input has no name to derive one from; give --output")
     targets = [outputs.output] if outputs.output is not None else [outputs.target(source) for source in inputs]
-    if outputs.is_chunked or outputs.is_streamed_sog:
+    if outputs.is_chunked or outputs.is_folder or outputs.is_streamed_sog:
         targets = with_chunks(targets)
     keep_apart(ctx, {"output" if outputs.output_dir is None else "output_dir": targets, "scene": named})
     claim_stdout(ctx, "output", as_json=general.as_json, binary=True)

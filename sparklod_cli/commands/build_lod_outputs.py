@@ -6,12 +6,22 @@ from dataclasses import dataclass
 
 import click
 
-from ..codecs.formats import FORMATS, WRITABLE
+from ..codecs.formats import FORMATS, WRITABLE, ending_of
 from ..codecs.gpu.table import NPZ, RAW_SUFFIXES
 from ..codecs.streamed_sog.names import MANIFEST
 from ..support.addresses import Place
 from ..support.stdin import DASH
-from .options.baking import FORMS, OF_BOTH, OF_PLACE, OF_RAD, OF_SELECTION, OF_SPZ, OF_TREES, STREAMED_SOG
+from .options.baking import (
+    FORMS,
+    OF_BOTH,
+    OF_PALETTES,
+    OF_PLACE,
+    OF_RAD,
+    OF_SELECTION,
+    OF_SPZ,
+    OF_TREES,
+    STREAMED_SOG,
+)
 from .options.detail import HEADING as DETAIL
 from .options.detail import OF_DETAIL
 from .paths import stem_of
@@ -21,8 +31,11 @@ from .usage import is_given, refuse
 TREES = {suffix: form.name for suffix, form in WRITABLE.items() if form.trees}
 SPZ = next(iter(TREES))
 
-#: Suffixes of formats that hold no tree.
-PLAIN = {suffix for form in FORMATS for suffix in form.suffixes if not form.trees}
+#: Suffixes of formats that hold no tree, and how else their names end.
+PLAIN = {ending for form in FORMATS for ending in (*form.suffixes, *form.endings) if not form.trees}
+
+#: Formats whose spherical harmonics can be a palette.
+WITH_PALETTE = ("RAD", "SOG")
 
 
 @dataclass(frozen=True)
@@ -47,8 +60,8 @@ class Outputs:
 
     @property
     def named_suffix(self) -> str:
-        """Of the output that was named, if one was."""
-        return self.output.suffix.lower() if self.output is not None and self.output != DASH else ""
+        """Of the output that was named, if one was; or its name where that tells the format, see `ending_of`."""
+        return ending_of(self.output.name) if self.output is not None and self.output != DASH else ""
 
     @property
     def is_raw(self) -> bool:
@@ -76,6 +89,11 @@ class Outputs:
     def is_chunked(self) -> bool:
         """Whether the chunks of a RAD are files of their own."""
         return self.form is not None and FORMS[self.form][1]
+
+    @property
+    def is_folder(self) -> bool:
+        """Whether the output is the first of several files in its folder."""
+        return self.suffix in WRITABLE and self.suffix == WRITABLE[self.suffix].unbundled
 
     @property
     def format_is_asked_for(self) -> bool:
@@ -111,6 +129,7 @@ def check_formats(ctx: click.Context, outputs: Outputs) -> None:
         refuse(ctx, OF_RAD, "is an option of RAD, not of --encoding")
         refuse(ctx, OF_BOTH, "is an option of SPZ and RAD, not of --encoding")
         refuse(ctx, OF_DETAIL, f"is an option of {DETAIL}, not of --encoding")
+        refuse(ctx, OF_PALETTES, "is an option of RAD and SOG, not of --encoding")
     if outputs.form is not None and suffix not in ("", outputs.suffix):
         raise click.UsageError(f"--format {outputs.form} writes {outputs.suffix}, not {suffix}")
     if outputs.unlod:
@@ -130,6 +149,10 @@ def check_formats(ctx: click.Context, outputs: Outputs) -> None:
         refuse(ctx, OF_RAD, f"is an option of RAD, not of {name or suffix}; name the output .rad, or add --format rad")
     if name is None:
         refuse(ctx, OF_BOTH, f"is an option of SPZ and RAD, not of {suffix}")
+    written = WRITABLE[outputs.suffix].name
+    if written not in WITH_PALETTE:
+        more = "" if outputs.unlod else "; name the output .rad, or add --format rad"
+        refuse(ctx, OF_PALETTES, f"is an option of RAD and SOG, not of {written}{more}")
 
 
 def _check_streamed_sog(ctx: click.Context, outputs: Outputs) -> None:

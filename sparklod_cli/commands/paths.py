@@ -110,11 +110,7 @@ def keep_apart(ctx: click.Context, stands_for: Mapping[str, Iterable[Place]] | N
 
 
 def with_chunks(headers: Iterable[Place]) -> list[Place]:
-    """Outputs whose chunks are files of their own, and the files beside them that are replaced or removed with them.
-
-    Args:
-        headers: of RADs, or manifests of Streamed SOGs.
-    """
+    """Outputs of several files each, and the files beside them that are replaced or removed with them."""
     from ..io import chunk_files, detail_files
 
     chunks: list[Place] = []

@@ -9,7 +9,8 @@ from typing import BinaryIO
 
 from ..codecs.formats import HEAD, sniff
 from ..codecs.rad import header as rad_header
-from ..codecs.sog.files import MAX_META, META, names_beside
+from ..codecs.sog.files import MAX_META, names_beside
+from ..codecs.sog.names import META
 from ..codecs.streamed_sog.manifest import MAX_MANIFEST, parse
 from ..codecs.streamed_sog.names import MANIFEST
 from ..support.addresses import Place

@@ -1,8 +1,12 @@
-"""Names of files, and why one cannot be opened, in words."""
+"""Names of files, which of them belong together, and why one cannot be opened, in words."""
 
 from __future__ import annotations
 
 import os
+from pathlib import PurePath
+
+from ..codecs.rad import names as rad_names
+from ..codecs.sog import names as sog_names
 
 
 def is_file_name(text: str) -> bool:
@@ -18,6 +22,16 @@ def leads_away(name: str, *, folders: bool = False) -> bool:
     if folders and "/" in name:
         return any(leads_away(part) for part in name.split("/"))
     return name in ("", ".", "..") or any(mark in name for mark in "/\\:") or not is_file_name(name)
+
+
+def number_of(name: str, header: str) -> int | None:
+    """The place of a file among those of an output that one called `header` names; None if it is none of them.
+
+    They are the images of a meta.json, and the chunks of any other header.
+    """
+    if header.lower() == sog_names.META:
+        return sog_names.number_of(name)
+    return rad_names.number_of(name, PurePath(header).stem)
 
 
 def reason_of(error: OSError) -> str:

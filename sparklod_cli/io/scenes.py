@@ -1,4 +1,4 @@
-"""Writes scenes as splat files, each whole or not at all, in one file or with chunks in files of their own."""
+"""Writes scenes as splat files, each whole or not at all, in one file or in several."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class SceneSink:
     Attributes:
         form: that is written.
         whole: writes one file; None for several.
-        together: writes a header and its chunks; None for one file.
+        together: writes a header and the files that it names; None for one file.
         stem: of the names of chunks.
     """
 
@@ -42,6 +42,9 @@ class SceneSink:
         if self.whole is not None:
             return self.whole(codec.encode(scene, options, threads=threads, progress=progress))
         assert self.together is not None
+        if self.form.unbundled is not None:
+            files = codec.encode_files(scene, options, threads=threads, progress=progress)
+            return self.together((name, (content,)) for name, content in files)
         return self.together(codec.encode_chunked(scene, options, self.stem, threads=threads, progress=progress))
 
     def assemble(self, encoder: Encoder, get: Get, *, threads: int = 1, progress: Progress = silent) -> int:
@@ -66,7 +69,8 @@ def scene_sink(path: Place, form: Format, *, chunked: bool = False, overwrite: b
     """What writes a scene in a format. Fails now if the output cannot be written later.
 
     Args:
-        path: of the file, or of the header where `chunked`; - is standard output, for one file.
+        path: of the file, or of the header where `chunked`; - is standard output, for one file. One that is called as
+            the `unbundled` of the format has the other files beside it.
         form: that is written.
         chunked: with each chunk in a file of its own, beside the header; of RAD.
         overwrite: replace files that exist.
@@ -75,6 +79,6 @@ def scene_sink(path: Place, form: Format, *, chunked: bool = False, overwrite: b
         OutputError: see `sink` and `sink_together`. Writing raises that, too, and what the codec raises.
     """
     stem = path.stem if isinstance(path, Address) else Path(os.path.realpath(path)).stem
-    if chunked:
+    if chunked or path.name.lower() == form.unbundled:
         return SceneSink(form, None, sink_together(path, overwrite=overwrite), stem)
     return SceneSink(form, sink(path, overwrite=overwrite), None, stem)

@@ -1,4 +1,4 @@
-"""Writes the files of one output, a header and its chunks, so that all of them appear or none does."""
+"""Writes the files of one output, a header and those that it names, so that all of them appear or none does."""
 
 from __future__ import annotations
 
@@ -7,12 +7,11 @@ import os
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from ..codecs.rad.names import CHUNK_SUFFIX, number_of
 from ..support import atomic_set
 from ..support.addresses import Address, Place
 from ..support.errors import OutputError
 from ..support.stdin import DASH
-from .names import reason_of
+from .names import number_of, reason_of
 from .uploads import check_together, upload_together
 from .writing import check_writable
 
@@ -24,23 +23,23 @@ SinkTogether = Callable[[Files], int]
 
 
 def chunk_files(path: Path) -> list[Path]:
-    """The files beside a header that are called as its chunks would be, whether it names them or not.
+    """The files beside a header that are called as those that it names would be, whether it names them or not.
 
     Args:
-        path: of a header, which need not exist.
+        path: of a header, which need not exist: the meta.json of a SOG, or a RAD.
     """
     target = Path(os.path.realpath(path))
     try:
-        found = {number_of(each.name, target.stem): each for each in target.parent.iterdir()}
+        found = {number_of(each.name, target.name): each for each in target.parent.iterdir()}
     except OSError:
         return []
     return [found[number] for number in sorted(number for number in found if number is not None)]
 
 
 def write_together(path: Place, files: Files, *, overwrite: bool) -> int:
-    """Writes a header and the files of its chunks, all or none of them, and returns their size; makes their folder.
+    """Writes a header and the files that it names, all or none of them, and returns their size; makes their folder.
 
-    With `overwrite`, chunks of a longer output that was there before are removed. See `atomic_set.write` for what an
+    With `overwrite`, files of a larger output that was there before are removed. See `atomic_set.write` for what an
     interruption leaves.
 
     Args:
@@ -56,7 +55,7 @@ def write_together(path: Place, files: Files, *, overwrite: bool) -> int:
         return upload_together(path, files, overwrite=overwrite)
     _check(path, overwrite=overwrite)
     target = Path(os.path.realpath(path))
-    placed = ((name if name.endswith(CHUNK_SUFFIX) else target.name, pieces) for name, pieces in files)
+    placed = ((target.name if number_of(name, target.name) is None else name, pieces) for name, pieces in files)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         return atomic_set.write(
@@ -72,7 +71,7 @@ def write_together(path: Place, files: Files, *, overwrite: bool) -> int:
 
 
 def sink_together(path: Place, *, overwrite: bool) -> SinkTogether:
-    """The function that writes a header and the files of its chunks. Fails now if they cannot be written later.
+    """The function that writes a header and the files that it names. Fails now if they cannot be written later.
 
     Raises:
         OutputError: it is no place for several files, or see `check_writable`.

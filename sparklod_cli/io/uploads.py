@@ -5,10 +5,9 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterable
 
-from ..codecs.rad.names import number_of
 from ..support.addresses import Address
 from ..support.errors import OutputError
-from .names import reason_of
+from .names import number_of, reason_of
 
 #: Schemes of addresses that are only read.
 READ_ONLY = ("http", "https")
@@ -40,25 +39,25 @@ def upload(address: Address, pieces: Iterable[bytes], *, overwrite: bool) -> int
 
 
 def chunks_at(address: Address) -> list[Address]:
-    """The files beside a header that are called as its chunks would be."""
+    """The files beside a header that are called as those that it names would be."""
     try:
         names = [name for name in address.parent.files() if "/" not in name]
     except OSError as error:
         raise OutputError(f"cannot list {address.parent}: {reason_of(error)}") from None
-    found = {number_of(name, address.stem): address.parent / name for name in names}
+    found = {number_of(name, address.name): address.parent / name for name in names}
     return [found[number] for number in sorted(number for number in found if number is not None)]
 
 
 def upload_together(address: Address, files: Iterable[tuple[str, Iterable[bytes]]], *, overwrite: bool) -> int:
-    """Writes the files of chunks, and then their header; returns their size.
+    """Writes the files that a header names, and then the header; returns their size.
 
-    If something fails, what was sent is removed, so that no header names chunks that are not there. Where files are
+    If something fails, what was sent is removed, so that no header names files that are not there. Where files are
     replaced, the old header is removed first for the same reason: services replace one object at a time.
 
     Args:
         address: of the header.
         files: names and contents; the last is the header, whose name is that of `address`.
-        overwrite: replace existing files, and remove chunks of a longer output.
+        overwrite: replace existing files, and remove those of a larger output.
 
     Raises:
         OutputError: a file exists and `overwrite` is not set, or one cannot be sent.
@@ -68,7 +67,7 @@ def upload_together(address: Address, files: Iterable[tuple[str, Iterable[bytes]
     try:
         address.unlink(missing_ok=True)
         for name, pieces in files:
-            place = address if number_of(name, address.stem) is None else address.parent / name
+            place = address if number_of(name, address.name) is None else address.parent / name
             sent.append(place)
             size += place.write(pieces)
         for outdated in former:
@@ -85,7 +84,7 @@ def upload_together(address: Address, files: Iterable[tuple[str, Iterable[bytes]
 
 
 def check_together(address: Address, *, overwrite: bool) -> None:
-    """As `check_address`, of a header and its chunks."""
+    """As `check_address`, of a header and the files that it names."""
     check_address(address, overwrite=overwrite)
     for each in [] if overwrite else chunks_at(address):
         raise _taken(each)

@@ -15,7 +15,7 @@ from urllib.parse import quote
 from ..codecs.formats import FORMATS, HEAD, sniff
 from ..codecs.rad.header import MAGIC, read_header
 from ..codecs.rad.records import RadHeader
-from ..codecs.sog.files import META
+from ..codecs.sog.names import META
 from ..codecs.streamed_sog.names import MANIFEST
 from ..io.beside import in_folder, path_beside
 from ..io.names import reason_of

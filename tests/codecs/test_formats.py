@@ -10,7 +10,7 @@ from importlib import import_module
 import numpy as np
 import pytest
 
-from sparklod_cli.codecs.formats import FORMATS, WRITABLE, Format
+from sparklod_cli.codecs.formats import FORMATS, WRITABLE, Format, ending_of
 from sparklod_cli.codecs.gpu.table import ENCODINGS
 from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.model.lod_tree import LodTree
@@ -37,6 +37,7 @@ def test_a_codec_has_the_signatures_of_all(form: Format) -> None:
         written = {"scene": False, "options": False, "threads": True, "progress": True}
         assert parameters(codec.encode) == written | more
         assert parameters(codec.settled) == {"scene": False, "options": False}
+    assert hasattr(codec, "encode_files") == (form.unbundled is not None)
     assert hasattr(codec, "encoder") == hasattr(codec, "needed") == form.trees
     if form.trees:
         assert parameters(codec.needed) == {"options": False}
@@ -45,8 +46,24 @@ def test_a_codec_has_the_signatures_of_all(form: Format) -> None:
 
 
 def test_one_format_is_written_by_each_suffix() -> None:
-    assert sum(len(form.suffixes) for form in FORMATS if form.writable) == len(WRITABLE)
-    assert set(WRITABLE) == {".ply", ".spz", ".splat", ".rad"}
+    assert sum(len(form.endings) for form in FORMATS if form.writable) == len(WRITABLE)
+    assert set(WRITABLE) == {".ply", ".spz", ".splat", ".rad", ".sog", "meta.json"}
+
+
+@pytest.mark.parametrize(
+    ("name", "ending"),
+    [
+        ("a.SOG", ".sog"),
+        ("x", ""),
+        (".ply", ""),
+        ("meta.json", "meta.json"),
+        ("Meta.JSON", "meta.json"),
+        ("a-meta.json", ".json"),
+        ("meta.json.ply", ".ply"),
+    ],
+)
+def test_the_name_of_a_file_tells_how_it_is_written(name: str, ending: str) -> None:
+    assert ending_of(name) == ending
 
 
 @pytest.mark.parametrize("suffix", sorted(suffix for suffix, form in WRITABLE.items() if not form.trees))

@@ -21,12 +21,16 @@ from fixtures import (
     by_hand_splat,
     by_hand_streamed_sog,
 )
-from sparklod_cli.codecs import octahedral, ply, quantize, splat, spz
+from sparklod_cli.codecs import octahedral, ply, quantize, sh_palette, splat, spz
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import codec as rad
 from sparklod_cli.codecs.rad.header import ENCODING_KEYS
 from sparklod_cli.codecs.rad.layout import choices
+from sparklod_cli.codecs.sog import codec as sog
+from sparklod_cli.codecs.sog import codings
+from sparklod_cli.codecs.sog.codebook import codebook
 from sparklod_cli.codecs.splat_encoding import SplatEncoding
+from sparklod_cli.model import morton
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.sh import SH_C0
 from sparklod_cli.model.splats import Splats
@@ -232,7 +236,46 @@ def as_sog(source: Scene, version: int, *, folder: bool = False) -> Content:
     return files if folder else by_hand_sog.zipped(files)
 
 
+def written_sog(source: Scene, *, folder: bool = False) -> Content:
+    return dict(sog.encode_files(source)) if folder else b"".join(sog.encode(source))
+
+
+def written_sog_precision(source: Scene) -> Precision:
+    """As the format allows; books and palettes are as exact as those that the writer makes."""
+    splats = source.splats
+    found = sog_precision(source, 2)
+    log_scale, dc = quantize.encode_log(splats.scale), quantize.encode_dc(splats.rgb)
+    sh = 0.0
+    if splats.sh_degree:
+        codes = sog.settled(source, WriteOptions()).sog.sh_codes
+        palette = sh_palette.cluster(splats.sh, codes or 0)
+        sh = float(np.abs(palette.expand() - splats.sh).max()) + largest_half_step(palette.codes)
+    return dataclasses.replace(
+        found,
+        log_scale=largest_half_step(log_scale) + 4e-6,
+        rgb=largest_half_step(dc) * SH_C0 + 1e-6,
+        sh=(sh + 1e-6, sh + 1e-6),
+    )
+
+
+def largest_half_step(values: NDArray[np.floating[Any]]) -> float:
+    return float(np.diff(codebook(values)).max()) / 2
+
+
+def in_sog_order(splats: Splats) -> Splats:
+    low, high = (codings.sign_log(end) for end in (splats.center.min(axis=0), splats.center.max(axis=0)))
+    return splats.take(morton.order_of_cells(codings.encode_center(splats.center, low, high)))
+
+
 SOG = {
+    f"sparklod{' folder' * folder}": Case(
+        "SOG 2",
+        functools.partial(written_sog, folder=folder),
+        written_sog_precision,
+        held=in_sog_order,
+    )
+    for folder in (False, True)
+} | {
     f"{version}{' folder' * folder}": Case(
         f"SOG {version}",
         functools.partial(as_sog, version=version, folder=folder),

@@ -17,10 +17,9 @@ from ...support.units import count_of
 from ...support.untrusted import ZIP_ERRORS, parse_json, quoted, quoted_value
 from ..compression import check_promise
 from ..stream import size_of
+from .names import META
 
 Texels = NDArray[np.uint8]
-
-META = "meta.json"
 
 #: Largest meta.json, bytes; codebooks take 15,000.
 MAX_META = 1 << 22

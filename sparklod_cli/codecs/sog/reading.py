@@ -20,19 +20,14 @@ from .. import quantize
 from ..compression import check_promise
 from ..content import Content, Scratch, rows_in
 from ..stream import Positioned
+from . import codings
 from .files import Files, Meta, Texels
-
-#: Entries in a row of the image of SH centroids.
-PALETTE_WIDTH = 64
 
 #: Most entries of the palette of SH: a label has 16 bits.
 MAX_PALETTE = 1 << 16
 
 #: Most splats: a WebP image has at most this many texels.
 MAX_SPLATS = 1 << 28
-
-#: Alpha of a rotation's texel minus the index, in w x y z, of the largest component.
-FIRST_TAG = 252
 
 
 def decode(
@@ -203,9 +198,7 @@ def _codebook(meta: Meta, name: str) -> FloatArray:
 
 def _center_tables(meta: Meta) -> FloatArray:
     """(3, 65536) coordinates of each word, between the bounds of sign(x) * log(1 + abs(x))."""
-    logs = quantize.range_table(meta.numbers(3, "means", "mins"), meta.numbers(3, "means", "maxs"), 1 << 16)
-    with np.errstate(over="ignore"):
-        return np.copysign(np.expm1(np.abs(logs)), logs).astype(np.float32)
+    return codings.center_table(meta.numbers(3, "means", "mins"), meta.numbers(3, "means", "maxs"))
 
 
 def _fill_centers(tables: FloatArray, splats: Splats, texels: list[Texels]) -> None:
@@ -216,12 +209,8 @@ def _fill_centers(tables: FloatArray, splats: Splats, texels: list[Texels]) -> N
 
 
 def _fill_quats(splats: Splats, texels: list[Texels]) -> None:
-    """Decodes rotations: three components in r g b. A texel without a tag gives NaN, an invalid splat."""
-    others = [(texels[0][:, k].astype(np.float32) / np.float32(127.5) - 1) * np.float32(np.sqrt(0.5)) for k in range(3)]
-    tag = texels[0][:, 3]
-    quat = quantize.quat_of_others(tag.astype(np.int16) - FIRST_TAG, *others)[:, [1, 2, 3, 0]]
-    quat[tag < FIRST_TAG] = np.nan
-    splats.quat_xyzw[:] = quat
+    """Decodes rotations."""
+    splats.quat_xyzw[:] = codings.decode_quat(texels[0])
 
 
 def _fill_sh(palette: FloatArray, splats: Splats, texels: list[Texels]) -> None:
@@ -235,8 +224,8 @@ def _read_palette(files: Files, version: int) -> FloatArray:
     """(entries, K, 3) SH coefficients of the palette."""
     image = files.image("shN", 0, MAX_PALETTE * COEFFICIENTS[3])
     width = image.shape[1]
-    coefficients = width // PALETTE_WIDTH
-    if coefficients not in COEFFICIENTS[1:4] or width % PALETTE_WIDTH:
+    coefficients = width // codings.PALETTE_WIDTH
+    if coefficients not in COEFFICIENTS[1:4] or width % codings.PALETTE_WIDTH:
         raise FormatError(f"its image of SH centroids is {width} texels wide, expected 64 times 3, 8 or 15")
     entries = image[:, :, :3].reshape(-1, coefficients, 3)
     if version == 1:

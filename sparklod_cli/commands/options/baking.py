@@ -56,8 +56,9 @@ OF_TREES = ("method", "base", "growth", "max_sh")
 OF_SELECTION = ("min_opacity", "min_box", "max_box", "within", "on_invalid", "rgba")
 OF_PLACE = ("up", "rotate", "scale", "translate")
 OF_SPZ = ("spz_version", "fractional_bits")
-OF_RAD = (*(f"rad_{name}" for name in PROPERTIES), "cluster_sh")
+OF_RAD = tuple(f"rad_{name}" for name in PROPERTIES)
 OF_BOTH = ("compression_level",)
+OF_PALETTES = ("cluster_sh",)
 
 OPTIONS: tuple[Callable[[Command], Command], ...] = (
     option(
@@ -218,12 +219,13 @@ OPTIONS: tuple[Callable[[Command], Command], ...] = (
     ),
     option(
         "--cluster-sh",
-        heading=RAD,
+        heading=FORMAT,
         type=Codes(defaults.MIN_SH_CODES, defaults.MAX_SH_CODES),
         is_flag=False,
         flag_value=str(defaults.MAX_SH_CODES),
-        help="Write spherical harmonics as a palette of at most N entries, 2 to 65,536, and a label for each splat: the"
-        " file gets smaller, and reflections less exact. N is 65,536 if it is left out.",
+        help="Write spherical harmonics to RAD as a palette of at most N entries, 2 to 65,536, and a label for each"
+        " splat: the file gets smaller, and reflections less exact. N is 65,536 if it is left out. SOG always has a"
+        " palette; this chooses its size, which otherwise suits the number of splats.",
     ),
 )
 
@@ -295,8 +297,8 @@ def bake_settings(ctx: click.Context, *, suffix: str, raw: bool, streamed_sog: b
 
 
 def write_options(ctx: click.Context) -> WriteOptions:
-    """How to write SPZ and RAD; what nobody chose is left to the library, which may take it from the input."""
-    from ...codecs.options import RadOptions, WriteOptions
+    """How to write; what nobody chose is left to the library, which may take it from the input."""
+    from ...codecs.options import RadOptions, SogOptions, WriteOptions
 
     asked = ctx.params
     return WriteOptions(
@@ -308,4 +310,5 @@ def write_options(ctx: click.Context) -> WriteOptions:
             chunked=asked["form"] is not None and FORMS[asked["form"]][1],
             sh_codes=asked["cluster_sh"],
         ),
+        sog=SogOptions(sh_codes=asked["cluster_sh"]),
     )

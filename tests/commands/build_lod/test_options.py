@@ -121,7 +121,10 @@ def test_more_processors_than_the_most_threads_are_no_error(scene: Path, monkeyp
         (["a.ply", "-o", "out.bin"], ".bin is a file of arrays; choose their layout with --encoding"),
         (["a.ply", "-o", "out.spz", "--encoding", "ext"], "--encoding writes .npz, .bin, .raw, not .spz"),
         (["a.ply", "-o", "out.png", "--encoding", "packed"], "--encoding writes .npz, .bin, .raw, not .png"),
-        (["a-lod.spz", "-o", "out.glb", "--unlod"], "--unlod writes .ply, .spz, .rad, .splat, not .glb"),
+        (
+            ["a-lod.spz", "-o", "out.glb", "--unlod"],
+            "--unlod writes .ply, .spz, .rad, .sog, meta.json, .splat, not .glb",
+        ),
         (["a.ply", "--quality"], "there is no option --quality; did you mean --method quality?"),
         (["a.ply", "--ext"], "there is no option --ext; did you mean --encoding ext?"),
         (["a.ply", "--overwritten"], "--overwrite"),

@@ -1,0 +1,67 @@
+"""The Morton curve: an order of points in which neighbours in space are mostly near each other."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .splats import FloatArray
+
+#: Bits of a coordinate along each axis of the bounding box: three of them fill a word of 64 bits.
+BITS = 21
+
+#: How the bits of a word move apart, step by step, until two zeros stand between any two of them: by how many places,
+#: and which bits are kept.
+_SPREADING = (
+    (32, 0x001F00000000FFFF),
+    (16, 0x001F0000FF0000FF),
+    (8, 0x100F00F00F00F00F),
+    (4, 0x10C30C30C30C30C3),
+    (2, 0x1249249249249249),
+)
+
+
+def order(center: FloatArray) -> NDArray[np.intp]:
+    """The order of points along the Morton curve of their bounding box, whose axes are each cut into 2 ** BITS cells.
+
+    Points of one cell keep their order.
+
+    Args:
+        center: (N, 3) finite coordinates.
+
+    Returns:
+        (N,) indices.
+    """
+    cells = np.zeros(center.shape, np.uint32)
+    for axis in range(3) if len(center) else ():
+        column = center[:, axis].astype(np.float64)
+        low, extent = column.min(), np.ptp(column)
+        if extent > 0:
+            cells[:, axis] = np.minimum((column - low) / extent * 2**BITS, 2**BITS - 1)
+    return order_of_cells(cells)
+
+
+def order_of_cells(cells: NDArray[np.unsignedinteger[Any]]) -> NDArray[np.intp]:
+    """The order of points by the numbers of their cells along each axis.
+
+    The curve takes the bits of z, y and x in turns, z first. Points of one cell keep their order.
+
+    Args:
+        cells: (N, 3) numbers below 2 ** BITS.
+
+    Returns:
+        (N,) indices.
+    """
+    codes = np.zeros(len(cells), np.uint64)
+    for axis in range(3):
+        codes |= _spread(cells[:, axis].astype(np.uint64)) << np.uint64(axis)
+    return np.argsort(codes, kind="stable")
+
+
+def _spread(words: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """Words of `BITS` bits with two zeros between any two of these."""
+    for places, kept in _SPREADING:
+        words = (words | words << np.uint64(places)) & np.uint64(kept)
+    return words
