@@ -35,8 +35,9 @@ class Format:
         companions: its files refer to others beside them; `decode` and `stream` take another argument, `beside`, which
             opens those.
         folders: those may be in folders there.
-        detailed: its files have several detail levels, and its module `decode_levels`, which takes what `decode` takes
-            and gives a `DetailScene`.
+        detailed: its files have several detail levels. Its module also has `decode_levels`, which takes what `decode`
+            takes and gives a `DetailScene`, and `encode_files(scene, options, settings, *, threads, progress)`, which
+            gives the names and contents of the files of one.
         selective: its module also has `examine(file, *, columns, threads, progress) -> Scene`, which decodes only some
             columns and accepts a broken tree; `beside`, too, where it has companions.
     """

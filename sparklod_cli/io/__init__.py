@@ -2,6 +2,7 @@
 
 from .beside import companions
 from .chunks import read_rad_chunk, read_rad_header
+from .details import detail_files, detail_sink
 from .identity import Identity, content_of, files_of, identity_of
 from .names import is_file_name
 from .rad_file import RadFile
@@ -24,6 +25,8 @@ __all__ = [
     "chunk_files",
     "companions",
     "content_of",
+    "detail_files",
+    "detail_sink",
     "examine_scene",
     "files_of",
     "identity_of",

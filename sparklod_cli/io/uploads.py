@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 from ..support.addresses import Address
 from ..support.errors import OutputError
@@ -63,11 +63,30 @@ def upload_together(address: Address, files: Iterable[tuple[str, Iterable[bytes]
         OutputError: a file exists and `overwrite` is not set, or one cannot be sent.
     """
     check_together(address, overwrite=overwrite)
-    former, sent, size = chunks_at(address), list[Address](), 0
+    placed = ((address.name if number_of(name, address.name) is None else name, pieces) for name, pieces in files)
+    return send_together(address, placed, former=chunks_at(address), overwrite=overwrite)
+
+
+def send_together(
+    address: Address, files: Iterable[tuple[str, Iterable[bytes]]], *, former: Sequence[Address], overwrite: bool
+) -> int:
+    """As `upload_together`, of files with any names.
+
+    Args:
+        address: of the file that names the others.
+        files: names, with the folders that they are in there, and contents; the last is that of `address`.
+        former: files of a former output, which are removed where no new one has their name.
+        overwrite: replace the file at `address`.
+
+    Raises:
+        OutputError: as `upload_together`.
+    """
+    check_address(address, overwrite=overwrite)
+    sent, size = list[Address](), 0
     try:
         address.unlink(missing_ok=True)
         for name, pieces in files:
-            place = address if number_of(name, address.name) is None else address.parent / name
+            place = address if name == address.name else address.parent / name
             sent.append(place)
             size += place.write(pieces)
         for outdated in former:

@@ -2,7 +2,7 @@
 
 They are filled and synced in a hidden folder beside their places, which is locked while its writer is alive, so that
 the next run can recognise and remove what a killed one left behind. Only then do they get their names, the one that the
-others mean nothing without last.
+others mean nothing without last. Names may have folders, which are made then.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import os
 import shutil
 import stat
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from . import atomic, leftovers
 
@@ -28,43 +28,74 @@ def write(
     overwrite: bool,
     outdated: Callable[[Collection[str]], Iterable[str]] = lambda names: (),
 ) -> int:
-    """Writes files of one folder that appear together, and returns their size in bytes.
+    """Writes files of one folder, and of folders there, that appear together; returns their size in bytes.
 
     The last file is the one that readers open first. Where files are replaced, that one is taken away before any other
     is touched, and is the last to get its name: for that time, some milliseconds, there is none. An error or an
     interrupt at any time leaves the former files; a kill within these milliseconds leaves new ones without the last.
+    A folder that a removed file leaves empty is removed, too, and other files in it are not touched.
 
     Permissions are those of `atomic.write`.
 
     Args:
         folder: of all files.
-        files: the name of each, and its content in order.
+        files: the name of each, with the folders that it is in there ("0_0/means_l.webp"), and its content in order.
         overwrite: replace existing files.
         outdated: given the names of the files, those of existing files that are removed where `overwrite` is set.
 
     Raises:
-        FileExistsError: a file exists, and `overwrite` is not set; has its path.
+        FileExistsError: a file exists, and `overwrite` is not set; or what is to be a folder is something else, such as
+            a link. It has the path.
         OSError: the file system reported an error.
     """
     leftovers.sweep(folder)
     with _stage(folder) as stage:
         size, names = 0, list[str]()
         for name, pieces in files:
+            (stage / name).parent.mkdir(parents=True, exist_ok=True)
             with (stage / name).open("xb") as file:
                 size += atomic.fill(file, pieces)
             names.append(name)
+        folders = _folders_of(names)
+        new = [each for each in folders if not os.path.lexists(folder / each)]
         try:
+            _refuse_no_folders(folder / each for each in folders)
+            gone = list[str]()
             if overwrite:
+                gone = list(outdated(names))
                 (stage / FORMER).mkdir()
-                _put_aside(stage, [*names[-1:], *names[:-1], *outdated(names)])
+                _put_aside(stage, [*names[-1:], *names[:-1], *gone])
             else:
                 _refuse_existing(folder / name for name in names)
+            for each in folders:
+                (folder / each).mkdir(exist_ok=True)
             for name in names:
                 atomic.rename(stage / name, folder / name, overwrite)
+            _remove_empty(folder / each for each in _folders_of(gone))
         except BaseException:
             _undo(stage, names)
+            _remove_empty(folder / each for each in new)
             raise
     return size
+
+
+def _folders_of(names: Iterable[str]) -> list[str]:
+    """The folders that files are in, by their names, those first that others are in."""
+    found = {str(parent) for name in names for parent in PurePosixPath(name).parents if parent.name}
+    return sorted(found, key=lambda folder: (folder.count("/"), folder))
+
+
+def _remove_empty(folders: Iterable[Path]) -> None:
+    """Removes folders that have nothing in them."""
+    for folder in reversed(list(folders)):
+        with contextlib.suppress(OSError):
+            folder.rmdir()
+
+
+def _refuse_no_folders(paths: Iterable[Path]) -> None:
+    for path in paths:
+        if path.is_symlink() or (path.exists() and not path.is_dir()):
+            raise FileExistsError(errno.EEXIST, "is not a folder", str(path))
 
 
 def _refuse_existing(paths: Iterable[Path]) -> None:
@@ -83,6 +114,7 @@ def _put_aside(stage: Path, names: Sequence[str]) -> None:
                 raise FileExistsError(errno.EEXIST, "is not a file", str(former))
             if part.exists():
                 part.chmod(stat.S_IMODE(mode) & 0o777)
+            (stage / FORMER / name).parent.mkdir(parents=True, exist_ok=True)
             former.rename(stage / FORMER / name)
 
 
@@ -93,14 +125,15 @@ def _undo(stage: Path, names: Sequence[str]) -> None:
     """
     for name in reversed(names):
         path, part = stage.parent / name, stage / name
-        with contextlib.suppress(FileNotFoundError):
+        with contextlib.suppress(FileNotFoundError, NotADirectoryError):
             if not part.exists() or path.samefile(part):
                 path.unlink()
     former = stage / FORMER
-    if former.exists():
-        last = names[-1:]
-        for path in sorted(former.iterdir(), key=lambda path: path.name in last):
-            path.replace(stage.parent / path.name)
+    found = {path.relative_to(former).as_posix(): path for path in former.rglob("*") if not path.is_dir()}
+    for name in sorted(found, key=lambda name: name in names[-1:]):
+        target = stage.parent / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        found[name].replace(target)
 
 
 @contextlib.contextmanager

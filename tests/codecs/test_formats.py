@@ -37,7 +37,10 @@ def test_a_codec_has_the_signatures_of_all(form: Format) -> None:
         written = {"scene": False, "options": False, "threads": True, "progress": True}
         assert parameters(codec.encode) == written | more
         assert parameters(codec.settled) == {"scene": False, "options": False}
-    assert hasattr(codec, "encode_files") == (form.unbundled is not None)
+    assert hasattr(codec, "encode_files") == (form.unbundled is not None or form.detailed)
+    assert hasattr(codec, "decode_levels") == form.detailed
+    if form.detailed:
+        assert parameters(codec.decode_levels) == parameters(codec.decode)
     assert hasattr(codec, "encoder") == hasattr(codec, "needed") == form.trees
     if form.trees:
         assert parameters(codec.needed) == {"options": False}

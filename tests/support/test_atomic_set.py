@@ -38,11 +38,18 @@ def longer(names: Collection[str]) -> list[str]:
 def put(folder: Path, *contents: dict[str, bytes]) -> None:
     for content in contents:
         for name, data in content.items():
+            (folder / name).parent.mkdir(exist_ok=True)
             (folder / name).write_bytes(data)
 
 
 def held(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in folder.iterdir()}
+    """All files in a folder and in folders there; an empty one is listed, too."""
+    found = {path.relative_to(folder).as_posix(): path for path in folder.rglob("*")}
+    return {
+        name: b"empty folder" if path.is_dir() else path.read_bytes()
+        for name, path in found.items()
+        if not path.is_dir() or not any(path.iterdir())
+    }
 
 
 @pytest.fixture(autouse=True)
@@ -171,6 +178,69 @@ def test_an_error_or_interrupt_at_any_step_leaves_what_was_there(
         assert held(folder) == before, (call, len(calls))
     expected = {("rename", True): 4, ("replace", True): 3, ("chmod", True): 3, ("link", False): 3}
     assert reached == (3 if not links and step[1] == "replace" else expected.get((step[1], existing), 0))
+
+
+#: The same in folders: one stays, one goes, one comes, and there is a file of somebody else's in one.
+OLD_FOLDERS = {"0/x": b"old 0x", "0/y": b"old 0y", "1/x": b"old 1x", "3/x": b"old 3x", "a": b"old"}
+NEW_FOLDERS = {"0/x": b"new 0x", "2/x": b"new 2x", "a": b"new"}
+OTHER_FOLDERS = {"3/notes": b"precious", "4/x": b"precious"}
+
+
+def no_more(names: Collection[str]) -> list[str]:
+    return [name for name in OLD_FOLDERS if name not in names]
+
+
+def test_folders_are_made_and_removed_with_their_files_and_no_others_are(tmp_path: Path) -> None:
+    put(tmp_path, OLD_FOLDERS, OTHER_FOLDERS)
+    atomic_set.write(tmp_path, files(NEW_FOLDERS), overwrite=True, outdated=no_more)
+    assert held(tmp_path) == NEW_FOLDERS | OTHER_FOLDERS
+    assert not (tmp_path / "1").exists()
+
+
+@pytest.mark.parametrize("after", [False, True])
+@pytest.mark.parametrize("step", [*STEPS, (Path, "mkdir"), (Path, "rmdir")], ids=lambda step: step[1])
+@pytest.mark.parametrize("existing", [False, True])
+def test_an_interrupt_at_any_step_leaves_folders_as_they_were(
+    step: tuple[object, str], existing: bool, after: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reached = 0
+    for call in range(20):
+        folder = tmp_path / str(call)
+        folder.mkdir()
+        before = OLD_FOLDERS | OTHER_FOLDERS if existing else OTHER_FOLDERS
+        put(folder, before)
+        with monkeypatch.context() as patch:
+            wrapped, calls = breaking(getattr(*step), call, after, KeyboardInterrupt())
+            patch.setattr(*step, wrapped)
+            with contextlib.suppress(KeyboardInterrupt):
+                atomic_set.write(folder, files(NEW_FOLDERS), overwrite=existing, outdated=no_more)
+                before = NEW_FOLDERS | OTHER_FOLDERS
+        if len(calls) <= call:
+            break
+        reached += 1
+        assert {name: data for name, data in held(folder).items() if not name.startswith(".sparklod-")} == before, call
+    assert reached or (step[1], existing) in {
+        ("link", True),
+        ("rename", False),
+        ("replace", False),
+        ("chmod", False),
+    } | {("rmdir", False)}
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_what_is_no_folder_is_left_alone(overwrite: bool, tmp_path: Path) -> None:
+    put(tmp_path, {"2": b"precious", "elsewhere/x": b"precious"})
+    before = held(tmp_path)
+    with pytest.raises(FileExistsError, match="is not a folder") as raised:
+        atomic_set.write(tmp_path, files(NEW_FOLDERS), overwrite=overwrite, outdated=no_more)
+    assert raised.value.filename == str(tmp_path / "2")
+    (tmp_path / "2").rename(tmp_path / "moved")
+    (tmp_path / "2").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(FileExistsError, match="is not a folder"):
+        atomic_set.write(tmp_path, files(NEW_FOLDERS), overwrite=overwrite, outdated=no_more)
+    (tmp_path / "2").unlink()
+    (tmp_path / "moved").rename(tmp_path / "2")
+    assert held(tmp_path) == before
 
 
 @pytest.mark.parametrize("mask", [0o022, 0o077])

@@ -8,4 +8,6 @@ from __future__ import annotations
 from .reading import decode as decode
 from .reading import decode_levels as decode_levels
 from .reading import stream as stream
+
 # from .writing import encode_files as encode_files
+from .writing import encode_files as encode_files

@@ -5,14 +5,15 @@ from __future__ import annotations
 import re
 from collections.abc import Collection
 
-#: The manifest, and what begins the files of an unpacked SOG.
-MANIFEST, META = "lod-meta.json", "meta.json"
+from ..sog.names import META, number_of
+
+#: The name of a manifest.
+MANIFEST = "lod-meta.json"
 
 #: The folder of the environment.
 ENVIRONMENT = "env"
 
 _CHUNK = re.compile(r"(?:0|[1-9]\d{0,8})_(?:0|[1-9]\d{0,8})", re.ASCII)
-_IMAGE = re.compile(r"\w+\.webp", re.ASCII)
 
 
 def chunk_name(level: int, number: int) -> str:
@@ -23,7 +24,7 @@ def chunk_name(level: int, number: int) -> str:
 def is_ours(name: str) -> bool:
     """Whether a file could be of an output: a file of an unpacked SOG, in the folder of a chunk or the environment."""
     folder, _, file = name.partition("/")
-    return is_folder(folder) and (file == META or _IMAGE.fullmatch(file) is not None)
+    return is_folder(folder) and (file == META or number_of(file) is not None)
 
 
 def is_folder(name: str) -> bool:

@@ -54,8 +54,8 @@ def _tree(nodes: tuple[ManifestNode, ...]) -> str:
 
 
 def _text(rounding: decimal.Context, number: float) -> str:
-    """A number of a bound, rounded to one side."""
-    return f"{float(rounding.create_decimal_from_float(number)):.{DIGITS}g}"
+    """A number of a bound, rounded to one side; one that has few enough digits stays as it is."""
+    return f"{float(rounding.create_decimal(repr(number))):.{DIGITS}g}"
 
 
 def _list(texts: Any) -> str:

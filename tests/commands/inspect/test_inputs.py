@@ -35,7 +35,8 @@ def test_an_unpacked_sog_counts_as_one_file(tmp_path: Path, capsys: Said) -> Non
     assert inspect(broken, tmp_path, "--check") == 3
     assert capsys.readouterr().out.splitlines() == [
         f"{broken}: error: container.corrupt: 'quats.webp', which it names, cannot be read: no such file or directory",
-        f"{tmp_path}: error: file.unreadable: cannot be read: is a directory, without the meta.json of an unpacked SOG or a lod-meta.json",
+        f"{tmp_path}: error: file.unreadable: cannot be read: is a directory, without the meta.json of an"
+        " unpacked SOG or a lod-meta.json",
     ]
 
 

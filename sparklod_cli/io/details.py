@@ -1,0 +1,151 @@
+"""Writes the files of a Streamed SOG, a manifest and folders of chunks, so that all of them appear or none does."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import os
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from ..codecs.sog.files import MAX_META, names_beside
+from ..codecs.sog.names import META
+from ..codecs.streamed_sog.manifest import MAX_MANIFEST, parse
+from ..codecs.streamed_sog.names import chunk_name, folders_of, is_folder, is_ours
+from ..support import atomic_set
+from ..support.addresses import Address, Place
+from ..support.errors import FormatError, OutputError
+from ..support.stdin import DASH
+from .names import reason_of
+from .together import Files, SinkTogether
+from .uploads import check_address, send_together
+from .writing import check_writable
+
+#: The folder that every output has.
+FIRST = chunk_name(0, 0)
+
+
+def detail_sink(path: Place, *, overwrite: bool) -> SinkTogether:
+    """The function that writes a manifest and the files of its chunks. Fails now if they cannot be written later.
+
+    It is given names, with their folders, and contents, the manifest last, and returns the size of all. With
+    `overwrite`, the chunks of the output that was there before are replaced or removed: those files that its manifest
+    and its chunks name. A folder that is called as one of the output and is not one of the former is never touched.
+    See `atomic_set.write` for what an interruption leaves.
+
+    Args:
+        path: of the manifest; where it is a symbolic link, all files go to where that leads.
+        overwrite: replace a former output.
+
+    Raises:
+        OutputError: it is no place for several files, a folder is in the way, or see `check_writable`.
+    """
+    target = _target(path)
+    if isinstance(target, Address):
+        check_address(target, overwrite=overwrite)
+    else:
+        if path == DASH:
+            raise OutputError("standard output cannot take several files; name a file")
+        check_writable(path, overwrite=overwrite)
+        if path.exists() and not path.is_file():
+            raise OutputError(f"{path} is a pipe or a device, which cannot take several files; name a file")
+    _check_folder(target, FIRST, _former(target))
+    return functools.partial(_write, path, overwrite=overwrite)
+
+
+def detail_files(path: Path) -> list[Path]:
+    """The files beside a manifest that are called as those of an output there, whether it names them or not.
+
+    Args:
+        path: of the manifest, which need not exist.
+    """
+    target = Path(os.path.realpath(path))
+    return [target.parent / name for name in _standing(target)]
+
+
+def _write(path: Place, files: Files, *, overwrite: bool) -> int:
+    target = _target(path)
+    former = _former(target)
+
+    def placed() -> Iterator[tuple[str, Iterable[bytes]]]:
+        seen = set[str]()
+        for name, pieces in files:
+            folders = folders_of([name])
+            for folder in folders:
+                if folder not in seen:
+                    seen.add(folder)
+                    _check_folder(target, folder, former)
+            yield name if folders else target.name, pieces
+
+    if isinstance(target, Address):
+        return send_together(target, placed(), former=[target.parent / name for name in former], overwrite=overwrite)
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        return atomic_set.write(
+            target.parent,
+            placed(),
+            overwrite=overwrite,
+            outdated=lambda names: [name for name in former if name not in names],
+        )
+    except FileExistsError as error:
+        taken = Path(error.filename or target)
+        if taken.exists() and not taken.is_file():
+            raise OutputError(f"{taken} is in the way; move it away, or name another output") from None
+        raise OutputError(f"{taken} exists, add --overwrite to replace it") from None
+    except OSError as error:
+        raise OutputError(f"cannot write {path}: {reason_of(error)}") from None
+
+
+def _target(path: Place) -> Place:
+    return path if isinstance(path, Address) else Path(os.path.realpath(path))
+
+
+def _check_folder(target: Place, folder: str, former: Iterable[str]) -> None:
+    """Raises `OutputError` where a folder is not empty, and not one of the former output."""
+    if folder in folders_of(list(former)):
+        return
+    place = target.parent / folder
+    try:
+        if isinstance(place, Path) and os.path.lexists(place):
+            in_the_way = place.is_symlink() or not place.is_dir() or any(place.iterdir())
+        else:
+            in_the_way = isinstance(place, Address) and bool(place.files())
+    except OSError as error:
+        raise OutputError(f"cannot write {place}: {reason_of(error)}") from None
+    if in_the_way:
+        raise OutputError(
+            f"{place} exists, and {target.name} there does not name it; move it away, or name another output"
+        )
+
+
+def _former(target: Place) -> list[str]:
+    """The files of the output that is there, as far as its manifest and its chunks name them and they are called so."""
+    found = list[str]()
+    with contextlib.suppress(OSError, FormatError):
+        metas = parse(_content(target, MAX_MANIFEST)).names()
+        for meta in metas:
+            folder = target.parent / meta.partition("/")[0]
+            if is_ours(meta) and meta.endswith("/" + META) and not (isinstance(folder, Path) and folder.is_symlink()):
+                found.append(meta)
+                with contextlib.suppress(OSError):
+                    images = names_beside(_content(target.parent / meta, MAX_META))
+                    found += [name for name in (meta.removesuffix(META) + image for image in images) if is_ours(name)]
+    standing = set(_standing(target))
+    return [name for name in dict.fromkeys(found) if name in standing]
+
+
+def _content(path: Place, most: int) -> bytes:
+    with path.open("rb") as file:
+        return file.read(most + 1)
+
+
+def _standing(target: Place) -> list[str]:
+    """The files in folders beside a manifest that are called as those of an output."""
+    if isinstance(target, Address):
+        return sorted(name for name in target.parent.files() if is_ours(name))
+    found = list[str]()
+    with contextlib.suppress(OSError):
+        for folder in target.parent.iterdir():
+            if is_folder(folder.name) and folder.is_dir() and not folder.is_symlink():
+                found += [f"{folder.name}/{file.name}" for file in folder.iterdir()]
+    return sorted(name for name in found if is_ours(name))
