@@ -281,7 +281,7 @@ def test_other_outputs_have_no_detail(scene: Path, tmp_path: Path, capsys: pytes
         (["--environment", "b.ply"], "--environment is an option of Streamed SOG, not of SPZ"),
         (["--environment-beyond", "3"], "--environment-beyond is an option of Streamed SOG, not of SPZ"),
         (["-o", MANIFEST, "--spz-version", "2"], "--spz-version is an option of SPZ, not of Streamed SOG"),
-        (["-o", MANIFEST, "--cluster-sh", "9"], "--cluster-sh is an option of RAD, not of Streamed SOG"),
+        (["-o", MANIFEST, "--rad-sh", "f16"], "--rad-sh is an option of RAD, not of Streamed SOG"),
         (["-o", MANIFEST, "--compression-level", "9"], "is an option of SPZ and RAD, not of Streamed SOG"),
         (["-o", MANIFEST, "--base", "1.2"], "--base is an option of --method quick, not of quality"),
         (["-o", MANIFEST, "--method", "quick", "--growth", "1.2"], "an option of --method quality, not of quick"),
