@@ -24,6 +24,9 @@ MAX_D, MAX_COLOR = f32(5), f32(65504)
 #: The key of a splat that is not drawn; it is sorted behind all others.
 NOT_DRAWN = np.uint64(0xFFFFFFFFFFFFFFFF)
 
+#: The distance of a splat that is not drawn.
+NOT_SEEN = f32(-1)
+
 #: The largest index in a key, whose lower half it is.
 MAX_INDEX = 0xFFFFFFFF
 
@@ -89,111 +92,127 @@ class Limits(NamedTuple):
     max_radius: Any
 
 
-@kernel(parallel=True)
-def project(splats, world_to_camera, lens, limits, radial, screen, keys):
-    """Splats on the screen, as Spark's vertex shader projects them.
+@kernel(inline=True)
+def project_splat(splats, i, world_to_camera, lens, limits, radial, row):
+    """A splat on the screen, as Spark's vertex shader projects it.
 
     Args:
         splats: `ShadedColumns`.
+        i: which of them.
         world_to_camera: (3, 4) float32; the camera looks along z, with y down.
         lens: `Lens`.
         limits: `Limits`.
         radial: splats are sorted by distance from the camera, not by depth.
+        row: (COLUMNS,) float32, filled if the splat is drawn.
+
+    Returns:
+        float32 distance to sort by, world units; NOT_SEEN if the splat is not drawn.
+    """
+    center, scale, quat, lod_opacity, rgb = splats
+    m = world_to_camera
+    d = min(lod_opacity[i], MAX_D)
+    x, y, z = center[i, 0], center[i, 1], center[i, 2]
+    u = m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]
+    v = m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]
+    w = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
+    if not (w > limits.near and w < limits.far and d >= limits.min_alpha):
+        return NOT_SEEN
+    inverse = f32(1) / w
+    dx, dy = lens.focal_x * u * inverse, lens.focal_y * v * inverse
+    half_width, half_height = f32(0.5) * lens.width, f32(0.5) * lens.height
+    if abs(lens.principal_x + dx - half_width) > limits.clip * half_width or (
+        abs(lens.principal_y + dy - half_height) > limits.clip * half_height
+    ):
+        return NOT_SEEN
+    # T: Jacobian of the projection, times the rotation into the camera. With the splat's rotation R and scales S,
+    # the covariance on the screen is (T R S) (T R S)^T; p and q are the rows of T R S.
+    jx, jy = lens.focal_x * inverse, lens.focal_y * inverse
+    kx, ky = -dx * inverse, -dy * inverse
+    t00, t01, t02 = jx * m[0, 0] + kx * m[2, 0], jx * m[0, 1] + kx * m[2, 1], jx * m[0, 2] + kx * m[2, 2]
+    t10, t11, t12 = jy * m[1, 0] + ky * m[2, 0], jy * m[1, 1] + ky * m[2, 1], jy * m[1, 2] + ky * m[2, 2]
+    qx, qy, qz, qw = quat[i, 0], quat[i, 1], quat[i, 2], quat[i, 3]
+    one = f32(1)
+    r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation_matrix(qx, qy, qz, qw, one)
+    sx, sy, sz = scale[i, 0], scale[i, 1], scale[i, 2]
+    p0, p1, p2 = (
+        (t00 * r00 + t01 * r10 + t02 * r20) * sx,
+        (t00 * r01 + t01 * r11 + t02 * r21) * sy,
+        (t00 * r02 + t01 * r12 + t02 * r22) * sz,
+    )
+    q0, q1, q2 = (
+        (t10 * r00 + t11 * r10 + t12 * r20) * sx,
+        (t10 * r01 + t11 * r11 + t12 * r21) * sy,
+        (t10 * r02 + t11 * r12 + t12 * r22) * sz,
+    )
+    a, b, c = p0 * p0 + p1 * p1 + p2 * p2, p0 * q0 + p1 * q1 + p2 * q2, q0 * q0 + q1 * q1 + q2 * q2
+    # Determinants before and after the blur as sums of terms >= 0: for needles, a * c - b * b would cancel.
+    before = (p0 * q1 - p1 * q0) ** 2 + (p0 * q2 - p2 * q0) ** 2 + (p1 * q2 - p2 * q1) ** 2
+    det = before + limits.blur * (a + c) + limits.blur * limits.blur
+    a += limits.blur
+    c += limits.blur
+    if not (det > 0 and a < MAX_VARIANCE and c < MAX_VARIANCE):
+        return NOT_SEEN
+    deviations = limits.std_devs + limits.std_devs_per_d * max(d - one, f32(0))
+    d *= np.sqrt(before / det)
+    if not d >= limits.min_alpha:
+        return NOT_SEEN
+    row[END] = deviations * deviations
+    mean = f32(0.5) * (a + c)
+    spread = np.sqrt(max(mean * mean - det, f32(0)))
+    longest = deviations * np.sqrt(mean + spread)
+    if longest > limits.max_radius:  # each axis is shortened by itself
+        is_turned = abs(b) > LEAST_COVARIANCE
+        ax, ay = (b, mean + spread - a) if is_turned else ((one, f32(0)) if a >= c else (f32(0), one))
+        norm = one / np.sqrt(ax * ax + ay * ay)
+        ax, ay = ax * norm, ay * norm
+        # The smaller eigenvalue is determinant / larger one: mean - spread cancels for thin splats.
+        first = (limits.max_radius / deviations) ** f32(2)
+        second = min(first, det / (mean + spread))
+        a, b, c = (
+            first * ax * ax + second * ay * ay,
+            (first - second) * ax * ay,
+            first * ay * ay + second * ax * ax,
+        )
+        det = first * second
+        if not det > 0:
+            return NOT_SEEN
+    row[X] = lens.principal_x + dx
+    row[Y] = lens.principal_y + dy
+    row[A] = c / det
+    row[B] = -b / det
+    row[C] = a / det
+    row[OPACITY] = d
+    row[POWER] = linear_opacity_above_1(d, one, f32(np.e)) if d > one else one
+    for channel in range(3):
+        value = rgb[i, channel]
+        row[RED + channel] = min(value, MAX_COLOR) if value > 0 else f32(0)
+    row[HALF_WIDTH] = deviations * np.sqrt(a)
+    row[HALF_HEIGHT] = deviations * np.sqrt(c)
+    if (
+        row[X] + row[HALF_WIDTH] < 0
+        or row[X] - row[HALF_WIDTH] > lens.width
+        or row[Y] + row[HALF_HEIGHT] < 0
+        or row[Y] - row[HALF_HEIGHT] > lens.height
+    ):
+        return NOT_SEEN
+    return np.sqrt(u * u + v * v + w * w) if radial else w
+
+
+@kernel(parallel=True)
+def project(splats, world_to_camera, lens, limits, radial, screen, keys):
+    """Splats on the screen; see `project_splat`.
+
+    Args:
+        splats, world_to_camera, lens, limits, radial: of `project_splat`.
         screen: (N, COLUMNS) float32, filled for splats that are drawn.
         keys: (N,) uint64, filled with distance and index, so that they sort from near to far, and among equal
             distances the last splat is in front, as in Spark; NOT_DRAWN for splats that are not drawn.
     """
-    center, scale, quat, lod_opacity, rgb = splats
-    m = world_to_camera
-    for i in prange(len(center)):
+    for i in prange(len(splats.center)):
         keys[i] = NOT_DRAWN
-        d = min(lod_opacity[i], MAX_D)
-        x, y, z = center[i, 0], center[i, 1], center[i, 2]
-        u = m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]
-        v = m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]
-        w = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
-        if not (w > limits.near and w < limits.far and d >= limits.min_alpha):
-            continue
-        inverse = f32(1) / w
-        dx, dy = lens.focal_x * u * inverse, lens.focal_y * v * inverse
-        half_width, half_height = f32(0.5) * lens.width, f32(0.5) * lens.height
-        if abs(lens.principal_x + dx - half_width) > limits.clip * half_width or (
-            abs(lens.principal_y + dy - half_height) > limits.clip * half_height
-        ):
-            continue
-        # T: Jacobian of the projection, times the rotation into the camera. With the splat's rotation R and scales S,
-        # the covariance on the screen is (T R S) (T R S)^T; p and q are the rows of T R S.
-        jx, jy = lens.focal_x * inverse, lens.focal_y * inverse
-        kx, ky = -dx * inverse, -dy * inverse
-        t00, t01, t02 = jx * m[0, 0] + kx * m[2, 0], jx * m[0, 1] + kx * m[2, 1], jx * m[0, 2] + kx * m[2, 2]
-        t10, t11, t12 = jy * m[1, 0] + ky * m[2, 0], jy * m[1, 1] + ky * m[2, 1], jy * m[1, 2] + ky * m[2, 2]
-        qx, qy, qz, qw = quat[i, 0], quat[i, 1], quat[i, 2], quat[i, 3]
-        one = f32(1)
-        r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation_matrix(qx, qy, qz, qw, one)
-        sx, sy, sz = scale[i, 0], scale[i, 1], scale[i, 2]
-        p0, p1, p2 = (
-            (t00 * r00 + t01 * r10 + t02 * r20) * sx,
-            (t00 * r01 + t01 * r11 + t02 * r21) * sy,
-            (t00 * r02 + t01 * r12 + t02 * r22) * sz,
-        )
-        q0, q1, q2 = (
-            (t10 * r00 + t11 * r10 + t12 * r20) * sx,
-            (t10 * r01 + t11 * r11 + t12 * r21) * sy,
-            (t10 * r02 + t11 * r12 + t12 * r22) * sz,
-        )
-        a, b, c = p0 * p0 + p1 * p1 + p2 * p2, p0 * q0 + p1 * q1 + p2 * q2, q0 * q0 + q1 * q1 + q2 * q2
-        # Determinants before and after the blur as sums of terms >= 0: for needles, a * c - b * b would cancel.
-        before = (p0 * q1 - p1 * q0) ** 2 + (p0 * q2 - p2 * q0) ** 2 + (p1 * q2 - p2 * q1) ** 2
-        det = before + limits.blur * (a + c) + limits.blur * limits.blur
-        a += limits.blur
-        c += limits.blur
-        if not (det > 0 and a < MAX_VARIANCE and c < MAX_VARIANCE):
-            continue
-        deviations = limits.std_devs + limits.std_devs_per_d * max(d - one, f32(0))
-        d *= np.sqrt(before / det)
-        if not d >= limits.min_alpha:
-            continue
-        screen[i, END] = deviations * deviations
-        mean = f32(0.5) * (a + c)
-        spread = np.sqrt(max(mean * mean - det, f32(0)))
-        longest = deviations * np.sqrt(mean + spread)
-        if longest > limits.max_radius:  # each axis is shortened by itself
-            is_turned = abs(b) > LEAST_COVARIANCE
-            ax, ay = (b, mean + spread - a) if is_turned else ((one, f32(0)) if a >= c else (f32(0), one))
-            norm = one / np.sqrt(ax * ax + ay * ay)
-            ax, ay = ax * norm, ay * norm
-            # The smaller eigenvalue is determinant / larger one: mean - spread cancels for thin splats.
-            first = (limits.max_radius / deviations) ** f32(2)
-            second = min(first, det / (mean + spread))
-            a, b, c = (
-                first * ax * ax + second * ay * ay,
-                (first - second) * ax * ay,
-                first * ay * ay + second * ax * ax,
-            )
-            det = first * second
-            if not det > 0:
-                continue
-        screen[i, X] = lens.principal_x + dx
-        screen[i, Y] = lens.principal_y + dy
-        screen[i, A] = c / det
-        screen[i, B] = -b / det
-        screen[i, C] = a / det
-        screen[i, OPACITY] = d
-        screen[i, POWER] = linear_opacity_above_1(d, one, f32(np.e)) if d > one else one
-        for channel in range(3):
-            value = rgb[i, channel]
-            screen[i, RED + channel] = min(value, MAX_COLOR) if value > 0 else f32(0)
-        screen[i, HALF_WIDTH] = deviations * np.sqrt(a)
-        screen[i, HALF_HEIGHT] = deviations * np.sqrt(c)
-        if (
-            screen[i, X] + screen[i, HALF_WIDTH] < 0
-            or screen[i, X] - screen[i, HALF_WIDTH] > lens.width
-            or screen[i, Y] + screen[i, HALF_HEIGHT] < 0
-            or screen[i, Y] - screen[i, HALF_HEIGHT] > lens.height
-        ):
-            continue
-        depth = np.sqrt(u * u + v * v + w * w) if radial else w
-        keys[i] = (np.uint64(np.float32(depth).view(np.uint32)) << np.uint64(32)) | np.uint64(MAX_INDEX - i)
+        depth = project_splat(splats, i, world_to_camera, lens, limits, radial, screen[i])
+        if depth >= 0:
+            keys[i] = (np.uint64(np.float32(depth).view(np.uint32)) << np.uint64(32)) | np.uint64(MAX_INDEX - i)
 
 
 @kernel(parallel=True)

@@ -131,6 +131,36 @@ def is_opaque(pixels, rows, columns):
     return most < OPAQUE
 
 
+@kernel(inline=True)
+def draw_tile(screen, start, splats, tile, across, design, least, image):
+    """Blends the splats of a tile, from near to far; see `draw_tiles`."""
+    height, width = image.shape[:2]
+    left, top = tile % across * TILE, tile // across * TILE
+    pixels = np.zeros((TILE, TILE // LANES, 4, LANES), np.float32)
+    pixels[:, :, 0] = 1
+    rows = min(TILE, height - top)
+    columns = min(TILE, width - left)
+    for entry in range(start[tile], start[tile + 1]):
+        row = screen[splats[entry]]
+        x, y = row[X] - f32(left) - f32(0.5), row[Y] - f32(top) - f32(0.5)
+        first = max(0, math.ceil(y - row[HALF_HEIGHT]))
+        last = min(rows, math.floor(y + row[HALF_HEIGHT]) + 1)
+        begin = max(0, math.ceil(x - row[HALF_WIDTH])) // LANES
+        end = (min(columns, math.floor(x + row[HALF_WIDTH]) + 1) + LANES - 1) // LANES
+        for line in range(first, last):
+            for block in range(begin, end):
+                blend_lanes(pixels[line, block], row, x - f32(LANES * block), f32(line) - y, design, least)
+        if (entry - start[tile]) % CHECK_EVERY == CHECK_EVERY - 1 and is_opaque(pixels, rows, columns):
+            break
+    for line in range(rows):
+        for i in range(columns):
+            lanes = pixels[line, i // LANES]
+            image[top + line, left + i, 0] = lanes[1, i % LANES]
+            image[top + line, left + i, 1] = lanes[2, i % LANES]
+            image[top + line, left + i, 2] = lanes[3, i % LANES]
+            image[top + line, left + i, 3] = f32(1) - lanes[0, i % LANES]
+
+
 @kernel(parallel=True, contract=True)
 def draw_tiles(screen, start, splats, across, down, design, least, image):
     """Blends the splats of each tile, from near to far.
@@ -142,29 +172,5 @@ def draw_tiles(screen, start, splats, across, down, design, least, image):
         least: float32, least alpha that is drawn.
         image: (height, width, 4) float32, filled: red, green and blue, premultiplied by alpha, and alpha.
     """
-    height, width = image.shape[:2]
     for tile in prange(across * down):
-        left, top = tile % across * TILE, tile // across * TILE
-        pixels = np.zeros((TILE, TILE // LANES, 4, LANES), np.float32)
-        pixels[:, :, 0] = 1
-        rows = min(TILE, height - top)
-        columns = min(TILE, width - left)
-        for entry in range(start[tile], start[tile + 1]):
-            row = screen[splats[entry]]
-            x, y = row[X] - f32(left) - f32(0.5), row[Y] - f32(top) - f32(0.5)
-            first = max(0, math.ceil(y - row[HALF_HEIGHT]))
-            last = min(rows, math.floor(y + row[HALF_HEIGHT]) + 1)
-            begin = max(0, math.ceil(x - row[HALF_WIDTH])) // LANES
-            end = (min(columns, math.floor(x + row[HALF_WIDTH]) + 1) + LANES - 1) // LANES
-            for line in range(first, last):
-                for block in range(begin, end):
-                    blend_lanes(pixels[line, block], row, x - f32(LANES * block), f32(line) - y, design, least)
-            if (entry - start[tile]) % CHECK_EVERY == CHECK_EVERY - 1 and is_opaque(pixels, rows, columns):
-                break
-        for line in range(rows):
-            for i in range(columns):
-                lanes = pixels[line, i // LANES]
-                image[top + line, left + i, 0] = lanes[1, i % LANES]
-                image[top + line, left + i, 1] = lanes[2, i % LANES]
-                image[top + line, left + i, 2] = lanes[3, i % LANES]
-                image[top + line, left + i, 3] = f32(1) - lanes[0, i % LANES]
+        draw_tile(screen, start, splats, tile, across, design, least, image)

@@ -1,0 +1,135 @@
+"""The errors of regions at their detail levels, measured on pictures.
+
+As splat-transform 3.7 measures them, so that its numbers and ours mean the same: each region is drawn alone from six
+directions, from so far away that the pictures have next to no perspective. An error is the squared difference to the
+pictures of the first level, of colours premultiplied by alpha and of alpha, divided by the squares of those; the same
+for a region of any size and place. See docs/decisions/2026-11-22-errors-of-regions.md.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..cameras.pose import rotation_of
+from ..model.detail import DetailScene
+from ..model.gaussian import lod_opacity
+from ..model.sh import degree_of
+from ..render.kernels.project import Limits, ShadedColumns
+from ..render.kernels.raster import TILE
+from ..render.kernels.region_errors import compare_levels
+from ..render.kernels.shade import add_sh
+from ..render.settings import BLUR, CLIP, MAX_STD_DEV, MIN_ALPHA, STD_DEV_PER_D
+from ..support.progress import Progress, silent
+from ..support.threads import on_threads
+
+Errors = NDArray[np.float64]
+
+#: Rotation w x y z of the axes that regions are seen along, from both sides: 45, 20 and 35 degrees about x, y and z, as
+#: in splat-transform 3.7. Along the world's axes many spherical harmonics are 0, and errors of them would not be seen.
+TURN = (0.8877160, 0.3111847, 0.2663317, 0.2102186)
+
+#: Signs of the axes of a camera that looks back, if two of its axes are exchanged.
+BACK = np.array([[1.0], [1.0], [-1.0]])
+
+#: Distance of the camera from the middle of a region, and half the width of the picture there, in radii of the region;
+#: those of splat-transform 3.7.
+DISTANCE, HALF_WIDTH = 200.0, 1.05
+
+#: Least and largest width of a picture, pixels.
+LEAST_WIDTH, MOST_WIDTH = 64, 128
+
+#: Pixels across the diameter of the small splats of a region: these are its FINE quantile by their longest axis.
+PIXELS, FINE = 4, 0.1
+
+#: Splats of a region that these are found from.
+SAMPLE = 4096
+
+#: Splats whose pictures are drawn between two reports of progress.
+BATCH = 1 << 21
+
+
+def measured(scene: DetailScene, *, threads: int | None = None, progress: Progress = silent) -> Errors:
+    """(R, L) float64 error of each region at each detail level.
+
+    0 at the first level that a region has, not decreasing, and the same for any number of threads. A level that a
+    region lacks has the error of the level before.
+
+    Args:
+        scene: its errors are not read.
+        threads: None for all processors.
+        progress: told of the regions.
+    """
+    order = np.argsort(scene.counts == 0, axis=1, kind="stable")  # levels that have splats come first
+    runs = np.take_along_axis(np.stack([scene.starts, scene.counts], 2), order[:, :, None], 1)
+    sums = _differences(scene, runs, threads, progress)
+    energy = sums[:, :1].copy()
+    sums[:, 0] = 0
+    # Where the first level cannot be seen, a level that can be seen is wrong altogether.
+    errors = np.where(energy > 0, sums / np.where(energy > 0, energy, 1), (sums > 0).astype(np.float64))
+    found = np.zeros_like(errors)
+    np.put_along_axis(found, order, errors, 1)
+    return np.maximum.accumulate(found, axis=1)
+
+
+def _differences(
+    scene: DetailScene, runs: NDArray[np.int64], threads: int | None, progress: Progress
+) -> NDArray[np.float64]:
+    """(R, L) sums of `compare_levels` over all views, level by level as in `runs`."""
+    splats = scene.splats
+    columns = ShadedColumns(
+        splats.center, splats.scale, splats.quat_xyzw, lod_opacity(splats.opacity), splats.rgb
+    )
+    turns = _turns()
+    poses, basis, widths = _poses(scene.bounds, turns), _basis(turns, splats.sh.shape[1]), _widths(scene, runs)
+    numbers = DISTANCE / 2, 2 * DISTANCE, CLIP, BLUR, MIN_ALPHA, MAX_STD_DEV, STD_DEV_PER_D, math.inf
+    limits, focal = Limits(*map(np.float32, numbers)), np.float32(DISTANCE / (2 * HALF_WIDTH))
+    sums = np.zeros((scene.regions, len(turns), scene.levels))
+    ends = np.cumsum(scene.counts.sum(axis=1)) // BATCH
+    batches = np.split(np.arange(scene.regions), np.flatnonzero(np.diff(ends)) + 1)
+    with on_threads(threads):
+        for batch in batches:
+            part = slice(int(batch[0]), int(batch[-1]) + 1)
+            compare_levels(columns, splats.sh, runs[part], poses[part], basis, widths[part], focal, limits, sums[part])
+            progress("errors", part.stop, scene.regions, "region")
+    return sums.sum(axis=1)
+
+
+def _turns() -> NDArray[np.float64]:
+    """(6, 3, 3) rotations from the world to cameras that look along z, with y down: along each axis, then back."""
+    axes = rotation_of(TURN).T
+    return np.array(
+        [turn for a, b, c in ((0, 1, 2), (1, 2, 0), (2, 0, 1)) for turn in (axes[[b, c, a]], axes[[c, b, a]] * BACK)]
+    )
+
+
+def _poses(bounds: NDArray[np.float64], turns: NDArray[np.float64]) -> NDArray[np.float32]:
+    """(R, 6, 3, 4) world to camera, in radii of each region, whose middle is DISTANCE in front of the camera."""
+    radius = np.linalg.norm(bounds[:, 1] - bounds[:, 0], axis=1) / 2
+    matrices = turns / np.where(radius > 0, radius, 1)[:, None, None, None]
+    offsets = -np.einsum("rvij,rj->rvi", matrices, bounds.mean(axis=1)) + [0, 0, DISTANCE]
+    return np.concatenate([matrices, offsets[..., None]], axis=3).astype(np.float32)
+
+
+def _basis(turns: NDArray[np.float64], coefficients: int) -> NDArray[np.float32]:
+    """(6, K) values of the spherical harmonics of degree 1 and above in the direction of each view."""
+    basis = np.zeros((len(turns), coefficients, 3), np.float32)
+    ones = np.repeat(np.eye(coefficients, dtype=np.float32)[:, :, None], 3, axis=2)
+    if coefficients:
+        for turn, values in zip(turns, basis, strict=True):
+            ahead = np.tile(turn[2].astype(np.float32), (coefficients, 1))
+            add_sh(ahead, ones, np.zeros(3, np.float32), degree_of(coefficients), values)
+    return np.ascontiguousarray(basis[:, :, 0])
+
+
+def _widths(scene: DetailScene, runs: NDArray[np.int64]) -> NDArray[np.int64]:
+    """(R,) widths of the pictures of each region, pixels: so that small splats of its first level can be seen."""
+    diameter = np.linalg.norm(scene.bounds[:, 1] - scene.bounds[:, 0], axis=1)
+    wanted = np.empty(scene.regions)
+    for region, (start, count) in enumerate(runs[:, 0]):
+        longest = scene.splats.scale[start : start + count : max(1, count // SAMPLE)].max(axis=1)
+        small = 2 * float(np.quantile(longest, FINE)) if len(longest) else 0.0
+        wanted[region] = PIXELS * diameter[region] / small if small > 0 else MOST_WIDTH
+    return (np.ceil(np.clip(wanted, LEAST_WIDTH, MOST_WIDTH) / TILE) * TILE).astype(np.int64)

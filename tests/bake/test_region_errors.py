@@ -1,0 +1,167 @@
+"""Errors of regions at their detail levels: laws, and the pictures that they are of."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from sparklod_cli.bake import region_errors
+from sparklod_cli.bake.region_errors import measured
+from sparklod_cli.cameras.camera import Camera
+from sparklod_cli.model.detail import DetailScene
+from sparklod_cli.model.gaussian import covariance
+from sparklod_cli.model.splats import Splats
+from sparklod_cli.render import rasterizer
+from sparklod_cli.render.settings import RasterSettings
+from sparklod_cli.render.shading import shade
+
+
+def cloud(count: int, seed: int, sh_degree: int = 1) -> Splats:
+    """Splats of all kinds in a box of about 4 units."""
+    rng = np.random.default_rng(seed)
+    splats = Splats.empty(count, sh_degree)
+    splats.center[:] = rng.uniform(-2, 2, (count, 3))
+    splats.scale[:] = np.exp(rng.normal(-2.5, 0.7, (count, 3)))
+    quat = rng.normal(size=(count, 4))
+    splats.quat_xyzw[:] = quat / np.linalg.norm(quat, axis=1)[:, None]
+    splats.opacity[:] = rng.uniform(0.05, 1, count)
+    splats.rgb[:] = rng.uniform(0, 1, (count, 3))
+    splats.sh[:] = rng.normal(0, 0.1, splats.sh.shape)
+    return splats
+
+
+def scene_of(regions: Sequence[Sequence[Splats]]) -> DetailScene:
+    """A scene of regions, each a list of its levels."""
+    levels = range(len(regions[0]))
+    counts = np.array([[len(run) for run in region] for region in regions], np.int64)
+    bounds = np.array([bound(Splats.concat(region)) for region in regions])
+    children = np.array([[-1 - r, r + 1 if r + 2 < len(regions) else -2 - r] for r in range(len(regions) - 1)], np.int64)
+    splats = Splats.concat([region[level] for level in levels for region in regions])
+    return DetailScene(splats, counts, bounds, children.reshape(-1, 2))
+
+
+def bound(splats: Splats) -> NDArray[np.float64]:
+    half = np.sqrt(covariance(splats.scale, splats.quat_xyzw)[:, [0, 3, 5]])
+    return np.array([(splats.center - half).min(axis=0), (splats.center + half).max(axis=0)])
+
+
+def moved(splats: Splats, scale: float, offset: Sequence[float]) -> Splats:
+    center = (splats.center * np.float64(scale) + offset).astype(np.float32)
+    return dataclasses.replace(splats, center=center, scale=(splats.scale * scale).astype(np.float32))
+
+
+@pytest.fixture(scope="module")
+def regions() -> list[list[Splats]]:
+    """Three regions at four levels: all splats, and each time fewer."""
+    full = [cloud(count, seed) for seed, count in enumerate((300, 40, 900))]
+    return [[splats.take(slice(0, None, step)) for step in (1, 2, 3, 20)] for splats in full]
+
+
+@pytest.fixture(scope="module")
+def errors(regions: list[list[Splats]]) -> NDArray[np.float64]:
+    return measured(scene_of(regions), threads=1)
+
+
+def test_errors_begin_with_0_and_do_not_decrease(errors: NDArray[np.float64]) -> None:
+    assert errors.shape == (3, 4)
+    assert (errors[:, 0] == 0).all()
+    assert (errors[:, 1] > 0.01).all()
+    assert (np.diff(errors, axis=1) >= 0).all()
+    assert np.isfinite(errors).all()
+
+
+def test_levels_with_the_same_splats_have_no_error() -> None:
+    splats = cloud(200, 3)
+    assert measured(scene_of([[splats, splats, splats]]), threads=1).tolist() == [[0, 0, 0]]
+
+
+def test_an_error_is_that_of_pictures_of_the_rasterizer(regions: list[list[Splats]], errors: NDArray[np.float64]) -> None:
+    """The slow, obvious way: each region at each level as a scene, seen by cameras."""
+    turns = region_errors._turns()
+    for region, expected in zip(regions, errors, strict=True):
+        low, high = bound(Splats.concat(region))
+        middle, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
+        small = np.quantile(region[0].scale.max(axis=1), region_errors.FINE)
+        width = int(np.ceil(np.clip(4 * radius / small, 64, region_errors.MOST_WIDTH) / 16) * 16)
+        focal = width * 200 / 2.1
+        settings = RasterSettings(near=100 * radius, far=400 * radius, sort="z", max_radius=1e6)
+        sums = np.zeros(len(region))
+        for right, down, ahead in turns:
+            pose = np.eye(4)
+            pose[:3] = np.stack([right, -down, -ahead, middle - 200 * radius * ahead], axis=1)
+            camera = Camera(pose, width, width, (focal, focal), (width / 2, width / 2))
+            pictures = [
+                rasterizer.draw(shade([(run, np.eye(4))], camera), camera, settings).astype(np.float64)
+                for run in region
+            ]
+            sums += [(pictures[0] ** 2).sum(), *(((other - pictures[0]) ** 2).sum() for other in pictures[1:])]
+        np.testing.assert_allclose(expected[1:], np.maximum.accumulate(sums[1:] / sums[0]), rtol=0.01)
+
+
+def test_views_are_at_right_angles_and_see_every_harmonic() -> None:
+    turns = region_errors._turns()
+    np.testing.assert_allclose(turns @ turns.transpose(0, 2, 1), np.tile(np.eye(3), (6, 1, 1)), atol=1e-6)
+    np.testing.assert_allclose(np.linalg.det(turns), 1, atol=1e-6)
+    ahead = turns[:, 2]
+    np.testing.assert_allclose(ahead.sum(axis=0), 0, atol=1e-6)
+    assert np.linalg.matrix_rank(ahead) == 3
+    assert abs(region_errors._basis(turns, 15)).min() > 0.05
+
+
+@pytest.mark.parametrize(("scale", "offset"), [(1e-3, (0, 0, 0)), (300.0, (0, 0, 0)), (1.0, (50, -80, 20))])
+def test_size_and_place_of_a_region_do_not_matter(
+    regions: list[list[Splats]], errors: NDArray[np.float64], scale: float, offset: Sequence[float]
+) -> None:
+    other = [[moved(run, scale, offset) for run in region] for region in regions]
+    np.testing.assert_allclose(measured(scene_of(other), threads=1), errors, rtol=2e-3)
+
+
+def test_other_regions_do_not_matter(regions: list[list[Splats]], errors: NDArray[np.float64]) -> None:
+    alone = [measured(scene_of([region]), threads=1)[0] for region in regions]
+    assert np.array_equal(alone, errors)
+
+
+def test_threads_and_batches_do_not_matter(
+    regions: list[list[Splats]], errors: NDArray[np.float64], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(region_errors, "BATCH", 500)
+    steps: list[tuple[int, int]] = []
+    found = measured(scene_of(regions), threads=2, progress=lambda name, done, total, unit: steps.append((done, total)))
+    assert np.array_equal(found, errors)
+    assert steps[-1] == (3, 3)
+    assert len(steps) > 1
+
+
+def test_a_level_that_shows_nothing_is_wrong_altogether() -> None:
+    splats = cloud(100, 4)
+    hidden = dataclasses.replace(splats, opacity=np.zeros_like(splats.opacity))
+    assert measured(scene_of([[splats, hidden]]), threads=1).tolist() == [[0, 1]]
+    assert measured(scene_of([[hidden, splats]]), threads=1).tolist() == [[0, 1]]
+    assert measured(scene_of([[hidden, hidden]]), threads=1).tolist() == [[0, 0]]
+
+
+def test_a_level_that_a_region_lacks_has_the_error_of_the_one_before() -> None:
+    splats = cloud(100, 5)
+    none, half = splats.take(slice(0)), splats.take(slice(0, 50))
+    full = measured(scene_of([[splats, half]]), threads=1)[0]
+    assert measured(scene_of([[splats, none, half, none]]), threads=1).tolist() == [[0, 0, full[1], full[1]]]
+    assert measured(scene_of([[none, splats, half]]), threads=1).tolist() == [[0, 0, full[1]]]
+
+
+def test_splats_without_extent_or_a_region_of_one_place() -> None:
+    splats = cloud(5, 6)
+    dots = dataclasses.replace(splats, center=np.zeros_like(splats.center), scale=np.zeros_like(splats.scale))
+    assert measured(scene_of([[dots, dots.take(slice(0, 1))]]), threads=1).tolist() == [[0, 0]]
+
+
+def test_colors_that_only_some_directions_see_count() -> None:
+    splats = cloud(100, 7, sh_degree=3)
+    for coefficient in range(15):
+        sh = splats.sh.copy()
+        sh[:, coefficient] += 0.5
+        found = measured(scene_of([[splats, dataclasses.replace(splats, sh=sh)]]), threads=1)
+        assert found[0, 1] > 1e-3
