@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from ..io import read_scene
 from ..model.selection import Selection
 from ..model.splats import Splats
@@ -44,9 +42,4 @@ def divided(splats: Splats, settings: BakeSettings) -> tuple[Splats, Splats | No
     from ..lod.environment import beyond
 
     far = beyond(splats, settings.environment_beyond)
-    if far.all():
-        raise InvalidSplatsError(
-            f"every splat is farther out than {settings.environment_beyond:g}, and none is left for the detail levels;"
-            " give a larger --environment-beyond"
-        )
-    return (splats.take(~far), splats.take(far)) if np.any(far) else (splats, None)
+    return (splats.take(~far), splats.take(far)) if far.any() else (splats, None)

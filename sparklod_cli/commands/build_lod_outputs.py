@@ -163,7 +163,7 @@ def _check_streamed_sog(ctx: click.Context, outputs: Outputs) -> None:
     if outputs.output is not None and not outputs.is_manifest:
         raise click.UsageError(
             f"{flag} writes {MANIFEST} and folders beside it, not {outputs.output.name}; name the output"
-            f" {outputs.output.with_suffix('') / MANIFEST}"
+            f" {outputs.output.parent / outputs.output.stem / MANIFEST}"
         )
     refuse(ctx, OF_SPZ, f"is an option of SPZ, not of {DETAIL}")
     refuse(ctx, OF_RAD, f"is an option of RAD, not of {DETAIL}")

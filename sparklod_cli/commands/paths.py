@@ -12,7 +12,8 @@ from typing import Any
 
 import click
 
-from ..codecs.streamed_sog.names import MANIFEST, META
+from ..codecs.sog.names import META
+from ..codecs.streamed_sog.names import MANIFEST
 from ..support.addresses import Address, Place, place_of
 from ..support.stdin import DASH
 from .console import is_terminal

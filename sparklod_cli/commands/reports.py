@@ -10,8 +10,7 @@ from ..support.units import format_size
 from .console import Console, count_of, size_of
 
 if TYPE_CHECKING:
-    from ..api.bake_jobs import Baked, Extracted
-    from ..bake.written import WrittenDetail
+    from ..api.bake_jobs import Baked, Extracted, WrittenDetail
     from ..codecs.clamps import Clamp
 
 #: What clamping does to a scene and what to do about it, by column of `Splats` and whether the upper end clamps.

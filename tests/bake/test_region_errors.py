@@ -39,7 +39,9 @@ def scene_of(regions: Sequence[Sequence[Splats]]) -> DetailScene:
     levels = range(len(regions[0]))
     counts = np.array([[len(run) for run in region] for region in regions], np.int64)
     bounds = np.array([bound(Splats.concat(region)) for region in regions])
-    children = np.array([[-1 - r, r + 1 if r + 2 < len(regions) else -2 - r] for r in range(len(regions) - 1)], np.int64)
+    children = np.array(
+        [[-1 - r, r + 1 if r + 2 < len(regions) else -2 - r] for r in range(len(regions) - 1)], np.int64
+    )
     splats = Splats.concat([region[level] for level in levels for region in regions])
     return DetailScene(splats, counts, bounds, children.reshape(-1, 2))
 
@@ -79,7 +81,9 @@ def test_levels_with_the_same_splats_have_no_error() -> None:
     assert measured(scene_of([[splats, splats, splats]]), threads=1).tolist() == [[0, 0, 0]]
 
 
-def test_an_error_is_that_of_pictures_of_the_rasterizer(regions: list[list[Splats]], errors: NDArray[np.float64]) -> None:
+def test_an_error_is_that_of_pictures_of_the_rasterizer(
+    regions: list[list[Splats]], errors: NDArray[np.float64]
+) -> None:
     """The slow, obvious way: each region at each level as a scene, seen by cameras."""
     turns = region_errors._turns()
     for region, expected in zip(regions, errors, strict=True):

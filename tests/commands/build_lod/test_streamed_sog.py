@@ -151,7 +151,7 @@ def test_an_environment_is_a_file_or_what_is_far_away(
     assert build(town, "-o", tmp_path / "none" / MANIFEST, "--environment-beyond", 1e4, "--json") == 0
     assert record_of(capsys)["detail"]["environment"] == 0
     assert build(town, "-o", tmp_path / "all" / MANIFEST, "--environment-beyond", 1e-3) == 1
-    assert "every splat is farther out than 0.001" in capsys.readouterr().err
+    assert "no splat is within 0.001 of the middle of the scene" in capsys.readouterr().err
 
 
 def test_an_environment_that_cannot_be_one_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
