@@ -68,6 +68,37 @@ def test_splat_is_sorted_by_importance(tree_file: Path, tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_scene(tmp_path / "back.splat").splats.center, expected.center)
 
 
+@pytest.mark.parametrize("name", ["back.sog", "web/meta.json"])
+def test_sog_holds_all_leaves(tree_file: Path, tmp_path: Path, name: str) -> None:
+    assert unlod(tree_file, "-o", tmp_path / name, "--cluster-sh", 3000) == 0
+    back, expected = read_scene(tmp_path / name), leaves(tree_file)
+    assert (back.format, back.antialiased, back.header["palette"]) == ("SOG 2", True, 3000)
+    for column in ("rgb", "opacity", "sh"):
+        one, two = (np.sort(getattr(each, column), axis=0) for each in (back.splats, expected))
+        np.testing.assert_allclose(one, two, atol=0.01)
+    np.testing.assert_allclose(back.splats.center.mean(axis=0), expected.center.mean(axis=0), atol=1e-4)
+
+
+def test_a_folder_of_sog_is_replaced_as_a_whole_or_not_at_all(
+    tree_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    meta = tmp_path / "web" / "meta.json"
+    meta.parent.mkdir()
+    taken = meta.with_name("sh0.webp")
+    taken.write_bytes(b"precious")
+    assert unlod(tree_file, "-o", meta) == 1
+    assert "sh0.webp exists, add --overwrite to replace it" in capsys.readouterr().err
+    assert [each.name for each in meta.parent.iterdir()] == ["sh0.webp"]
+    assert unlod(tree_file, "-o", meta, "--overwrite") == 0
+    assert meta.with_name("shN_labels.webp").exists()
+    plain = tmp_path / "plain-lod.spz"
+    plain.write_bytes(b"".join(spz.encode(Scene(*quick.build(random_splats(40))))))
+    assert unlod(plain, "-o", meta, "--overwrite") == 0
+    names = ["means_l.webp", "means_u.webp", "meta.json", "quats.webp", "scales.webp", "sh0.webp"]
+    assert sorted(each.name for each in meta.parent.iterdir()) == names  # those of SH are gone
+    assert len(read_scene(meta)) == 40
+
+
 def test_fractional_bits_and_version_can_be_chosen(tree_file: Path, tmp_path: Path) -> None:
     assert unlod(tree_file, "-o", tmp_path / "back.spz", "--spz-version", 3, "--fractional-bits", 8) == 0
     back = read_scene(tmp_path / "back.spz")

@@ -108,6 +108,17 @@ def test_where_a_link_leads_all_files_are_together(tmp_path: Path) -> None:
     assert len(chunk_files(link)) == 2
 
 
+def test_images_of_a_sog_are_those_of_its_names(tmp_path: Path) -> None:
+    for name in ("shN_labels.webp", "means_l.webp", "other.webp", "meta-0.radc", "meta.json"):
+        (tmp_path / name).write_bytes(b"x")
+    assert [path.name for path in chunk_files(tmp_path / "meta.json")] == ["means_l.webp", "shN_labels.webp"]
+    some = [("quats.webp", [b"image"]), ("meta.json", [b"{", b"}"])]
+    with pytest.raises(OutputError, match=r"meta\.json exists"):
+        write_together(tmp_path / "meta.json", some, overwrite=False)
+    assert write_together(tmp_path / "meta.json", some, overwrite=True) == 7
+    assert names(tmp_path) == ["meta-0.radc", "meta.json", "other.webp", "quats.webp"]
+
+
 def test_a_full_disk_is_an_error_that_names_the_header(tmp_path: Path) -> None:
     def full() -> Iterator[bytes]:
         yield b"chunk"

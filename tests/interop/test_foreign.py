@@ -14,6 +14,7 @@ import pytest
 
 from sparklod_cli.cli import run
 from sparklod_cli.codecs import ply, splat
+from sparklod_cli.codecs.sog import codec as sog
 from sparklod_cli.io import read_scene
 from sparklod_cli.model.splats import Splats
 from tests.conftest import FIXTURES, real_scene
@@ -27,6 +28,12 @@ Writer = Callable[[Foreign, Path, Path], Path]
 
 def by(action: str, name: str, **options: Any) -> Writer:
     return lambda foreign, source, folder: foreign.write(action, source, folder / name, **options)
+
+
+def our_folder(_: Foreign, source: Path, folder: Path) -> Path:
+    for name, content in sog.encode_files(read_scene(source)):
+        (folder / name).write_bytes(content)
+    return folder / "meta.json"
 
 
 def ours(codec: ModuleType, name: str) -> Writer:
@@ -53,6 +60,8 @@ WRITERS: dict[str, Writer] = {
     **{f"KSPLAT {level} in sections": by("ksplat", "scene.ksplat", level=level, **SECTIONS) for level in range(3)},
     "our PLY": ours(ply, "ours.ply"),
     "our SPLAT": ours(splat, "ours.splat"),
+    "our SOG": ours(sog, "ours.sog"),
+    "our unpacked SOG": our_folder,
 }
 #: Files that fixtures/make_fixtures.py writes. No available program writes SOG of version 1 or the older chunks.
 BY_HAND = [
@@ -185,7 +194,7 @@ def seen_by_spark(file: File, splats: Splats) -> Floats:
 
 def spark_can_read(writer: str | None, source: str) -> bool:
     """Whether Spark 2.2 can read it: not SPZ 4, nor several files, as its worker gets only one here."""
-    return writer not in ("SPZ 4", "unpacked SOG") and not source.endswith("meta.json")
+    return writer not in ("SPZ 4", "unpacked SOG", "our unpacked SOG") and not source.endswith("meta.json")
 
 
 @pytest.mark.parametrize("file", [row for row in FILES if spark_can_read(*row.values[0])], indirect=True)
@@ -230,7 +239,11 @@ CUT, SMALL = 2.0**-10, 2.0**-24
 SPLAT = Loss(degrees=np.degrees(2 * (np.sqrt(3) / 256 + 1 / 128)), color=1 / 510 + 1e-6, sh_degree=0)
 #: Positions are rounded to 32767 steps in half a block, colours are rounded down to bytes.
 KSPLAT = Loss(5 / 2 / 32767 / 2 + 1e-6, CUT + 1e-6, np.degrees(2 * CUT), 1 / 255 + 1e-6, sh_degree=2)
+#: Fixtures span 3.3 units, whose logarithms have 65,535 steps; books of scales and colours are nearly exact, that of SH less.
+OUR_SOG = Loss(4 / 65535, 0.01, 1.1, 0.005, sh=lambda sh: 0.05)
 LOSSES = {
+    "our SOG": OUR_SOG,
+    "our unpacked SOG": OUR_SOG,
     "our PLY": Loss(),
     "our SPLAT": SPLAT,
     "SPLAT": SPLAT,

@@ -62,7 +62,7 @@ def encode_quat(quat_xyzw: FloatArray) -> Bytes:
 def decode_quat(codes: Bytes) -> FloatArray:
     """(N, 4) bytes to (N, 4) unit quaternions x y z w; one without a tag gives NaN, an invalid splat.
 
-    Largest error: 0.55 degrees of rotation.
+    Largest error: 1.1 degrees of rotation.
     """
     others = [(codes[:, k].astype(np.float32) / np.float32(127.5) - 1) * np.float32(np.sqrt(0.5)) for k in range(3)]
     tag = codes[:, 3]

@@ -87,9 +87,13 @@ class Meta:
             values = [rest[0] + (rest[0] - rest[-1]) / (count - 1), *rest]
         return np.array([_finite(value, way) for value in values])
 
-    def flag(self, *way: str | int) -> bool:
-        """True or false."""
-        return self._get(*way) is True
+    def is_true(self, key: str) -> bool:
+        """Whether there is such a key at the top level, and it is true."""
+        return self.root.get(key) is True
+
+    def is_text(self, key: str, text: str) -> bool:
+        """Whether there is such a key at the top level, and it is this text."""
+        return self.root.get(key) == text
 
     def name(self, *way: str | int) -> str:
         """A text."""

@@ -23,7 +23,7 @@ LARGEST_COLOR = 1e15
 
 
 def codes_for(count: int) -> int:
-    """The most SH codes of so many splats, where nobody chooses: one for at least 8 of them, or 1,024."""
+    """The most SH codes of so many splats, where nobody chooses: one for one to two splats, from 1,024 to 65,536."""
     steps = 2 ** math.floor(math.log2(count / LEAST_CODES)) if count > LEAST_CODES else 1
     return min(LEAST_CODES * steps, MAX_SH_CODES)
 

@@ -124,7 +124,7 @@ def _content(
 
         for_blocks(work, len(out), threads, lambda done: None)
 
-    antialiased = version == 2 and meta.has("antialias") and meta.flag("antialias")
+    antialiased = version == 2 and (meta.is_true("antialias") or meta.is_text("model", "antialiased"))
     header = {"version": version, "palette": len(palette) if palette is not None else 0, "bytes": files.size}
     fill = fill_some if unpacked is not None else fill_all
     return Content(count, degree, fill, f"SOG {version}", antialiased, header=header)
