@@ -79,9 +79,7 @@ def _differences(
 ) -> NDArray[np.float64]:
     """(R, L) sums of `compare_levels` over all views, level by level as in `runs`."""
     splats = scene.splats
-    columns = ShadedColumns(
-        splats.center, splats.scale, splats.quat_xyzw, lod_opacity(splats.opacity), splats.rgb
-    )
+    columns = ShadedColumns(splats.center, splats.scale, splats.quat_xyzw, lod_opacity(splats.opacity), splats.rgb)
     turns = _turns()
     poses, basis, widths = _poses(scene.bounds, turns), _basis(turns, splats.sh.shape[1]), _widths(scene, runs)
     numbers = DISTANCE / 2, 2 * DISTANCE, CLIP, BLUR, MIN_ALPHA, MAX_STD_DEV, STD_DEV_PER_D, math.inf

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 
 import numpy as np
 import pytest
@@ -24,8 +25,8 @@ def scene() -> Splats:
     rng = np.random.default_rng(0)
     inside = rng.normal(size=(900, 3))
     inside *= rng.uniform(0, 1, (900, 1)) / np.linalg.norm(inside, axis=1, keepdims=True)
-    sky = rng.normal(size=(100, 3)) + [1000, 0, 0]
-    return at(*((np.concatenate([inside, sky]) + [10, 20, 30]).tolist()))
+    sky = rng.normal(size=(100, 3)) + np.array([1000, 0, 0])
+    return at(*((np.concatenate([inside, sky]) + np.array([10, 20, 30])).tolist()))
 
 
 def test_a_sky_is_beyond_and_does_not_move_the_middle(scene: Splats) -> None:
@@ -40,7 +41,7 @@ def test_those_at_the_radius_are_not_beyond() -> None:
 
 def test_a_larger_radius_leaves_fewer(scene: Splats) -> None:
     wider = [beyond(scene, radius) for radius in (0.5, 0.8, 5, 999, 2000)]
-    assert all((a | ~b).all() for a, b in zip(wider, wider[1:], strict=False))
+    assert all((a | ~b).all() for a, b in itertools.pairwise(wider))
     assert [int(mask.sum()) for mask in wider[2:]] == sorted((int(mask.sum()) for mask in wider[2:]), reverse=True)
     assert not wider[-1].any()
 

@@ -97,7 +97,7 @@ def project_run(splats, sh, start, count, view, screen):
 
 @kernel()
 def by_depth(center, world_to_camera):
-    """(n,) int32 rows of (n, 3) centres from near to far, all in front of the camera; of equal depths, the last first."""
+    """(n,) int32 rows of (n, 3) centres in front of a camera, from near to far; of equal depths, the last first."""
     m, n = world_to_camera, len(center)
     keys, order = np.empty(n, np.uint32), np.empty(n, np.int32)
     low, high = np.uint32(0xFFFFFFFF), np.uint32(0)

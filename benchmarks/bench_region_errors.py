@@ -1,0 +1,220 @@
+"""How well errors of regions choose their detail levels: measured on pictures, the tree's own, or distance alone.
+
+For each scene, regions and levels are made from its quality tree; a budget of splats is then spent region by region,
+and the pictures are compared with those of full detail. Prints a table of mean PSNR in dB over the views.
+
+    python benchmarks/bench_region_errors.py scene.ply ... [--regions 64] [--widths 32 64 128 256]
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+
+import numpy as np
+
+import sparklod_cli
+from sparklod_cli.bake import region_errors
+from sparklod_cli.cameras.camera import Camera
+from sparklod_cli.lod import quality
+from sparklod_cli.lod.detail_cuts import detail_cuts
+from sparklod_cli.lod.detail_levels import make
+from sparklod_cli.lod.detail_settings import DetailSettings
+from sparklod_cli.model.detail import DetailScene
+from sparklod_cli.model.gaussian import covariance
+from sparklod_cli.render import rasterizer
+from sparklod_cli.render.settings import RasterSettings
+from sparklod_cli.render.shading import shade
+
+SHARES = (0.5, 0.25, 0.12, 0.06)
+BUDGETS = (0.1, 0.2, 0.4)
+SIZE = (480, 270)
+
+#: Row and column of the variances of a covariance xx xy xz yy yz zz on the planes xy, xz and yz.
+PLANES = ((0, 3, 1, 0, 1), (0, 5, 2, 0, 2), (3, 5, 4, 1, 2))
+
+
+def products(nodes, first, second):
+    """Integrals of products of splats `first` and `second` of a tree, over three planes, of colour and opacity."""
+    cov = covariance(nodes.scale, nodes.quat_xyzw)
+    height = np.minimum(nodes.opacity.astype(np.float64), 1)
+    color = np.concatenate([nodes.rgb.astype(np.float64), np.ones((len(nodes), 1))], 1) * height[:, None]
+    total = np.zeros(len(first))
+    offset = nodes.center[second].astype(np.float64) - nodes.center[first]
+    a, b = cov[first], cov[second]
+    for xx, yy, xy, across, along in PLANES:
+        sxx, syy, sxy = a[:, xx] + b[:, xx], a[:, yy] + b[:, yy], a[:, xy] + b[:, xy]
+        dets = [np.maximum(c[:, xx] * c[:, yy] - c[:, xy] ** 2, 0) for c in (a, b)]
+        det = np.maximum(sxx * syy - sxy**2, 1e-300)
+        x, y = offset[:, across], offset[:, along]
+        power = np.clip((syy * x * x - 2 * sxy * x * y + sxx * y * y) / (2 * det), 0, 60)
+        total += 2 * np.pi * np.sqrt(dets[0] * dets[1] / det) * np.exp(-power)
+    return total * (color[first] * color[second]).sum(1)
+
+
+def merging_errors(nodes, tree):
+    """(M,) squared difference of each node to its children, in closed form; and (M,) each node's own energy."""
+    every = np.arange(len(tree))
+    own = products(nodes, every, every)
+    inner = np.flatnonzero(tree.child_count)
+    counts = tree.child_count[inner].astype(np.int64)
+    parent = np.repeat(inner, counts)
+    child = np.repeat(tree.child_start[inner].astype(np.int64) - np.cumsum(counts) + counts, counts)
+    child += np.arange(len(child))
+    error = np.zeros(len(tree))
+    error[inner] = own[inner]
+    np.add.at(error, parent, own[child] - 2 * products(nodes, parent, child))
+    for step in range(1, int(counts.max())):  # pairs of siblings
+        left = np.flatnonzero(child + step < np.repeat(tree.child_start[inner].astype(np.int64) + counts, counts))
+        np.add.at(error, parent[left], 2 * products(nodes, child[left], child[left] + step))
+    return np.maximum(error, 0), own
+
+
+def tree_errors(nodes, tree, scene: DetailScene):
+    """(R, L) the tree's own errors: those of all merges below the nodes of a level, by the energy of the leaves."""
+    error, own = merging_errors(nodes, tree)
+    below = error.copy()  # children come after their parents
+    cuts = detail_cuts(nodes, tree, SHARES)
+    parent = cuts.parent
+    for node in range(len(tree) - 1, 0, -1):
+        below[parent[node]] += below[node]
+    owner = cuts.owners()
+    # Regions of the nodes of the coarsest level, found by centres in the runs.
+    last = scene.levels - 1
+    place = {tuple(c): r for r in range(scene.regions) for c in scene.splats.center[scene.run(r, last)].tolist()}
+    region = np.array([place[tuple(c)] for c in nodes.center[cuts.coarsest].tolist()])
+    sums = [np.bincount(region[owner[level]], below[level], scene.regions) for level in cuts.nodes]
+    energy = np.bincount(region[owner[cuts.nodes[0]]], own[cuts.nodes[0]], scene.regions)
+    return np.maximum.accumulate(np.stack(sums, 1) / energy[:, None], axis=1)
+
+
+def by_errors(scene: DetailScene, errors, camera: Camera, budget: int):
+    """Levels, refined one by one where the error falls most, by splat, and for the solid angle of the region."""
+    level = np.full(scene.regions, scene.levels - 1)
+    middle = scene.bounds.mean(axis=1)
+    radius = np.linalg.norm(scene.bounds[:, 1] - scene.bounds[:, 0], axis=1) / 2
+    weight = (radius / np.maximum(np.linalg.norm(middle - camera.position, axis=1), radius)) ** 2
+    spent = int(scene.counts[:, -1].sum())
+    while True:
+        best = (0.0, -1, 0)
+        for r in range(scene.regions):
+            for finer in range(level[r]):  # the steepest step, over several levels if that is better
+                more = scene.counts[r, finer] - scene.counts[r, level[r]]
+                if spent + more <= budget and more > 0:
+                    gain = weight[r] * (errors[r, level[r]] - errors[r, finer]) / more
+                    best = max(best, (gain, r, finer))
+        if best[1] < 0:
+            return level
+        _, r, finer = best
+        spent += int(scene.counts[r, finer] - scene.counts[r, level[r]])
+        level[r] = finer
+
+
+def by_distance(scene: DetailScene, camera: Camera, budget: int):
+    """Levels of distances that grow threefold from level to level, as near as the budget allows."""
+    nearest = np.clip(camera.position, scene.bounds[:, 0], scene.bounds[:, 1])
+    distance = np.maximum(np.linalg.norm(nearest - camera.position, axis=1), 1e-6)
+    best = np.full(scene.regions, scene.levels - 1)
+    for base in np.geomspace(distance.min() / 1000, distance.max() * 2, 400):
+        level = np.clip(np.ceil(np.log(distance / base) / np.log(3)), 0, scene.levels - 1).astype(int)
+        if scene.counts[np.arange(scene.regions), level].sum() <= budget:
+            best = level
+    # What is left goes to the nearest regions.
+    spent = int(scene.counts[np.arange(scene.regions), best].sum())
+    for r in np.argsort(distance):
+        while best[r] and spent + scene.counts[r, best[r] - 1] - scene.counts[r, best[r]] <= budget:
+            spent += int(scene.counts[r, best[r] - 1] - scene.counts[r, best[r]])
+            best[r] -= 1
+    return best
+
+
+def picture(splats, camera):
+    """The rasterizer's picture of plain splats."""
+    return rasterizer.draw(shade([(splats, np.eye(4))], camera), camera, RasterSettings())
+
+
+def cameras_of(scene: DetailScene):
+    """Three around the scene, and three near to its parts."""
+    center = scene.splats.center[scene.level(0)].astype(np.float64)
+    low, high = np.quantile(center, [0.02, 0.98], axis=0)
+    middle, size = (low + high) / 2, float(np.linalg.norm(high - low))
+    found = []
+    for k, (far, up) in enumerate([(1.0, 0.2), (0.8, 0.5), (0.9, 0.1), (0.45, 0.15), (0.4, 0.25), (0.35, 0.05)]):
+        angle = 2.4 * k
+        eye = middle + size * far * np.array([np.cos(angle), -up, np.sin(angle)])
+        found.append(Camera.look_at(eye.tolist(), middle.tolist(), size=SIZE))
+    return found
+
+
+def main() -> None:
+    """Prints the table."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("scenes", nargs="+", type=Path)
+    parser.add_argument("--regions", type=int, default=64)
+    parser.add_argument("--widths", type=int, nargs="*", default=[32, 64, 128, 256])
+    options = parser.parse_args()
+    print("scene regions budget% distance tree", *(f"pictures-{w}" for w in options.widths))
+    for path in options.scenes:
+        splats = sparklod_cli.read(path).splats
+        count = len(splats)
+        nodes, tree = quality.build(splats, 2.0)
+        most = int(count * (1 + sum(SHARES)) / options.regions)
+        settings = DetailSettings(levels=SHARES, chunk_splats=max(most, 1), extent=1e9, min_splats=1)
+        scene = make(nodes, tree, settings)
+        ways = {"tree": tree_errors(nodes, tree, scene)}
+        for width in options.widths:
+            region_errors.LEAST_WIDTH, region_errors.MOST_WIDTH = min(width, 64), width
+            began = time.process_time()
+            ways[f"pictures-{width}"] = region_errors.measured(scene, threads=1)
+            print(
+                "#",
+                path.stem,
+                width,
+                "px",
+                f"{time.process_time() - began:.2f} s of a processor for",
+                f"{len(scene.splats):,} splats; mean errors",
+                ways[f"pictures-{width}"].mean(0).round(4).tolist(),
+                flush=True,
+            )
+        best = ways[f"pictures-{options.widths[-1]}"]
+        for name, errors in ways.items():
+            orders = [each[:, 1:].argsort(axis=0).argsort(axis=0) for each in (errors, best)]
+            corr = [np.corrcoef(a, b)[0, 1] for a, b in zip(orders[0].T, orders[1].T, strict=True)]
+            print(
+                "#",
+                path.stem,
+                name,
+                "rank correlation by level",
+                np.round(corr, 3).tolist(),
+                "ratio",
+                (np.median(errors[:, 1:] / best[:, 1:], axis=0)).round(3).tolist(),
+                flush=True,
+            )
+        views = cameras_of(scene)
+        full = [picture(scene.splats.take(scene.level(0)), camera) for camera in views]
+        for budget in BUDGETS:
+            most = int(budget * count)
+            rows = {}
+            for name in ("distance", *ways):
+                figures = []
+                for camera, whole in zip(views, full, strict=True):
+                    if name == "distance":
+                        level = by_distance(scene, camera, most)
+                    else:
+                        level = by_errors(scene, ways[name], camera, most)
+                    index = np.concatenate(
+                        [np.arange(s.start, s.stop) for s in map(scene.run, range(scene.regions), level)]
+                    )
+                    seen = picture(scene.splats.take(index), camera)
+                    figures.append(-10 * np.log10(((seen[..., :3].astype(float) - whole[..., :3]) ** 2).mean()))
+                rows[name] = (np.mean(figures), np.round(figures, 1).tolist())
+            print(
+                path.stem, scene.regions, f"{100 * budget:g}", *(f"{mean:.2f}" for mean, _ in rows.values()), flush=True
+            )
+            for name, (_, each) in rows.items():
+                print("#", name, each, flush=True)
+
+
+if __name__ == "__main__":
+    main()
