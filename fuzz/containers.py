@@ -55,12 +55,14 @@ def valid_seeds() -> tuple[str, ...]:
 
 
 #: Folders of files that belong together, and the names by which a command is given them.
-FOLDERS = {"sh1-sog": (".", "meta.json"), "sh3-rad": ("sh3.rad",)}
+FOLDERS = {"sh1-sog": (".", "meta.json"), "sh1-streamed-sog": (".", "lod-meta.json"), "sh3-rad": ("sh3.rad",)}
 
 
 def folder_seed(name: str) -> dict[str, bytes]:
-    """The files of one of `FOLDERS`, by name."""
-    return {path.name: path.read_bytes() for path in sorted((FIXTURES / "golden" / name).iterdir())}
+    """The files of one of `FOLDERS` and of the folders there, by their paths in it."""
+    folder = FIXTURES / "golden" / name
+    files = (path for path in sorted(folder.rglob("*")) if path.is_file())
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
 
 
 def split_file(data: bytes) -> tuple[Parts, Callable[[Parts], bytes]]:

@@ -12,7 +12,7 @@ from PIL import Image
 
 from sparklod_cli.commands.inspect_text import finding_line
 from sparklod_cli.inspection import report
-from sparklod_cli.io import open_stream, read_scene
+from sparklod_cli.io import open_stream, read_levels, read_scene
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.selection import Selection
 from sparklod_cli.model.splats import COLUMNS, Splats
@@ -53,6 +53,21 @@ def check_stream(path: Path, threads: int) -> None:
             raise LawError(f"as a stream: {found!r:.200}; as a whole: {whole!r:.200}", "stream")
     elif any(getattr(whole, name).tobytes() != getattr(found, name).tobytes() for name in COLUMNS):
         raise LawError("a stream gives other splats than the reader of the whole file", "stream")
+
+
+def check_levels(path: Path, threads: int) -> None:
+    """Checks that the detail levels of a scene can be drawn, or are refused; a file of another format is."""
+    try:
+        scene = read_levels(path, threads=threads)
+    except FormatError:
+        return
+    check_scene(scene.scene())
+    if not np.isfinite(scene.bounds).all():
+        raise LawError("a bound of a region is not finite", "bound")
+    below = np.sort(scene.children, axis=None)
+    expected = [*range(-scene.regions, 0), *range(1, scene.regions - 1)] if scene.regions > 1 else []
+    if below.tolist() != expected:
+        raise LawError(f"children are {scene.children.tolist()!r:.100}", "children")
 
 
 def _streamed(path: Path, threads: int) -> Splats:

@@ -20,7 +20,7 @@ def make(rng: Rng) -> Case:
     if rng.integers(20) == 0:
         folder = pick(rng, list(FOLDERS))
         files = folder_seed(folder)
-        name = pick(rng, list(files))
+        name = pick(rng, list(files) if rng.integers(2) else [FOLDERS[folder][-1]])
         if Path(name).suffix in (".rad", ".radc"):
             files[name] = mutated_scene(rng, files[name], files[pick(rng, list(files))])[1]
         else:
@@ -39,5 +39,7 @@ def check(case: Case, folder: Path) -> None:
     path, threads = Path(case.run["path"]), case.run["threads"]
     laws.check_report(path)
     laws.check_stream(path, threads)
+    if path.is_dir() or path.suffix == ".json":
+        laws.check_levels(path, threads)
     examine_scene(path, columns=("center", "scale"), threads=threads)
     laws.check_scene(read_scene(path, threads=threads))

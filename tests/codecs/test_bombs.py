@@ -10,7 +10,7 @@ import subprocess
 import sys
 import time
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -103,6 +103,10 @@ def all_images(side: int, **changes: object) -> dict[str, bytes]:
     return {name: flat for name in SOG if name.endswith(".webp")} | meta(shN=None, **changes)
 
 
+def manifest(levels: int = 1, filenames: Sequence[str] = ("0_0/meta.json",), **tree: object) -> bytes:
+    return json.dumps({"lodLevels": levels, "filenames": filenames, "tree": tree}).encode()
+
+
 ASCII = by_hand.ply(splat_columns(20), text=True)
 COMPRESSED = (FIXTURES / "golden" / "sh3-compressed.ply").read_bytes()
 ZIP_BOMB, META_BOMB = deflate_bomb(SOG["means_l.webp"]), deflate_bomb(b'{"version":2')
@@ -148,6 +152,15 @@ BOMBS: dict[str, bytes] = {
     "meta.json of a deep nest of objects": b'{"a":' * 500_000,
     "meta.json of a long number": b'{"version":2,"count":' + b"9" * 1_000_000 + b"}",
     "meta.json of a long text": b'{"version":2,"asset":"' + b"x" * 50_000_000 + b'"}',
+    "manifest of a deep tree": b'{"lodLevels":1,"filenames":[],"tree":' + b'{"children":[' * 300_000,
+    "manifest of many nodes": manifest(children=[{"lods": {}}] * 200_000),
+    "manifest of many levels": manifest(levels=2**31, lods={}),
+    "manifest of billions of splats": manifest(lods={"0": {"file": 0, "offset": 0, "count": 1 << 28}}),
+    "manifest of many chunks": manifest(lods={"0": {"file": 0, "offset": 0, "count": 1}}, filenames=["x"] * 500_000),
+    "manifest of many chunks of billions": manifest(
+        children=[{"lods": {"0": {"file": file, "offset": 0, "count": 1 << 28}}} for file in range(20_000)],
+        filenames=[f"{file}/meta.json" for file in range(20_000)],
+    ),
     "meta.json of many numbers": b'{"version":2,"count":1,"means":{"mins":[' + b"0," * 1_500_000 + b"0]}}",
 }
 

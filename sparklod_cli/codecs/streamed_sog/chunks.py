@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from typing import BinaryIO
 
 from ...model.scene import Scene
-from ...model.sh import COEFFICIENTS
 from ...model.splats import COLUMNS, Splats
 from ...model.streams import SceneStream
 from ...support.errors import FormatError
@@ -17,7 +16,6 @@ from ...support.parallel import ordered_map
 from ...support.progress import Progress
 from ...support.units import count_of
 from ...support.untrusted import quoted_value
-from ..compression import check_promise
 from ..sog import codec as sog
 from .names import MANIFEST
 
@@ -108,7 +106,6 @@ def filled(beside: Beside | None, chunks: Sequence[Chunk], sh_degree: int, threa
         FormatError: a chunk is broken; names it.
     """
     count = sum(chunk.rows for chunk in chunks)
-    check_promise(count * 4 * (14 + 3 * COEFFICIENTS[sh_degree]), sum(chunk.bytes for chunk in chunks))
     out = Splats.empty(count, sh_degree)
     together = min(threads, len(chunks))
 

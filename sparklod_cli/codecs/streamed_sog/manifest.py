@@ -6,7 +6,6 @@ report can be made of a file that breaks it.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -133,20 +132,21 @@ def parse(data: bytes) -> Manifest:
 
 def _nodes(tree: Any, levels: int, files: int) -> tuple[ManifestNode, ...]:
     """The nodes of a tree, however deep, root first and depth first."""
-    found, children = list[ManifestNode](), list[list[int]]()
+    keys = {str(level): level for level in range(levels)}
+    parents, ordinals, children = list[int](), list[int](), list[list[int]]()
+    values = list[tuple[Bound | None, dict[int, Run] | None, Any]]()
     waiting = [(tree, -1, 0)]  # a value, the number of its parent, and which child it is
 
     def place(parent: int, ordinal: int) -> str:
         way = list[int]()
         while parent >= 0:
             way.append(ordinal)
-            ordinal, parent = ordinals[parent], found[parent].parent
+            ordinal, parent = ordinals[parent], parents[parent]
         return "tree" + "".join(f".children[{each}]" for each in reversed(way))
 
-    ordinals = list[int]()
     while waiting:
         value, parent, ordinal = waiting.pop()
-        number = len(found)
+        number = len(values)
         if number == MAX_NODES:
             raise FormatError(f"the tree of {MANIFEST} has more than {MAX_NODES:,} nodes")
         if not isinstance(value, dict):
@@ -155,16 +155,20 @@ def _nodes(tree: Any, levels: int, files: int) -> tuple[ManifestNode, ...]:
         if not isinstance(below, list):
             raise _wrong(f"{place(parent, ordinal)}.children", below, "a list")
         try:
-            runs = None if lods is None else _runs(lods, levels, files)
+            runs = None if lods is None else _runs(lods, keys, files)
         except _RunError as error:
             raise _wrong(f"{place(parent, ordinal)}.lods{error.place}", error.value, error.wanted) from None
-        found.append(ManifestNode(_bound(value.get("bound")), (), runs, value.get("errors"), parent))
+        values.append((_bound(value.get("bound")), runs, value.get("errors")))
+        parents.append(parent)
         ordinals.append(ordinal)
         children.append([])
         if parent >= 0:
             children[parent].append(number)
-        waiting.extend((child, number, each) for each, child in reversed(list(enumerate(below))))
-    return tuple(dataclasses.replace(node, children=tuple(below)) for node, below in zip(found, children, strict=True))
+        waiting.extend((below[each], number, each) for each in reversed(range(len(below))))
+    rows = zip(values, children, parents, strict=True)
+    return tuple(
+        ManifestNode(bound, tuple(below), runs, errors, parent) for (bound, runs, errors), below, parent in rows
+    )
 
 
 class _RunError(Exception):
@@ -175,15 +179,14 @@ class _RunError(Exception):
         self.place, self.value, self.wanted = place, value, wanted
 
 
-def _runs(lods: Any, levels: int, files: int) -> dict[int, Run]:
-    """The runs of a region by detail level."""
+def _runs(lods: Any, keys: Mapping[str, int], files: int) -> dict[int, Run]:
+    """The runs of a region by detail level; `keys` has the levels by their names."""
     if not isinstance(lods, dict):
         raise _RunError("", lods, "an object of runs")
-    keys = {str(level): level for level in range(levels)}
     runs = dict[int, Run]()
     for key, value in lods.items():
         if key not in keys:
-            raise _RunError("", key, f"of the levels 0 to {levels - 1}")
+            raise _RunError("", key, f"of the levels 0 to {len(keys) - 1}")
         if not isinstance(value, dict):
             raise _RunError(f".{key}", value, "a run")
         for name, most in (("file", files - 1), ("offset", MAX_RUN), ("count", MAX_RUN)):

@@ -10,11 +10,13 @@ import numpy as np
 
 from ...model.detail import DetailScene
 from ...model.scene import Scene
+from ...model.sh import COEFFICIENTS
 from ...model.splats import Splats
 from ...model.streams import BLOCK_SPLATS, SceneStream
 from ...support.errors import FormatError
 from ...support.progress import Progress, silent
 from ...support.untrusted import quoted_value
+from ..compression import check_promise
 from ..content import Scratch
 from ..stream import size_of
 from .chunks import Beside, Chunk, Piece, check_count, filled, open_chunk
@@ -106,8 +108,7 @@ def stream(
             if stop >= end:
                 kept.pop(number, None)
 
-    count = sum(chunk.rows for chunk in opened.chunks)
-    return SceneStream(count, opened.sh_degree, read, opened.antialiased, opened.format, (), opened.header)
+    return SceneStream(opened.count, opened.sh_degree, read, opened.antialiased, opened.format, (), opened.header)
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,6 +124,11 @@ class _Opened:
     layout: Layout
     chunks: tuple[Chunk, ...]
     bytes: int
+
+    @property
+    def count(self) -> int:
+        """The splats that are wanted."""
+        return sum(chunk.rows for chunk in self.chunks)
 
     @property
     def sh_degree(self) -> int:
@@ -146,26 +152,31 @@ class _Opened:
         return {"version": VERSION, "levels": levels, "regions": regions, "bytes": self.bytes}
 
 
-def _open(file: BinaryIO, beside: Beside | None, *, full_detail: bool) -> _Opened:
+def _open(source: BinaryIO, beside: Beside | None, *, full_detail: bool) -> _Opened:
     """A manifest and its chunks: those of level 0, or all."""
-    size = size_of(file)
-    layout = layout_of(parse(file.read(MAX_MANIFEST + 1)))
+    size = size_of(source)
+    layout = layout_of(parse(source.read(MAX_MANIFEST + 1)))
     runs, manifest = layout.runs, layout.manifest
     wanted = runs.level == 0 if full_detail else np.ones(len(runs.level), np.bool_)
     rows = np.cumsum(runs.count * wanted) - runs.count if full_detail else layout.starts()
-    names = [manifest.filenames[number] for number in np.unique(runs.file[wanted])]
-    if not names:
-        raise FormatError(f"{MANIFEST} has no splats of {'level 0' if full_detail else 'any level'}")
-    if twice := next((name for name in names if names.count(name) > 1), None):
-        raise FormatError(f"{MANIFEST} names {quoted_value(twice)} twice")
-    chunks = list[Chunk]()
-    for name, number in zip(names, np.unique(runs.file[wanted]), strict=True):
-        inside = runs.file == number
-        here = np.flatnonzero(inside & wanted)
+    files, first = np.unique(runs.file, return_index=True)
+    names, chunks = set[str](), list[Chunk]()
+    ends = np.append(first[1:], len(runs.file))
+    for file, begin, end in zip(files.tolist(), first.tolist(), ends.tolist(), strict=False):
+        here = begin + np.flatnonzero(wanted[begin:end])
+        if not len(here):
+            continue
+        name = manifest.filenames[file]
+        if name in names:
+            raise FormatError(f"{MANIFEST} names {quoted_value(name)} twice")
+        names.add(name)
         pieces = [Piece(int(runs.offset[run]), int(runs.count[run]), int(rows[run])) for run in here]
-        chunk = open_chunk(beside, name, pieces)
-        check_count(chunk, int(runs.count[inside].sum()))
-        chunks.append(chunk)
+        chunks.append(open_chunk(beside, name, pieces))
+        check_count(chunks[-1], int(runs.count[begin:end].sum()))
+    if not chunks:
+        raise FormatError(f"{MANIFEST} has no splats of {'level 0' if full_detail else 'any level'}")
     if manifest.environment is not None:
         chunks.append(open_chunk(beside, manifest.environment, None, sum(chunk.rows for chunk in chunks)))
-    return _Opened(layout, tuple(chunks), size + sum(chunk.bytes for chunk in chunks))
+    opened = _Opened(layout, tuple(chunks), size + sum(chunk.bytes for chunk in chunks))
+    check_promise(opened.count * 4 * (14 + 3 * COEFFICIENTS[opened.sh_degree]), opened.bytes)
+    return opened

@@ -50,7 +50,7 @@ def beside(files: Mapping[str, bytes]) -> Callable[[str], BinaryIO]:
 
     def opened(name: str) -> BinaryIO:
         if name not in files:
-            raise FormatError(f"there is no {name}")
+            raise FormatError(f"there is no {name!r:.40}")
         return io.BytesIO(files[name])
 
     return opened
