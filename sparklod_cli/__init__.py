@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from .codecs.rad.records import RadChunkEntry, RadChunkHeader, RadHeader
     from .codecs.splat_encoding import SplatEncoding
     from .inspection.report import Report
+    from .lod.detail_rule import DetailRule
     from .lod.detail_settings import DetailSettings
     from .lod.settings import LodSettings
     from .model.foveation import Cones, Frustum
@@ -72,6 +73,7 @@ _MODULES = {
     "codecs.splat_encoding": ("SplatEncoding",),
     "inspection.report": ("Report",),
     "lod.detail_settings": ("DetailSettings",),
+    "lod.detail_rule": ("DetailRule",),
     "lod.settings": ("LodSettings",),
     "model.foveation": ("Cones", "Frustum"),
     "model.instances": ("Instance",),
@@ -101,6 +103,7 @@ __all__ = [
     "ComparisonTable",
     "Cones",
     "Cut",
+    "DetailRule",
     "DetailSettings",
     "FormatError",
     "Frames",

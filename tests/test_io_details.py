@@ -5,14 +5,17 @@ from __future__ import annotations
 import errno
 import json
 import os
+import uuid
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from sparklod_cli.io import companions, detail_files, detail_sink, files_of
+from sparklod_cli.io import companions, detail_files, detail_sink, files_of, read_levels, read_scene
 from sparklod_cli.io.names import leads_away
 from sparklod_cli.support import leftovers
+from sparklod_cli.support.addresses import Address
 from sparklod_cli.support.errors import OutputError
 from tests.conftest import FIXTURES
 from tests.support.test_atomic_set import held
@@ -175,6 +178,59 @@ def test_places_for_no_or_one_file_are_refused(tmp_path: Path) -> None:
         detail_sink(Path("-"), overwrite=True)
     with pytest.raises(OutputError, match="is a pipe or a device"):
         detail_sink(Path(os.devnull), overwrite=True)
+
+
+# --- Addresses --------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def address() -> Address:
+    pytest.importorskip("fsspec")
+    return Address(f"memory://{uuid.uuid4().hex}") / "lod-meta.json"
+
+
+def held_at(address: Address) -> dict[str, bytes]:
+    folder = address.parent
+    return {name: (folder / name).read(0, (folder / name).size()) for name in folder.files()}
+
+
+def test_an_output_at_an_address_replaces_a_former_one(address: Address) -> None:
+    old = output("0_0", "0_1", "env")
+    assert detail_sink(address, overwrite=False)(pieces(old)) == sum(map(len, old.values()))
+    assert held_at(address) == old
+    with pytest.raises(OutputError, match="exists, add --overwrite"):
+        detail_sink(address, overwrite=False)
+    (address.parent / "0_1/notes").write([b"precious"])
+    new = output("0_0", "1_0", mark="new")
+    detail_sink(address, overwrite=True)(pieces(new))
+    assert held_at(address) == new | {"0_1/notes": b"precious"}
+
+
+def test_what_is_in_the_way_at_an_address_is_told_before_anything_is_removed(address: Address) -> None:
+    detail_sink(address, overwrite=False)(pieces(output("0_0")))
+    (address.parent / "2_0/meta.json").write([b"precious"])
+    before = held_at(address)
+    with pytest.raises(OutputError, match=r"2_0 exists, and lod-meta\.json there does not name it"):
+        detail_sink(address, overwrite=True)
+    assert held_at(address) == before
+
+
+def test_what_was_sent_is_removed_where_the_rest_cannot_be_made(address: Address) -> None:
+    def broken() -> Iterator[tuple[str, Iterable[bytes]]]:
+        yield from list(pieces(output("0_0", "0_1")))[:-1]
+        raise OSError(errno.EIO, "broken")
+
+    with pytest.raises(OutputError, match=r"cannot write memory://.*: broken"):
+        detail_sink(address, overwrite=False)(broken())
+    assert held_at(address) == {}
+
+
+def test_an_output_at_an_address_is_read_from_there(address: Address) -> None:
+    files = {name: (GOLDEN / name).read_bytes() for name in GOLDEN_NAMES if name != "lod-meta.json"}
+    detail_sink(address, overwrite=False)(pieces(files | {"lod-meta.json": (GOLDEN / "lod-meta.json").read_bytes()}))
+    for place in (address, address.parent):
+        np.testing.assert_array_equal(read_scene(place).splats.center, read_scene(GOLDEN).splats.center)
+    assert read_levels(address.parent).counts.tolist() == read_levels(GOLDEN).counts.tolist()
 
 
 # --- Files that are read together -------------------------------------------------------------------------------------

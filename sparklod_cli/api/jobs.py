@@ -121,7 +121,7 @@ def _source(
 ) -> CutSource:
     settings = None if budget is None else dataclasses.replace(lod, budget=scenes.splats_of(budget))
     try:
-        if loading is None or settings is None or not scenes.trees:
+        if loading is None or settings is None or not scenes.with_cuts:
             return CutFinder(scenes, settings)
         from ..simulation.loading import LoadingCuts
 

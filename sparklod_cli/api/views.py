@@ -13,8 +13,10 @@ import numpy as np
 from ..cameras.camera import Camera
 from ..cameras.path import CameraPath
 from ..images import metrics
+from ..lod import detail_rule
 from ..lod.budget import LARGEST, Budget, parse_budget
 from ..lod.settings import LodSettings
+from ..model.detail import DetailScene
 from ..model.instances import Instance, names_of
 from ..model.scene import Scene
 from ..render.backends import BACKENDS
@@ -36,8 +38,8 @@ from .results import ComparisonTable, Frames
 if TYPE_CHECKING:
     from ..simulation.streaming import StreamingSettings
 
-#: A scene or a tree, or several of them, each with where it stands.
-Viewed = Scene | Instance | Iterable["Scene | Instance"]
+#: A scene, a tree or a scene at several detail levels, or several of them, each with where it stands.
+Viewed = Scene | DetailScene | Instance | Iterable["Scene | DetailScene | Instance"]
 
 #: A count of splats, a share of full detail (a float, 0 to 1), or either as text: "500k", "5%".
 BudgetLike = int | float | str | np.integer[Any] | np.floating[Any]
@@ -56,13 +58,14 @@ def cut(
     precision: str = PRECISIONS[0],
     threads: int | None = None,
 ) -> Cut:
-    """The nodes that a viewer draws for a camera.
+    """The nodes that a viewer draws for a camera, or the splats of the detail levels that it chooses.
 
     Args:
-        viewed: a tree, or instances. Of scenes without a tree all splats are drawn.
+        viewed: a tree, a scene at several detail levels, or instances. Of other scenes all splats are drawn.
         camera: that sees them.
         budget: the most splats that are drawn; that of `settings` unless given.
-        settings: foveation, pixel-scale limit and so on; Spark 2's on a desktop unless given.
+        settings: foveation, pixel-scale limit and so on; Spark 2's on a desktop unless given, and for detail levels
+            those of PlayCanvas.
         continuous: a cut that fades nodes into their children; the width of that, or True for 1.25.
         precision: "float32", or "float16" for the centres and sizes that Spark holds of a tree.
         threads: to prepare the trees on; None for all processors.
@@ -130,7 +133,7 @@ def traverse(
     """What a viewer draws and fetches along a camera path: a row for each frame.
 
     Args:
-        viewed: a tree, or instances of trees.
+        viewed: a tree, a scene at several detail levels, or instances of trees or of such scenes.
         cameras: the path.
         budget: the most splats that are drawn; that of `settings` unless given.
         settings: foveation, pixel-scale limit and so on; Spark 2's on a desktop unless given.
@@ -169,8 +172,8 @@ def compare(
     """How far cuts of some budgets are from full detail, in PSNR and SSIM on black and on white.
 
     Args:
-        viewed: a tree, or instances of trees.
-        scene: what full detail is; None for the leaves of the trees.
+        viewed: a tree, a scene at several detail levels, or instances of trees or of such scenes.
+        scene: what full detail is; None for the leaves of the trees, or level 0.
         cameras: that both are seen by.
         budgets: of the cuts.
         settings: of the cuts; with Spark 2's foveation and without a pixel-scale limit unless given.
@@ -238,7 +241,7 @@ def scenes_of(viewed: Viewed, threads: int | None, precision: str = PRECISIONS[0
     if precision not in PRECISIONS:
         raise ValueError(f"there is no precision {precision!r}; give one of {', '.join(PRECISIONS)}")
     count = thread_count(threads)
-    if isinstance(viewed, Scene):
+    if isinstance(viewed, (Scene, DetailScene)):
         kept: dict[str, Scenes] = viewed.__dict__.setdefault(_PREPARED, {})
         if precision not in kept:
             kept[precision] = read_scenes([Instance(viewed, UNNAMED)], precision=precision, threads=count)
@@ -263,7 +266,7 @@ def _named(instances: Sequence[Instance]) -> list[Instance]:
 
 def _trees(viewed: Viewed, threads: int, precision: str) -> Scenes:
     scenes = scenes_of(viewed, threads, precision)
-    plain = next((loaded.name for loaded in scenes.loaded if not loaded.is_tree), None)
+    plain = next((loaded.name for loaded in scenes.loaded if not loaded.has_cuts), None)
     if plain is not None:
         raise FormatError(f"{plain}: it is not a Level-of-Detail tree; build_lod makes one of it")
     return scenes
@@ -272,7 +275,8 @@ def _trees(viewed: Viewed, threads: int, precision: str) -> Scenes:
 def _lod(
     scenes: Scenes, budget: BudgetLike | None, settings: LodSettings | None, continuous: bool | float
 ) -> LodSettings:
-    settings = settings or LodSettings()
+    if settings is None:
+        settings = LodSettings(detail_rule.BUDGET) if scenes.details else LodSettings()
     if budget is not None:
         settings = replace(settings, budget=_budget(budget).of(scenes.leaves))
     if continuous:

@@ -40,6 +40,8 @@ def lines(name: str, report: dict[str, Any]) -> Iterator[str]:
         yield _row("note", note)
     if report["rad"]:
         yield from _rad(report["rad"])
+    if report["streamed_sog"]:
+        yield from _streamed_sog(report["streamed_sog"])
     if tree:
         yield from _tree(tree)
     if values:
@@ -70,6 +72,34 @@ def _rad(rad: dict[str, Any]) -> Iterator[str]:
         yield f"    {name:<12} {text}".rstrip()
     if rad["comment"]:
         yield _row("comment", printable(rad["comment"], MOST_COMMENT))
+
+
+def _streamed_sog(streamed: dict[str, Any]) -> Iterator[str]:
+    first, manifest = size_of(streamed["first_bytes"]), size_of(streamed["manifest_bytes"])
+    yield _row("stored", f"manifest {manifest}, with all that the coarsest level needs {first}")
+    if streamed["file_bytes"]:
+        least, median, most = (size_of(streamed["file_bytes"][name]) for name in ("min", "median", "max"))
+        count = count_of(streamed["files"], "chunk file")
+        yield _row("files", f"{count} of {least} to {most}, median {median}")
+    splats, edge = streamed["region_splats"], streamed["region_edge"]
+    regions = count_of(streamed["regions"], "region")
+    yield _row("regions", f"{regions} in a tree of depth {streamed['depth']}")
+    yield _row("", f"{splats['min']:,.0f} to {splats['max']:,.0f} splats of level 0 each, median {splats['p50']:,.0f}")
+    yield _row("", f"{edge['min']:.4g} to {edge['max']:.4g} world units long, median {edge['p50']:.4g}")
+    head = [f"{'splats':>12} {'share':>8} {'regions':>8} {'files':>6} {'bytes':>13}"]
+    if any(level["errors"] for level in streamed["levels"]):
+        head.append(f"{'error p25':>10} {'p50':>10} {'p75':>10}")
+    yield _row("levels", " ".join(head))
+    for number, level in enumerate(streamed["levels"]):
+        share = "" if level["share"] is None else f"{100 * level['share']:.1f} %"
+        errors = [f"{level['errors'][name]:>10.3g}" for name in ("p25", "p50", "p75")] if level["errors"] else []
+        counts = f"{level['splats']:>12,} {share:>8} {level['regions']:>8,} {level['files']:>6,} {level['bytes']:>13,}"
+        yield f"    {number:<8} {' '.join([counts, *errors])}"
+    if streamed["environment"]:
+        around = streamed["environment"]
+        yield _row("environment", f"{count_of(around['splats'], 'splat')}, {size_of(around['bytes'])}")
+    if streamed["generator"]:
+        yield _row("written by", streamed["generator"])
 
 
 def _ranged(value: float | bool) -> str:

@@ -15,7 +15,7 @@ import click
 
 from ..images.defaults import THUMBNAIL_SIZE, THUMBNAIL_SUPERSAMPLE
 from .command import COMMON, Command
-from .options import appearance, cameras, comparison, cut, inputs, pictures, streaming
+from .options import appearance, cameras, comparison, cut, inputs, pictures, streamed_sog, streaming
 from .options.camera_options import camera_options
 from .options.common import General, common_options
 from .paths import claim_stdout, keep_apart
@@ -46,7 +46,7 @@ Examples:
 """
 
 HEADINGS = (
-    *(COMMON, inputs.HEADING, cameras.HEADING, cut.HEADING, streaming.HEADING),
+    *(COMMON, inputs.HEADING, cameras.HEADING, cut.HEADING, streamed_sog.HEADING, streaming.HEADING),
     *(appearance.HEADING, comparison.HEADING, pictures.HEADING),
 )
 
@@ -58,6 +58,7 @@ class RenderOptions:
     inputs: inputs.Inputs
     cameras: cameras.PictureCameras
     cut: cut.PictureCut
+    detail: streamed_sog.Detail
     streaming: streaming.PictureStreaming
     appearance: appearance.Appearance
     comparison: comparison.Comparison
@@ -75,6 +76,7 @@ class RenderOptions:
             options_of(ctx, inputs.Inputs),
             options_of(ctx, cameras.PictureCameras),
             options_of(ctx, cut.PictureCut),
+            options_of(ctx, streamed_sog.Detail),
             options_of(ctx, streaming.PictureStreaming),
             options_of(ctx, appearance.Appearance),
             options_of(ctx, comparison.Comparison),
@@ -85,6 +87,9 @@ class RenderOptions:
         asked.pictures.check(ctx)
         asked.cameras.check(ctx)
         asked.cut.check(ctx)
+        asked.detail.check(ctx)
+        if asked.cut.full:
+            exclude(ctx, streamed_sog.OPTIONS, "--full")
         asked.streaming.check(ctx)
         if asked.streaming.after is not None:
             exclude(ctx, ["full", "continuous", "compare"], "--after")
@@ -102,6 +107,7 @@ class RenderOptions:
 @inputs.input_options
 @functools.partial(camera_options, still=True)
 @functools.partial(cut.cut_options, pictures=True)
+@streamed_sog.detail_options
 @functools.partial(streaming.streaming_options, pictures=True)
 @appearance.appearance_options
 @comparison.comparison_options
@@ -111,7 +117,8 @@ def render(ctx: click.Context, /, **_: Any) -> None:
     """Draw pictures of splat files as a viewer draws them.
 
     Of Level-of-Detail files written by build-lod, a picture shows the cut that Spark's traversal finds within the
-    budget; of other files, and with --full, it shows all splats. Several files are drawn together.
+    budget; of Streamed SOG, the detail levels that PlayCanvas chooses; of other files, and with --full, it shows all
+    splats. Several files are drawn together.
 
     Without a camera, the picture shows the whole scene from its front. A camera path makes a picture for each camera,
     or an animation, by the name of --output.
@@ -145,10 +152,11 @@ def _draw(ctx: click.Context, asked: RenderOptions) -> None:
 
         def ready(path: CameraPath, scenes: Scenes) -> None:
             notes = [*path.notes, *scenes.notes, *_upside_down(asked, scenes)]
-            unused = given(ctx, (*cut.CUTS, *streaming.OF_LOADING))
-            if unused and not scenes.trees:
+            streamed_sog.check_scenes(ctx, scenes)
+            unused = streamed_sog.without_effect(ctx, scenes, (*cut.CUTS, *streaming.OF_LOADING))
+            if unused:
                 unused_flags = ", ".join(unused)
-                notes.append(f"no file is a Level-of-Detail tree, so all splats are drawn; no effect: {unused_flags}")
+                notes.append(f"no file has levels to choose, so all splats are drawn; no effect: {unused_flags}")
             for note in notes:
                 console.say(note)
             console.detail(f"  read in {time.perf_counter() - start:.2f} s")
@@ -157,7 +165,7 @@ def _draw(ctx: click.Context, asked: RenderOptions) -> None:
             drawn = draw_files(
                 viewed_files(asked, instances, console),
                 budget,
-                asked.cut.settings(budget=1),
+                asked.cut.settings(1, asked.detail.rule()),
                 look.settings(),
                 place,
                 fit_planes=fit_planes(ctx),

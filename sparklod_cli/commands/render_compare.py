@@ -14,6 +14,7 @@ import click
 from ..support.stdin import DASH
 from .console import Console, count_of, for_screen, is_terminal
 from .options.common import table_form
+from .options.streamed_sog import check_scenes
 from .paths import keep_apart
 
 if TYPE_CHECKING:
@@ -43,6 +44,7 @@ def compare(ctx: click.Context, asked: RenderOptions) -> int:
         def ready(path: CameraPath, scenes: Scenes) -> None:
             for note in path.notes:
                 console.say(note)
+            check_scenes(ctx, scenes)
 
         def passed(pieces: Iterable[bytes]) -> Iterable[bytes]:
             console.clear()  # a bar and a table do not go together on one screen
@@ -89,7 +91,7 @@ def _on_screen(asked: RenderOptions) -> bool:
 
 def _limited(asked: RenderOptions) -> LodSettings:
     """Settings of cuts that only the budget limits, not the size of a pixel, unless a limit was given."""
-    settings = asked.cut.settings(budget=1)
+    settings = asked.cut.settings(1, asked.detail.rule())
     if settings.pixel_scale_limit is None and settings.render_scale == 1:
         return dataclasses.replace(settings, pixel_scale_limit=0.0)
     return settings

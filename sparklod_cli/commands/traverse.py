@@ -12,7 +12,7 @@ import click
 
 from .command import COMMON, Command
 from .console import Console, for_screen, is_terminal
-from .options import cameras, cut, inputs, streaming
+from .options import cameras, cut, inputs, streamed_sog, streaming
 from .options import table as tables
 from .options.camera_options import camera_options
 from .options.common import General, common_options
@@ -38,7 +38,10 @@ Examples:
   sparklod traverse scene-lod.spz --look-at 0,-1,4:0,0,0 --indices-out cuts --padded
 """
 
-HEADINGS = (COMMON, inputs.HEADING, cameras.HEADING, cut.HEADING, streaming.HEADING, tables.HEADING)
+HEADINGS = (
+    *(COMMON, inputs.HEADING, cameras.HEADING, cut.HEADING, streamed_sog.HEADING),
+    *(streaming.HEADING, tables.HEADING),
+)
 
 
 @click.command("traverse", cls=Command, headings=HEADINGS, epilog=EXAMPLES, context_settings={"show_default": True})
@@ -46,17 +49,20 @@ HEADINGS = (COMMON, inputs.HEADING, cameras.HEADING, cut.HEADING, streaming.HEAD
 @inputs.input_options
 @camera_options
 @cut.cut_options
+@streamed_sog.detail_options
 @streaming.streaming_options
 @functools.partial(
     common_options, json="Print the summary as one JSON object on standard output; write a table only to --output."
 )
 @click.pass_context
 def traverse(ctx: click.Context, /, **_: Any) -> None:
-    """Simulate what a viewer draws of Level-of-Detail files along a camera path.
+    """Simulate what a viewer draws of Level-of-Detail files or Streamed SOG along a camera path.
 
     Finds the cut of every frame as Spark's traversal would find it: the nodes of the trees that a viewer draws within
     its budget. Reports how fine the cuts are, how much changes from frame to frame, and what has to be fetched, as a
     table with a row for each frame. Files are those that build-lod writes; several share one budget.
+
+    Of Streamed SOG, the cut is made of the detail levels that PlayCanvas would choose for the regions of the scene.
 
     Coordinates are those of the files; --up, --world-transform and --camera-axes bring cameras into them.
     """
@@ -66,7 +72,8 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
         options_of(ctx, tables.Table),
         options_of(ctx, General),
     )
-    for group in (where, lod, network):
+    levels = options_of(ctx, streamed_sog.Detail)
+    for group in (where, lod, levels, network):
         group.check(ctx)
     place.check(ctx, as_json=general.as_json)
     claim_stdout(ctx, "output", as_json=general.as_json)
@@ -84,6 +91,7 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
         def ready(path: CameraPath, scenes: Scenes) -> None:
             for note in path.notes:
                 console.say(note)
+            streamed_sog.check_scenes(ctx, scenes)
             keep_apart(ctx, {**besides, "indices_out": outputs.index_files(path.numbers, len(instances))})
 
         console.announce_compiling("traverse")
@@ -96,7 +104,7 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
                 traversed = traverse_files(
                     files_viewed,
                     budget,
-                    lod.settings(budget=1),
+                    lod.settings(1, levels.rule()),
                     network.settings(),
                     outputs,
                     by_instance=place.per_instance,

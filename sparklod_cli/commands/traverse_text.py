@@ -46,6 +46,7 @@ STOPS = {
     "pixel": "at the pixel limit",
     "exhausted": "in full detail",
     "missing": "at missing chunks",
+    "distance": "at the levels that distances ask for",
 }
 
 

@@ -31,14 +31,17 @@ NAMES: dict[str, Callable[[dict[str, Any]], Any]] = {
     "depth": lambda report: report["tree"]["depth"],
     "sh": lambda report: report["sh_degree"],
     "lod": lambda report: report["tree"] is not None,
-    "chunk_bytes": lambda report: report["rad"]["chunk_bytes"]["max"],
-    "first_bytes": lambda report: report["rad"]["first_bytes"],
+    "chunk_bytes": lambda report: _chunked(report)["max"],
+    "first_bytes": lambda report: (report["rad"] or report["streamed_sog"])["first_bytes"],
     "chunked": lambda report: report["rad"]["chunked"],
     "palette": lambda report: report["rad"]["palette"],
+    "levels": lambda report: len(report["streamed_sog"]["levels"]),
+    "regions": lambda report: report["streamed_sog"]["regions"],
 }
 
-#: Those of them that only a RAD file has.
-OF_RAD = ("chunk_bytes", "first_bytes", "chunked", "palette")
+#: The formats of those of them that are not about a tree.
+FORMATS = dict.fromkeys(("chunk_bytes", "first_bytes"), "RAD or Streamed SOG")
+FORMATS |= dict.fromkeys(("chunked", "palette"), "RAD") | dict.fromkeys(("levels", "regions"), "Streamed SOG")
 
 #: The codes of findings about some names; that of the others is expect.value.
 CODES = {
@@ -176,7 +179,13 @@ def _value(plain: dict[str, Any], name: str) -> Any:
     try:
         return NAMES[name](plain)
     except TypeError:
-        raise NoFieldError("the file is not RAD" if name in OF_RAD else "the file has no tree") from None
+        form = FORMATS.get(name)
+        raise NoFieldError("the file has no tree" if form is None else f"the file is not {form}") from None
+
+
+def _chunked(report: dict[str, Any]) -> Any:
+    """Sizes of what a viewer fetches at a time."""
+    return report["rad"]["chunk_bytes"] if report["rad"] else report["streamed_sog"]["file_bytes"]
 
 
 def check(report: Report, expected: Expectations) -> list[Finding]:

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
+from ..codecs.promises import Violation
 from ..codecs.rad.promises import ERRORS as RAD_ERRORS
 from ..codecs.rad.promises import WARNINGS as RAD_WARNINGS
+from ..codecs.streamed_sog.promises import ERRORS as STREAMED_SOG_ERRORS
+from ..codecs.streamed_sog.promises import WARNINGS as STREAMED_SOG_WARNINGS
 
 ERROR, WARNING, NOTE = "error", "warning", "note"
 
@@ -26,6 +30,8 @@ CODES: dict[str, tuple[str, str]] = {
     "container.left-out": (WARNING, "the file holds data that sparklod does not read"),
     **{code: (ERROR, meaning) for code, meaning in RAD_ERRORS.items()},
     **{code: (WARNING, meaning) for code, meaning in RAD_WARNINGS.items()},
+    **{code: (ERROR, meaning) for code, meaning in STREAMED_SOG_ERRORS.items()},
+    **{code: (WARNING, meaning) for code, meaning in STREAMED_SOG_WARNINGS.items()},
     "values.empty": (ERROR, "there are no splats"),
     "values.non-finite": (ERROR, "a number is not finite, or a rotation has length 0"),
     "values.rotation": (ERROR, "the length of a rotation is not 1"),
@@ -89,3 +95,14 @@ class Finding:
     def severity(self) -> str:
         """error, warning or note."""
         return CODES[self.code][0]
+
+
+def findings_of(violations: Iterable[Violation]) -> list[Finding]:
+    """A finding for each code: the text of its first violation, and how many more there are."""
+    by_code: dict[str, list[str]] = {}
+    for each in violations:
+        by_code.setdefault(each.code, []).append(each.text)
+    return [
+        Finding(code, texts[0] + (f" (and {len(texts) - 1:,} more like it)" if len(texts) > 1 else ""))
+        for code, texts in by_code.items()
+    ]

@@ -16,6 +16,7 @@ from ..tables.histograms import Histogram
 from . import values
 from .findings import CODES, ERROR, NOTE, WARNING
 from .html_parts import NONE, figure_of, number_text, panel, size_text, table_of
+from .html_streamed_sog import streamed_sog_panels
 from .report import Report
 
 #: Content security policy: only the style and the pictures inside the page, whatever the name of a file contains.
@@ -149,6 +150,8 @@ def _section(section: Section, anchor: str) -> str:
     ]
     if report.get("rad"):
         parts.append(_rad(report["rad"]))
+    if report.get("streamed_sog"):
+        parts.append(streamed_sog_panels(report["streamed_sog"]))
     if report.get("tree"):
         parts.append(_tree(report["tree"]))
     if report.get("values"):

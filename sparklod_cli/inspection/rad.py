@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import statistics
 from collections import Counter
-from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from ..codecs.promises import Violation
+from ..codecs.rad.codec import name_of
 from ..codecs.rad.encodings import LARGEST_F16
 from ..codecs.rad.header import ENCODING_KEYS
 from ..codecs.rad.layout import BY_NAME, PROPERTIES, SIZES
@@ -17,7 +16,8 @@ from ..codecs.rad.survey import survey_chunks, survey_file
 from ..codecs.splat_encoding import log_scale_table
 from ..io import opened
 from ..support.printable import MOST, printable
-from .findings import Finding
+from .findings import Finding, findings_of
+from .surveys import Head
 from .value_checks import Ends
 
 #: Name of the format in `codecs.formats`.
@@ -85,13 +85,13 @@ class Survey:
     """What the headers of a file tell and break.
 
     Attributes:
-        header: of the file.
+        head: what a report begins with; None where `facts` is.
         facts: what they tell; None where a promise is broken without which the rest cannot be trusted.
         findings: broken promises, one for each code.
         fatal: findings because of which the file cannot be read.
     """
 
-    header: RadHeader
+    head: Head | None
     facts: RadFacts | None
     findings: list[Finding]
     fatal: list[Finding]
@@ -117,9 +117,12 @@ def survey(path: Path, *, check: bool) -> Survey | None:
                 violations += chunk.violations
                 if chunk.header is not None:
                     gathered.add(chunk.header)
-    fatal = _findings(each for each in violations if each.fatal)
-    facts = None if fatal else _facts(header, gathered)
-    return Survey(header, facts, _findings(violations), fatal)
+    fatal = findings_of(each for each in violations if each.fatal)
+    if fatal:
+        return Survey(None, None, findings_of(violations), fatal)
+    facts = _facts(header, gathered)
+    head = Head(name_of(header), facts.bytes, header.count, header.max_sh, header.antialiased)
+    return Survey(head, facts, findings_of(violations), [])
 
 
 @dataclass
@@ -185,14 +188,3 @@ def ends_of(facts: RadFacts) -> Ends:
         table = log_scale_table(scales.min, scales.max)
         ends = replace(ends, scale=(float(table[1]), float(table[-1])))
     return ends
-
-
-def _findings(violations: Iterable[Violation]) -> list[Finding]:
-    """A finding for each code: the text of its first violation, and how many more there are."""
-    by_code: dict[str, list[str]] = {}
-    for each in violations:
-        by_code.setdefault(each.code, []).append(each.text)
-    return [
-        Finding(code, texts[0] + (f" (and {len(texts) - 1:,} more like it)" if len(texts) > 1 else ""))
-        for code, texts in by_code.items()
-    ]

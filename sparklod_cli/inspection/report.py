@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from ..codecs.rad.codec import name_of
 from ..codecs.spz_layout import KNOWN_FLAGS
 from ..io import RadFile, examine_scene, read_arrays, size_of_input
 from ..model.scene import Scene
@@ -19,7 +18,7 @@ from ..support.printable import printable
 from ..support.progress import Progress, silent
 from ..support.untrusted import QUOTED
 from ..tables.columns import Row
-from . import arrays, chunks, rad, tree, value_checks, values
+from . import arrays, chunks, rad, streamed_sog, tree, value_checks, values
 from .blocks import Block, Blocks
 from .findings import Finding
 
@@ -30,8 +29,22 @@ SCHEMA_VERSION = 1
 TREE_COLUMNS = tree.USED
 
 
-#: Fields for which the headers of a RAD file are enough.
-HEADER_FIELDS = ("file", "bytes", "format", "splats", "sh_degree", "bytes_per_splat", "compression_ratio", "rad")
+#: Fields for which the headers of a RAD file, or of the files of a Streamed SOG, are enough.
+HEADER_FIELDS = (
+    "file",
+    "bytes",
+    "format",
+    "splats",
+    "sh_degree",
+    "bytes_per_splat",
+    "compression_ratio",
+    "rad",
+    "streamed_sog",
+)
+
+
+#: What the headers of a file tell, of the formats that have much to tell there.
+Surveyed = rad.Survey | streamed_sog.Survey
 
 
 class NoFieldError(SparklodError):
@@ -47,7 +60,7 @@ class ReportSettings:
         all_quantities: all of their quantities, instead of the main ones.
         check: findings.
         chunks: a row for each chunk.
-        headers_only: read no more than the headers of a RAD file; its tree and values are left out.
+        headers_only: read no more than headers where a format has those; tree and values are left out.
         at_once: have the whole scene in memory, as those need who look at it besides; False reads RAD files chunk by
             chunk; None does so with large ones, see `RadFile.fits`.
     """
@@ -66,7 +79,7 @@ class Report:
 
     Attributes:
         file: path, as it was given.
-        bytes: size on disk; of an unpacked SOG, that of all its files.
+        bytes: size on disk; of a file that names others, that of all files together.
         format: name for display; None if the file could not be read.
         splats: number of splats, or nodes of a tree.
         sh_degree, antialiased: of the splats.
@@ -75,6 +88,7 @@ class Report:
         compression_ratio: size of the decoded splats, as 4-byte floats, over that of the file.
         notes: data that the reader left out.
         rad: what the headers of a RAD file tell; None for other formats.
+        streamed_sog: what the manifest of a Streamed SOG tells; None for other formats.
         tree: facts of the Level-of-Detail tree; None without one.
         values: statistics of the splats; None if not asked for.
         chunks: a row for each chunk, see `chunks.COLUMNS`; None if not asked for.
@@ -92,6 +106,7 @@ class Report:
     compression_ratio: float | None = None
     notes: list[str] = dataclasses.field(default_factory=list)
     rad: rad.RadFacts | None = None
+    streamed_sog: streamed_sog.StreamedSogFacts | None = None
     tree: tree.TreeFacts | None = None
     values: values.ValueFacts | None = None
     chunks: list[Row] | None = None
@@ -150,12 +165,14 @@ def inspect(
         if held is not None:
             facts_of_arrays, scene_of_arrays = arrays.examine(held, settings, threads=threads)
             return Report(**arrays.as_report_fields(facts_of_arrays, path, size, settings)), scene_of_arrays
-        surveyed = rad.survey(path, check=settings.check)
+        surveyed = rad.survey(path, check=settings.check) or streamed_sog.survey(
+            path, check=settings.check, threads=threads, progress=progress
+        )
         if surveyed is not None and surveyed.facts is None:
             return Report(str(path), size, findings=surveyed.findings if settings.check else surveyed.fatal), None
         if surveyed is not None and settings.headers_only:
             return _of_headers(path, surveyed), None
-        if surveyed is not None and settings.at_once is not True:
+        if isinstance(surveyed, rad.Survey) and settings.at_once is not True:
             file = RadFile.open(path)
             if file is not None and not (settings.at_once is None and file.fits):
                 blocks = Blocks.of_file(file, threads=threads, progress=progress)
@@ -163,25 +180,33 @@ def inspect(
         scene = examine_scene(path, columns=columns, threads=threads, progress=progress)
     except FormatError as error:
         found = surveyed.findings if surveyed is not None and settings.check else []
-        return Report(str(path), size, findings=[*found, Finding(error.code, str(error))]), None
+        known = any(each.code == error.code for each in found)
+        return Report(str(path), size, findings=[*found, *([] if known else [Finding(error.code, str(error))])]), None
     return _of_blocks(path, Blocks.of(scene), size, settings, surveyed), scene
 
 
-def _of_headers(path: Path, surveyed: rad.Survey) -> Report:
-    """The report on a RAD file of which only the headers were read."""
-    header, facts = surveyed.header, surveyed.facts
-    assert facts is not None
+def _of_headers(path: Path, surveyed: Surveyed) -> Report:
+    """The report on a file of which only the headers were read."""
+    head = surveyed.head
+    assert head is not None
     return Report(
         str(path),
-        facts.bytes,
-        name_of(header),
-        header.count,
-        header.max_sh,
-        header.antialiased,
-        bytes_per_splat=_bytes_per_splat(facts.bytes, header.count),
-        compression_ratio=_compression_ratio(facts.bytes, header.count, header.max_sh),
-        rad=facts,
+        head.bytes,
+        head.format,
+        head.splats,
+        head.sh_degree,
+        head.antialiased,
+        bytes_per_splat=_bytes_per_splat(head.bytes, head.splats),
+        compression_ratio=_compression_ratio(head.bytes, head.splats, head.sh_degree),
+        **_facts_of(surveyed),
     )
+
+
+def _facts_of(surveyed: Surveyed | None) -> dict[str, Any]:
+    """The field of a report that has what the headers of a format tell."""
+    if surveyed is None:
+        return {}
+    return {"rad" if isinstance(surveyed, rad.Survey) else "streamed_sog": surveyed.facts}
 
 
 class _Passed(Protocol):
@@ -191,15 +216,17 @@ class _Passed(Protocol):
 
 
 def _of_blocks(
-    path: Path, blocks: Blocks, size: int | None, settings: ReportSettings, surveyed: rad.Survey | None
+    path: Path, blocks: Blocks, size: int | None, settings: ReportSettings, surveyed: Surveyed | None
 ) -> Report:
     """The report on a file that can be read, block by block."""
     size = blocks.header.get("bytes", size)
     ends = value_checks.ends_of(blocks.header)
     findings = _container_findings(blocks)
     if surveyed is not None and surveyed.facts is not None:
-        size, ends = surveyed.facts.bytes, rad.ends_of(surveyed.facts)
+        size = surveyed.facts.bytes
         findings += surveyed.findings
+    if isinstance(surveyed, rad.Survey) and surveyed.facts is not None:
+        ends = rad.ends_of(surveyed.facts)
     columns = tree.Columns.of(blocks.count) if blocks.is_tree and blocks.count else None
     statistics = values.Statistics(blocks.sh_degree, all_quantities=settings.all_quantities)
     checks = value_checks.ValueChecks(ends, is_tree=blocks.is_tree)
@@ -219,7 +246,7 @@ def _of_blocks(
     in_order = rows.rows(columns) if settings.chunks else None
     if columns is not None:
         facts, found = tree.examine_blocks(
-            blocks, columns, check=settings.check, scale_ends=ends.scale, in_chunks=surveyed is not None
+            blocks, columns, check=settings.check, scale_ends=ends.scale, in_chunks=isinstance(surveyed, rad.Survey)
         )
         findings += found
     if settings.check:
@@ -235,11 +262,11 @@ def _of_blocks(
         bytes_per_splat=_bytes_per_splat(size, blocks.count),
         compression_ratio=_compression_ratio(size, blocks.count, blocks.sh_degree),
         notes=list(blocks.notes),
-        rad=None if surveyed is None else surveyed.facts,
         tree=facts,
         values=statistics.facts() if settings.values else None,
         chunks=in_order,
         findings=findings if settings.check else None,
+        **_facts_of(surveyed),
     )
 
 

@@ -4,6 +4,7 @@ from .beside import companions
 from .chunks import read_rad_chunk, read_rad_header
 from .details import detail_files, detail_sink
 from .identity import Identity, content_of, files_of, identity_of
+from .level_files import LevelFiles, has_levels, read_level_files
 from .names import is_file_name
 from .rad_file import RadFile
 from .reading import examine_scene, opened, read_arrays, read_levels, read_scene, size_of_input
@@ -16,6 +17,7 @@ from .writing import Sink, check_writable, sink, write_stdout, write_whole
 __all__ = [
     "MAX_TEXT",
     "Identity",
+    "LevelFiles",
     "PlacedFile",
     "RadFile",
     "SceneSink",
@@ -29,12 +31,14 @@ __all__ = [
     "detail_sink",
     "examine_scene",
     "files_of",
+    "has_levels",
     "identity_of",
     "is_file_name",
     "open_stream",
     "open_streams",
     "opened",
     "read_arrays",
+    "read_level_files",
     "read_levels",
     "read_rad_chunk",
     "read_rad_header",

@@ -49,7 +49,9 @@ def detail_sink(path: Place, *, overwrite: bool) -> SinkTogether:
         check_writable(path, overwrite=overwrite)
         if path.exists() and not path.is_file():
             raise OutputError(f"{path} is a pipe or a device, which cannot take several files; name a file")
-    _check_folder(target, FIRST, _former(target))
+    former = _former(target)
+    for folder in [FIRST] if isinstance(target, Path) else [FIRST, *folders_of(_standing(target))]:
+        _check_folder(target, folder, former)  # at an address all of them now: nothing can be undone there later
     return functools.partial(_write, path, overwrite=overwrite)
 
 

@@ -24,12 +24,14 @@ class Budget:
         share: share of the leaves of all instances together; None for a count.
         count: number of splats; None for a share.
         scale: factor for the budget, Spark's `lodSplatScale`.
+        by_default: nobody chose it; viewers of another format have another default.
     """
 
     text: str
     share: Fraction | None
     count: int | None
     scale: float = 1.0
+    by_default: bool = False
 
     @classmethod
     def of_count(cls, count: int) -> Budget:

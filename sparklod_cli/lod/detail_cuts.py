@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..model.gaussian import spark_size
 from ..model.lod_tree import LodTree
 from ..model.splats import Splats
-from .kernels.tree_links import find_depths, find_parents
+from .detail_order import losses
+from .kernels.tree_links import find_parents
 
 #: Without given shares, each level has this share of the splats of the level before. A viewer goes one level coarser
 #: with each factor of its own in distance, by default 3 in PlayCanvas's engine: a surface then covers a ninth of the
@@ -78,8 +78,8 @@ def shares_of(levels: Sequence[float] | None, leaves: int) -> list[float]:
 def detail_cuts(nodes: Splats, tree: LodTree, shares: Sequence[float]) -> DetailCuts:
     """Cuts of a tree with shares of its leaves, rounded, never more and less by at most the children of a node.
 
-    Nodes are refined in the order of their limits, the least feature size from the root to the node; one order for all
-    cuts, so that each refines the coarser ones.
+    Nodes are refined in the order of their losses (see `detail_order.losses`), which do not grow from a node to its
+    children; one order for all cuts, so that each refines the coarser ones.
 
     Args:
         nodes: M splats, final order.
@@ -87,9 +87,9 @@ def detail_cuts(nodes: Splats, tree: LodTree, shares: Sequence[float]) -> Detail
         shares: of each level after full detail, descending, between 0 and 1.
     """
     parent, _ = find_parents(tree.child_count, tree.child_start)
-    _, limit = find_depths(tree.child_count, tree.child_start, spark_size(nodes))
+    loss = losses(nodes, tree, parent)
     inner = np.flatnonzero(~tree.is_leaf)
-    order = inner[np.argsort(-limit[inner], kind="stable")]  # parents come first among equals, too
+    order = inner[np.argsort(-loss[inner], kind="stable")]  # parents come first among equals, too
     turn = np.full(len(tree), len(order), np.int64)  # the number of nodes refined before it, leaves after all
     turn[order] = np.arange(len(order))
     turn_of_parent = np.where(parent >= 0, turn[np.maximum(parent, 0)], -1)

@@ -1,12 +1,13 @@
-"""`LodSettings`: what a viewer draws of Level-of-Detail trees."""
+"""`LodSettings`: what a viewer draws of Level-of-Detail trees, and of scenes at several detail levels."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from ..model.foveation import SPARK, Foveation
 from ..support.defaults import PRESETS
+from .detail_rule import DetailRule
 
 
 @dataclass(frozen=True)
@@ -20,6 +21,7 @@ class LodSettings:
         render_scale: multiplies the pixel scale of a pixel, Spark's `lodRenderScale`.
         continuous: width of continuous cuts, the ratio of the pixel scales between which a node fades into its
             children, above 1 (see `continuous`); None for ordinary cuts.
+        detail: how detail levels of Streamed SOG are chosen; all but this and the budget is of trees.
     """
 
     budget: int = PRESETS["desktop"]
@@ -27,6 +29,7 @@ class LodSettings:
     pixel_scale_limit: float | None = None
     render_scale: float = 1.0
     continuous: float | None = None
+    detail: DetailRule = field(default_factory=DetailRule)
 
     def limit(self, fov_y: float, height: int) -> float:
         """Pixel scale at or below which no node is refined; by vertical field of view (radians) and height (pixels)."""

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from .detail import DetailScene
 from .foveation import Foveation
 from .scene import Scene
 from .transforms import LARGEST, SKEW, Transform
@@ -25,10 +26,11 @@ class Instance:
     """A scene and where it stands.
 
     Attributes:
-        source: a splat file (a path, which may be a string), or a scene in memory.
+        source: a splat file (a path, which may be a string), or a scene in memory, of one level or more.
         name: its name in messages and tables; unique among the instances of a run.
         object_to_world: (4, 4) rotation, uniform scale and translation.
-        lod_scale: multiplies the pixel scales of its nodes; above 1 it gets more of the budget than others.
+        lod_scale: multiplies the pixel scales of its nodes, or the distances at which its detail levels begin; above 1
+            it gets more of the budget than others.
         foveation: its own; None for that of the viewer.
 
     Raises:
@@ -36,7 +38,7 @@ class Instance:
         ValueError: the matrix has another shape.
     """
 
-    source: Path | Scene
+    source: Path | Scene | DetailScene
     name: str = ""
     object_to_world: Matrix = field(default_factory=lambda: np.eye(4))
     lod_scale: float = 1.0
@@ -45,7 +47,7 @@ class Instance:
     def __post_init__(self) -> None:
         if isinstance(self.source, str):
             object.__setattr__(self, "source", Path(self.source))
-        if not isinstance(self.source, (Path, Scene)):
+        if not isinstance(self.source, (Path, Scene, DetailScene)):
             raise TypeError(f"an instance is of a file or a scene, not of {type(self.source).__name__}")
         matrix = np.asarray(self.object_to_world, np.float64)
         if matrix.shape != (4, 4):

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from ..cameras.camera import Camera
 from ..model.gaussian import lod_opacity, moved, spark_size
-from ..model.nodes import CHUNK_NODES
 from ..model.splats import FloatArray
 from ..scenes.finder import CutSource
 from ..scenes.loaded import Part
@@ -72,7 +71,8 @@ class Scale:
 def values_of(by: str, part: Part) -> FloatArray:
     """(M,) the numbers that some splats are coloured by: "level", "lod-opacity", "size" or "chunk".
 
-    Sizes are in world units; splats of files without a tree are of level 0.
+    A level is a depth in a tree, or a detail level. Sizes are in world units; splats of files without either are of
+    level 0.
     """
     if by in ("level", "chunk"):
         return numbers_of(by, part.scene, part.index).astype(np.float64)
@@ -91,13 +91,16 @@ def scale_of_splats(by: str, source: CutSource, cameras: Sequence[Camera], progr
         progress: called with the number of cuts that were examined.
 
     Raises:
-        SparklodError: by level, where no file is a tree.
+        SparklodError: by level, where no file has any.
     """
     candidates = source.candidates().parts
-    if by == "level" and not any(part.scene.is_tree for part in candidates):
-        raise SparklodError("there are no levels to colour by: no file is a Level-of-Detail tree")
-    if by in ("chunk", "level"):
-        return _whole(by, source, cameras, progress)
+    if by == "level" and not any(part.scene.has_cuts for part in candidates):
+        raise SparklodError("there are no levels to colour by: no file is a Level-of-Detail tree, or Streamed SOG")
+    if by == "level":
+        detail = not any(part.scene.is_tree for part in candidates)
+        return _whole(by, "detail level" if detail else "tree depth", source, cameras, progress)
+    if by == "chunk":
+        return _whole(by, by, source, cameras, progress)
     every = max(1, sum(len(part.index) for part in candidates) // SAMPLE)
     values = np.concatenate([values_of(by, part)[::every] for part in candidates])
     return _opacities(values) if by == "lod-opacity" else _sizes(values)
@@ -130,7 +133,7 @@ def scale_of_overdraw(counts: Sequence[FloatArray]) -> Scale:
     return _linear("overdraw", 0.0, max(1.0, float(math.ceil(most))), MAGMA, ends=True)
 
 
-def _whole(by: str, source: CutSource, cameras: Sequence[Camera], progress: Progress) -> Scale:
+def _whole(by: str, title: str, source: CutSource, cameras: Sequence[Camera], progress: Progress) -> Scale:
     """From the least to the most that some cameras see; others may see less, or more."""
     every = -(-len(cameras) // CUTS)
     some = cameras[::every]
@@ -142,14 +145,13 @@ def _whole(by: str, source: CutSource, cameras: Sequence[Camera], progress: Prog
     ends = ends or [(0, 0)]
     low, high = min(low for low, _ in ends), max(high for _, high in ends)
     beyond = int(every > 1)
-    title = "tree depth" if by == "level" else by
     return Scale(whole_numbers(title, np.arange(low - beyond, high + 1 + beyond), low, high), low, high)
 
 
 def numbers_of(by: str, scene: LoadedScene, index: Index) -> NDArray[np.int64]:
-    """(M,) the "level" or the "chunk" of some splats of a file; without a tree, all are of level 0."""
+    """(M,) the "level" or the "chunk" of some splats of a file; without levels, all are of level 0."""
     if by == "chunk":
-        return scene.first_chunk + index // CHUNK_NODES
+        return scene.chunk_of(index)
     return np.zeros(len(index), np.int64) if scene.depth is None else scene.depth[index].astype(np.int64)
 
 

@@ -8,6 +8,7 @@ from typing import Protocol
 
 from ..cameras.camera import Camera
 from ..lod.continuous import ContinuousCuts
+from ..lod.detail_traversal import DetailTraversal
 from ..lod.settings import LodSettings
 from ..lod.traversal import Traversal, View
 from .loaded import Cut, Part, Scenes
@@ -42,7 +43,7 @@ class CutFinder:
     """Finds what a viewer draws of scenes; several threads may ask it.
 
     Args:
-        scenes: with trees or without.
+        scenes: with trees or detail levels, or without.
         settings: of the viewer; None draws full detail.
 
     Raises:
@@ -51,11 +52,11 @@ class CutFinder:
 
     def __init__(self, scenes: Scenes, settings: LodSettings | None) -> None:
         self.scenes, self.settings = scenes, settings
-        self._traversal: Traversal | None = None
+        self._traversal: Traversal | DetailTraversal | None = None
         self._continuous: ContinuousCuts | None = None
-        if settings is not None and scenes.trees:
+        if settings is not None and scenes.with_cuts:
             self._traversal = scenes.traversal(settings)
-            if settings.continuous is not None:
+            if settings.continuous is not None and isinstance(self._traversal, Traversal):
                 self._continuous = ContinuousCuts(self._traversal)
 
     def with_budget(self, budget: int) -> CutFinder:
@@ -67,7 +68,7 @@ class CutFinder:
         return twin
 
     def cut(self, camera: Camera) -> Cut:
-        """What a camera sees: the cut of the trees, and all splats of scenes that have none."""
+        """What a camera sees: the cut of the trees or detail levels, and all splats of scenes that have none."""
         if self._traversal is None or self.settings is None:
             return self.scenes.full()
         view, limit = view_of(camera), self.settings.limit(camera.fov_y, camera.height)
@@ -82,7 +83,7 @@ class CutFinder:
         return Cut(self.scenes.parts_of(nodes), blended.threshold)
 
     def candidates(self) -> Cut:
-        """All that some camera may see: whole trees where cuts are drawn, else full detail."""
+        """All that some camera may see: whole trees and all levels where cuts are drawn, else full detail."""
         if self._traversal is None:
             return self.scenes.full()
         return Cut(

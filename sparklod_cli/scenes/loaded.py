@@ -9,8 +9,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ..lod import detail_rule
 from ..lod.budget import Budget
 from ..lod.continuous import faded
+from ..lod.detail_traversal import DetailForest, DetailTraversal
 from ..lod.settings import LodSettings
 from ..lod.traversal import Forest, Traversal, TreeCut, TreeInstance
 from ..model.balls import Balls, balls_of
@@ -22,6 +24,7 @@ from ..model.scene import Scene
 from ..model.splats import Splats
 from ..support.defaults import PRECISIONS
 from ..support.units import count_of
+from .detail_scene import LoadedDetail
 from .loaded_scene import Index, LoadedScene, depth_of, nodes_of
 from .paged_forest import PagedForest
 from .paged_scene import PagedScene, sampled_balls
@@ -58,7 +61,7 @@ class Part:
 
     @property
     def depth(self) -> NDArray[np.int32]:
-        """(M,) edges from the root to each; 0 without a tree."""
+        """(M,) edges from the root to each, or its detail level; 0 of scenes without."""
         depth = self.scene.depth
         return np.zeros(len(self.index), np.int32) if depth is None else depth[self.index]
 
@@ -70,8 +73,8 @@ class Cut:
     Attributes:
         parts: one for each instance.
         pixel_scale: nodes above it are refined; None where no tree was cut, or nothing refined.
-        reason: why the cut has no more nodes: "budget", "pixel" (the limit), "missing" (chunks) or "exhausted" (full
-            detail); None where no tree was cut, or the cut is continuous.
+        reason: why the cut has no more nodes: "budget", "pixel" (the limit), "missing" (chunks), "distance" (of detail
+            levels) or "exhausted" (full detail); None where all is drawn, or the cut is continuous.
     """
 
     parts: tuple[Part, ...]
@@ -134,17 +137,40 @@ class Scenes:
         return [loaded for loaded in self.loaded if loaded.is_tree]
 
     @functools.cached_property
+    def details(self) -> list[LoadedDetail]:
+        """The scenes at several detail levels, in the order of `detail_forest`."""
+        return [loaded for loaded in self.loaded if isinstance(loaded, LoadedDetail)]
+
+    @property
+    def with_cuts(self) -> Sequence[LoadedScene]:
+        """The scenes of which viewers draw cuts, in the order of `forest`: trees, or scenes at several detail levels.
+
+        Raises:
+            ValueError: there are both, which no viewer draws.
+        """
+        if self.trees and self.details:
+            raise ValueError(
+                f"{self.trees[0].name} is a Level-of-Detail tree and {self.details[0].name} is Streamed SOG, whose"
+                " viewers choose splats in different ways; look at one of them at a time, or at full detail"
+            )
+        return self.details or self.trees
+
+    @functools.cached_property
     def leaves(self) -> int:
-        """Leaves of all instances of trees together: what budgets are shares of."""
-        return sum(loaded.leaf_count for loaded in self.of_instance if loaded.is_tree)
+        """Splats of full detail of all instances of which cuts are drawn: what budgets are shares of."""
+        return sum(loaded.leaf_count for loaded in self.of_instance if loaded.has_cuts)
 
     def splats_of(self, budget: Budget) -> int:
         """The splats of a budget, of which some are shares of the leaves."""
+        if budget.by_default and self.details:
+            budget = replace(budget, count=detail_rule.BUDGET)
         return budget.of(self.leaves if budget.share is not None else 0)
 
     @functools.cached_property
     def forest(self) -> Forest:
-        """The trees as the traversal reads them."""
+        """The trees, or the scenes at several detail levels, as traversals read them."""
+        if self.details:
+            return self.detail_forest
         if not any(isinstance(loaded, PagedScene) for loaded in self.trees):
             return Forest([self._nodes(loaded.scene) for loaded in self.trees])
         return PagedForest(
@@ -155,30 +181,45 @@ class Scenes:
         )
 
     @functools.cached_property
+    def detail_forest(self) -> DetailForest:
+        """The scenes at several detail levels as traversals read them."""
+        details = self.details
+        return DetailForest(
+            [loaded.detail for loaded in details],
+            [loaded.scene.splats for loaded in details],
+            [loaded.files for loaded in details],
+        )
+
+    @functools.cached_property
     def depth(self) -> NDArray[np.int32]:
-        """(nodes,) edges from the root to each node of `forest`, as far as it was read."""
+        """(nodes,) edges from the root to each node of `forest`, as far as it was read, or the detail level of each."""
         if isinstance(self.forest, PagedForest):
             return self.forest.depth
-        return np.concatenate([depth_of(loaded) for loaded in self.trees])
+        return np.concatenate([depth_of(loaded) for loaded in self.with_cuts])
 
     def _nodes(self, scene: Scene) -> Nodes:
         assert scene.tree is not None
         return nodes_of(scene.splats, scene.tree, self.precision, self.threads)
 
     def tree_instances(self, foveation: Foveation) -> list[TreeInstance]:
-        """The instances of trees; those without a foveation of their own have this one."""
-        numbers = {id(loaded): number for number, loaded in enumerate(self.trees)}
+        """The instances of which cuts are drawn; those without a foveation of their own have this one."""
+        numbers = {id(loaded): number for number, loaded in enumerate(self.with_cuts)}
         return [
             TreeInstance(numbers[id(loaded)], at.object_to_world, at.lod_scale, at.foveation or foveation)
             for at, loaded in zip(self.instances, self.of_instance, strict=True)
-            if loaded.is_tree
+            if loaded.has_cuts
         ]
 
-    def traversal(self, settings: LodSettings) -> Traversal:
-        """Finds the cuts of the instances of trees.
+    def traversal(self, settings: LodSettings, *, remembers: bool = False) -> Traversal | DetailTraversal:
+        """Finds the cuts of the instances of trees, or of scenes at several detail levels.
+
+        Args:
+            settings: of the viewer.
+            remembers: of `DetailTraversal`: cuts are found one after the other, along a path.
 
         Raises:
-            ValueError: the budget is too small for the roots, or there are too many instances.
+            ValueError: the budget is too small for the roots, there are too many instances, or trees as well as scenes
+                at several detail levels; or the settings are for trees alone.
         """
         instances = self.tree_instances(settings.foveation)
         if settings.budget < len(instances):
@@ -186,7 +227,21 @@ class Scenes:
             raise ValueError(f"a budget of {budget} is less than one for each of {len(instances)} instances")
         if len(instances) > MAX_INSTANCES:
             raise ValueError(f"{len(instances):,} instances are more than {MAX_INSTANCES:,}")
-        return Traversal(self.forest, instances)
+        if not self.details:
+            return Traversal(self.forest, instances)
+        self._check_detail(settings)
+        fixed = sum(loaded.leaf_count for loaded in self.of_instance if not loaded.has_cuts)
+        return DetailTraversal(self.detail_forest, instances, settings.detail, fixed=fixed, remembers=remembers)
+
+    def _check_detail(self, settings: LodSettings) -> None:
+        """Raises a ValueError for what viewers of Streamed SOG do not do."""
+        if settings.continuous is not None:
+            raise ValueError(f"{self.details[0].name} is Streamed SOG; continuous cuts are of trees alone")
+        for at, loaded in zip(self.instances, self.of_instance, strict=True):
+            if loaded.has_cuts and at.foveation is not None:
+                raise ValueError(
+                    f"{at.name} is Streamed SOG, and has a foveation, which is for trees alone; leave it out"
+                )
 
     def full(self) -> Cut:
         """Full detail: all leaves, and all splats of scenes without trees."""
@@ -198,11 +253,11 @@ class Scenes:
         return Cut(self.parts_of([(nodes, None) for nodes in found.indices()]), least, found.reason)
 
     def parts_of(self, of_trees: Sequence[tuple[NDArray[np.uint32], Weights | None]]) -> tuple[Part, ...]:
-        """What is drawn of each instance: of trees, in order, these nodes by these weights; of others all splats."""
+        """What is drawn of each instance: of those with cuts, in order, these nodes by these weights; of others all."""
         found = iter(of_trees)
         parts = []
         for number, (at, loaded) in enumerate(zip(self.instances, self.of_instance, strict=True)):
-            if loaded.is_tree:
+            if loaded.has_cuts:
                 nodes, weight = next(found)
                 parts.append(Part(loaded, nodes.astype(np.int64), weight, at.object_to_world))
             else:

@@ -49,6 +49,11 @@ class LoadedScene:
         """Whether it has a Level-of-Detail tree, so that cuts of it can be drawn."""
         return self.scene.tree is not None
 
+    @property
+    def has_cuts(self) -> bool:
+        """Whether a viewer draws cuts of it, by what a camera sees: of a tree, or of detail levels."""
+        return self.is_tree
+
     @functools.cached_property
     def depth(self) -> NDArray[np.int32] | None:
         """(N,) edges from the root to each node; None without a tree."""
@@ -93,6 +98,10 @@ class LoadedScene:
         """Whether its format has chunks of as many splats as Spark streams (RAD)."""
         sizes, splats = self.scene.chunk_bytes, self.scene.header.get("chunk_size")
         return sizes is not None and len(sizes) == self.chunks and splats == CHUNK_NODES
+
+    def chunk_of(self, index: Index) -> NDArray[np.int64]:
+        """(M,) numbers of the chunks that some splats are in, where the chunks of all scenes are counted."""
+        return self.first_chunk + index // CHUNK_NODES
 
     def chunk_bytes(self) -> NDArray[np.int64]:
         """(chunks,) bytes of each in the file; without chunks of its own (SPZ) as if the file were cut evenly."""

@@ -8,7 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from ..codecs.rounding import after
-from ..io import RadFile, examine_scene, size_of_input
+from ..io import RadFile, examine_scene, has_levels, read_level_files, read_levels, size_of_input
+from ..model.detail import DetailScene
 from ..model.instances import Instance
 from ..model.nodes import CHUNK_NODES
 from ..model.scene import Scene
@@ -18,6 +19,7 @@ from ..support.defaults import PRECISIONS
 from ..support.errors import FormatError, InvalidSplatsError, SparklodError, TreeError, memory_errors_translated
 from ..support.progress import Progress, silent
 from ..support.stdin import DASH
+from .detail_scene import LoadedDetail, files_in_memory, files_of, whole_scene
 from .loaded import Scenes
 from .loaded_scene import UNNAMED, LoadedScene, nodes_of
 from .paged_scene import PagedScene, empty_scene
@@ -42,7 +44,7 @@ def read_scenes(
     Args:
         instances: at least one.
         columns: of `Splats` that are read; only with `trees_only`; of scenes without trees all are read.
-        trees_only: refuse scenes without trees.
+        trees_only: refuse scenes of which no cuts are drawn: those with neither a tree nor detail levels.
         through: one of `rounding.ROUND_TRIPS`, a coding after which splats are drawn; cuts are those of the scene.
         precision: one of `PRECISIONS`, of the nodes that cuts are found with.
         paged: only cuts are looked at, so that of large RAD trees those chunks suffice
@@ -70,11 +72,21 @@ def read_scenes(
             loaded[_key(source)] = entry
             chunks += entry.chunks
             continue
+        detail = _detail(source, threads, progress)
+        if detail is not None:
+            entry = _loaded_detail(source, detail, through, chunks, threads)
+            notes += (f"{entry.name}: {note}" for note in detail.notes)
+            loaded[_key(source)] = entry
+            chunks += entry.chunks
+            continue
+        assert not isinstance(source, DetailScene)
         scene = _read(source, columns if trees_only else COLUMNS, threads, progress)
         file = source if isinstance(source, Path) else None
         name = file if file is not None else UNNAMED
         if scene.tree is None and trees_only:
-            raise FormatError(f"{name}: it is not a Level-of-Detail tree; bake it first with sparklod build-lod")
+            raise FormatError(
+                f"{name}: it is not a Level-of-Detail tree, nor Streamed SOG; bake it first with sparklod build-lod"
+            )
         notes += (f"{name}: {note}" for note in scene.notes)
         if scene.tree is None:
             scene = _drawable(str(name), scene, notes)
@@ -86,13 +98,40 @@ def read_scenes(
     return Scenes(instances, list(loaded.values()), of_instance, notes, precision, threads)
 
 
-def _key(source: Path | Scene) -> Path | int:
+def _key(source: Path | Scene | DetailScene) -> Path | int:
     return source if isinstance(source, Path) else id(source)
 
 
-def _pages(source: Path | Scene, precision: str, threads: int) -> Pages | None:
+def _detail(source: Path | Scene | DetailScene, threads: int, progress: Progress) -> DetailScene | None:
+    """A scene at several detail levels; None for others."""
+    if isinstance(source, Scene):
+        return None
+    try:
+        if not isinstance(source, DetailScene):
+            if not has_levels(source):
+                return None
+            with memory_errors_translated():
+                source = read_levels(source, threads=threads, progress=progress)
+    except SparklodError as error:
+        raise type(error)(f"{source}: {error}") from None
+    return source
+
+
+def _loaded_detail(
+    source: Path | Scene | DetailScene, detail: DetailScene, through: str | None, chunks: int, threads: int
+) -> LoadedDetail:
+    file = source if isinstance(source, Path) else None
+    scene = whole_scene(detail)
+    if not len(scene.splats):
+        raise InvalidSplatsError(f"{file or UNNAMED}: it has no splats")
+    files = files_in_memory(detail) if file is None else files_of(read_level_files(file))
+    drawn = after(through, file or Path(UNNAMED), scene, threads)
+    return LoadedDetail(file, int(files.sizes.sum()) + files.manifest, scene, drawn, chunks, detail=detail, files=files)
+
+
+def _pages(source: Path | Scene | DetailScene, precision: str, threads: int) -> Pages | None:
     """The pages of a file that is too large to be read whole; None for others, and where reading them will fail."""
-    if isinstance(source, Scene) or source == DASH:
+    if isinstance(source, (Scene, DetailScene)) or source == DASH:
         return None
     try:
         file = RadFile.open(source)

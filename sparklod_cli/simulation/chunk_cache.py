@@ -10,6 +10,8 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..support.defaults import FETCHERS
+
 #: How many bytes Spark's pager asks for at first, then if they do not hold the whole header of a file.
 HEADER_REQUESTS = (64 << 10, 256 << 10, 1 << 20)
 
@@ -40,19 +42,31 @@ class Chunks:
         sizes: for each tree the sizes of its chunks in the file, bytes.
         headers: for each tree the sizes of the answers that a viewer waits for, one after the other, before it can ask
             for a chunk, see `header_answers`; none unless given.
+        rooted: whether trees are drawn from their first chunks on, which hold their roots; chunk files of Streamed SOG
+            are drawn each for itself.
+        fetchers: how many a viewer fetches at a time unless told otherwise.
 
     Attributes:
         sizes: of each chunk, bytes.
-        roots: the first chunk of each tree, which holds its root.
+        firsts: the first chunk of each tree.
+        roots: the chunks that are always wanted: the first of each tree if `rooted`.
         headers: for each tree.
 
     Raises:
         ValueError: a tree has no chunks, or a size is negative; or there are not as many headers as trees.
     """
 
-    def __init__(self, sizes: Sequence[ArrayLike], headers: Sequence[Sequence[int]] | None = None) -> None:
+    def __init__(
+        self,
+        sizes: Sequence[ArrayLike],
+        headers: Sequence[Sequence[int]] | None = None,
+        *,
+        rooted: bool = True,
+        fetchers: int = FETCHERS,
+    ) -> None:
+        self.fetchers = fetchers
         self.sizes: list[int] = []
-        self.roots: list[int] = []
+        self.firsts: list[int] = []
         self.headers = [tuple(each) for each in headers or [()] * len(sizes)]
         if len(self.headers) != len(sizes):
             raise ValueError(f"there are {len(self.headers)} headers of {len(sizes)} trees")
@@ -60,15 +74,20 @@ class Chunks:
             column = np.asarray(of_tree, np.int64)
             if column.ndim != 1 or not len(column) or column.min() < 0:
                 raise ValueError(f"the chunks of tree {tree} must be a list of sizes, each 0 or more")
-            self.roots.append(len(self.sizes))
+            self.firsts.append(len(self.sizes))
             self.sizes += column.tolist()
+        self.roots = self.firsts if rooted else []
 
     def __len__(self) -> int:
         return len(self.sizes)
 
     def tree_of(self, chunk: int) -> int:
         """The tree of a chunk."""
-        return bisect_right(self.roots, chunk) - 1
+        return bisect_right(self.firsts, chunk) - 1
+
+    def shows(self, resident: NDArray[np.bool_]) -> bool:
+        """Whether anything is drawn with (chunks,) bool resident chunks."""
+        return bool((resident[self.roots] if self.roots else resident).any())
 
     def bytes_of(self, chunks: Iterable[int]) -> int:
         """The total size of some chunks."""

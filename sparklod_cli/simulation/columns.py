@@ -39,13 +39,19 @@ COLUMNS = (
         "",
         "why the cut is not finer: `budget`: refining one more node would exceed it; `pixel`: no node above the "
         "pixel-scale limit is left to refine; `missing`: the children of the nodes to be refined are not resident; "
-        "`exhausted`: only leaves are left",
+        "`exhausted`: only leaves are left; of Streamed SOG `distance`: no region is near enough for a finer level",
     ),
     Column("pixel_scale_min", float, ".6g", "", "pixel scale down to which all nodes have been refined"),
     Column("frontier", int, "", "splats", "of the cut, nodes still waiting to be refined when the search stops"),
-    Column("level_min", int, "", "", "smallest depth of a node of the cut: edges from the root"),
-    Column("level_mean", float, ".3f", "", "mean depth of the nodes of the cut"),
-    Column("level_max", int, "", "", "largest depth of a node of the cut"),
+    Column(
+        "level_min",
+        int,
+        "",
+        "",
+        "smallest depth of a node of the cut, edges from the root; of Streamed SOG the finest detail level",
+    ),
+    Column("level_mean", float, ".3f", "", "mean depth of the nodes of the cut, or detail level of its splats"),
+    Column("level_max", int, "", "", "largest depth of a node of the cut, or detail level"),
     Column("in_frustum", int, "", "splats", "of the cut, splats inside the frustum: their centre is in the image"),
     Column("outside", int, "", "splats", "of the cut, splats in front of the camera but outside the frustum"),
     Column("behind", int, "", "splats", "of the cut, splats behind the camera"),
@@ -63,7 +69,8 @@ COLUMNS = (
         int,
         "",
         "chunks",
-        "chunks of 65,536 nodes that the search for the cut reads, or would read if they were resident",
+        "chunks of 65,536 nodes that the search for the cut reads, or would read if they were resident; of Streamed SOG"
+        " chunk files that are drawn from or asked for",
     ),
     Column("chunks_new", int, "", "chunks", "chunks that arrived since the previous frame"),
     Column(
@@ -71,8 +78,8 @@ COLUMNS = (
         int,
         "",
         "bytes",
-        "bytes that arrived since the previous frame: chunks and header of RAD; of SPZ, which has no chunks, as if the "
-        "file were cut evenly",
+        "bytes that arrived since the previous frame: chunks and header of RAD, chunk files and manifest of Streamed "
+        "SOG; of SPZ, which has no chunks, as if the file were cut evenly",
     ),
     Column("chunks_resident", int, "", "chunks", "chunks in the cache after this frame"),
     Column(
@@ -80,7 +87,8 @@ COLUMNS = (
         int,
         "",
         "splats",
-        "nodes drawn although they should be refined, because their children are not resident",
+        "nodes drawn although they should be refined, because their children are not resident; of Streamed SOG splats "
+        "that should be drawn, but whose chunk files are not resident",
     ),
     Column(
         "complete_in_s",
@@ -111,6 +119,9 @@ LOADING = (
     Column("resident_all_bytes", int, "", "bytes", "bytes that have arrived by then"),
 )
 
+#: Columns that Streamed SOG has no values for.
+OF_TREES = ("pixel_scale_limit", "pixel_scale_min", "frontier")
+
 #: Columns that differ from run to run.
 TIMING = ("traverse_ms",)
 
@@ -122,6 +133,9 @@ EMPTY = {
     "added": "it compares a frame with the one before, and there is only one frame",
     "removed": "it compares a frame with the one before, and there is only one frame",
     "churn": "it compares a frame with the one before, and there is only one frame",
+    "pixel_scale_limit": "only trees have it, not Streamed SOG",
+    "pixel_scale_min": "no node was refined, or it is Streamed SOG",
+    "frontier": "only trees have it, not Streamed SOG",
     "projected_px_p50": "no splat is inside the frustum on any frame",
     "projected_px_p95": "no splat is inside the frustum on any frame",
 } | dict.fromkeys((column.name for column in LOADING), "it needs --bandwidth, and a --chunk-cache that suffices")

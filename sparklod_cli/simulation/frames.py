@@ -19,7 +19,7 @@ from ..scenes.loaded import Scenes
 from ..support.parallel import ordered_map
 from ..support.progress import Progress, silent
 from ..tables.columns import Row
-from .columns import COLUMNS
+from .columns import COLUMNS, OF_TREES
 from .loading import chunks_of
 from .streaming import Stream, StreamingSettings
 
@@ -58,7 +58,7 @@ class Simulation:
     """A viewer that moves along a camera path through trees.
 
     Args:
-        scenes: scenes that are all trees.
+        scenes: scenes that all have cuts: trees, or several detail levels.
         settings: settings of the cuts; continuous cuts are not simulated.
         streaming: network and cache; everything is resident unless given.
         by_instance: make a row per instance, too.
@@ -77,7 +77,7 @@ class Simulation:
     ) -> None:
         self.scenes, self.settings, self._by_instance = scenes, settings, by_instance
         self._streaming = streaming or StreamingSettings()
-        self._traversal = scenes.traversal(settings)
+        self._traversal = scenes.traversal(settings, remembers=not self._streaming.network.instant)
         self._depth = scenes.depth
         self._chunks = chunks_of(scenes)
         self._names = [instance.name for instance in scenes.instances]
@@ -104,6 +104,8 @@ class Simulation:
             rows[0] |= chunks
             whole = drawn.whole
             in_front = 1 - whole.behind / whole.selected if whole.selected else 1.0
+            if self.scenes.details:
+                rows = [row | dict.fromkeys(OF_TREES) for row in rows]
             yield Frame(number, camera, drawn.cut, resident, [_rounded(row) for row in rows], in_front)
             progress("traverse", at + 1, len(path.cameras), "frame")
 
@@ -135,7 +137,8 @@ class Simulation:
         if instant:
             stream.want(wanted)
         drawn, resident = ideal, stream.cache.resident()
-        if not all(chunk in stream.cache for chunk in wanted):
+        # What is drawn of detail levels depends on what was drawn before, as long as files are missing.
+        if not all(chunk in stream.cache for chunk in wanted) or (self.scenes.details and not instant):
             drawn = self._find(camera, resident)
         if not instant:
             stream.want(drawn.cut.chunks())  # a viewer discovers chunks through those that it has

@@ -1,4 +1,4 @@
-"""Loading: what a visitor sees who opens a page with trees and waits, arrival by arrival."""
+"""Loading: what a visitor sees who opens a page with trees or Streamed SOG and waits, arrival by arrival."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cameras.camera import Camera
+from ..lod import detail_rule
 from ..lod.settings import LodSettings
 from ..lod.traversal import TreeCut
-from ..model.nodes import CHUNK_BITS
 from ..scenes.finder import CutFinder, view_of
 from ..scenes.loaded import Cut, Scenes
 from ..tables.columns import Row
@@ -44,7 +44,7 @@ class Loader:
     """Opens a page with scenes, for one camera after another.
 
     Args:
-        scenes: with trees; others are there from the beginning.
+        scenes: with trees or detail levels; others are there from the beginning.
         settings: of the cuts; continuous cuts are not simulated.
         streaming: network and cache.
 
@@ -86,7 +86,7 @@ class Loader:
         """
         figures: Row = dict.fromkeys(column.name for column in LOADING)
         for arrival in self.arrivals(camera):
-            if figures["first_picture_s"] is None and arrival.resident[self._chunks.roots].any():
+            if figures["first_picture_s"] is None and self._chunks.shows(arrival.resident):
                 figures["first_picture_s"] = arrival.seconds
             for name, share in (("resident_90", MOST), ("resident_all", 1)):
                 if figures[f"{name}_s"] is None and arrival.share >= share:
@@ -111,9 +111,10 @@ class Loader:
     def _splats_of(self, cut: TreeCut) -> NDArray[np.int64]:
         """(chunks,) how many splats of a cut are in each chunk of all trees."""
         counts = np.zeros(len(self._chunks), np.int64)
-        for view, nodes in zip(cut.views, cut.indices(), strict=True):
-            chunks, splats = np.unique(nodes >> CHUNK_BITS, return_counts=True)
-            counts[int(view["chunk_base"]) + chunks.astype(np.int64)] += splats
+        scenes = [loaded for loaded in self.scenes.of_instance if loaded.has_cuts]
+        for loaded, view, nodes in zip(scenes, cut.views, cut.indices(), strict=True):
+            chunks, splats = np.unique(loaded.chunk_of(nodes.astype(np.int64)) - loaded.first_chunk, return_counts=True)
+            counts[int(view["chunk_base"]) + chunks] += splats
         return counts
 
 
@@ -121,7 +122,7 @@ class LoadingCuts:
     """What visitors see who opened the page so many seconds ago, each in front of a camera of their own.
 
     Args:
-        scenes: some or all of them trees; those that are none are there from the beginning.
+        scenes: some or all of them with cuts; others are there from the beginning.
         settings, streaming: as of `Loader`.
         seconds: since then.
 
@@ -143,7 +144,11 @@ class LoadingCuts:
 
 
 def chunks_of(scenes: Scenes) -> Chunks:
-    """The chunks of all trees of scenes, and what a viewer needs before it can ask for them."""
+    """The chunks of scenes with cuts, and what a viewer needs before it can ask for them."""
+    if scenes.details:
+        manifests = [[loaded.files.manifest] if loaded.files.manifest else [] for loaded in scenes.details]
+        sizes = [loaded.chunk_bytes() for loaded in scenes.details]
+        return Chunks(sizes, manifests, rooted=False, fetchers=detail_rule.FETCHERS)
     return Chunks(
         [tree.chunk_bytes() for tree in scenes.trees],
         [header_answers(tree.header_bytes, tree.bytes) for tree in scenes.trees],

@@ -9,7 +9,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from heapq import heappop, heappush
 
-from ..support.defaults import FETCHERS
 from .chunk_cache import ChunkCache, Chunks
 
 
@@ -20,7 +19,8 @@ class Network:
     Attributes:
         bandwidth: bytes/s, shared equally by all transfers under way.
         latency: seconds from the request for a chunk to its first byte, during which it uses no bandwidth.
-        fetchers: maximum number of concurrent requests; Spark's `numFetchers` is 3.
+        fetchers: maximum number of concurrent requests; None for that of the viewer: 3 in Spark (`numFetchers`), 2
+            in PlayCanvas, which shows Streamed SOG.
 
     Raises:
         ValueError: a value is out of range.
@@ -28,14 +28,14 @@ class Network:
 
     bandwidth: float = math.inf
     latency: float = 0.0
-    fetchers: int = FETCHERS
+    fetchers: int | None = None
 
     def __post_init__(self) -> None:
         if not self.bandwidth > 0:
             raise ValueError(f"a bandwidth of {self.bandwidth:g} bytes/s brings nothing; make it more than 0")
         if not 0 <= self.latency < math.inf:
             raise ValueError(f"a latency of {self.latency:g} s is not possible; make it 0 or more")
-        if self.fetchers < 1:
+        if self.fetchers is not None and self.fetchers < 1:
             raise ValueError(f"{self.fetchers} fetchers bring nothing; make it 1 or more")
 
     @property
@@ -92,6 +92,7 @@ class Stream:
     ) -> None:
         self._chunks = chunks
         self._network = network or Network()
+        self._fetchers = self._network.fetchers or chunks.fetchers
         self.cache = ChunkCache(chunks, capacity)
         self.now = start
         self._next = 0  # all admitted chunks before this one are resident or under way
@@ -179,7 +180,7 @@ class Stream:
     def _request(self, time: float) -> None:
         """Starts requests on the free fetchers."""
         admitted = self.cache.admitted
-        while len(self._under_way) < self._network.fetchers and self._next < len(admitted):
+        while len(self._under_way) < self._fetchers and self._next < len(admitted):
             chunk = admitted[self._next]
             self._next += 1
             if chunk not in self.cache and chunk not in self._under_way:

@@ -12,8 +12,19 @@ from sparklod_cli.commands.render import render
 from sparklod_cli.commands.traverse import traverse
 
 HEADINGS = {
-    "render": [COMMON, "Inputs", "Cameras", "Cut", "Streaming", "Appearance", "Comparison", "Output", GENERAL],
-    "traverse": [COMMON, "Inputs", "Cameras", "Cut", "Streaming", "Output", GENERAL],
+    "render": [
+        COMMON,
+        "Inputs",
+        "Cameras",
+        "Cut",
+        "Streamed SOG",
+        "Streaming",
+        "Appearance",
+        "Comparison",
+        "Output",
+        GENERAL,
+    ],
+    "traverse": [COMMON, "Inputs", "Cameras", "Cut", "Streamed SOG", "Streaming", "Output", GENERAL],
 }
 
 

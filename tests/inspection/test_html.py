@@ -235,13 +235,16 @@ def test_many_files_are_listed() -> None:
     assert "Report on 3 splat files" in " ".join(reader.text)
 
 
-@pytest.mark.parametrize("name", ["golden/tree-v3.spz", "golden/sh3-v2.sog", "sh1.ply", "points.ply"])
+@pytest.mark.parametrize(
+    "name", ["golden/tree-v3.spz", "golden/sh3-v2.sog", "golden/sh1-streamed-sog", "sh1.ply", "points.ply"]
+)
 def test_a_page_of_a_real_file_says_what_its_report_says(name: str) -> None:
     report, scene = inspect(FIXTURES / name, ReportSettings(values=True, all_quantities=True, check=True))
     counted = {} if scene is None else {name: histogram_of(scene.splats, name) for name in names_of(scene.splats)}
     text = said(Section(report.as_dict(), histograms=counted))
     assert name in text
     assert ("Nodes by depth" in text) == (report.tree is not None)
+    assert ("Detail levels" in text) == (report.streamed_sog is not None)
     assert ("anisotropy" in text) == (scene is not None)
 
 

@@ -173,7 +173,8 @@ def full(lod: Path) -> Report:
     report["chunks"][0]["bytes"] = 1
     finding = {"severity": "error", "code": "tree.size", "message": "node 3", "index": 3, "count": 1}
     rad = report_of(FIXTURES / "golden" / "sh1-tree.rad", ReportSettings())["rad"]
-    report = report | {"findings": [finding], "notes": ["a note"], "rad": rad}
+    streamed = report_of(FIXTURES / "golden" / "sh1-streamed-sog", ReportSettings())["streamed_sog"]
+    report = report | {"findings": [finding], "notes": ["a note"], "rad": rad, "streamed_sog": streamed}
     assert faults(report) == []
     return report
 
@@ -186,6 +187,7 @@ def may_be_null(way: tuple[Any, ...]) -> bool:
             "bytes_per_splat",
             "compression_ratio",
             "rad",
+            "streamed_sog",
             "tree",
             "values",
             "chunks",
@@ -196,6 +198,7 @@ def may_be_null(way: tuple[Any, ...]) -> bool:
         way in (("values", "box"), ("values", "box_98"), ("tree", "more_than_opaque"))
         or way in (("rad", "chunk_bytes"), ("rad", "ranges"), ("rad", "comment"))
         or (way[:2] == ("rad", "properties") and way[-1] in ("min", "max"))
+        or (way[0] == "streamed_sog" and way[-1] in ("generator", "file_bytes", "environment", "share", "errors"))
         or (way[:2] == ("values", "quantities") and len(way) == 4)
         or (way[0] == "chunks" and len(way) == 3 and way[-1] not in ("chunk", "base", "splats"))
         or (finding and way[-1] in ("index", "count"))
@@ -319,7 +322,7 @@ def test_the_page_has_every_field(full: Report) -> None:
         value_at(full, way.replace("KEY", "rgbMax").replace("PROPERTY", "center"))
     tops = {way.split(".")[0] for way in named}
     assert tops == SCHEMA["properties"].keys()
-    for name in ("rad", "tree", "values"):
+    for name in ("rad", "streamed_sog", "tree", "values"):
         assert {way.split(".")[1] for way in named if way.startswith(f"{name}.")} == full[name].keys()
     assert {way.split(".")[2] for way in named if way.startswith("chunks.")} == {each.name for each in chunks.COLUMNS}
     assert {way.split(".")[2] for way in named if way.startswith("findings.")} == full["findings"][0].keys()

@@ -16,6 +16,7 @@ from ...support.parallel import ordered_map
 from ...support.progress import Progress
 from ...support.units import count_of
 from ...support.untrusted import quoted_value
+from ..promises import error_of
 from ..sog import codec as sog
 from .names import MANIFEST
 
@@ -89,7 +90,8 @@ def check_count(chunk: Chunk, count: int) -> None:
     """Raises `FormatError` where a chunk has another number of splats than its runs."""
     if chunk.count != count:
         has = count_of(chunk.count, "splat")
-        raise FormatError(f"{quoted_value(chunk.name)} has {has}, but its runs in {MANIFEST} have {count:,}")
+        text = f"{quoted_value(chunk.name)} has {has}, but its runs in {MANIFEST} have {count:,}"
+        raise error_of("streamed-sog.runs", text)
 
 
 def filled(beside: Beside | None, chunks: Sequence[Chunk], sh_degree: int, threads: int, progress: Progress) -> Splats:
@@ -140,7 +142,7 @@ def _copy(out: Splats, piece: Piece, splats: Splats) -> None:
 
 @contextlib.contextmanager
 def _opened(beside: Beside | None, name: str) -> Iterator[tuple[BinaryIO, Beside]]:
-    """The meta.json of a chunk, and what opens the files beside that; `FormatError`s of the body name the chunk."""
+    """The meta.json of a chunk, and what opens the files beside that; errors of the body name the chunk."""
     if beside is None:
         raise FormatError(f"{MANIFEST} names {quoted_value(name)}, but other files cannot be opened here")
     folder = posixpath.dirname(name)
@@ -148,8 +150,12 @@ def _opened(beside: Beside | None, name: str) -> Iterator[tuple[BinaryIO, Beside
     def images(other: str) -> BinaryIO:
         return beside(f"{folder}/{other}" if folder else other)
 
-    with beside(name) as file:
+    try:
+        opened = beside(name)
+    except FormatError as error:  # which names it
+        raise error_of("streamed-sog.chunk-files", str(error)) from None
+    with opened as file:
         try:
             yield file, images
         except FormatError as error:
-            raise type(error)(f"{quoted_value(name)}: {error}") from None
+            raise error_of("streamed-sog.chunk-files", f"{quoted_value(name)}: {error}") from None

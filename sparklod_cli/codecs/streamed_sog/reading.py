@@ -18,11 +18,13 @@ from ...support.progress import Progress, silent
 from ...support.untrusted import quoted_value
 from ..compression import check_promise
 from ..content import Scratch
+from ..promises import check
 from ..stream import size_of
 from .chunks import Beside, Chunk, Piece, check_count, filled, open_chunk
 from .layout import Layout, layout_of
 from .manifest import MAX_MANIFEST, VERSION, parse
 from .names import MANIFEST
+from .promises import violations
 
 
 def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent, beside: Beside | None = None) -> Scene:
@@ -155,7 +157,10 @@ class _Opened:
 def _open(source: BinaryIO, beside: Beside | None, *, full_detail: bool) -> _Opened:
     """A manifest and its chunks: those of level 0, or all."""
     size = size_of(source)
-    layout = layout_of(parse(source.read(MAX_MANIFEST + 1)))
+    parsed = parse(source.read(MAX_MANIFEST + 1))
+    if not full_detail:
+        check(violations(parsed))
+    layout = layout_of(parsed)
     runs, manifest = layout.runs, layout.manifest
     wanted = runs.level == 0 if full_detail else np.ones(len(runs.level), np.bool_)
     rows = np.cumsum(runs.count * wanted) - runs.count if full_detail else layout.starts()

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import click
 
+from ...lod import detail_rule
 from ...support import defaults
 from ..command import COMMON, option, with_options
 from ..usage import exclude, flag_of, require
@@ -16,10 +17,14 @@ from .types import Quantity, Real
 
 if TYPE_CHECKING:
     from ...lod.budget import Budget
+    from ...lod.detail_rule import DetailRule
     from ...lod.settings import LodSettings
     from ...model.foveation import Foveation
 
 HEADING = "Cut"
+
+#: A key of `defaults.PRESETS`.
+DEFAULT_PRESET = "desktop"
 
 #: The options of `cut_options` that have no effect where full detail is drawn.
 CUTS = (
@@ -58,7 +63,7 @@ class Cut:
 
     Attributes:
         budget: counts of splats, or shares of the leaves; one, but for comparisons.
-        preset: a key of `defaults.PRESETS`.
+        preset: a key of `defaults.PRESETS`; None for the default.
         lod_splat_scale: multiplies the budget.
         lod_render_scale: pixels; smaller nodes are not refined.
         pixel_scale_limit: the same as size over distance.
@@ -68,7 +73,7 @@ class Cut:
     """
 
     budget: tuple[Budget, ...] | None
-    preset: str
+    preset: str | None
     lod_splat_scale: float
     lod_render_scale: float
     pixel_scale_limit: float | None
@@ -105,7 +110,11 @@ class Cut:
         if self.budget is not None and len(self.budget) > 1:
             texts = ",".join(budget.text for budget in self.budget)
             raise click.UsageError(f"--budget {texts} names several, which only render --compare takes; give one")
-        budget = self.budget[0] if self.budget else Budget.of_count(defaults.PRESETS[self.preset])
+        if self.budget:
+            budget = self.budget[0]
+        else:
+            count = defaults.PRESETS[self.preset or DEFAULT_PRESET]
+            budget = replace(Budget.of_count(count), by_default=self.preset is None)
         scaled = budget.scaled(self.lod_splat_scale)
         if scaled.count is not None and not scaled.count * scaled.scale <= LARGEST:
             raise click.UsageError(
@@ -113,8 +122,8 @@ class Cut:
             )
         return scaled
 
-    def settings(self, budget: int) -> LodSettings:
-        """Settings of the cuts, with a budget in splats."""
+    def settings(self, budget: int, detail: DetailRule) -> LodSettings:
+        """Settings of the cuts, with a budget in splats and how detail levels of Streamed SOG are chosen."""
         from ...lod.settings import LodSettings
 
         return LodSettings(
@@ -123,6 +132,7 @@ class Cut:
             pixel_scale_limit=self.pixel_scale_limit,
             render_scale=self.lod_render_scale,
             continuous=self.width,
+            detail=detail,
         )
 
     @property
@@ -205,8 +215,8 @@ def cut_options(command: Command, *, pictures: bool = False) -> Command:
         add(
             "--preset",
             type=click.Choice(list(defaults.PRESETS)),
-            default="desktop",
-            help="Budget of a device: Spark 2's, or that of Spark's LoD design with preview-desktop and mobile.",
+            help="Budget of a device: Spark 2's, or that of Spark's LoD design with preview-desktop and mobile."
+            f"  [default: {DEFAULT_PRESET}; for Streamed SOG PlayCanvas's, {detail_rule.BUDGET:,} splats]",
         ),
         add(
             "--lod-splat-scale",

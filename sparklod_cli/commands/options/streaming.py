@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from ...lod import detail_rule
 from ...support import defaults
 from ...support.units import parse_bandwidth, parse_latency
 from ..command import option, with_options
@@ -54,7 +55,7 @@ class Streaming:
 
         if self.bandwidth is None:
             return StreamingSettings(chunk_cache=self.chunk_cache)
-        network = Network(self.bandwidth, self.latency or 0.0, self.fetchers or defaults.FETCHERS)
+        network = Network(self.bandwidth, self.latency or 0.0, self.fetchers)
         return StreamingSettings(network, self.chunk_cache)
 
 
@@ -118,6 +119,7 @@ def streaming_options(command: Command, *, pictures: bool = False) -> Command:
             "--fetchers",
             metavar="N",
             type=click.IntRange(1, 1000),
-            help=f"Number of chunks that are fetched at a time.  [default: {defaults.FETCHERS}]",
+            help="Number of chunks that are fetched at a time."
+            f"  [default: {defaults.FETCHERS}; {detail_rule.FETCHERS} of Streamed SOG]",
         ),
     )

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from sparklod_cli.inspection.expectations import NAMES, OF_RAD
-from tests.commands.inspect.runs import PLAIN, RAD, TREE, Said, inspect, records
+from sparklod_cli.inspection.expectations import FORMATS, NAMES
+from tests.commands.inspect.runs import PLAIN, RAD, STREAMED, TREE, Said, inspect, records
 
 #: Of a tree of nine nodes, of which six are leaves.
 HOLD = (
@@ -54,7 +54,8 @@ def test_what_a_plain_file_does_not_have_does_not_hold(capsys: Said) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_every_short_name_has_a_value_of_a_tree(name: str, capsys: Said) -> None:
-    assert inspect(RAD if name in OF_RAD else TREE, "--assert", f"{name}==12345") == 3
+    files = {"Streamed SOG": STREAMED, "RAD": RAD, "RAD or Streamed SOG": STREAMED}
+    assert inspect(files.get(FORMATS.get(name, ""), TREE), "--assert", f"{name}==12345") == 3
     assert f"{name}==12345: {name} is " in capsys.readouterr().out
 
 

@@ -170,4 +170,4 @@ def test_cameras_that_see_nothing_give_a_warning(tmp_path: Path, capsys: Said) -
 
 def test_a_budget_for_files_without_a_tree_gives_a_warning(tmp_path: Path, capsys: Said) -> None:
     assert render(PLAIN, *SIZE, "--budget", 50, "-o", tmp_path / "x.png") == 0
-    assert "no file is a Level-of-Detail tree, so all splats are drawn" in capsys.readouterr().err
+    assert "no file has levels to choose, so all splats are drawn" in capsys.readouterr().err

@@ -23,7 +23,9 @@ from sparklod_cli.render.rasterizer import Image
 from sparklod_cli.render.settings import RasterSettings
 from sparklod_cli.render.shading import ShadedSplats
 from tests.conftest import FIXTURES
+from tests.lod.details import row_of_regions
 from tests.scenes import random_splats
+from tests.streamed import write_streamed
 
 CAMERAS = FIXTURES / "cameras"
 AT = ("--look-at", "0.5,-0.2,-2:0,0.1,0")
@@ -58,6 +60,11 @@ GIVEN: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "budget": ((), ("--budget", "50")),
     "preset": ((), ("--preset", "quest", "--lod-splat-scale", "1e-4")),
     "lod_splat_scale": ((), ("--lod-splat-scale", "1e-5")),
+    "budget_mode": (("--budget", "1M"), ("--budget-mode", "limit")),
+    "lod_base_distance": (("--budget-mode", "limit", "--budget", "1M"), ("--lod-base-distance", "1")),
+    "lod_multiplier": ((), ("--lod-multiplier", "1.2")),
+    "lod_behind_penalty": ((), ("--lod-behind-penalty", "9")),
+    "lod_underfill": (("--after", "9s", "--bandwidth", "100kbit"), ("--lod-underfill", "2")),
     "lod_render_scale": ((), ("--lod-render-scale", "30")),
     "pixel_scale_limit": ((), ("--pixel-scale-limit", "1")),
     "cone_fov0": (("--budget", "90"), ("--cone-fov0", "0")),
@@ -108,6 +115,7 @@ MODES: dict[str, tuple[str, ...]] = {
     "a still": (*AT, "-o", "out.png"),
     "a view of the scene": ("-o", "out.png"),
     "a file without a tree": (*AT, "-o", "out.png"),
+    "Streamed SOG": ("--look-at", "0,0,7:0,0,20", "--budget", "200", "-o", "out.png"),
     "full": (*AT, "--full", "-o", "out.png"),
     "views": ("--view", "1,0,-2:0,0,0", "--view", "0,1,-2:0,0,0", "-o", "out.png"),
     "frames": ("--orbit", "3", "--distance", "2", "-o", "out.%d.png"),
@@ -162,6 +170,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert run(["build-lod", str(folder / "away.ply"), "-o", str(folder / "tree.spz"), "-q"]) == 0
     for tree, file in zip(MORE, ("other.ply", "plain.ply"), strict=True):
         assert run(["build-lod", str(folder / file), "-o", str(folder / tree), "-q"]) == 0
+    write_streamed(folder / "web", row_of_regions(8, 4))
     there = {"file": "tree.spz", "translation": [-AWAY, 0, 0]}
     (folder / "back.json").write_text(json.dumps({"instances": [there]}))
     twice = [there, there | {"translation": [1 - AWAY, 0, 0]}]
@@ -187,7 +196,8 @@ def test_every_option_of_render_is_used_or_refused(
 
     def came(*arguments: str) -> Came:
         if arguments not in known:
-            scene = ("plain.ply",) if mode == "a file without a tree" else ("--scene", "back.json")
+            others = {"a file without a tree": ("plain.ply",), "Streamed SOG": ("web",)}
+            scene = others.get(mode, ("--scene", "back.json"))
             size = () if "--size" in arguments else ("--size", "48x32")
             asked.clear()
             code = run(["render", *scene, *MODES[mode], *size, "--json", *arguments])

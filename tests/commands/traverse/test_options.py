@@ -13,6 +13,8 @@ from sparklod_cli.commands.traverse import traverse as command
 from sparklod_cli.figures import traversal_chart
 from tests.commands.render.test_options import GIVEN as OF_RENDER
 from tests.conftest import FIXTURES
+from tests.lod.details import row_of_regions
+from tests.streamed import write_streamed
 
 TOWN = FIXTURES / "traverse" / "town.spz"
 CAMERAS = FIXTURES / "cameras"
@@ -29,6 +31,7 @@ OWN: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "cone_foveate": (("--budget", "5k", "--cone-fov0", "0"), ("--cone-foveate", "0.01")),
     "outside_foveate": (("--budget", "5k"), ("--outside-foveate", "0.01")),
     "behind_foveate": (("--budget", "5k"), ("--behind-foveate", "0.001")),
+    "lod_underfill": (("--bandwidth", "100kbit"), ("--lod-underfill", "2")),
     "distance": ((), ("--distance", "2")),
     "chunk_cache": ((), ("--chunk-cache", "2")),
     "bandwidth": ((), ("--bandwidth", "1Mbit")),
@@ -54,6 +57,7 @@ MODES: dict[str, tuple[str, ...]] = {
     "a dolly over a network": ("--dolly", "--every", "20", "--bandwidth", "2Mbit", "--latency", "20ms"),
     "a camera path": ("--camera-path", str(CAMERAS / "inria.json")),
     "keyframes": ("--keyframes", "0.5,-0.5,0.5:3,0,3 -0.5,-0.5,0.5:3,0,-3", "--every", "20"),
+    "Streamed SOG": ("--keyframes", "0,0,7:0,0,20 0,0,1:0,0,20", "--every", "10", "--budget", "200"),
     "a summary": ("--orbit", "3", "--distance", "6", "--json"),
     "a summary and a table": ("--orbit", "3", "--distance", "6", "--json", "-o", "out.csv"),
 }
@@ -84,18 +88,20 @@ def test_every_option_of_traverse_is_used_or_refused(
         traversal_chart, "plot", lambda *arguments: traversal_chart.Plot(b"a plot", None)
     )  # takes seconds, and has its tests
     (tmp_path / "town.spz").write_bytes(TOWN.read_bytes())
+    write_streamed(tmp_path / "web", row_of_regions(8, 4))
     (tmp_path / "scene.json").write_text(json.dumps({"instances": [{"file": "town.spz", "scale": 3}]}))
     inputs = {path.name for path in tmp_path.iterdir()}
     known: dict[tuple[str, ...], Any] = {}
 
     def came(*arguments: str) -> Any:
         if arguments not in known:
-            files = () if "--scene" in arguments else ("town.spz",)
+            file = "web" if mode == "Streamed SOG" else "town.spz"
+            files = () if "--scene" in arguments else (file,)
             code = run(["traverse", *files, *MODES[mode], *arguments])
             out, err = capsys.readouterr()
             written = {}
             for path in sorted(tmp_path.rglob("*")):
-                if path.is_file() and path.name not in inputs:
+                if path.is_file() and not inputs & {path.name, path.relative_to(tmp_path).parts[0]}:
                     table = path.suffix in ("", ".csv")
                     written[path.name] = tidy(path.read_text(), table=True) if table else path.read_bytes()
                     path.unlink()

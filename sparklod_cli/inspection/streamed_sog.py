@@ -1,0 +1,246 @@
+"""Facts of a Streamed SOG that its manifest and the headers of its chunk files tell, and findings about both."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ..codecs.stream import size_of
+from ..codecs.streamed_sog.chunks import Chunk
+from ..codecs.streamed_sog.manifest import VERSION, Manifest
+from ..codecs.streamed_sog.promises import level_counts
+from ..codecs.streamed_sog.survey import survey_file, survey_splats
+from ..io import opened
+from ..support.printable import MOST, printable
+from ..support.progress import Progress, silent
+from ..support.untrusted import LARGEST
+from .findings import Finding, findings_of
+from .rad import ChunkBytes
+from .surveys import Head
+from .values import Box
+
+#: Name of the format in `codecs.formats`.
+FORMAT = "Streamed SOG"
+
+#: Quantiles of regions, by name.
+QUANTILES = {"min": 0.0, "p25": 0.25, "p50": 0.5, "p75": 0.75, "max": 1.0}
+
+
+@dataclass(frozen=True)
+class LevelFacts:
+    """A detail level.
+
+    Attributes:
+        splats: of all regions.
+        share: of the splats of level 0; None if that has none.
+        regions: that have splats at this level.
+        files: chunk files that hold it.
+        bytes: of these.
+        errors: quantiles of the errors of these regions, each weighted by its splats at level 0, and their mean; None
+            where not all of them have one.
+    """
+
+    splats: int
+    share: float | None
+    regions: int
+    files: int
+    bytes: int
+    errors: dict[str, float] | None
+
+
+@dataclass(frozen=True)
+class EnvironmentFacts:
+    """The splats that are drawn whatever the detail levels are: how many, and the bytes of their files."""
+
+    splats: int
+    bytes: int
+
+
+@dataclass(frozen=True)
+class StreamedSogFacts:
+    """What the manifest and the headers of the chunk files tell.
+
+    Attributes:
+        generator: the program that wrote it, on one line and shortened; None where the manifest does not say.
+        bytes: of the manifest and all files that it names.
+        manifest_bytes: of the manifest.
+        first_bytes: of the manifest, the chunk files of the coarsest level and the environment: what a viewer needs
+            before it can show all of the scene.
+        splats: of all levels, without the environment.
+        levels: from full detail to the coarsest.
+        regions: leaves of the tree.
+        depth: edges from the root of the tree to the deepest region.
+        region_splats: quantiles of the splats of a region at level 0.
+        region_edge: quantiles of the longest edge of the bound of a region, in world units.
+        bound: that of the root.
+        files: chunk files.
+        file_bytes: their sizes; None without any.
+        environment: None without one.
+    """
+
+    generator: str | None
+    bytes: int
+    manifest_bytes: int
+    first_bytes: int
+    splats: int
+    levels: list[LevelFacts]
+    regions: int
+    depth: int
+    region_splats: dict[str, float]
+    region_edge: dict[str, float]
+    bound: Box
+    files: int
+    file_bytes: ChunkBytes | None
+    environment: EnvironmentFacts | None
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What the manifest and the files that it names tell and break.
+
+    Attributes:
+        head: what a report begins with; None where `facts` is.
+        facts: None where a promise is broken without which the rest cannot be trusted.
+        findings: broken promises, one for each code.
+        fatal: findings because of which the file cannot be read.
+    """
+
+    head: Head | None
+    facts: StreamedSogFacts | None
+    findings: list[Finding]
+    fatal: list[Finding]
+
+
+def survey(path: Path, *, check: bool, threads: int = 1, progress: Progress = silent) -> Survey | None:
+    """Reads a manifest and the headers of its chunk files; None for a file of another format.
+
+    Args:
+        path: of the manifest, or of its folder; - is standard input.
+        check: decode the chunk files and look at their splats, too.
+        threads: to decode with.
+        progress: called while they are decoded.
+
+    Raises:
+        FormatError: the manifest cannot be parsed, or the path is no splat file.
+    """
+    with opened(path) as (file, form, more):
+        if form.name != FORMAT:
+            return None
+        size = size_of(file)
+        manifest, files, violations = survey_file(file, more["beside"])
+        fatal = [each for each in violations if each.fatal]
+        if fatal:
+            return Survey(None, None, findings_of(violations), findings_of(fatal))
+        if check:
+            found = survey_splats(more["beside"], manifest, files, threads=threads, progress=progress)
+            violations = [*violations, *found]
+    chunks = {name: chunk for name, chunk in files.items() if isinstance(chunk, Chunk)}
+    facts = _facts(manifest, chunks, size)
+    return Survey(_head(manifest, chunks, facts), facts, findings_of(violations), [])
+
+
+def _head(manifest: Manifest, chunks: Mapping[str, Chunk], facts: StreamedSogFacts) -> Head:
+    """As reading level 0 and the environment gives it."""
+    read = [chunks[name] for name in _names_of(manifest, 0)]
+    count = facts.levels[0].splats
+    if manifest.environment is not None:
+        read.append(chunks[manifest.environment])
+        count += chunks[manifest.environment].count
+    degree = max((chunk.sh_degree for chunk in read), default=0)
+    antialiased = any(chunk.antialiased for chunk in read)
+    return Head(f"{FORMAT} {VERSION}", facts.bytes, count, degree, antialiased)
+
+
+def _names_of(manifest: Manifest, level: int) -> list[str]:
+    """The chunk files with splats of a level."""
+    held = {
+        run.file
+        for _, node in manifest.regions()
+        for number, run in (node.runs or {}).items()
+        if number == level and run.count
+    }
+    return [manifest.filenames[number] for number in sorted(held)]
+
+
+def _facts(manifest: Manifest, chunks: Mapping[str, Chunk], size: int) -> StreamedSogFacts:
+    counts = level_counts(manifest)
+    levels = [_level(manifest, chunks, level, counts) for level in range(manifest.levels)]
+    environment = None
+    if manifest.environment is not None:
+        chunk = chunks[manifest.environment]
+        environment = EnvironmentFacts(chunk.count, chunk.bytes)
+    beyond = 0 if environment is None else environment.bytes
+    sizes = [chunks[name].bytes for name in manifest.filenames]
+    asset = manifest.head.get("asset")
+    generator = asset.get("generator") if isinstance(asset, dict) else None
+    regions = [node for _, node in manifest.regions()]
+    edges = [max(map(_edge, *node.bound)) for node in regions if node.bound is not None]
+    full = [node.runs[0].count if node.runs and 0 in node.runs else 0 for node in regions]
+    bound = manifest.nodes[0].bound
+    assert bound is not None
+    return StreamedSogFacts(
+        generator=printable(" ".join(generator.split()), MOST) if isinstance(generator, str) else None,
+        bytes=size + sum(sizes) + beyond,
+        manifest_bytes=size,
+        first_bytes=size + levels[-1].bytes + beyond,
+        splats=sum(counts),
+        levels=levels,
+        regions=len(regions),
+        depth=_depth(manifest),
+        region_splats=_quantiles(full),
+        region_edge=_quantiles(edges),
+        bound=Box(list(bound[0]), list(bound[1])),
+        files=len(sizes),
+        file_bytes=ChunkBytes(min(sizes), round(statistics.median(sizes)), max(sizes)) if sizes else None,
+        environment=environment,
+    )
+
+
+def _level(manifest: Manifest, chunks: Mapping[str, Chunk], level: int, counts: Sequence[int]) -> LevelFacts:
+    names = _names_of(manifest, level)
+    held = [node for _, node in manifest.regions() if node.runs and level in node.runs and node.runs[level].count]
+    errors = [node.errors[level] for node in held if node.errors is not None]
+    weights = [node.runs[0].count if node.runs and 0 in node.runs else 0 for node in held]
+    known = bool(errors) and len(errors) == len(held) and any(weights)
+    return LevelFacts(
+        splats=counts[level],
+        share=round(counts[level] / counts[0], 4) if counts[0] else None,
+        regions=len(held),
+        files=len(names),
+        bytes=sum(chunks[name].bytes for name in names),
+        errors=_quantiles(errors, weights) if known else None,
+    )
+
+
+def _depth(manifest: Manifest) -> int:
+    """Edges to the deepest node; each node comes after its parent."""
+    depths = [0] * len(manifest.nodes)
+    for number, node in enumerate(manifest.nodes[1:], 1):
+        depths[number] = depths[node.parent] + 1
+    return max(depths)
+
+
+def _edge(low: float, high: float) -> float:
+    """The length between two numbers, which are finite but may be as large as numbers are."""
+    return min(max(high - low, -LARGEST), LARGEST)
+
+
+def _quantiles(values: Sequence[float], weights: Sequence[float] | None = None) -> dict[str, float]:
+    """The quantiles of values, each of them one of these, and their mean.
+
+    Args:
+        values: one or more.
+        weights: of the values, not all 0; without, all count the same.
+    """
+    numbers = np.asarray(values, np.float64)
+    order = np.argsort(numbers, kind="stable")
+    weighed = np.ones(len(numbers)) if weights is None else np.asarray(weights, np.float64)
+    below = np.cumsum(weighed[order])
+    places = np.searchsorted(below, [share * below[-1] for share in QUANTILES.values()])
+    found = numbers[order][places]
+    mean = float(numbers @ (weighed / below[-1]))
+    return {name: float(f"{each:.6g}") for name, each in [*zip(QUANTILES, found, strict=True), ("mean", mean)]}
