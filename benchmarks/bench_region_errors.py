@@ -1,7 +1,8 @@
 """How well errors of regions choose their detail levels: measured on pictures, the tree's own, or distance alone.
 
 For each scene, regions and levels are made from its quality tree; a budget of splats is then spent region by region,
-and the pictures are compared with those of full detail. Prints a table of mean PSNR in dB over the views.
+and the pictures are compared with those of full detail. Prints the mean PSNR in dB over the views,
+and that of each view.
 
     python benchmarks/bench_region_errors.py scene.ply ... [--regions 64] [--widths 32 64 128 256]
 """
@@ -26,6 +27,7 @@ from sparklod_cli.model.gaussian import covariance
 from sparklod_cli.render import rasterizer
 from sparklod_cli.render.settings import RasterSettings
 from sparklod_cli.render.shading import shade
+from sparklod_cli.support.progress import silent
 
 SHARES = (0.5, 0.25, 0.12, 0.06)
 BUDGETS = (0.1, 0.2, 0.4)
@@ -89,26 +91,22 @@ def tree_errors(nodes, tree, scene: DetailScene):
     return np.maximum.accumulate(np.stack(sums, 1) / energy[:, None], axis=1)
 
 
-def by_errors(scene: DetailScene, errors, camera: Camera, budget: int):
-    """Levels, refined one by one where the error falls most, by splat, and for the solid angle of the region."""
-    level = np.full(scene.regions, scene.levels - 1)
+def by_errors(scene: DetailScene, errors, weight, camera: Camera, budget: int):
+    """Levels, refined one by one where the error falls most, by splat, for the solid angle of a region and a weight."""
     middle = scene.bounds.mean(axis=1)
     radius = np.linalg.norm(scene.bounds[:, 1] - scene.bounds[:, 0], axis=1) / 2
-    weight = (radius / np.maximum(np.linalg.norm(middle - camera.position, axis=1), radius)) ** 2
-    spent = int(scene.counts[:, -1].sum())
+    angle = (radius / np.maximum(np.linalg.norm(middle - camera.position, axis=1), radius)) ** 2
+    every = np.arange(scene.regions)
+    level = np.full(scene.regions, scene.levels - 1)
     while True:
-        best = (0.0, -1, 0)
-        for r in range(scene.regions):
-            for finer in range(level[r]):  # the steepest step, over several levels if that is better
-                more = scene.counts[r, finer] - scene.counts[r, level[r]]
-                if spent + more <= budget and more > 0:
-                    gain = weight[r] * (errors[r, level[r]] - errors[r, finer]) / more
-                    best = max(best, (gain, r, finer))
-        if best[1] < 0:
+        counts = scene.counts[every, level]
+        more = scene.counts - counts[:, None]
+        gain = (angle * weight)[:, None] * (errors[every, level][:, None] - errors) / np.maximum(more, 1)
+        gain[(more <= 0) | (counts.sum() + more > budget)] = 0
+        region, finer = np.unravel_index(np.argmax(gain), gain.shape)
+        if not gain[region, finer] > 0:
             return level
-        _, r, finer = best
-        spent += int(scene.counts[r, finer] - scene.counts[r, level[r]])
-        level[r] = finer
+        level[region] = finer
 
 
 def by_distance(scene: DetailScene, camera: Camera, budget: int):
@@ -134,6 +132,13 @@ def picture(splats, camera):
     return rasterizer.draw(shade([(splats, np.eye(4))], camera), camera, RasterSettings())
 
 
+def brightness(scene: DetailScene):
+    """(R,) mean square of the pictures of each region at full detail."""
+    runs = np.stack([scene.starts, scene.counts], 2)
+    widths = region_errors._widths(scene, runs)
+    return region_errors._differences(scene, runs, 1, silent)[:, 0] / widths**2
+
+
 def cameras_of(scene: DetailScene):
     """Three around the scene, and three near to its parts."""
     center = scene.splats.center[scene.level(0)].astype(np.float64)
@@ -154,66 +159,47 @@ def main() -> None:
     parser.add_argument("--regions", type=int, default=64)
     parser.add_argument("--widths", type=int, nargs="*", default=[32, 64, 128, 256])
     options = parser.parse_args()
-    print("scene regions budget% distance tree", *(f"pictures-{w}" for w in options.widths))
     for path in options.scenes:
         splats = sparklod_cli.read(path).splats
         count = len(splats)
         nodes, tree = quality.build(splats, 2.0)
-        most = int(count * (1 + sum(SHARES)) / options.regions)
-        settings = DetailSettings(levels=SHARES, chunk_splats=max(most, 1), extent=1e9, min_splats=1)
-        scene = make(nodes, tree, settings)
+        most = max(1, int(count * (1 + sum(SHARES)) / options.regions))
+        scene = make(nodes, tree, DetailSettings(levels=SHARES, chunk_splats=most, extent=1e9, min_splats=1))
         ways = {"tree": tree_errors(nodes, tree, scene)}
         for width in options.widths:
             region_errors.LEAST_WIDTH, region_errors.MOST_WIDTH = min(width, 64), width
             began = time.process_time()
             ways[f"pictures-{width}"] = region_errors.measured(scene, threads=1)
-            print(
-                "#",
-                path.stem,
-                width,
-                "px",
-                f"{time.process_time() - began:.2f} s of a processor for",
-                f"{len(scene.splats):,} splats; mean errors",
-                ways[f"pictures-{width}"].mean(0).round(4).tolist(),
-                flush=True,
-            )
+            seconds = time.process_time() - began
+            print(f"{path.stem}: pictures of {width}, {seconds:.2f} s of a processor for {len(scene.splats):,} splats")
         best = ways[f"pictures-{options.widths[-1]}"]
         for name, errors in ways.items():
             orders = [each[:, 1:].argsort(axis=0).argsort(axis=0) for each in (errors, best)]
-            corr = [np.corrcoef(a, b)[0, 1] for a, b in zip(orders[0].T, orders[1].T, strict=True)]
-            print(
-                "#",
-                path.stem,
-                name,
-                "rank correlation by level",
-                np.round(corr, 3).tolist(),
-                "ratio",
-                (np.median(errors[:, 1:] / best[:, 1:], axis=0)).round(3).tolist(),
-                flush=True,
-            )
+            same = [np.corrcoef(a, b)[0, 1] for a, b in zip(orders[0].T, orders[1].T, strict=True)]
+            ratio = np.median(errors[:, 1:] / best[:, 1:], axis=0)
+            print(f"{path.stem}: {name}, rank correlation {np.round(same, 3)}, ratio {np.round(ratio, 3)}")
+        bright = brightness(scene)
+        plans = {"distance": None}
+        plans |= {name: (errors, np.ones(scene.regions)) for name, errors in ways.items()}
+        plans |= {f"{name} by brightness": (errors, bright) for name, errors in ways.items()}
         views = cameras_of(scene)
         full = [picture(scene.splats.take(scene.level(0)), camera) for camera in views]
         for budget in BUDGETS:
             most = int(budget * count)
-            rows = {}
-            for name in ("distance", *ways):
-                figures = []
+            for name, plan in plans.items():
+                found = []
                 for camera, whole in zip(views, full, strict=True):
-                    if name == "distance":
-                        level = by_distance(scene, camera, most)
-                    else:
-                        level = by_errors(scene, ways[name], camera, most)
-                    index = np.concatenate(
-                        [np.arange(s.start, s.stop) for s in map(scene.run, range(scene.regions), level)]
+                    level = by_errors(scene, *plan, camera, most) if plan else by_distance(scene, camera, most)
+                    runs = map(scene.run, range(scene.regions), level)
+                    seen = picture(
+                        scene.splats.take(np.concatenate([np.arange(r.start, r.stop) for r in runs])), camera
                     )
-                    seen = picture(scene.splats.take(index), camera)
-                    figures.append(-10 * np.log10(((seen[..., :3].astype(float) - whole[..., :3]) ** 2).mean()))
-                rows[name] = (np.mean(figures), np.round(figures, 1).tolist())
-            print(
-                path.stem, scene.regions, f"{100 * budget:g}", *(f"{mean:.2f}" for mean, _ in rows.values()), flush=True
-            )
-            for name, (_, each) in rows.items():
-                print("#", name, each, flush=True)
+                    found.append(-10 * np.log10(((seen[..., :3].astype(float) - whole[..., :3]) ** 2).mean()))
+                each = " ".join(f"{value:.1f}" for value in found)
+                print(
+                    f"{path.stem}: {scene.regions} regions, {100 * budget:g} %, {name}: {np.mean(found):.2f} ({each})",
+                    flush=True,
+                )
 
 
 if __name__ == "__main__":

@@ -196,7 +196,8 @@ def compare_files(
         passed: what the bytes of the table are passed through on their way to standard output.
 
     Raises:
-        SparklodError: a file cannot be read or written, is no tree, or a picture cannot be drawn.
+        UnfitError: there are both trees and Streamed SOG, or too many instances.
+        SparklodError: a file cannot be read or written, has no levels, or a picture cannot be drawn.
     """
     from ..compare import Comparison, write_charts
     from ..tables.assertions import check
@@ -215,7 +216,10 @@ def compare_files(
         load_matplotlib()
     ready(path, scenes)
     with on_threads(files.threads):
-        comparison = Comparison(scenes, lod, budgets, render)
+        try:
+            comparison = Comparison(scenes, lod, budgets, render)
+        except ValueError as error:
+            raise UnfitError(str(error)) from None
         rows = list(comparison.run(path, threads=files.threads, progress=files.progress))
     table.write(rows, passed=passed)
     if plot is not None:

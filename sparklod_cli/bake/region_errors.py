@@ -38,7 +38,7 @@ BACK = np.array([[1.0], [1.0], [-1.0]])
 #: those of splat-transform 3.7.
 DISTANCE, HALF_WIDTH = 200.0, 1.05
 
-#: Least and largest width of a picture, pixels.
+#: Least and largest width of a picture, pixels. Measured against 256 and 512, see the page above.
 LEAST_WIDTH, MOST_WIDTH = 64, 128
 
 #: Pixels across the diameter of the small splats of a region: these are its FINE quantile by their longest axis.

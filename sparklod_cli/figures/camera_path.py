@@ -43,6 +43,7 @@ def picture_of_path(
     splats: Splats,
     depth: NDArray[Any],
     *,
+    title: str = "tree depth",
     frame: int | None = None,
     size: tuple[int, int] = (1600, 1000),
 ) -> bytes:
@@ -51,7 +52,8 @@ def picture_of_path(
     Args:
         cameras: of the path; at least one.
         splats: N splats of the cut; those that are not finite are left out.
-        depth: (N,) edges from the root to each node of the cut.
+        depth: (N,) edges from the root to each node of the cut, or the detail level of each splat.
+        title: which of both it is, for display.
         frame: index of the camera whose cut it is; that camera is marked.
         size: width and height in pixels.
 
@@ -64,7 +66,7 @@ def picture_of_path(
     drawable = splats.with_max_sh(0).take(index)
     chosen = index[evenly(len(index), MOST_POINTS)]
     shown = splats.with_max_sh(0).take(chosen)
-    coloring = whole_numbers("tree depth", depth[chosen], *range_of(depth[chosen]))
+    coloring = whole_numbers(title, depth[chosen], *range_of(depth[chosen]))
     low, high = bounds(drawable)
     way = np.array([camera.position for camera in cameras])
     low, high = np.minimum(low, way.min(axis=0)), np.maximum(high, way.max(axis=0))

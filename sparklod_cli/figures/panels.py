@@ -145,7 +145,11 @@ def _depths(axes: Axes, frames: Frames, matplotlib: ModuleType) -> Series:
     axes.plot(frames.x, mean, color=GREEN, linewidth=1.6, label="mean")
     axes.yaxis.set_major_locator(matplotlib.ticker.MaxNLocator(6, integer=True))
     _from_zero(axes, most)
-    axes.set_ylabel("edges from the root")
+    if frames.has("pixel_scale_limit"):
+        axes.set_ylabel("edges from the root")
+    else:  # only trees have such a limit
+        axes.set_title("Detail levels of the cut")
+        axes.set_ylabel("level")
     return mean
 
 

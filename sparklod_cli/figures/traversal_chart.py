@@ -39,14 +39,16 @@ class PathScene:
     Attributes:
         cameras: of the path.
         splats: N splats of the cut of one frame.
-        depth: (N,) edges from the root to each node of the cut.
+        depth: (N,) edges from the root to each node of the cut, or the detail level of each splat.
         frame: index of the camera whose cut it is; that camera is marked. None for none.
+        title: which of both the depths are, for display.
     """
 
     cameras: Sequence[Camera]
     splats: Splats
     depth: NDArray[Any]
     frame: int | None = None
+    title: str = "tree depth"
 
 
 @dataclass(frozen=True)
@@ -75,7 +77,7 @@ def plot(rows: Iterable[Row], marked: Mapping[str, int], title: str, scene: Path
     images, note = [_head(title, frames, marked), Image.fromarray(charts.draw(frames, marked))], None
     if scene is not None:
         try:
-            picture = picture_of_path(scene.cameras, scene.splats, scene.depth, frame=scene.frame)
+            picture = picture_of_path(scene.cameras, scene.splats, scene.depth, title=scene.title, frame=scene.frame)
             images.append(Image.open(io.BytesIO(picture)).convert("RGB"))
         except SparklodError as error:
             note = f"drawn without the picture of the path: {error}"

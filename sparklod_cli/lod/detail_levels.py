@@ -43,7 +43,7 @@ def make(nodes: Splats, tree: LodTree, settings: DetailSettings, *, progress: Pr
     order = np.concatenate(cuts.nodes)
     owner = owner[order]
     under = len(cuts.coarsest)
-    center = nodes.center[order].astype(np.float64)
+    center = nodes.center[order]
     box = united(np.stack([center, center], axis=1), owner, under)
     places = Places(nodes.center[cuts.coarsest], box, np.bincount(owner, minlength=under))
     regions = divide(places, settings)

@@ -105,9 +105,9 @@ def extents(splats: Splats) -> Boxes:
     return found
 
 
-def united(boxes: Boxes, number: NDArray[np.int64], count: int) -> Boxes:
+def united(boxes: FloatArray, number: NDArray[np.int64], count: int) -> Boxes:
     """(count, 2, 3) boxes around all boxes of each number, each of which occurs."""
     order = np.argsort(number, kind="stable")
     starts = np.searchsorted(number[order], np.arange(count))
     low = np.minimum.reduceat(boxes[order, 0], starts)
-    return np.stack([low, np.maximum.reduceat(boxes[order, 1], starts)], axis=1)
+    return np.stack([low, np.maximum.reduceat(boxes[order, 1], starts)], axis=1).astype(np.float64)

@@ -164,6 +164,7 @@ def _plot(simulation: Simulation, path: CameraPath, target: Path, data: _ChartDa
         cut.splats,
         np.concatenate([part.depth for part in cut.parts]),
         path.numbers.index(frame.number),
+        "detail level" if simulation.scenes.details else "tree depth",
     )
     marked = {moment.what: moment.frame for moment in data.lookout.moments()}
     drawn = traversal_chart.plot(data.rows, marked, simulation.scenes.title, scene)

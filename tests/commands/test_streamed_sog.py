@@ -144,8 +144,8 @@ def test_options_that_have_nothing_to_do_are_refused(web: Path, capsys: Said) ->
     assert "--lod-multiplier cannot be used with --full" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("name", ["render", "traverse"])
-def test_trees_and_streamed_sog_are_refused_together(web: Path, name: str, capsys: Said) -> None:
-    assert command(name, web, TREE, *AT, "-q") == 2
+@pytest.mark.parametrize("name", [("render",), ("traverse",), ("render", "--compare")])
+def test_trees_and_streamed_sog_are_refused_together(web: Path, name: tuple[str, ...], capsys: Said) -> None:
+    assert command(*name, web, TREE, *AT, "-q") == 2
     error = capsys.readouterr().err
     assert "is a Level-of-Detail tree and" in error and "look at one of them at a time" in error

@@ -85,6 +85,14 @@ class TestCharts:
     def test_any_name_can_be_a_title(self, title: str) -> None:
         assert plotted(flight(3), title).png
 
+    @pytest.mark.parametrize(("limit", "said"), [(0.001, "edges from the root"), (None, "level")])
+    def test_levels_without_pixel_scales_are_detail_levels(self, limit: float | None, said: str) -> None:
+        matplotlib = charts.load_matplotlib()
+        (panel,) = (each for each in panels.PANELS if "level_mean" in each.columns)
+        axes = matplotlib.figure.Figure().subplots()
+        panel.draw(axes, series.Frames([each | {"pixel_scale_limit": limit} for each in flight(4)]), matplotlib)
+        assert axes.get_ylabel() == said
+
     def test_a_chart_leaves_single_instances_out(self) -> None:
         rows = flight(20)
         assert plotted([*rows, *(each | {"instance": "tree"} for each in rows)], "a") == plotted(rows, "a")

@@ -44,10 +44,10 @@ class Foreign:
             columns[name] = np.fromfile(file, "<f4")
             Path(file).unlink()
         assert all(len(column) == answer["count"] for column in columns.values())
-        return _splats(columns)
+        return splats_of(columns)
 
 
-def _splats(columns: dict[str, NDArray[np.float32]]) -> Splats:
+def splats_of(columns: dict[str, NDArray[np.float32]]) -> Splats:
     """Converts the columns of a PLY file to `Splats`."""
 
     def stack(*names: str) -> NDArray[np.float64]:

@@ -15,8 +15,6 @@ from sparklod_cli.lod.detail_choice import Chains, Distant, choose
 from sparklod_cli.lod.detail_distance import RegionBounds
 from sparklod_cli.lod.detail_rule import DetailRule
 from sparklod_cli.lod.traversal import View
-from tests.interop import npm
-from tests.interop.foreign import PACKAGES
 from tests.interop.node import Node
 from tests.lod.details import Regions, random_regions, random_view
 
@@ -34,14 +32,12 @@ SCENES = 6
 
 
 @pytest.fixture(scope="module")
-def engine(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Node]:
+def engine(engines_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Node]:
     """PlayCanvas's modules in Node."""
     if shutil.which("node") is None:
         pytest.skip("Node is not installed")
-    only = {"playcanvas": PACKAGES["playcanvas"]}
-    folder = npm.folder_with(only, variable="FOREIGN_DIR", request=request, tmp_path_factory=tmp_path_factory)
     program = Path(__file__).with_name("detail_choice.mjs")
-    process = Node([str(program), str(folder)], tmp_path_factory.mktemp("engine") / "stderr.txt")
+    process = Node([str(program), str(engines_dir)], tmp_path_factory.mktemp("engine") / "stderr.txt")
     yield process
     process.close()
 

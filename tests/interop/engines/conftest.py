@@ -1,0 +1,100 @@
+"""The browser with the engines, splat-transform, and the scene that they show; or a skipped test if one is missing."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+import sparklod_cli
+from sparklod_cli.cameras.camera import Camera
+from sparklod_cli.codecs.options import WriteOptions
+from sparklod_cli.codecs.streamed_sog import codec
+from sparklod_cli.io import detail_sink, read_scene
+from sparklod_cli.lod import detail_levels, quality
+from sparklod_cli.lod.detail_settings import DetailSettings
+from sparklod_cli.model.splats import Splats
+from tests.conftest import FIXTURES
+from tests.interop import npm
+from tests.interop.engines import PACKAGES, recipes
+from tests.interop.engines.browser import Browser
+from tests.interop.engines.splat_transform import SplatTransform
+from tests.interop.pictures import cameras_around
+
+SIZE = 320, 180
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A scene as Streamed SOG and how it is looked at.
+
+    Attributes:
+        file: lod-meta.json of three levels in several chunks and regions.
+        splats: of level 0.
+        camera: sees all of them from the side, upright where -y of the file is up.
+    """
+
+    file: Path
+    splats: Splats
+    camera: Camera
+
+
+def counts_of(file: Path) -> list[int]:
+    """The splats of each detail level, as lod-meta.json says."""
+    counts: list[int] = json.loads(file.read_text(encoding="utf-8"))["counts"]
+    return counts
+
+
+@pytest.fixture(scope="session")
+def engines_dir(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder whose node_modules has `PACKAGES`: the one that ENGINES_DIR names, or one that is installed here."""
+    return npm.folder_with(PACKAGES, variable="ENGINES_DIR", request=request, tmp_path_factory=tmp_path_factory)
+
+
+@pytest.fixture(scope="session")
+def browser(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    """The browser, started once for all tests."""
+    chromium = shutil.which("chromium")
+    if chromium is None:
+        pytest.skip("Chromium is not installed (Debian's package chromium)")
+    if shutil.which("node") is None:
+        pytest.skip("Node is not installed")
+    browser = Browser(request.getfixturevalue("engines_dir"), chromium, tmp_path_factory.mktemp("pictures"))
+    yield browser
+    browser.close()
+
+
+@pytest.fixture(scope="session")
+def splat_transform(engines_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[SplatTransform]:
+    """splat-transform, started once for all tests."""
+    if shutil.which("node") is None:
+        pytest.skip("Node is not installed")
+    process = SplatTransform(engines_dir, tmp_path_factory.mktemp("columns"))
+    yield process
+    process.close()
+
+
+@pytest.fixture(scope="session")
+def shot(tmp_path_factory: pytest.TempPathFactory) -> Shot:
+    """The demo scene, in which up, left and front differ, as Streamed SOG."""
+    file = tmp_path_factory.mktemp("web") / recipes.MANIFEST
+    settings = DetailSettings((0.25, 0.05), chunk_splats=8_000, extent=4, min_splats=2_000)
+    scene = detail_levels.make(*quality.build(read_scene(FIXTURES / "demo.ply").splats, 2.0), settings)
+    detail_sink(file, overwrite=False)(codec.encode_files(scene, WriteOptions(), settings))
+    splats = read_scene(file).splats
+    return Shot(file, splats, cameras_around(splats.center, *SIZE)[1])
+
+
+@pytest.fixture(scope="session")
+def sog(shot: Shot, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Level 0 as a plain SOG, bundled and unbundled, by the names of the files."""
+    folder = tmp_path_factory.mktemp("sog")
+    scene = sparklod_cli.read(shot.file)
+    files = {name: folder / name for name in (recipes.SOG, "meta.json")}
+    for file in files.values():
+        sparklod_cli.write(file, scene)
+    return files

@@ -1,0 +1,43 @@
+"""The pages that docs/playcanvas.md gives its readers."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from functools import cache
+
+from tests.conftest import ROOT
+
+#: Headings of the engines' sections.
+PLAYCANVAS, SUPERSPLAT, BABYLON = "PlayCanvas", "SuperSplat's viewer", "Babylon.js"
+#: Names of the scene in the pages.
+MANIFEST, SOG = "lod-meta.json", "scene.sog"
+
+
+@cache
+def blocks(heading: str, language: str) -> tuple[str, ...]:
+    """The blocks of code of a language in a section."""
+    text = (ROOT / "docs" / "playcanvas.md").read_text(encoding="utf-8")
+    (section,) = re.findall(rf"^## {re.escape(heading)}\n(.*?)(?=^## |\Z)", text, re.DOTALL | re.MULTILINE)
+    return tuple(re.findall(rf"^```{language}\n(.*?)^```", section, re.DOTALL | re.MULTILINE))
+
+
+def page(heading: str, name: str = MANIFEST) -> str:
+    """The page of a section, for a scene of another name."""
+    (html,) = blocks(heading, "html")
+    return replaced(html, {MANIFEST: name})
+
+
+def babylon_of_one_file(name: str = SOG) -> str:
+    """The page of Babylon.js, in which the lines for a plain SOG take the place of those that stream."""
+    html = page(BABYLON)
+    (lines,) = blocks(BABYLON, "js")
+    return replaced(html[: html.index("  const metadata")] + lines + "</script>", {SOG: name})
+
+
+def replaced(html: str, changes: Mapping[str, str]) -> str:
+    """A page with some of its text replaced, all of which it must have."""
+    for old, new in changes.items():
+        assert old in html, f"the page has no {old}"
+        html = html.replace(old, new)
+    return html

@@ -1,0 +1,104 @@
+"""PlayCanvas's engine, SuperSplat's viewer and Babylon.js show SOG and Streamed SOG as we do, the right way up."""
+
+from __future__ import annotations
+
+import re
+import textwrap
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from tests.conftest import ROOT
+from tests.interop.engines import PACKAGES, recipes
+from tests.interop.engines.browser import Browser, Request, Shown
+from tests.interop.engines.conftest import Shot, counts_of
+from tests.interop.engines.likeness import likeness, our_picture
+
+#: Least PSNR in dB, of red, green and blue of all pixels. PlayCanvas is set to draw as we do, but for its falloff and a
+#: sort of few bits; SuperSplat's viewer and Babylon.js are as they are, so that opacity does not make up for the blur.
+PLAYCANVAS, OTHERS = 38, 30
+
+#: Most PSNR in dB of pictures that are turned or mirrored.
+WRONG = 20
+
+
+@pytest.fixture(scope="module")
+def ours(shot: Shot) -> NDArray[np.float32]:
+    """Our picture of level 0, with the engines' blur."""
+    return our_picture(shot.splats, shot.camera)
+
+
+def check(shown: Shown, ours: NDArray[np.float32], least: float) -> None:
+    """Asserts that a picture is ours, and that it would be noticed if it were turned by half a turn or mirrored."""
+    rgba = shown.rgba
+    assert likeness(rgba, ours) >= least, f"{likeness(rgba, ours):.2f} dB"
+    assert max(likeness(wrong, ours) for wrong in (rgba[::-1], rgba[:, ::-1], rgba[::-1, ::-1])) < WRONG
+
+
+def levels_of(requests: list[Request]) -> list[int]:
+    """The levels of the chunks that a page asked for after the manifest; asserts that coarse ones come first."""
+    assert requests[0].name == recipes.MANIFEST
+    levels = [int(each.name.split("_")[0]) for each in requests[1:] if each.name.endswith("/meta.json")]
+    assert levels == sorted(levels, reverse=True), levels
+    return levels
+
+
+def test_playcanvas_shows_a_coarse_level_first_and_then_all(
+    browser: Browser, shot: Shot, ours: NDArray[np.float32]
+) -> None:
+    shown = browser.playcanvas(shot.file, shot.camera)
+    check(shown, ours, PLAYCANVAS)
+    counts = counts_of(shot.file)
+    assert set(levels_of(shown.requests)) == {0, 1, 2}
+    assert shown.frames[0] <= counts[1], "the first frame shows a part of level 0"
+    assert shown.frames[-1] == counts[0]
+
+
+@pytest.mark.parametrize("name", ["scene.sog", "meta.json"])
+def test_playcanvas_shows_sog(
+    browser: Browser, shot: Shot, sog: dict[str, Path], ours: NDArray[np.float32], name: str
+) -> None:
+    shown = browser.playcanvas(sog[name], shot.camera)
+    check(shown, ours, PLAYCANVAS)
+    assert shown.frames == [len(shot.splats)]
+
+
+def test_supersplat_shows_it_upright(browser: Browser, shot: Shot, ours: NDArray[np.float32]) -> None:
+    shown = browser.supersplat(shot.file, shot.camera)
+    check(shown, ours, OTHERS)
+    assert shown.frames[-1] == counts_of(shot.file)[0]
+    assert set(levels_of(shown.requests)) == {0, 2}  # it goes straight from the coarsest level to what it wants
+
+
+def test_babylon_streams_it(browser: Browser, shot: Shot, ours: NDArray[np.float32]) -> None:
+    shown = browser.babylon(shot.file, shot.camera)
+    check(shown, ours, OTHERS)
+    assert shown.frames[0] < shown.frames[-1]
+    assert 0 <= shown.frames[-1] - counts_of(shot.file)[0] < 16  # rounded up
+
+
+def test_babylon_lays_what_it_streams_on_its_side(browser: Browser, shot: Shot, ours: NDArray[np.float32]) -> None:
+    """Why its page has a line about it: once this fails, Babylon.js has changed."""
+    shown = browser.babylon(shot.file, shot.camera, {"stream.rotation.x = 0;": ""})
+    assert likeness(shown.rgba, ours) < WRONG
+
+
+def test_babylon_shows_sog_upright(
+    browser: Browser, shot: Shot, sog: dict[str, Path], ours: NDArray[np.float32]
+) -> None:
+    check(browser.babylon(sog["scene.sog"], shot.camera), ours, OTHERS)
+
+
+def test_the_five_lines_for_playcanvas_are_those_of_its_page() -> None:
+    (lines,) = recipes.blocks(recipes.PLAYCANVAS, "js")
+    assert len(lines.splitlines()) == 5
+    assert textwrap.indent(lines, "  ") in recipes.page(recipes.PLAYCANVAS)
+
+
+def test_the_pages_name_the_versions_that_are_tested() -> None:
+    text = (ROOT / "docs" / "playcanvas.md").read_text(encoding="utf-8")
+    named = dict(re.findall(r"(\S+)@(\d+\.\d+\.\d+)", text.replace("`", " ")))
+    assert named.items() <= PACKAGES.items()
+    assert {"playcanvas", "@playcanvas/supersplat-viewer", "@babylonjs/core", "@babylonjs/loaders"} <= named.keys()
