@@ -15,9 +15,7 @@ def test_shares_of_levels_are_read() -> None:
     assert len(parse_levels(",".join(f"{share}%" for share in range(MOST_LEVELS, 0, -1))) or ()) == MOST_LEVELS
 
 
-@pytest.mark.parametrize(
-    "text", ["", "50", "0.5", "50%,", "50%,50%", "25%,50%", "100%", "0%", "-5%", "50% 25%"]
-)
+@pytest.mark.parametrize("text", ["", "50", "0.5", "50%,", "50%,50%", "25%,50%", "100%", "0%", "-5%", "50% 25%"])
 def test_other_texts_are_refused(text: str) -> None:
     with pytest.raises(ValueError, match="is neither auto nor shares of full detail such as 50%,25%,12%"):
         parse_levels(text)
