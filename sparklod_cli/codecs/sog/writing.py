@@ -29,8 +29,8 @@ from .options import settled
 #: How meta.json names what wrote the file; the version follows.
 GENERATOR = "sparklod "
 
-#: Power of the weights of splats in the palette of SH. Measured, 13,961 merged splats and 8,192 codes: the pictures of 1
-#: are 2.4 dB better, but its coefficients have 6 % more error than those of splat-transform, and 0.5 has 13 % less.
+#: Power of the weights of splats in the palette of SH. With 1, pictures are better still, but the error of coefficients
+#: is larger than that of splat-transform's; docs/decisions has the measurements.
 SEEN = 0.5
 
 Order = NDArray[np.intp]
