@@ -15,6 +15,7 @@ docs/decisions/2026-11-22-sh-palette.md has what it was measured against.
 
 from __future__ import annotations
 
+import threading
 from dataclasses import dataclass
 
 import numpy as np
@@ -46,6 +47,9 @@ WEIGHT_FLOOR = 1e-6
 
 #: Power of the seen area in `visible_weight`. Measured: 1 is better in far views, 0.5 in near ones.
 AREA_POWER = 0.75
+
+#: Held while kernels run: numba's own threads, where it finds no OpenMP, end a process that calls kernels from two.
+_KERNELS = threading.Lock()
 
 Indices = NDArray[np.uint32]
 Weights = NDArray[np.float64]
@@ -107,7 +111,7 @@ def cluster(
     if len(rows) and not (np.isfinite(rows.min()) and np.isfinite(rows.max())):
         raise ValueError("sh holds NaN or infinity; give finite coefficients")
     of_rows = _weights(weight, len(rows))
-    with on_threads(threads):  # loads numba
+    with _KERNELS, on_threads(threads):  # loads numba
         first, inverse = _distinct(rows)
         if len(first) <= codes:
             return ShPalette(sh[first], inverse)

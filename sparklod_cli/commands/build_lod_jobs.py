@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from ..codecs.formats import WRITABLE
 from ..codecs.rad.names import SUFFIX as RAD
 from ..support.addresses import Place
 from ..support.errors import SparklodError
@@ -37,9 +38,17 @@ def job_of(
 
     shared: dict[str, Any] = {"overwrite": outputs.overwrite, "progress": console.progress}
     if outputs.unlod:
+        if WRITABLE[outputs.suffix].name == "SOG":
+            console.announce_compiling("palette")
         how: dict[str, Any] = {"suffix": outputs.suffix, "options": write_options(ctx), "threads": general.threads}
         return _one_by_one(functools.partial(extract_leaves, **how, **shared)), report_extracted
-    settings = bake_settings(ctx, suffix=outputs.suffix, raw=outputs.is_raw, converts=outputs.format_is_asked_for)
+    settings = bake_settings(
+        ctx,
+        suffix=outputs.suffix,
+        raw=outputs.is_raw,
+        streamed_sog=outputs.is_streamed_sog,
+        converts=outputs.format_is_asked_for,
+    )
     more = [] if outputs.suffix != RAD else ["rad"] if settings.options.rad.sh_codes is None else ["rad", "palette"]
     console.announce_compiling(settings.method, *more)
     make, resources = bake_unless_there if ctx.params["skip_existing"] else bake, resources_of(ctx)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 
@@ -269,3 +270,24 @@ def test_kernels_run_on_the_threads_that_are_given() -> None:
     before = jit.threads_in_use()
     cluster(coefficients(2000, 3), 100, threads=1)
     assert jit.threads_in_use() == before
+
+
+TOGETHER = """
+import sys
+from concurrent.futures import ThreadPoolExecutor
+import numpy as np
+from sparklod_cli.codecs.sh_palette import cluster
+some = [np.random.default_rng(seed).normal(size=(3000, 3, 3)).astype(np.float32) for seed in range(4)]
+with ThreadPoolExecutor(4) as pool:
+    found = list(pool.map(lambda sh: cluster(sh, 64, threads=2), some))
+assert all(np.array_equal(cluster(sh, 64).codes, each.codes) for sh, each in zip(some, found))
+"""
+
+
+def test_palettes_are_made_on_several_threads_at_once_whoever_runs_the_kernels() -> None:
+    """numba's own layer ends the process where two threads call kernels at once."""
+    environment = {**os.environ, "NUMBA_THREADING_LAYER": "workqueue"}
+    done = subprocess.run(
+        [sys.executable, "-c", TOGETHER], env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr

@@ -29,6 +29,7 @@ from sparklod_cli.codecs.rad.layout import choices
 from sparklod_cli.codecs.sog import codec as sog
 from sparklod_cli.codecs.sog import codings
 from sparklod_cli.codecs.sog.codebook import codebook
+from sparklod_cli.codecs.sog.writing import SEEN
 from sparklod_cli.codecs.splat_encoding import SplatEncoding
 from sparklod_cli.model import morton
 from sparklod_cli.model.scene import Scene
@@ -248,7 +249,7 @@ def written_sog_precision(source: Scene) -> Precision:
     sh = 0.0
     if splats.sh_degree:
         codes = sog.settled(source, WriteOptions()).sog.sh_codes
-        palette = sh_palette.cluster(splats.sh, codes or 0)
+        palette = sh_palette.cluster(splats.sh, codes or 0, weight=sh_palette.visible_weight(splats) ** SEEN)
         sh = float(np.abs(palette.expand() - splats.sh).max()) + largest_half_step(palette.codes)
     return dataclasses.replace(
         found,

@@ -239,7 +239,8 @@ CUT, SMALL = 2.0**-10, 2.0**-24
 SPLAT = Loss(degrees=np.degrees(2 * (np.sqrt(3) / 256 + 1 / 128)), color=1 / 510 + 1e-6, sh_degree=0)
 #: Positions are rounded to 32767 steps in half a block, colours are rounded down to bytes.
 KSPLAT = Loss(5 / 2 / 32767 / 2 + 1e-6, CUT + 1e-6, np.degrees(2 * CUT), 1 / 255 + 1e-6, sh_degree=2)
-#: Fixtures span 3.3 units, whose logarithms have 65,535 steps; books of scales and colours are nearly exact, that of SH less.
+#: Fixtures span 3.3 units, whose logarithms have 65,535 steps; books of scales and colours are nearly exact, that of SH
+#: is less so.
 OUR_SOG = Loss(4 / 65535, 0.01, 1.1, 0.005, sh=lambda sh: 0.05)
 LOSSES = {
     "our SOG": OUR_SOG,

@@ -29,6 +29,10 @@ from .options import settled
 #: How meta.json names what wrote the file; the version follows.
 GENERATOR = "sparklod "
 
+#: Power of the weights of splats in the palette of SH. With 1, pictures are better still, but the error of coefficients
+#: is larger than that of splat-transform's; docs/decisions has the measurements.
+SEEN = 0.5
+
 Order = NDArray[np.intp]
 
 
@@ -91,7 +95,8 @@ def encode_files(
     }
     if splats.sh_degree:
         assert options.sog.sh_codes is not None
-        palette = sh_palette.cluster(splats.sh, options.sog.sh_codes, threads=threads, progress=progress)
+        weight = sh_palette.visible_weight(splats) ** SEEN
+        palette = sh_palette.cluster(splats.sh, options.sog.sh_codes, weight=weight, threads=threads, progress=progress)
         makers["shN"] = functools.partial(_sh, palette, splats.sh_degree, order)
 
     meta: dict[str, Any] = {"version": 2, "asset": {"generator": GENERATOR + __version__}, "count": len(splats)}

@@ -63,6 +63,16 @@ def test_outputs_go_into_a_folder(folder: Address, tmp_path: Path) -> None:
     assert (tmp_path / "back.ply").is_file()
 
 
+def test_a_folder_of_sog_is_written(folder: Address) -> None:
+    tree, meta = folder / "tree.spz", folder / "web/meta.json"
+    assert build(SMALL, "-o", tree.url) == 0
+    assert build(tree.url, "--unlod", "-o", meta.url) == 0
+    names = ["means_l.webp", "means_u.webp", "meta.json", "quats.webp", "scales.webp", "sh0.webp"]
+    assert meta.parent.files() == sorted([*names, "shN_centroids.webp", "shN_labels.webp"])
+    assert build(tree.url, "--unlod", "-o", meta.url) == 1
+    assert build(tree.url, "--unlod", "-o", meta.url, "-f") == 0
+
+
 def test_an_output_is_replaced_only_where_that_is_asked_for(scan: Address, capsys: pytest.CaptureFixture[str]) -> None:
     for form, name in (("spz", "scan-lod.spz"), ("rad-chunked", "scan-lod.rad")):
         options = [scan.url, "--format", form]
