@@ -34,8 +34,8 @@ FARTHER = {"lodBaseDistance: 20": "lodBaseDistance: 1000"}
 
 
 def levels_of(shown: Shown) -> str:
-    """The levels of the chunks in the order of the requests, with how many follow each other: "2 x1, 1 x1, 0 x4"."""
-    names = [each.name for each in shown.requests if each.name.endswith("/meta.json") and each.name[0].isdigit()]
+    """The levels of the chunks whose images were asked for, in order, and how many of each follow: "2 x1, 0 x4"."""
+    names = [each.name for each in shown.requests if each.name.endswith("/means_l.webp") and each.name[0].isdigit()]
     levels = itertools.groupby(name.split("_")[0] for name in names)
     return ", ".join(f"{level} x{len(list(files))}" for level, files in levels)
 

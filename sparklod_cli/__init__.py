@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from .codecs.splat_encoding import SplatEncoding
     from .inspection.report import Report
     from .lod.detail_rule import DetailRule
+    from .lod.detail_settings import DetailSettings
     from .lod.settings import LodSettings
     from .model.foveation import Cones, Frustum
     from .model.instances import Instance
@@ -71,6 +72,7 @@ _MODULES = {
     "codecs.rad.records": ("RadChunkEntry", "RadChunkHeader", "RadHeader"),
     "codecs.splat_encoding": ("SplatEncoding",),
     "inspection.report": ("Report",),
+    "lod.detail_settings": ("DetailSettings",),
     "lod.detail_rule": ("DetailRule",),
     "lod.settings": ("LodSettings",),
     "model.foveation": ("Cones", "Frustum"),
@@ -102,6 +104,7 @@ __all__ = [
     "Cones",
     "Cut",
     "DetailRule",
+    "DetailSettings",
     "FormatError",
     "Frames",
     "Frustum",

@@ -99,6 +99,10 @@ JOBS = {
         ),
         ("build-lod shiny.spz --format rad --cluster-sh 4 -o palette.rad",),
     ),
+    "streamed-sog": Job(
+        ("region_errors.compare_levels", "row_hash.hash_rows", "shade.add_sh", "tree_links.find_parents"),
+        ("build-lod shiny.spz -o web/lod-meta.json",),
+    ),
 }
 
 

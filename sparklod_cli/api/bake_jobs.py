@@ -11,5 +11,6 @@ from ..bake.out_of_core.cluster import ClusterSettings as ClusterSettings
 from ..bake.out_of_core.cluster import cluster as cluster
 from ..bake.out_of_core.cluster_engine import ClusterEngine as ClusterEngine
 from ..bake.side_by_side import bake_side_by_side as bake_side_by_side
+from ..bake.written import WrittenDetail as WrittenDetail
 from ..extract_leaves import Extracted as Extracted
 from ..extract_leaves import extract_leaves as extract_leaves

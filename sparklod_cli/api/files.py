@@ -40,7 +40,7 @@ def read(
     """Reads a splat file; its content tells the format. The scene is a `Tree` if the file has a Level-of-Detail tree.
 
     Args:
-        path: of a file, or of a folder that holds an unpacked SOG.
+        path: of a file, or of a folder that holds an unpacked SOG or a Streamed SOG, of which level 0 is read.
         columns: of `Splats`, where not all are needed; the others may be 0.
         threads: to decode on; None for all processors.
         progress: called with how much is done.

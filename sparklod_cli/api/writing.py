@@ -8,7 +8,8 @@ from pathlib import Path
 from types import NoneType
 from typing import TYPE_CHECKING
 
-from ..io import scene_sink, write_whole
+from ..codecs.streamed_sog.names import MANIFEST
+from ..io import detail_sink, scene_sink, write_whole
 from ..model.scene import Scene
 from ..support.defaults import (
     DEFAULT_COMPRESSION,
@@ -25,7 +26,10 @@ from .files import pack
 from .progress import Told, telling
 
 if TYPE_CHECKING:
+    from ..bake.detail_output import DetailOutput
     from ..codecs.options import RadOptions, SogOptions
+    from ..lod.detail_settings import DetailSettings
+    from ..support.progress import Progress
 
 #: Binary digits after the point of the smallest number of float32.
 MAX_CENTER_BITS = 149
@@ -58,6 +62,8 @@ def write(
     rad: RadOptions | None = None,
     sog: SogOptions | None = None,
     encoding: str | None = None,
+    detail: DetailSettings | None = None,
+    environment: Scene | None = None,
     threads: int | None = None,
     progress: Told = None,
 ) -> Written:
@@ -65,8 +71,8 @@ def write(
 
     Args:
         path: of the file, whose suffix tells the format: .spz or .rad; for a scene without a tree, .ply, .sog or
-            .splat, too. One that is called meta.json gets the images of an unpacked SOG beside it; all files appear, or
-            none.
+            .splat, too. Of several files, it names the first, and all appear or none: meta.json has the images of an
+            unpacked SOG beside it; for a tree, lod-meta.json has the folders of a Streamed SOG.
         scene: what is written.
         overwrite: replace a file that exists.
         spz_version: of SPZ, 2 or 3; None for 3.
@@ -78,6 +84,8 @@ def write(
         sog: options of SOG.
         encoding: write the arrays of "packed", "ext", "lodtree" or "texture" as .npz instead, or as the words alone
             where the path ends in .bin or .raw.
+        detail: of a Streamed SOG, which regions and detail levels are made of the tree.
+        environment: of a Streamed SOG, a scene without a tree whose splats are always drawn, such as a sky.
         threads: to encode on; None for all processors. The bytes do not depend on it.
         progress: called with how much is done.
 
@@ -86,15 +94,18 @@ def write(
         InvalidSplatsError: the scene has no splats.
         OutputError: the file exists, or cannot be written.
         TypeError: an option is of another type.
-        ValueError: an option is out of its range, or one of SPZ is given for another format.
+        ValueError: an option is out of its range, or is of another format.
     """
+    from ..bake.detail_output import DetailOutput
     from ..codecs.formats import WRITABLE, ending_of
     from ..codecs.options import RadOptions, SogOptions, WriteOptions
     from ..codecs.splat_encoding import SplatEncoding
+    from ..lod.detail_settings import DetailSettings
 
     path, count = Path(path), thread_count(threads)
     form = None if encoding is not None else WRITABLE.get(ending_of(path.name))
     written = None if form is None else form.name
+    streamed = encoding is None and path.name == MANIFEST
     whole_within("compression_level", compression_level, MIN_COMPRESSION, MAX_COMPRESSION)
     if fractional_bits is not None:
         whole_within("fractional_bits", fractional_bits, 0, MAX_FRACTIONAL_BITS)
@@ -102,8 +113,12 @@ def write(
         raise ValueError(f"{path}: spz_version and fractional_bits are of SPZ; leave them out, or write a .spz")
     if (rad is not None or chunked) and written != "RAD":
         raise ValueError(f"{path}: chunked and rad are of RAD; leave them out, or write a .rad")
-    if sog is not None and written != "SOG":
+    if sog is not None and written != "SOG" and not streamed:
         raise ValueError(f"{path}: sog is of SOG; leave it out, or write a .sog")
+    if (detail is not None or environment is not None) and not streamed:
+        raise ValueError(f"{path}: detail and environment are of Streamed SOG; leave them out, or write a {MANIFEST}")
+    if not isinstance(detail, (DetailSettings, NoneType)):
+        raise TypeError(f"detail is {detail!r}; give DetailSettings")
     if not isinstance(rad, (RadOptions, NoneType)):
         raise TypeError(f"rad is {rad!r}; give RadOptions")
     if not isinstance(sog, (SogOptions, NoneType)):
@@ -121,6 +136,10 @@ def write(
     with telling(progress) as told, memory_errors_translated():
         if encoding is not None:
             return _write_arrays(path, scene, encoding, overwrite=overwrite, threads=count)
+        if streamed:
+            options = WriteOptions(sog=sog or SogOptions())
+            output = DetailOutput(detail or DetailSettings(), options, detail_sink(path, overwrite=overwrite))
+            return _write_levels(path, scene, environment, output, count, told)
         if form is None or (scene.tree is not None and not form.trees):
             known = ", ".join(ending for ending, each in WRITABLE.items() if each.trees or scene.tree is None)
             what = "a tree" if scene.tree is not None else "a scene"
@@ -130,6 +149,21 @@ def write(
         options = WriteOptions(spz_version, fractional_bits, compression_level, rad, sog or SogOptions())
         save = scene_sink(path, form, chunked=rad.chunked, overwrite=overwrite)
         return Written(path, form.name, save(scene, options, threads=count, progress=told))
+
+
+def _write_levels(
+    path: Path, scene: Scene, environment: Scene | None, output: DetailOutput, threads: int, progress: Progress
+) -> Written:
+    from ..bake.clock import Clock
+
+    if scene.tree is None:
+        raise FormatError(f"{path}: detail levels are cuts of a tree; build_lod makes one, best by method='quality'")
+    if environment is not None and scene_like(environment).tree is not None:
+        raise FormatError(f"{path}: the environment has a tree; extract_leaves gives its splats")
+    if environment is not None and not len(environment.splats):
+        raise InvalidSplatsError(f"{path}: the environment has no splats to write")
+    always = None if environment is None else environment.splats
+    return Written(path, "Streamed SOG", output.write(scene, always, Clock(), threads, progress).bytes)
 
 
 def _write_arrays(path: Path, scene: Scene, encoding: str, *, overwrite: bool, threads: int) -> Written:

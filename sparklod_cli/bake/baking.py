@@ -13,20 +13,21 @@ from ..io import read_rgba
 from ..model.lod_tree import LodTree
 from ..model.scene import Scene
 from ..model.splats import Splats
-from ..model.transforms import Transform
 from ..support.addresses import Place
 from ..support.errors import memory_errors_translated
 from ..support.progress import Progress, silent
 from ..support.threads import on_threads
-from .checks import check_transformed
+from .checks import transformed
 from .clock import Clock
+from .environment import divided, read_environment
 from .kept_tree import check_kept
 from .out_of_core.contracts import Engine
-from .output import Output, WrittenTree, output_of
+from .output import Output, output_of
 from .resources import Resources
 from .scaling import Scaled, bake_scaled
 from .settings import BakeSettings
 from .sources import Source, read_source
+from .written import WrittenTree
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,7 +42,7 @@ class Baked(WrittenTree):
         method: that built the tree; None for the tree of the input.
         nodes, levels: of the tree; levels is its depth and 1, so that a tree of one node has one.
         notes: what the reader had to leave out, for display.
-        seconds: by stage (read, build, order, arrange, write).
+        seconds: by stage (read, build, order, arrange, levels, errors, write).
         blocks: that were built one after the other, out of core; None in memory.
         scratch_bytes_written, scratch_bytes_read: in the scratch folder; None in memory.
     """
@@ -61,8 +62,22 @@ class Baked(WrittenTree):
     scratch_bytes_read: int | None = None
 
 
-#: Nodes and their tree, the number of leaves, and the splats that were left out, by reason.
-_Made = tuple[Splats, LodTree, int, dict[str, int]]
+@dataclass(frozen=True)
+class _Made:
+    """What is written.
+
+    Attributes:
+        nodes, tree: the tree.
+        leaves: how many it has.
+        dropped: the splats that were left out, by reason.
+        environment: splats that are no part of the tree.
+    """
+
+    nodes: Splats
+    tree: LodTree
+    leaves: int
+    dropped: dict[str, int]
+    environment: Splats | None = None
 
 
 def bake(
@@ -118,27 +133,29 @@ def bake(
         scenes = [read_source(source, threads=threads, progress=progress)]
         form, notes, read = scenes[0].format, scenes[0].notes, len(scenes[0])
         antialiased, has_tree = scenes[0].antialiased, scenes[0].tree is not None
+        environment = read_environment(settings, threads=threads, progress=progress)
         if has_tree:
-            splats, tree, leaves, dropped = _kept(scenes, settings, clock)
+            made = _kept(scenes, settings, clock)
         else:
-            splats, tree, leaves, dropped = _built(scenes, settings, output, clock, threads, progress)
+            made = _built(scenes, settings, output, clock, threads, progress)
+        nodes, tree = made.nodes, made.tree
         if output.in_chunks:
             with on_threads(threads):
                 from ..lod.chunk_order import arrange
 
-                splats, tree = arrange(splats, tree, progress=progress)
+                nodes, tree = arrange(nodes, tree, progress=progress)
             clock.end("arrange")
-        written = output.write(Scene(splats, tree, antialiased), threads, progress)
-        clock.end("write")
+        environment = made.environment if environment is None else environment
+        written = output.write(Scene(nodes, tree, antialiased), environment, clock, threads, progress)
     return Baked(
         **vars(written),
         format=form,
         read=read,
-        splats=leaves,
-        sh_degree=splats.sh_degree,
-        dropped=dropped,
+        splats=made.leaves,
+        sh_degree=nodes.sh_degree,
+        dropped=made.dropped,
         method=None if has_tree else settings.method,
-        nodes=len(splats),
+        nodes=len(nodes),
         levels=int(tree.depths().max()) + 1,
         notes=notes,
         seconds=clock.seconds,
@@ -172,7 +189,7 @@ def _kept(scenes: list[Scene], settings: BakeSettings, clock: Clock) -> _Made:
     check_kept(scene, settings)
     assert scene.tree is not None
     clock.end("read")
-    return scene.splats, scene.tree, int(np.count_nonzero(scene.tree.is_leaf)), {}
+    return _Made(scene.splats, scene.tree, int(np.count_nonzero(scene.tree.is_leaf)), {})
 
 
 def _built(
@@ -181,28 +198,19 @@ def _built(
     """A tree of the splats of the input."""
     scene = scenes.pop()
     kept, dropped = settings.selection.apply(_recolored(scene.splats, settings.rgba).with_max_sh(settings.max_sh))
-    kept = _transformed(kept, settings.transform)
+    kept, far = divided(kept, settings)
+    kept = transformed(kept, settings.transform)
+    environment = None if far is None else transformed(far, settings.transform)
     clock.end("read")
     output.check(Scene(kept))  # before building, so that what does not fit is said at once
     leaves = len(kept)
     # The builder frees its input as it goes, if nobody else holds it: a third of the peak.
     handed_over = [kept]
-    del scene, kept
+    del scene, kept, far
     with on_threads(threads):
         nodes, tree = settings.builder()(handed_over.pop(), progress=progress)
     clock.end("build")
-    return nodes, tree, leaves, dropped
-
-
-def _transformed(splats: Splats, transform: Transform) -> Splats:
-    """Splats turned, scaled and moved.
-
-    Raises:
-        InvalidSplatsError: one leaves the range of float32.
-    """
-    turned = transform.apply(splats)
-    check_transformed(0 if turned is splats else len(turned.invalid()))
-    return turned
+    return _Made(nodes, tree, leaves, dropped, environment)
 
 
 def _recolored(splats: Splats, rgba: Path | None) -> Splats:

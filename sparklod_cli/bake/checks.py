@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from ..model.splats import Splats
+from ..model.transforms import Transform
 from ..support.errors import InvalidSplatsError
 
 
@@ -11,3 +13,14 @@ def check_transformed(beyond: int) -> None:
         raise InvalidSplatsError(
             "scaled and moved like this, it leaves the range of float32; give a smaller --scale or --translate"
         )
+
+
+def transformed(splats: Splats, transform: Transform) -> Splats:
+    """Splats turned, scaled and moved.
+
+    Raises:
+        InvalidSplatsError: one leaves the range of float32.
+    """
+    turned = transform.apply(splats)
+    check_transformed(0 if turned is splats else len(turned.invalid()))
+    return turned

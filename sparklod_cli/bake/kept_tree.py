@@ -17,7 +17,8 @@ def check_kept(scene: Scene, settings: BakeSettings) -> None:
             a tree can be given.
     """
     held = scene.format.split()[0]
-    if settings.encoding is not None or not settings.converts or _is_same(scene, held, settings):
+    same = settings.detail is None and _is_same(scene, held, settings)
+    if settings.encoding is not None or not settings.converts or same:
         other = next(each for each in (WRITABLE[RAD], WRITABLE[SPZ]) if each.name != held)
         raise FormatError(
             "it is a Level-of-Detail file already; --unlod writes its splats back out, and --format"

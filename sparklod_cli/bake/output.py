@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Protocol
 
 from ..codecs import clamps
-from ..codecs.clamps import Clamp, Range
+from ..codecs.clamps import Range
 from ..codecs.encoder import CLAMPED, Encoder, Get, windows_of
 from ..codecs.formats import WRITABLE, Format
 from ..codecs.gpu import dump
@@ -16,42 +16,18 @@ from ..codecs.rad import options as rad_options
 from ..codecs.rad.layout import OPTIONS
 from ..codecs.rad.names import SUFFIX as RAD
 from ..codecs.statistics import Statistics
-from ..io import SceneSink, Sink, scene_sink, sink
+from ..io import SceneSink, Sink, detail_sink, scene_sink, sink
 from ..model.nodes import CHUNK_NODES
 from ..model.scene import Scene
+from ..model.splats import Splats
 from ..model.streams import NodeStream
 from ..support.addresses import Place
 from ..support.errors import FormatError
 from ..support.progress import Progress
+from .clock import Clock
+from .detail_output import DetailOutput
 from .settings import BakeSettings
-
-
-@dataclass(frozen=True, kw_only=True)
-class WrittenTree:
-    """What was written.
-
-    Attributes:
-        output_format: "spz", "rad", "rad-chunked", or the name of the encoding of arrays.
-        bytes: of the output, all of its files.
-        version, fractional_bits: of an SPZ output, else None.
-        chunks: of a RAD output, else None.
-        encodings: of a RAD output, by the field of `RadOptions`.
-        sh_codes: the most entries of the SH palette of a RAD output; None without one.
-        arrays: shapes of the arrays of another output, in its order.
-        clamped: by the column of `Splats`, the number of nodes with a value that the output cannot hold.
-        clamps: at which ends, and how far beyond.
-    """
-
-    output_format: str
-    bytes: int
-    version: int | None = None
-    fractional_bits: int | None = None
-    chunks: int | None = None
-    encodings: dict[str, str] = field(default_factory=dict)
-    sh_codes: int | None = None
-    arrays: dict[str, tuple[int, ...]] = field(default_factory=dict)
-    clamped: dict[str, int] = field(default_factory=dict)
-    clamps: tuple[Clamp, ...] = ()
+from .written import WrittenTree
 
 
 class Output(Protocol):
@@ -71,8 +47,17 @@ class Output(Protocol):
     def check_statistics(self, found: Statistics) -> None:
         """As `check`, of statistics of these splats; and where it cannot be written without all nodes in memory."""
 
-    def write(self, scene: Scene, threads: int, progress: Progress) -> WrittenTree:
-        """Writes a tree."""
+    def write(
+        self, scene: Scene, environment: Splats | None, clock: Clock, threads: int, progress: Progress
+    ) -> WrittenTree:
+        """Writes a tree.
+
+        Args:
+            scene: the tree.
+            environment: splats beside it that are always drawn, which only a Streamed SOG can hold; None without.
+            clock: told of the stages.
+            threads, progress: as for `bake`.
+        """
 
     def encoder(self, nodes: NodeStream, found: Statistics, threads: int, progress: Progress) -> Encoder:
         """The encoder of a tree, which `write_windows` takes.
@@ -94,8 +79,10 @@ def output_of(target: Place, settings: BakeSettings, *, overwrite: bool) -> Outp
     """The output that settings ask for; fails now if it cannot be written later.
 
     Raises:
-        OutputError: see `io.scene_sink`.
+        OutputError: see `io.scene_sink` and `io.detail_sink`.
     """
+    if settings.detail is not None:
+        return DetailOutput(settings.detail, settings.options, detail_sink(target, overwrite=overwrite))
     if settings.encoding is not None:
         return _Arrays(settings.encoding, settings.raw, sink(target, overwrite=overwrite))
     form, chunked = WRITABLE[settings.suffix], settings.options.rad.chunked
@@ -134,11 +121,14 @@ class _Arrays:
             " .spz or .rad"
         )
 
-    def write(self, scene: Scene, threads: int, progress: Progress) -> WrittenTree:
+    def write(
+        self, scene: Scene, environment: Splats | None, clock: Clock, threads: int, progress: Progress
+    ) -> WrittenTree:
         """Writes them."""
         arrays = dump.pack(scene, self.encoding, threads)
         size = self.sink(dump.encode_raw(arrays) if self.raw else dump.encode_npz(arrays))
         shapes = {name: words.shape for name, words in arrays.items()}
+        clock.end("write")
         return WrittenTree(output_format=self.encoding, bytes=size, arrays=shapes)
 
     def encoder(self, nodes: NodeStream, found: Statistics, threads: int, progress: Progress) -> Encoder:
@@ -181,11 +171,14 @@ class _File:
         """The codec knows."""
         self.form.codec().settled(found, self.options)
 
-    def write(self, scene: Scene, threads: int, progress: Progress) -> WrittenTree:
+    def write(
+        self, scene: Scene, environment: Splats | None, clock: Clock, threads: int, progress: Progress
+    ) -> WrittenTree:
         """Writes it."""
         options: WriteOptions = self.form.codec().settled(scene, self.options)
         size = self.sink(scene, options, threads=threads, progress=progress)
         beyond = clamps.find(scene.splats, threads, self._held(options, scene.splats.sh_degree))
+        clock.end("write")
         return self._written(options, size, len(scene), scene.splats.sh_degree, beyond)
 
     def encoder(self, nodes: NodeStream, found: Statistics, threads: int, progress: Progress) -> Encoder:

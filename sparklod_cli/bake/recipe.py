@@ -12,14 +12,17 @@ from typing import Any
 import numpy as np
 
 from .. import __version__
-from ..io import files_of, identity_of
+from ..io import Identity, files_of, identity_of
 from ..support.addresses import Place
 from ..support.errors import UnreadableError
 from ..support.untrusted import parse_json, quoted_value
 from .settings import BakeSettings
 
-#: Settings that are no part of a recipe: a message, and a file whose content is one of the inputs.
-NO_PART = ("unused", "rgba")
+#: Settings that name a file whose content is one of the inputs.
+FILES = ("rgba", "environment")
+
+#: Settings that are no part of a recipe: a message, and files whose names do not matter.
+NO_PART = ("unused", *FILES)
 
 #: How the version of the program is called in a recipe.
 PROGRAM = "sparklod"
@@ -93,13 +96,23 @@ def recipe_of(sources: Iterable[Place], settings: BakeSettings, **more: Any) -> 
         UnreadableError: an input cannot be read.
     """
     found = [identity_of(file) for source in sources for file in files_of(source)]
-    if settings.rgba is not None:
-        try:
-            found.append(identity_of(settings.rgba))
-        except UnreadableError as error:
-            raise UnreadableError(f"{settings.rgba} {error}") from None
+    found += map(_identity_of_named, files_named_in(settings))
     inputs = tuple(f"{each.bytes} {each.modified} {each.sample}" for each in found)
     return Recipe(inputs, tuple(each.name for each in found), settings_of(settings) | more)
+
+
+def files_named_in(settings: BakeSettings) -> list[Place]:
+    """The files that settings name, and those that belong to these."""
+    named = filter(None, (getattr(settings, name) for name in FILES))
+    return [file for path in named for file in files_of(path)]
+
+
+def _identity_of_named(file: Place) -> Identity:
+    """What a file is like; an error names it, as it is none of the inputs."""
+    try:
+        return identity_of(file)
+    except UnreadableError as error:
+        raise UnreadableError(f"{file} {error}") from None
 
 
 def settings_of(settings: BakeSettings) -> dict[str, Any]:

@@ -102,8 +102,9 @@ def bake_scaled(
     store = store_of(folder)
     left = bool(store.names())
     why = _reason(size, settings, memory, resources, engine, is_left=left)
-    if why is not None and settings.encoding is not None:
-        say(f"{name_of(source)}: goes on in memory, although {why}: --encoding writes arrays as a whole")
+    whole = _as_a_whole(settings)
+    if why is not None and whole is not None:
+        say(f"{name_of(source)}: goes on in memory, although {why}: {whole}")
         why = None
     if why is None:
         if left:  # refused, or removed
@@ -185,6 +186,13 @@ def _reason(
     if resources.resume and is_left:
         return "it was interrupted there"
     return "blocks were asked for" if resources.block_splats else None
+
+
+def _as_a_whole(settings: BakeSettings) -> str | None:
+    """Why an output is made in memory only, as the end of a sentence; None where it need not be."""
+    if settings.encoding is not None:
+        return "--encoding writes arrays as a whole"
+    return None if settings.detail is None else "detail levels are made of a whole tree"
 
 
 def _block_splats(splats: int, sh_degree: int, method: str, memory: int | None, *, in_chunks: bool) -> int:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from ..codecs.options import WriteOptions
 from ..lod.builders import BUILDERS, METHODS
+from ..lod.detail_settings import DetailSettings
 from ..model.lod_tree import LodTree
 from ..model.selection import Selection
 from ..model.splats import Splats
@@ -35,6 +36,10 @@ class BakeSettings:
         options: how to write it.
         encoding: of `codecs.gpu.table.ENCODINGS`, to write arrays in that layout instead.
         raw: write their words alone, rather than as .npz.
+        detail: of regions and detail levels, to write a Streamed SOG instead.
+        environment: of a Streamed SOG, a file whose splats are always drawn; turned and moved as the scene.
+        environment_beyond: of a Streamed SOG, splats of the input farther out than this become its environment, see
+            `lod.environment.beyond`; in the input's units. None for none.
         converts: an input that has a tree keeps it, if its format is another one; otherwise it is refused.
         unused: flags of options that were given and mean nothing to an input that has a tree, which is refused then.
     """
@@ -50,6 +55,9 @@ class BakeSettings:
     options: WriteOptions = field(default_factory=WriteOptions)
     encoding: str | None = None
     raw: bool = False
+    detail: DetailSettings | None = None
+    environment: Path | None = None
+    environment_beyond: float | None = None
     converts: bool = False
     unused: tuple[str, ...] = ()
 

@@ -12,6 +12,7 @@ from ..support.errors import SparklodError
 from ..support.progress import Progress, silent
 from .baking import Baked, bake
 from .out_of_core.cluster_engine import ClusterEngine
+from .recipe import FILES
 from .resources import Resources
 from .scaling import fits_in_memory
 from .settings import BakeSettings
@@ -42,7 +43,8 @@ def bake_side_by_side(
         progress: told how many scenes are done.
     """
     small = [fits_in_memory(source, settings, resources.memory) for source, _ in pairs]
-    settings = dataclasses.replace(settings, rgba=settings.rgba and settings.rgba.absolute())
+    named = {name: getattr(settings, name) for name in FILES}
+    settings = dataclasses.replace(settings, **{name: path and path.absolute() for name, path in named.items()})
     whole = [
         (absolute_source(source), absolute(target)) for source, target in pairs
     ]  # workers have folders of their own

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from pathlib import Path
 from typing import Any
 
 from ..io import Identity, content_of, files_of, identity_of, sink
@@ -15,7 +16,7 @@ from ..support.addresses import Place, size_of
 from ..support.errors import OutputError
 from ..support.untrusted import parse_json
 from .baking import Baked, bake
-from .recipe import Recipe, settings_of
+from .recipe import Recipe, files_named_in, settings_of
 from .settings import BakeSettings
 from .sources import Source, placement_of, places_of
 
@@ -38,7 +39,7 @@ def bake_unless_there(
     """
     beside = target.parent / f"{target.name}{SUFFIX}"
     former = _former(beside)
-    files = [*(file for place in places_of(source) for file in files_of(place)), *filter(None, [settings.rgba])]
+    files = [*(file for place in places_of(source) for file in files_of(place)), *files_named_in(settings)]
     seen = [identity_of(file) for file in files]
     recipe = _recipe(source, settings, files, seen, former)
     if target.exists() and not target.is_dir():
@@ -95,7 +96,14 @@ def _differences(recipe: Recipe, target: Place, former: dict[str, Any]) -> list[
 def _told(target: Place) -> dict[str, Any]:
     """What tells an output: a digest of a sample of it, and the size of each file that it names."""
     files = files_of(target)
-    return {"sample": identity_of(target).sample, "bytes": {file.name: size_of(file) for file in files}}
+    return {"sample": identity_of(target).sample, "bytes": {_within(target, file): size_of(file) for file in files}}
+
+
+def _within(target: Place, file: Place) -> str:
+    """The name of a file of an output, with the folder that it has beside it."""
+    if isinstance(target, Path) and isinstance(file, Path) and file.is_relative_to(target.parent):
+        return file.relative_to(target.parent).as_posix()
+    return file.name
 
 
 def _remove(place: Place) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 
 import click
 
+from ..codecs.streamed_sog.names import MANIFEST
 from ..support.errors import SparklodError
 from ..support.printable import MOST, shortened
 from ..support.stdin import DASH, name_of
@@ -16,7 +17,7 @@ from .build_lod_inputs import Inputs, check_inputs, input_options, record_of
 from .build_lod_jobs import job_of
 from .build_lod_outputs import Outputs, check_formats
 from .command import COMMON, Command, option
-from .options.baking import baking_options, check_method
+from .options.baking import STREAMED_SOG, baking_options, check_method, method_of
 from .options.cluster import OF_CLUSTERS, check_cluster, cluster_of, cluster_options
 from .options.common import General, common_options, output_option, overwrite_option
 from .options.resources import HEADING as LARGE
@@ -41,6 +42,8 @@ Examples:
   sparklod build-lod scene.ply --format rad             # scene-lod.rad, which Spark streams
   sparklod build-lod scene.ply -o web/scene.rad --cluster-sh
   sparklod build-lod scene-lod.spz --format rad         # the same tree in the other format
+  sparklod build-lod scene.ply -o web/lod-meta.json     # Streamed SOG, which PlayCanvas streams
+  sparklod build-lod scene.ply --format streamed-sog --levels 50%,25%,10%    # scene-lod/lod-meta.json
   sparklod build-lod scene.sog --encoding ext           # writes scene-lod.npz
   sparklod build-lod scene-lod.spz --unlod -o scene.ply
   sparklod build-lod scene-lod.spz --unlod -o scene.sog # for PlayCanvas
@@ -51,7 +54,8 @@ Examples:
 @input_options
 @output_option(
     "Output of a single input; - is standard output.  [default: NAME-lod.spz beside the input;"
-    " NAME-lod.rad with --format rad, NAME-lod.npz with --encoding, NAME-unlod.spz with --unlod]",
+    f" NAME-lod.rad with --format rad, NAME-lod/{MANIFEST} with --format {STREAMED_SOG}, NAME-lod.npz with --encoding,"
+    " NAME-unlod.spz with --unlod]",
     addresses=True,
 )
 @option(
@@ -83,11 +87,12 @@ Examples:
 @common_options
 @click.pass_context
 def build_lod(ctx: click.Context, /, **_: Any) -> None:
-    """Bake splat files into Level-of-Detail files for Spark.
+    """Bake splat files into Level-of-Detail files for Spark, PlayCanvas, SuperSplat and Babylon.js.
 
-    Reads PLY (also PlayCanvas's compressed PLY), SPZ, RAD, SOG (.sog, or a folder with a meta.json), .splat and
-    .ksplat; merges splats into a tree, and writes the tree as SPZ with Spark's extension, or as RAD, which Spark
-    streams. An INPUT of - is standard input.
+    Reads PLY (also PlayCanvas's compressed PLY), SPZ, RAD, SOG (.sog, or a folder with a meta.json), Streamed SOG
+    (its full detail), .splat and .ksplat; merges splats into a tree, and writes the tree as SPZ with Spark's
+    extension, or as RAD, which Spark streams, or cuts of it as Streamed SOG, which the others stream. An INPUT of - is
+    standard input.
 
     The axes of the input are kept unless --up or --rotate turns them. Selection goes by the coordinates of the input;
     of merged inputs, by those at which they stand together.
@@ -133,7 +138,7 @@ def _check(ctx: click.Context, given: Inputs, named: list[Path], outputs: Output
     elif DASH in inputs:
         raise click.UsageError("standard input has no name to derive one from; give --output")
     targets = [outputs.output] if outputs.output is not None else [outputs.target(source) for source in inputs]
-    if outputs.is_chunked or outputs.is_folder:
+    if outputs.is_chunked or outputs.is_folder or outputs.is_streamed_sog:
         targets = with_chunks(targets)
     keep_apart(ctx, {"output" if outputs.output_dir is None else "output_dir": targets, "scene": named})
     claim_stdout(ctx, "output", as_json=general.as_json, binary=True)
@@ -146,6 +151,6 @@ def _check(ctx: click.Context, given: Inputs, named: list[Path], outputs: Output
     if outputs.unlod:
         exclude(ctx, (*OF_BAKES, *OF_CLUSTERS, "skip_existing"), "--unlod")
     else:
-        check_method(ctx)
+        check_method(ctx, method_of(ctx, streamed_sog=outputs.is_streamed_sog))
     if DASH in inputs:
         exclude(ctx, OF_CLUSTERS, "standard input, which workers cannot read; save it to a file first")

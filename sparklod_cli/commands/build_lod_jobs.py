@@ -42,7 +42,13 @@ def job_of(
             console.announce_compiling("palette")
         how: dict[str, Any] = {"suffix": outputs.suffix, "options": write_options(ctx), "threads": general.threads}
         return _one_by_one(functools.partial(extract_leaves, **how, **shared)), report_extracted
-    settings = bake_settings(ctx, suffix=outputs.suffix, raw=outputs.is_raw, converts=outputs.format_is_asked_for)
+    settings = bake_settings(
+        ctx,
+        suffix=outputs.suffix,
+        raw=outputs.is_raw,
+        streamed_sog=outputs.is_streamed_sog,
+        converts=outputs.format_is_asked_for,
+    )
     more = [] if outputs.suffix != RAD else ["rad"] if settings.options.rad.sh_codes is None else ["rad", "palette"]
     console.announce_compiling(settings.method, *more)
     make, resources = bake_unless_there if ctx.params["skip_existing"] else bake, resources_of(ctx)

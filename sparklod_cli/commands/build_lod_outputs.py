@@ -8,11 +8,24 @@ import click
 
 from ..codecs.formats import FORMATS, WRITABLE, ending_of
 from ..codecs.gpu.table import NPZ, RAW_SUFFIXES
+from ..codecs.streamed_sog.names import MANIFEST
 from ..support.addresses import Place
 from ..support.stdin import DASH
-from .options.baking import FORMS, OF_BOTH, OF_PALETTES, OF_PLACE, OF_RAD, OF_SELECTION, OF_SPZ, OF_TREES
+from .options.baking import (
+    FORMS,
+    OF_BOTH,
+    OF_PALETTES,
+    OF_PLACE,
+    OF_RAD,
+    OF_SELECTION,
+    OF_SPZ,
+    OF_TREES,
+    STREAMED_SOG,
+)
+from .options.detail import HEADING as DETAIL
+from .options.detail import OF_DETAIL
 from .paths import stem_of
-from .usage import refuse
+from .usage import is_given, refuse
 
 #: Suffixes of the formats in which a tree can be written, and what they are called; the first one is the default.
 TREES = {suffix: form.name for suffix, form in WRITABLE.items() if form.trees}
@@ -63,8 +76,18 @@ class Outputs:
         return FORMS[self.form][0] if self.form is not None else self.named_suffix or SPZ
 
     @property
+    def is_streamed_sog(self) -> bool:
+        """Whether regions at several detail levels are written."""
+        return self.form == STREAMED_SOG or (self.is_manifest and not (self.form or self.encoding or self.unlod))
+
+    @property
+    def is_manifest(self) -> bool:
+        """Whether the output that was named is called as a Streamed SOG has to be."""
+        return self.output is not None and self.output != DASH and self.output.name == MANIFEST
+
+    @property
     def is_chunked(self) -> bool:
-        """Whether chunks are files of their own."""
+        """Whether the chunks of a RAD are files of their own."""
         return self.form is not None and FORMS[self.form][1]
 
     @property
@@ -75,7 +98,7 @@ class Outputs:
     @property
     def format_is_asked_for(self) -> bool:
         """Whether somebody chose the format, by --format or by a name."""
-        return self.form is not None or self.named_suffix in TREES
+        return self.form is not None or self.named_suffix in TREES or self.is_streamed_sog
 
     def target(self, source: Place) -> Place:
         """Where an input goes."""
@@ -83,6 +106,8 @@ class Outputs:
 
     def _name(self, source: Place) -> str:
         stem = stem_of(source)
+        if self.is_streamed_sog:
+            return f"{stem.removesuffix('-lod')}-lod/{MANIFEST}"
         if self.unlod:
             return f"{stem.removesuffix('-lod')}-unlod{self.suffix}"
         if self.form is not None and source.suffix.lower() in TREES:  # a tree in another format has its name
@@ -93,6 +118,9 @@ class Outputs:
 def check_formats(ctx: click.Context, outputs: Outputs) -> None:
     """Raises a `click.UsageError` where the options of formats, and the name of the output, contradict each other."""
     suffix = outputs.named_suffix
+    if outputs.is_streamed_sog:
+        _check_streamed_sog(ctx, outputs)
+        return
     if outputs.is_chunked and outputs.output == DASH:
         raise click.UsageError("--format rad-chunked writes several files; name the output, or use --format rad")
     if outputs.encoding:
@@ -100,11 +128,12 @@ def check_formats(ctx: click.Context, outputs: Outputs) -> None:
         refuse(ctx, OF_SPZ, "is an option of SPZ, not of --encoding")
         refuse(ctx, OF_RAD, "is an option of RAD, not of --encoding")
         refuse(ctx, OF_BOTH, "is an option of SPZ and RAD, not of --encoding")
+        refuse(ctx, OF_DETAIL, f"is an option of {DETAIL}, not of --encoding")
         refuse(ctx, OF_PALETTES, "is an option of RAD and SOG, not of --encoding")
     if outputs.form is not None and suffix not in ("", outputs.suffix):
         raise click.UsageError(f"--format {outputs.form} writes {outputs.suffix}, not {suffix}")
     if outputs.unlod:
-        _check_unlod(ctx, suffix)
+        _check_unlod(ctx, outputs)
     elif outputs.encoding:
         if suffix not in ("", NPZ, *RAW_SUFFIXES):
             raise click.UsageError(f"--encoding writes {', '.join((NPZ, *RAW_SUFFIXES))}, not {suffix}")
@@ -112,6 +141,8 @@ def check_formats(ctx: click.Context, outputs: Outputs) -> None:
     else:
         _check_tree(suffix)
     name = TREES.get(outputs.suffix)
+    detail = f"name the output {MANIFEST}, or add --format {STREAMED_SOG}"
+    refuse(ctx, OF_DETAIL, f"is an option of {DETAIL}, not of {name or suffix}; {detail}")
     if name != TREES[SPZ]:
         refuse(ctx, OF_SPZ, f"is an option of SPZ, not of {name or suffix}")
     if name != "RAD":
@@ -124,18 +155,38 @@ def check_formats(ctx: click.Context, outputs: Outputs) -> None:
         refuse(ctx, OF_PALETTES, f"is an option of RAD and SOG, not of {written}{more}")
 
 
-def _check_unlod(ctx: click.Context, suffix: str) -> None:
+def _check_streamed_sog(ctx: click.Context, outputs: Outputs) -> None:
+    flag = f"--format {STREAMED_SOG}"
+    refuse(ctx, ("unlod", "encoding"), f"cannot be used with {flag}")
+    if outputs.output == DASH:
+        raise click.UsageError(f"{flag} writes several files; name the output, such as web/{MANIFEST}")
+    if outputs.output is not None and not outputs.is_manifest:
+        raise click.UsageError(
+            f"{flag} writes {MANIFEST} and folders beside it, not {outputs.output.name}; name the output"
+            f" {outputs.output.parent / outputs.output.stem / MANIFEST}"
+        )
+    refuse(ctx, OF_SPZ, f"is an option of SPZ, not of {DETAIL}")
+    refuse(ctx, OF_RAD, f"is an option of RAD, not of {DETAIL}")
+    refuse(ctx, OF_BOTH, f"is an option of SPZ and RAD, not of {DETAIL}")
+    if is_given(ctx, "environment"):
+        refuse(ctx, ("environment_beyond",), "cannot be used with --environment")
+
+
+def _check_unlod(ctx: click.Context, outputs: Outputs) -> None:
+    suffix = outputs.named_suffix
+    if outputs.is_manifest:
+        raise click.UsageError(f"--unlod writes splats without detail levels, not {MANIFEST}")
     refuse(ctx, (*OF_TREES, *OF_SELECTION, *OF_PLACE, "encoding"), "cannot be used with --unlod")
     if suffix not in ("", *WRITABLE):
         raise click.UsageError(f"--unlod writes {', '.join(WRITABLE)}, not {suffix}")
 
 
 def _check_tree(suffix: str) -> None:
-    known = " or ".join(TREES)
+    known = f"{', '.join(TREES)} or {MANIFEST}"
     if suffix in (NPZ, *RAW_SUFFIXES):
         raise click.UsageError(f"{suffix} is a file of arrays; choose their layout with --encoding")
     if suffix in PLAIN:
         raise click.UsageError(f"{suffix} cannot hold a tree; name the output {known}")
     if suffix not in ("", *TREES):
-        names = " or ".join(TREES.values())
+        names = f"{', '.join(TREES.values())} or {DETAIL}"
         raise click.UsageError(f"trees are written as {names}, not as {suffix}; name the output {known}")

@@ -76,7 +76,8 @@ def _rad(rad: dict[str, Any]) -> Iterator[str]:
 
 def _streamed_sog(streamed: dict[str, Any]) -> Iterator[str]:
     first, manifest = size_of(streamed["first_bytes"]), size_of(streamed["manifest_bytes"])
-    yield _row("stored", f"manifest {manifest}, with all that the coarsest level needs {first}")
+    around = " and the environment" if streamed["environment"] else ""
+    yield _row("stored", f"manifest {manifest}, with the coarsest level{around} {first}")
     if streamed["file_bytes"]:
         least, median, most = (size_of(streamed["file_bytes"][name]) for name in ("min", "median", "max"))
         count = count_of(streamed["files"], "chunk file")

@@ -12,6 +12,8 @@ from typing import Any
 
 import click
 
+from ..codecs.sog.names import META
+from ..codecs.streamed_sog.names import MANIFEST
 from ..support.addresses import Address, Place, place_of
 from ..support.stdin import DASH
 from .console import is_terminal
@@ -110,11 +112,12 @@ def keep_apart(ctx: click.Context, stands_for: Mapping[str, Iterable[Place]] | N
 
 def with_chunks(headers: Iterable[Place]) -> list[Place]:
     """Outputs of several files each, and the files beside them that are replaced or removed with them."""
-    from ..io import chunk_files
+    from ..io import chunk_files, detail_files
 
     chunks: list[Place] = []
     for header in headers:
-        chunks += [header, *(chunk_files(header) if isinstance(header, Path) else ())]
+        beside = detail_files if header.name == MANIFEST else chunk_files
+        chunks += [header, *(beside(header) if isinstance(header, Path) else ())]
     return chunks
 
 
@@ -212,7 +215,7 @@ def _folds_case(folder: str) -> bool:
 def stem_of(source: Place) -> str:
     """What outputs made of an input are named after: the input, or its folder where it is an unpacked SOG."""
     whole = source if isinstance(source, Address) else source.absolute()
-    return whole.parent.name if source.name == "meta.json" else whole.stem or whole.name
+    return whole.parent.name if source.name in (META, MANIFEST) else whole.stem or whole.name
 
 
 def file_of(text: str) -> Path | None:

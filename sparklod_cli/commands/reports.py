@@ -10,7 +10,7 @@ from ..support.units import format_size
 from .console import Console, count_of, size_of
 
 if TYPE_CHECKING:
-    from ..api.bake_jobs import Baked, Extracted
+    from ..api.bake_jobs import Baked, Extracted, WrittenDetail
     from ..codecs.clamps import Clamp
 
 #: What clamping does to a scene and what to do about it, by column of `Splats` and whether the upper end clamps.
@@ -46,12 +46,12 @@ def report_baked(console: Console, source: Place, target: Place, baked: Baked) -
     """A line about the file, and one for each thing that a person should know."""
     from ..model.selection import describe
 
-    chunks = f", {count_of(baked.chunks, 'chunk')}" if baked.chunks else ""
     console.say(
         f"{name_of(source)}  {count_of(baked.splats, 'splat')}, SH {baked.sh_degree}  ->  {_name(target)} "
-        f" {count_of(baked.nodes, 'node')}, depth {baked.levels - 1}{chunks},"
-        f" {size_of(baked.bytes)}, {_total(baked.seconds)}"
+        f" {_made(baked)}, {size_of(baked.bytes)}, {_total(baked.seconds)}"
     )
+    if baked.detail is not None and len(baked.detail.levels) > 1:
+        console.say(f"  {_levels(baked.detail)}")
     if baked.dropped:
         console.say(f"  left out: {describe(baked.dropped)}")
     for note in baked.notes:
@@ -65,8 +65,32 @@ def report_baked(console: Console, source: Place, target: Place, baked: Baked) -
         console.detail(f"  out of core in {count_of(baked.blocks, 'block')}; scratch: {written} written, {read} read")
 
 
+def _made(baked: Baked) -> str:
+    """What the output holds."""
+    detail = baked.detail
+    if detail is None:
+        chunks = f", {count_of(baked.chunks, 'chunk')}" if baked.chunks else ""
+        return f"{count_of(baked.nodes, 'node')}, depth {baked.levels - 1}{chunks}"
+    environment = f", environment of {count_of(detail.environment, 'splat')}" if detail.environment else ""
+    return (
+        f"{count_of(len(detail.levels), 'detail level')} of {count_of(detail.regions, 'region')},"
+        f" {count_of(detail.chunks, 'chunk file')}{environment}"
+    )
+
+
+def _levels(detail: WrittenDetail) -> str:
+    """The detail levels after full detail, and how far they are from it."""
+    levels = (
+        f"{level.splats:,} splats ({100 * level.share:.3g} %, error at most {level.worst_error:.2g})"
+        for level in detail.levels[1:]
+    )
+    return f"levels below full detail: {', '.join(levels)}"
+
+
 def _written(baked: Baked) -> str:
     """The format of the output and the choices that were made for it."""
+    if baked.detail is not None:
+        return "Streamed SOG"
     if baked.arrays:
         return ", ".join(f"{name} uint32{list(shape)}" for name, shape in baked.arrays.items())
     if baked.chunks is None:

@@ -42,7 +42,7 @@ class Identity:
 
 
 def files_of(path: Place) -> list[Place]:
-    """The file of a path and those that it names beside itself, or the files of a folder that is an unpacked SOG."""
+    """The file of a path and those that it names, or the files of a folder that is an unpacked or a Streamed SOG."""
     if path == DASH or isinstance(path, Address):
         return [path]
     found = companions(path, ())

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 from ..support import defaults
+from .budget import SHARE
+
+#: The most levels after full detail. Viewers choose between a handful; chosen.
+MOST_LEVELS = 15
 
 
 @dataclass(frozen=True)
@@ -23,3 +28,32 @@ class DetailSettings:
     chunk_splats: int = defaults.DETAIL_CHUNK_SPLATS
     extent: float = defaults.DETAIL_EXTENT
     min_splats: int = defaults.DETAIL_MIN_SPLATS
+
+    def __post_init__(self) -> None:
+        levels = self.levels
+        if levels is not None and not (
+            0 < len(levels) <= MOST_LEVELS and all(a > b for a, b in itertools.pairwise((1.0, *levels, 0.0)))
+        ):
+            raise ValueError(f"levels are {levels}; give 1 to {MOST_LEVELS} shares below 1 and above 0, descending")
+        for name in ("chunk_splats", "extent", "min_splats"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} is {getattr(self, name)}; give more than 0")
+
+
+def parse_levels(text: str) -> tuple[float, ...] | None:
+    """The levels of a text such as "50%,25%,12%", as shares of full detail; None for "auto".
+
+    Raises:
+        ValueError: the text is neither.
+    """
+    if text.strip() == "auto":
+        return None
+    found = [SHARE.fullmatch(part.strip()) for part in text.split(",")]
+    shares = tuple(float(share[1]) / 100 for share in found if share is not None)
+    try:
+        return DetailSettings(shares if len(shares) == len(found) else ()).levels
+    except ValueError:
+        raise ValueError(
+            f"{text!r} is neither auto nor shares of full detail such as 50%,25%,12%: at most {MOST_LEVELS}, each"
+            " smaller than the one before, above 0% and below 100%"
+        ) from None

@@ -7,12 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sparklod_cli.bake.output import Output, WrittenTree, output_of
+from sparklod_cli.bake.clock import Clock
+from sparklod_cli.bake.output import Output, output_of
 from sparklod_cli.bake.settings import BakeSettings
+from sparklod_cli.bake.written import WrittenTree
 from sparklod_cli.codecs import encoder
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
 from sparklod_cli.codecs.statistics import Statistics
 from sparklod_cli.lod import quick
+from sparklod_cli.lod.detail_settings import DetailSettings
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.support.errors import FormatError, OutputError
 from sparklod_cli.support.progress import silent
@@ -61,7 +64,7 @@ def test_a_stream_is_written_as_the_scene(
         target.parent.mkdir()
         output = output_of(target, settings, overwrite=False)
         if folder == "scene":
-            said.append(output.write(scene, 2, silent))
+            said.append(output.write(scene, None, Clock(), 2, silent))
             continue
         parts = np.array_split(np.arange(len(scene)), 3)
         leaf = scene.tree.is_leaf
@@ -92,12 +95,21 @@ def test_windows_that_cannot_be_read_leave_no_output(scene: Scene, tmp_path: Pat
     assert not list(tmp_path.iterdir())
 
 
-def test_arrays_are_packed_in_memory_only(scene: Scene, tmp_path: Path) -> None:
-    output = output_of(tmp_path / "town.npz", BakeSettings(encoding="packed"), overwrite=False)
+@pytest.mark.parametrize(
+    ("name", "settings", "message"),
+    [
+        ("town.npz", BakeSettings(encoding="packed"), r"--encoding are packed in memory.*give more --memory"),
+        ("lod-meta.json", BakeSettings(detail=DetailSettings()), r"levels are made in memory.*give more --memory"),
+    ],
+)
+def test_what_is_made_in_memory_only_takes_no_stream(
+    name: str, settings: BakeSettings, message: str, scene: Scene, tmp_path: Path
+) -> None:
+    output = output_of(tmp_path / name, settings, overwrite=False)
     assert output.needed == frozenset()
     found = Statistics.of_scene(scene, output.needed)
-    with pytest.raises(FormatError, match=r"--encoding are packed in memory.*give more --memory"):
+    with pytest.raises(FormatError, match=message):
         output.check_statistics(found)
-    with pytest.raises(FormatError, match="--encoding are packed in memory"):
+    with pytest.raises(FormatError, match=message):
         output.encoder(node_stream(scene), found, 1, silent)
     assert not list(tmp_path.iterdir())

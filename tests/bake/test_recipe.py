@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from sparklod_cli.bake.recipe import Recipe, recipe_of
+from sparklod_cli.bake.recipe import NO_PART, Recipe, recipe_of
 from sparklod_cli.bake.settings import BakeSettings
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
 from sparklod_cli.model.selection import Selection
@@ -25,6 +25,7 @@ OTHERS = {
     "transform.rotation": BakeSettings(transform=Transform.from_parts(up="-y")),
     "options.rad.sh_codes": BakeSettings(options=WriteOptions(rad=RadOptions(sh_codes=16))),
     "suffix": BakeSettings(suffix=".rad"),
+    "environment_beyond": BakeSettings(environment_beyond=9.0),
 }
 
 
@@ -51,7 +52,7 @@ def test_every_setting_is_part_of_it(scene: Path, name: str) -> None:
 
 
 def test_all_settings_are_named_once(scene: Path) -> None:
-    names = {field.name for field in dataclasses.fields(BakeSettings)} - {"unused", "rgba"}
+    names = {field.name for field in dataclasses.fields(BakeSettings)} - {*NO_PART}
     assert {name.split(".")[0] for name in recipe_of([scene], SETTINGS).settings} == {*names, "sparklod"}
 
 

@@ -22,7 +22,12 @@ LOOK = ("--look-at", "0,-1,4:0,0,0")
 
 #: What is asked of each command, by the parameter that gets the input X.
 INPUTS: dict[str, dict[str, tuple[object, ...]]] = {
-    "build-lod": {"inputs": ("X",), "rgba": (PLAIN, "--rgba", "X"), "scene": ("--scene", "X")},
+    "build-lod": {
+        "inputs": ("X",),
+        "rgba": (PLAIN, "--rgba", "X"),
+        "scene": ("--scene", "X"),
+        "environment": (PLAIN, "--environment", "X"),
+    },
     "inspect": {"files": ("X",), "expect": (LOD, "--expect", "X"), "leaves_of": (LOD, "--leaves-of", "X")},
     "traverse": {
         "files": ("X", *LOOK),

@@ -18,8 +18,9 @@ from ...model.streams import NodeStream, SceneStream
 from ...support.parallel import blocks_of
 from ...support.progress import Progress, silent
 from ..clock import Clock
-from ..output import Output, WrittenTree
+from ..output import Output
 from ..settings import BakeSettings
+from ..written import WrittenTree
 from .blocks import cut_into_blocks
 from .contracts import Engine, Store, Task
 from .job import ORDER, Job, clean_of, encoded_of, stage_of

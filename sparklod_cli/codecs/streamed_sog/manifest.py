@@ -6,6 +6,7 @@ report can be made of a file that breaks it.
 
 from __future__ import annotations
 
+import bisect
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -52,7 +53,7 @@ class ManifestNode:
 
     Attributes:
         bound: lowest and highest corner in world units; None where it is missing, or is not of finite numbers.
-        children: numbers of nodes; two in a tree that keeps the rules, none of a region.
+        children: numbers of nodes, ascending; two in a tree that keeps the rules, none of a region.
         runs: of a region, by detail level; None where the node has no `lods`.
         errors: of a region, as the file has them; None where it has none.
         parent: number of the node above, -1 of the root.
@@ -87,7 +88,7 @@ class Manifest:
         """Where a node is in the file: "tree.children[0]"."""
         way = list[str]()
         while (parent := self.nodes[number].parent) >= 0:
-            way.append(f".children[{self.nodes[parent].children.index(number)}]")
+            way.append(f".children[{bisect.bisect_left(self.nodes[parent].children, number)}]")
             number = parent
         return "tree" + "".join(reversed(way))
 

@@ -63,7 +63,7 @@ def violations(manifest: Manifest) -> Iterator[Violation]:
     """The broken promises of a manifest."""
     yield from _nodes(manifest)
     yield from _names(manifest)
-    yield from _runs(manifest)
+    yield from run_violations(manifest)
     yield from _counts(manifest)
     yield from _details(manifest)
     yield from _unions(manifest)
@@ -110,15 +110,16 @@ def leads_away(name: str) -> bool:
 
 def _nodes(manifest: Manifest) -> Iterator[Violation]:
     for number, node in enumerate(manifest.nodes):
-        place = manifest.place(number)
         if len(node.children) not in (0, 2) or bool(node.children) == (node.runs is not None):
             having = count_of(len(node.children), "child", "children")
+            place = manifest.place(number)  # not of every node: there may be many, and deep ones
             text = f"{place} has {having} and {'no ' * (node.runs is None)}lods; a node has two children or lods"
             yield broken("nodes", text)
         if node.bound is None:
-            yield broken("bounds", f"{place} has no bound of six finite numbers")
+            yield broken("bounds", f"{manifest.place(number)} has no bound of six finite numbers")
         elif not is_box(node.bound):
-            yield broken("bounds", f"the bound of {place} is {_text(node.bound)}, the wrong way round", fatal=False)
+            text = f"the bound of {manifest.place(number)} is {_text(node.bound)}, the wrong way round"
+            yield broken("bounds", text, fatal=False)
 
 
 def _names(manifest: Manifest) -> Iterator[Violation]:
@@ -133,7 +134,7 @@ def _names(manifest: Manifest) -> Iterator[Violation]:
         yield broken("environment", text)
 
 
-def _runs(manifest: Manifest) -> Iterator[Violation]:
+def run_violations(manifest: Manifest) -> Iterator[Violation]:
     """Of the runs in each chunk file, which hold one level and lie end to end."""
     by_file: list[list[tuple[int, int, int, int]]] = [[] for _ in manifest.filenames]
     for number, held, _ in regions_of(manifest):

@@ -24,7 +24,7 @@ from .chunks import Beside, Chunk, Piece, check_count, filled, open_chunk
 from .layout import Layout, layout_of
 from .manifest import MAX_MANIFEST, VERSION, parse
 from .names import MANIFEST
-from .promises import violations
+from .promises import run_violations, violations
 
 
 def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent, beside: Beside | None = None) -> Scene:
@@ -52,8 +52,7 @@ def decode_levels(
     Regions are in the order of the tree, depth first.
 
     Raises:
-        FormatError: as `decode`; also where a region has no bound, errors are no numbers, or the tree is not a binary
-            one.
+        FormatError: as `decode`; also where another rule of `promises` is broken that is fatal.
     """
     opened = _open(file, beside, full_detail=False)
     layout = opened.layout
@@ -157,11 +156,10 @@ class _Opened:
 def _open(source: BinaryIO, beside: Beside | None, *, full_detail: bool) -> _Opened:
     """A manifest and its chunks: those of level 0, or all."""
     size = size_of(source)
-    parsed = parse(source.read(MAX_MANIFEST + 1))
-    if not full_detail:
-        check(violations(parsed))
-    layout = layout_of(parsed)
-    runs, manifest = layout.runs, layout.manifest
+    manifest = parse(source.read(MAX_MANIFEST + 1))
+    check(run_violations(manifest) if full_detail else violations(manifest))
+    layout = layout_of(manifest)
+    runs = layout.runs
     wanted = runs.level == 0 if full_detail else np.ones(len(runs.level), np.bool_)
     rows = np.cumsum(runs.count * wanted) - runs.count if full_detail else layout.starts()
     files, first = np.unique(runs.file, return_index=True)

@@ -10,12 +10,14 @@ import click
 from ...codecs.gpu.table import ENCODINGS, NPZ, RAW_SUFFIXES
 from ...codecs.rad.layout import OPTIONS as PROPERTIES
 from ...codecs.rad.layout import choices
+from ...codecs.streamed_sog.names import MANIFEST
 from ...lod.builders import BUILDERS, METHODS
 from ...support import defaults
 from ..command import COMMON, option, with_options
 from ..paths import InputPath
 from ..usage import given, is_given, refuse
 from .common import Command
+from .detail import detail_of, detail_options
 from .types import AutoOr, Ball, Codes, Numbers, Real
 
 if TYPE_CHECKING:
@@ -25,8 +27,19 @@ if TYPE_CHECKING:
 TREE, SELECTION, PLACE, FORMAT = "Tree", "Selection", "Rotation, scale and position", "File format"
 RAD = "RAD"
 
-#: Values of --format: the suffix of the file, and whether each chunk gets a file of its own.
-FORMS = {"spz": (".spz", False), "rad": (".rad", False), "rad-chunked": (".rad", True)}
+#: The value of --format for regions at several detail levels.
+STREAMED_SOG = "streamed-sog"
+
+#: Values of --format: the suffix of the file, and whether each chunk of a RAD gets a file of its own.
+FORMS = {
+    "spz": (".spz", False),
+    "rad": (".rad", False),
+    "rad-chunked": (".rad", True),
+    STREAMED_SOG: (".json", False),
+}
+
+#: What builds the tree unless somebody chooses, and what builds that which a Streamed SOG is cut from.
+METHOD, METHOD_OF_DETAIL = METHODS[0], "quality"
 
 #: What the properties of RAD are called in --help.
 NAMES = {
@@ -54,17 +67,18 @@ OPTIONS: tuple[Callable[[Command], Command], ...] = (
         heading=COMMON,
         type=click.Choice(list(FORMS)),
         help="Format of the output. rad is what Spark streams; rad-chunked writes each chunk to a file of its own,"
-        " NAME-lod-0.radc and so on, beside NAME-lod.rad. A Level-of-Detail file of another format keeps its tree. "
-        " [default: by the suffix of FILE, or spz]",
+        " NAME-lod-0.radc and so on, beside NAME-lod.rad; streamed-sog is what PlayCanvas, SuperSplat and Babylon.js"
+        f" stream, {MANIFEST} and folders beside it. A Level-of-Detail file of another format keeps its tree. "
+        " [default: by the name of FILE, or spz]",
         show_default=False,
     ),
     option(
         "--method",
         heading=COMMON,
         type=click.Choice(METHODS),
-        default=METHODS[0],
         help="How splats are merged. quick takes seconds; quality takes longer, and its cuts come closer to full"
-        " detail.",
+        f" detail.  [default: {METHOD}; {METHOD_OF_DETAIL} with --format {STREAMED_SOG}]",
+        show_default=False,
     ),
     option(
         "--max-sh",
@@ -110,8 +124,9 @@ OPTIONS: tuple[Callable[[Command], Command], ...] = (
         heading=TREE,
         metavar="N",
         type=Real(defaults.MIN_GROWTH, defaults.MAX_GROWTH),
-        default=defaults.DEFAULT_GROWTH,
-        help="Largest number of nodes for each leaf, with --method quality.",
+        help="Largest number of nodes for each leaf, with --method quality. "
+        f" [default: {defaults.DEFAULT_GROWTH:g}; {defaults.DETAIL_GROWTH:g} with --format {STREAMED_SOG}]",
+        show_default=False,
     ),
     option(
         "--min-box",
@@ -217,24 +232,30 @@ OPTIONS: tuple[Callable[[Command], Command], ...] = (
 
 def baking_options(command: Command) -> Command:
     """Adds the options of this module; `bake_settings` and `write_options` take what they are given."""
-    return with_options(command, *OPTIONS)
+    return with_options(command, *OPTIONS, detail_options)
 
 
-def check_method(ctx: click.Context) -> None:
-    """Raises a `click.UsageError` where the number of one method is given with another."""
-    chosen = ctx.params["method"]
+def method_of(ctx: click.Context, *, streamed_sog: bool) -> str:
+    """The method that was asked for, or that suits the output."""
+    asked: str | None = ctx.params["method"]
+    return asked or (METHOD_OF_DETAIL if streamed_sog else METHOD)
+
+
+def check_method(ctx: click.Context, chosen: str) -> None:
+    """Raises a `click.UsageError` where the number of one method is given with another, which was chosen."""
     for method, row in BUILDERS.items():
         if method != chosen:
             refuse(ctx, [row.setting], f"is an option of --method {method}, not of {chosen}")
 
 
-def bake_settings(ctx: click.Context, *, suffix: str, raw: bool, converts: bool) -> BakeSettings:
+def bake_settings(ctx: click.Context, *, suffix: str, raw: bool, streamed_sog: bool, converts: bool) -> BakeSettings:
     """What the options ask for; loads numpy.
 
     Args:
         ctx: of the command.
         suffix: of the format of the output.
         raw: write the words of --encoding alone.
+        streamed_sog: write that.
         converts: somebody chose the format of the output, so that the tree of an input is kept.
     """
     from ...api.bake_jobs import BakeSettings
@@ -242,6 +263,7 @@ def bake_settings(ctx: click.Context, *, suffix: str, raw: bool, converts: bool)
     from ...model.transforms import Transform
 
     asked = ctx.params
+    growth = defaults.DETAIL_GROWTH if streamed_sog else defaults.DEFAULT_GROWTH
     try:
         transform = Transform.from_parts(
             up=asked["up"], rotate=asked["rotate"], scale=asked["scale"], translate=asked["translate"]
@@ -249,9 +271,9 @@ def bake_settings(ctx: click.Context, *, suffix: str, raw: bool, converts: bool)
     except ValueError as error:
         raise click.UsageError(str(error)) from None
     return BakeSettings(
-        method=asked["method"],
+        method=method_of(ctx, streamed_sog=streamed_sog),
         base=asked["base"],
-        growth=asked["growth"],
+        growth=growth if asked["growth"] is None else asked["growth"],
         max_sh=asked["max_sh"],
         selection=Selection(
             drop_invalid=asked["on_invalid"] == "drop",
@@ -266,8 +288,11 @@ def bake_settings(ctx: click.Context, *, suffix: str, raw: bool, converts: bool)
         options=write_options(ctx),
         encoding=asked["encoding"],
         raw=raw,
+        detail=detail_of(ctx) if streamed_sog else None,
+        environment=asked["environment"],
+        environment_beyond=asked["environment_beyond"],
         converts=converts,
-        unused=tuple(given(ctx, (*OF_TREES, *OF_SELECTION, *OF_PLACE))),
+        unused=tuple(given(ctx, (*OF_TREES, *OF_SELECTION, *OF_PLACE, "environment_beyond"))),
     )
 
 

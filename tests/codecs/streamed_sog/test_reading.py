@@ -180,14 +180,13 @@ def change_run(**changes: Any) -> Callable[[Any], object]:
 
 
 REFUSED: dict[str, tuple[Callable[[Any], object], str]] = {
-    "a gap": (change_run(offset=1), r"tree\.children\[0\]\.lods\.0 of lod-meta\.json begins at splat 1 of '0_0/meta"),
-    "an overlap": (change_run(count=26), r"begins at splat 25 of '0_0/meta.json', but the runs before it end at 26"),
+    "a gap": (change_run(offset=1), r"tree\.children\[0\]\.lods\.0 begins at splat 1 of '0_0/meta"),
+    "an overlap": (change_run(count=26), r"begins at splat 25 of '0_0/meta.json', but the run before it ends at 26"),
     "too few": (lambda meta: meta["tree"]["children"][1]["children"][1]["lods"]["0"].update(count=14), "14"),
     "no such chunk": (lambda meta: meta["filenames"].__setitem__(0, "9_0/meta.json"), "there is no '9_0/meta.json'"),
     "twice": (lambda meta: meta["filenames"].__setitem__(1, "0_0/meta.json"), "names '0_0/meta.json' twice"),
     "not a SOG": (lambda meta: meta["filenames"].__setitem__(0, "lod-meta.json"), "'lod-meta.json': meta.json has no"),
     "an image": (lambda meta: meta["filenames"].__setitem__(0, "0_0/sh0.webp"), r"'0_0/sh0.webp': meta\.json is not"),
-    "a node with both": (lambda meta: meta["tree"].update(lods={}), "tree of lod-meta.json has both children and lods"),
     "no splats": (
         lambda meta: meta.update(tree={"bound": meta["tree"]["bound"], "lods": {}}),
         "lod-meta.json has no splats of level 0",
@@ -203,6 +202,7 @@ def test_what_does_not_fit_together_is_refused(name: str) -> None:
 
 
 REFUSED_LEVELS: dict[str, tuple[Callable[[Any], object], str]] = {
+    "a node with both": (lambda meta: meta["tree"].update(lods={}), "tree has 2 children and lods; a node has two"),
     "no bound": (
         lambda meta: first_leaf(meta).pop("bound"),
         r"tree\.children\[0\] has no bound of six finite numbers",

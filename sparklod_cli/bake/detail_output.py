@@ -1,0 +1,129 @@
+"""Writing a tree as a Streamed SOG: its regions at several detail levels, their errors, and chunk files."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+from ..codecs.encoder import Encoder, Get
+from ..codecs.options import WriteOptions
+from ..codecs.statistics import Statistics
+from ..codecs.streamed_sog.names import ENVIRONMENT, folders_of
+from ..io import SinkTogether
+from ..io.together import Files
+from ..lod.detail_settings import DetailSettings
+from ..model.detail import DetailScene
+from ..model.scene import Scene
+from ..model.splats import Splats
+from ..model.streams import NodeStream
+from ..support.errors import FormatError
+from ..support.progress import Progress
+from ..support.threads import on_threads
+from .clock import Clock
+from .written import WrittenDetail, WrittenLevel, WrittenTree
+
+
+def detail_levels(
+    scene: Scene,
+    environment: Splats | None,
+    settings: DetailSettings,
+    clock: Clock,
+    *,
+    threads: int,
+    progress: Progress,
+) -> DetailScene:
+    """Regions of a tree at several detail levels, with their errors.
+
+    Args:
+        scene: a tree.
+        environment: splats beside it; None without.
+        settings: of levels and regions.
+        clock: told of the stages.
+        threads: to work on; the result does not depend on it.
+        progress: told of the stages.
+    """
+    from ..lod.detail_levels import make
+    from .region_errors import measured
+
+    assert scene.tree is not None
+    with on_threads(threads):
+        made = make(scene.splats, scene.tree, settings, progress=progress)
+    clock.end("levels")
+    errors = measured(made, threads=threads, progress=progress)
+    clock.end("errors")
+    return dataclasses.replace(made, errors=errors, environment=environment, antialiased=scene.antialiased)
+
+
+@dataclass(frozen=True)
+class DetailOutput:
+    """A Streamed SOG.
+
+    Attributes:
+        settings: of levels and regions.
+        options: how chunk files are written.
+        sink: writes it.
+        in_chunks: see `Output`.
+    """
+
+    settings: DetailSettings
+    options: WriteOptions
+    sink: SinkTogether
+    in_chunks: bool = False
+
+    @property
+    def needed(self) -> frozenset[str]:
+        """None: nothing is settled by statistics."""
+        return frozenset()
+
+    def check(self, scene: Scene) -> None:
+        """It holds anything."""
+
+    def check_statistics(self, found: Statistics) -> None:
+        """It is made of all nodes at once."""
+        raise FormatError(
+            "detail levels are made in memory, and this tree does not fit: give more --memory, or write .spz or .rad"
+        )
+
+    def write(
+        self, scene: Scene, environment: Splats | None, clock: Clock, threads: int, progress: Progress
+    ) -> WrittenTree:
+        """Makes its levels and writes them."""
+        from ..codecs.streamed_sog.codec import encode_files
+
+        made = detail_levels(scene, environment, self.settings, clock, threads=threads, progress=progress)
+        names: list[str] = []
+        files = encode_files(made, self.options, self.settings, threads=threads, progress=progress)
+        size = self.sink(_noted(files, names))
+        clock.end("write")
+        return WrittenTree(output_format="streamed-sog", bytes=size, detail=_told(made, names))
+
+    def encoder(self, nodes: NodeStream, found: Statistics, threads: int, progress: Progress) -> Encoder:
+        """There is none."""
+        self.check_statistics(found)
+        raise AssertionError
+
+    def write_windows(self, encoder: Encoder, get: Get, threads: int, progress: Progress) -> WrittenTree:
+        """There are none."""
+        raise AssertionError
+
+
+def _noted(files: Files, names: list[str]) -> Iterator[tuple[str, Iterable[bytes]]]:
+    """The same files; their names are added to a list."""
+    for name, pieces in files:
+        names.append(name)
+        yield name, pieces
+
+
+def _told(made: DetailScene, names: list[str]) -> WrittenDetail:
+    """What is said of a scene that was written to files of these names."""
+    assert made.errors is not None
+    splats, errors = made.counts.sum(axis=0).tolist(), made.errors.max(axis=0).tolist()
+    return WrittenDetail(
+        levels=tuple(
+            WrittenLevel(count, round(count / splats[0], 6), error) for count, error in zip(splats, errors, strict=True)
+        ),
+        regions=made.regions,
+        chunks=len({*folders_of(names)} - {ENVIRONMENT}),
+        environment=0 if made.environment is None else len(made.environment),
+    )
