@@ -29,7 +29,7 @@ from sparklod_cli.codecs.rad.layout import choices
 from sparklod_cli.codecs.sog import codec as sog
 from sparklod_cli.codecs.sog import codings
 from sparklod_cli.codecs.sog.codebook import codebook
-from sparklod_cli.codecs.sog.writing import SEEN
+from sparklod_cli.codecs.sog.writing import LARGE, SEEN
 from sparklod_cli.codecs.splat_encoding import SplatEncoding
 from sparklod_cli.model import morton
 from sparklod_cli.model.scene import Scene
@@ -253,7 +253,7 @@ def written_sog_precision(source: Scene) -> Precision:
         sh = float(np.abs(palette.expand() - splats.sh).max()) + largest_half_step(palette.codes)
     return dataclasses.replace(
         found,
-        log_scale=largest_half_step(log_scale) + 4e-6,
+        log_scale=float(np.diff(codebook(log_scale, LARGE)).max()) / 2 + 4e-6,
         rgb=largest_half_step(dc) * SH_C0 + 1e-6,
         sh=(sh + 1e-6, sh + 1e-6),
     )

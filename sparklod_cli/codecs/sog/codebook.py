@@ -21,7 +21,7 @@ CROWDING = 0.5
 PASSES = 20
 
 
-def codebook(values: FloatArray) -> FloatArray:
+def codebook(values: FloatArray, tilt: float = 0) -> FloatArray:
     """A book for some numbers.
 
     If at most 256 of them differ, the book has just these. Otherwise it has the least and the largest number, so that
@@ -31,6 +31,7 @@ def codebook(values: FloatArray) -> FloatArray:
 
     Args:
         values: finite float32 of any shape, at least one.
+        tilt: a number weighs e ** (tilt * number).
 
     Returns:
         (256,) ascending float32; the last value is repeated where there are fewer.
@@ -45,7 +46,7 @@ def codebook(values: FloatArray) -> FloatArray:
     found = np.empty(CODES, np.float32)
     found[0], found[-1] = ordered[0], ordered[-1]
     first, last = np.searchsorted(ordered, ordered[0], "right"), np.searchsorted(ordered, ordered[-1], "left")
-    found[1:-1] = _means(ordered[first:last].astype(np.float64), CODES - 2)
+    found[1:-1] = _means(ordered[first:last].astype(np.float64), CODES - 2, tilt)
     return found
 
 
@@ -60,21 +61,23 @@ def nearest(values: FloatArray, book: FloatArray) -> NDArray[np.uint8]:
     return np.searchsorted((wide[1:] + wide[:-1]) / 2, values.ravel()).astype(np.uint8).reshape(values.shape)
 
 
-def _means(ordered: NDArray[np.float64], codes: int) -> NDArray[np.float64]:
+def _means(ordered: NDArray[np.float64], codes: int, tilt: float) -> NDArray[np.float64]:
     """(codes,) ascending means of cells of ascending numbers, more than codes of which differ."""
     low, extent = ordered[0], ordered[-1] - ordered[0]
     bins = np.minimum((ordered - low) * (BINS / extent), BINS - 1).astype(np.int64)
     counts = np.bincount(bins, minlength=BINS).astype(np.float64)
     crowded = np.maximum(counts, 1) ** (CROWDING - 1)
-    weight = np.append(0, np.cumsum(crowded[bins]))
-    moment = np.append(0, np.cumsum(crowded[bins] * (ordered - low)))
-    density = np.append(0, np.cumsum(counts ** (CROWDING / 3) * (counts > 0)))
+    weights = crowded[bins] * np.exp(tilt * (ordered - low))
+    weight = np.append(0, np.cumsum(weights))
+    moment = np.append(0, np.cumsum(weights * (ordered - low)))
+    tilted = np.exp(tilt / 3 * np.linspace(0, extent, BINS))
+    density = np.append(0, np.cumsum(counts ** (CROWDING / 3) * (counts > 0) * tilted))
     shares = (np.arange(codes) + 0.5) * (density[-1] / codes)
     means = np.interp(shares, density, np.linspace(0, extent, BINS + 1)) + low
     for _ in range(PASSES):
         begin = np.concatenate([[0], np.searchsorted(ordered, (means[1:] + means[:-1]) / 2), [len(ordered)]])
-        weights, moments = np.diff(weight[begin]), np.diff(moment[begin])
-        filled = begin[1:] > begin[:-1]
-        means[filled] = low + moments[filled] / weights[filled]
+        within, moments = np.diff(weight[begin]), np.diff(moment[begin])
+        filled = within > 0
+        means[filled] = low + moments[filled] / within[filled]
         means.sort()
     return means
