@@ -20,7 +20,7 @@ from .options.resources import resources_of
 from .reports import report_baked, report_extracted
 
 if TYPE_CHECKING:
-    from ..api.bake_jobs import Baked, ClusterEngine, Extracted, Source
+    from ..api.bake_jobs import Baked, BakeSettings, ClusterEngine, Extracted, Source
     from .console import Console
 
     #: What is known of an output; None where it was there already.
@@ -49,8 +49,7 @@ def job_of(
         streamed_sog=outputs.is_streamed_sog,
         converts=outputs.format_is_asked_for,
     )
-    more = [] if outputs.suffix != RAD else ["rad"] if settings.options.rad.sh_codes is None else ["rad", "palette"]
-    console.announce_compiling(settings.method, *more)
+    console.announce_compiling(settings.method, *_jobs_of(outputs, settings))
     make, resources = bake_unless_there if ctx.params["skip_existing"] else bake, resources_of(ctx)
     if engine is not None:
         resources = dataclasses.replace(resources, memory=engine.memory)
@@ -70,6 +69,15 @@ def job_of(
         **shared,
     )
     return lambda pairs: (beside if len(pairs) > 1 else alone)(pairs), report_baked
+
+
+def _jobs_of(outputs: Outputs, settings: BakeSettings) -> list[str]:
+    """The jobs of `warmup.JOBS` after that of the builder."""
+    if outputs.is_streamed_sog:
+        return ["streamed-sog"]
+    if outputs.suffix != RAD:
+        return []
+    return ["rad"] if settings.options.rad.sh_codes is None else ["rad", "palette"]
 
 
 def _one_by_one(make: Callable[..., Made]) -> Make:
