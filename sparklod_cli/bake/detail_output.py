@@ -6,9 +6,7 @@ import dataclasses
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
-from ..codecs.encoder import Encoder, Get
 from ..codecs.options import WriteOptions
-from ..codecs.statistics import Statistics
 from ..codecs.streamed_sog.names import ENVIRONMENT, folders_of
 from ..io import SinkTogether
 from ..io.together import Files
@@ -16,11 +14,10 @@ from ..lod.detail_settings import DetailSettings
 from ..model.detail import DetailScene
 from ..model.scene import Scene
 from ..model.splats import Splats
-from ..model.streams import NodeStream
-from ..support.errors import FormatError
 from ..support.progress import Progress
 from ..support.threads import on_threads
 from .clock import Clock
+from .whole_output import WholeOutput
 from .written import WrittenDetail, WrittenLevel, WrittenTree
 
 
@@ -56,34 +53,20 @@ def detail_levels(
 
 
 @dataclass(frozen=True)
-class DetailOutput:
+class DetailOutput(WholeOutput):
     """A Streamed SOG.
 
     Attributes:
         settings: of levels and regions.
         options: how chunk files are written.
         sink: writes it.
-        in_chunks: see `Output`.
     """
 
     settings: DetailSettings
     options: WriteOptions
     sink: SinkTogether
-    in_chunks: bool = False
 
-    @property
-    def needed(self) -> frozenset[str]:
-        """None: nothing is settled by statistics."""
-        return frozenset()
-
-    def check(self, scene: Scene) -> None:
-        """It holds anything."""
-
-    def check_statistics(self, found: Statistics) -> None:
-        """It is made of all nodes at once."""
-        raise FormatError(
-            "detail levels are made in memory, and this tree does not fit: give more --memory, or write .spz or .rad"
-        )
+    made = "detail levels are made"
 
     def write(
         self, scene: Scene, environment: Splats | None, clock: Clock, threads: int, progress: Progress
@@ -97,15 +80,6 @@ class DetailOutput:
         size = self.sink(_noted(files, names))
         clock.end("write")
         return WrittenTree(output_format="streamed-sog", bytes=size, detail=_told(made, names))
-
-    def encoder(self, nodes: NodeStream, found: Statistics, threads: int, progress: Progress) -> Encoder:
-        """There is none."""
-        self.check_statistics(found)
-        raise AssertionError
-
-    def write_windows(self, encoder: Encoder, get: Get, threads: int, progress: Progress) -> WrittenTree:
-        """There are none."""
-        raise AssertionError
 
 
 def _noted(files: Files, names: list[str]) -> Iterator[tuple[str, Iterable[bytes]]]:

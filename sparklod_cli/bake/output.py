@@ -22,11 +22,11 @@ from ..model.scene import Scene
 from ..model.splats import Splats
 from ..model.streams import NodeStream
 from ..support.addresses import Place
-from ..support.errors import FormatError
 from ..support.progress import Progress
 from .clock import Clock
 from .detail_output import DetailOutput
 from .settings import BakeSettings
+from .whole_output import WholeOutput
 from .written import WrittenTree
 
 
@@ -91,35 +91,20 @@ def output_of(target: Place, settings: BakeSettings, *, overwrite: bool) -> Outp
 
 
 @dataclass(frozen=True)
-class _Arrays:
+class _Arrays(WholeOutput):
     """Arrays in the layout of a viewer's memory.
 
     Attributes:
         encoding: of `codecs.gpu.table.ENCODINGS`.
         raw: their words alone, rather than a .npz.
         sink: writes them.
-        in_chunks: see `Output`.
     """
 
     encoding: str
     raw: bool
     sink: Sink
-    in_chunks: bool = False
 
-    @property
-    def needed(self) -> frozenset[str]:
-        """None: nothing is settled by statistics."""
-        return frozenset()
-
-    def check(self, scene: Scene) -> None:
-        """They hold anything."""
-
-    def check_statistics(self, found: Statistics) -> None:
-        """They are made of all nodes at once."""
-        raise FormatError(
-            "the arrays of --encoding are packed in memory, and this tree does not fit: give more --memory, or write"
-            " .spz or .rad"
-        )
+    made = "the arrays of --encoding are packed"
 
     def write(
         self, scene: Scene, environment: Splats | None, clock: Clock, threads: int, progress: Progress
@@ -130,15 +115,6 @@ class _Arrays:
         shapes = {name: words.shape for name, words in arrays.items()}
         clock.end("write")
         return WrittenTree(output_format=self.encoding, bytes=size, arrays=shapes)
-
-    def encoder(self, nodes: NodeStream, found: Statistics, threads: int, progress: Progress) -> Encoder:
-        """There is none."""
-        self.check_statistics(found)
-        raise AssertionError
-
-    def write_windows(self, encoder: Encoder, get: Get, threads: int, progress: Progress) -> WrittenTree:
-        """There are none."""
-        raise AssertionError
 
 
 @dataclass(frozen=True)

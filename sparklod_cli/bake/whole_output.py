@@ -1,0 +1,49 @@
+"""Outputs that are made of all nodes at once, in memory."""
+
+from __future__ import annotations
+
+from typing import NoReturn
+
+from ..codecs.encoder import Encoder, Get
+from ..codecs.statistics import Statistics
+from ..model.scene import Scene
+from ..model.streams import NodeStream
+from ..support.errors import FormatError
+from ..support.progress import Progress
+
+
+class WholeOutput:
+    """The part of an `Output` that refuses to be written window by window.
+
+    Attributes:
+        in_chunks: see `Output`.
+        made: what is made of the nodes, and how, for the refusal.
+    """
+
+    in_chunks = False
+    made = ""
+
+    @property
+    def needed(self) -> frozenset[str]:
+        """None: nothing is settled by statistics."""
+        return frozenset()
+
+    def check(self, scene: Scene) -> None:
+        """It holds anything."""
+
+    def check_statistics(self, found: Statistics) -> None:
+        """Refuses."""
+        self._refuse()
+
+    def encoder(self, nodes: NodeStream, found: Statistics, threads: int, progress: Progress) -> Encoder:
+        """Refuses."""
+        self._refuse()
+
+    def write_windows(self, encoder: Encoder, get: Get, threads: int, progress: Progress) -> NoReturn:
+        """Refuses."""
+        self._refuse()
+
+    def _refuse(self) -> NoReturn:
+        raise FormatError(
+            f"{self.made} in memory, and this tree does not fit: give more --memory, or write .spz or .rad"
+        )
