@@ -116,10 +116,15 @@ def _failed(error: BaseException, verbosity: Verbosity) -> int:
 
 def main() -> NoReturn:
     """Entry point of the script; cleans up on a polite kill as on Ctrl-C."""
-    stdout.reserve()
-    interrupts.handle()
-    code = run()
-    interrupts.ignore()
+    try:
+        stdout.reserve()
+        interrupts.handle()
+        code = run()
+        interrupts.ignore()
+    except KeyboardInterrupt:  # before the work began, or after its end
+        interrupts.ignore()
+        say("interrupted")
+        code = interrupts.INTERRUPTED
     # An interrupt that came while Python ran a string, as dataclasses does, would otherwise make it end by that signal,
     # whatever the status: it remembers the last one until another string has run.
     exec("")

@@ -17,8 +17,7 @@ def check_kept(scene: Scene, settings: BakeSettings) -> None:
             a tree can be given.
     """
     held = scene.format.split()[0]
-    same = settings.detail is None and _is_same(scene, held, settings)
-    if settings.encoding is not None or not settings.converts or same:
+    if settings.encoding is not None or not settings.converts or _is_same(scene, held, settings):
         other = next(each for each in (WRITABLE[RAD], WRITABLE[SPZ]) if each.name != held)
         raise FormatError(
             "it is a Level-of-Detail file already; --unlod writes its splats back out, and --format"
@@ -33,5 +32,7 @@ def check_kept(scene: Scene, settings: BakeSettings) -> None:
 
 def _is_same(scene: Scene, held: str, settings: BakeSettings) -> bool:
     """Whether the format that is written is that of the scene."""
+    if settings.detail is not None:
+        return False
     chunked = bool(scene.header.get("chunked"))
     return held == WRITABLE[settings.suffix].name and chunked == settings.options.rad.chunked

@@ -73,7 +73,7 @@ def attempt(name: str, data: bytes, *, files: Mapping[str, bytes] | None = None,
             raise FormatError("there is no such file")
         return io.BytesIO(among[other])
 
-    among = files_of(name) if files is None and form.folders else files or {}
+    among = files_of(name) if name and files is None and form.folders else files or {}
 
     more = {"beside": beside} if form.companions else {}
     start = time.perf_counter()

@@ -12,7 +12,7 @@ import pytest
 from sparklod_cli.model import streams
 from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.support.errors import FormatError, HasTreeError
-from tests.codecs.test_damaged import FILES, WORDS, content, format_of, header, insides
+from tests.codecs.test_damaged import FILES, WORDS, content, files_of, format_of, header, insides
 
 TRIES = 40
 
@@ -40,11 +40,18 @@ def compare(name: str, data: bytes) -> str:
         return "unknown"
     codec: Any = form.codec()
 
+    def beside(other: str) -> BinaryIO:
+        if other not in files_of(name):
+            raise FormatError("there is no such file")
+        return io.BytesIO(files_of(name)[other])
+
+    more = {"beside": beside} if form.folders else {}
+
     def streamed() -> Splats:
-        stream = codec.stream(io.BytesIO(data), scratch=in_memory)
+        stream = codec.stream(io.BytesIO(data), scratch=in_memory, **more)
         return Splats.concat([Splats.empty(0, stream.sh_degree), *stream.blocks()])
 
-    whole, found = outcome(lambda: codec.decode(io.BytesIO(data)).splats), outcome(streamed)
+    whole, found = outcome(lambda: codec.decode(io.BytesIO(data), **more).splats), outcome(streamed)
     if found is None:
         return "tree"
     if isinstance(whole, Splats) and isinstance(found, Splats):
