@@ -11,7 +11,7 @@ import numpy as np
 
 from ..codecs.stream import size_of
 from ..codecs.streamed_sog.chunks import Chunk
-from ..codecs.streamed_sog.manifest import VERSION, Manifest
+from ..codecs.streamed_sog.manifest import VERSION, Manifest, ManifestNode
 from ..codecs.streamed_sog.promises import level_counts
 from ..codecs.streamed_sog.survey import survey_file, survey_splats
 from ..io import opened
@@ -157,12 +157,7 @@ def _head(manifest: Manifest, chunks: Mapping[str, Chunk], facts: StreamedSogFac
 
 def _names_of(manifest: Manifest, level: int) -> list[str]:
     """The chunk files with splats of a level."""
-    held = {
-        run.file
-        for _, node in manifest.regions()
-        for number, run in (node.runs or {}).items()
-        if number == level and run.count
-    }
+    held = {node.runs[level].file for _, node in manifest.regions() if node.runs and _count(node, level)}
     return [manifest.filenames[number] for number in sorted(held)]
 
 
@@ -179,7 +174,7 @@ def _facts(manifest: Manifest, chunks: Mapping[str, Chunk], size: int) -> Stream
     generator = asset.get("generator") if isinstance(asset, dict) else None
     regions = [node for _, node in manifest.regions()]
     edges = [max(map(_edge, *node.bound)) for node in regions if node.bound is not None]
-    full = [node.runs[0].count if node.runs and 0 in node.runs else 0 for node in regions]
+    full = [_count(node, 0) for node in regions]
     bound = manifest.nodes[0].bound
     assert bound is not None
     return StreamedSogFacts(
@@ -202,9 +197,9 @@ def _facts(manifest: Manifest, chunks: Mapping[str, Chunk], size: int) -> Stream
 
 def _level(manifest: Manifest, chunks: Mapping[str, Chunk], level: int, counts: Sequence[int]) -> LevelFacts:
     names = _names_of(manifest, level)
-    held = [node for _, node in manifest.regions() if node.runs and level in node.runs and node.runs[level].count]
+    held = [node for _, node in manifest.regions() if _count(node, level)]
     errors = [node.errors[level] for node in held if node.errors is not None]
-    weights = [node.runs[0].count if node.runs and 0 in node.runs else 0 for node in held]
+    weights = [_count(node, 0) for node in held]
     known = bool(errors) and len(errors) == len(held) and any(weights)
     return LevelFacts(
         splats=counts[level],
@@ -214,6 +209,11 @@ def _level(manifest: Manifest, chunks: Mapping[str, Chunk], level: int, counts: 
         bytes=sum(chunks[name].bytes for name in names),
         errors=_quantiles(errors, weights) if known else None,
     )
+
+
+def _count(node: ManifestNode, level: int) -> int:
+    """The splats of a region at a level."""
+    return node.runs[level].count if node.runs and level in node.runs else 0
 
 
 def _depth(manifest: Manifest) -> int:

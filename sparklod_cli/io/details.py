@@ -15,11 +15,9 @@ from ..codecs.streamed_sog.names import chunk_name, folders_of, is_folder, is_ou
 from ..support import atomic_set
 from ..support.addresses import Address, Place
 from ..support.errors import FormatError, OutputError
-from ..support.stdin import DASH
 from .names import reason_of
-from .together import Files, SinkTogether
+from .together import Files, SinkTogether, check_header
 from .uploads import check_address, send_together
-from .writing import check_writable
 
 #: The folder that every output has.
 FIRST = chunk_name(0, 0)
@@ -44,11 +42,7 @@ def detail_sink(path: Place, *, overwrite: bool) -> SinkTogether:
     if isinstance(target, Address):
         check_address(target, overwrite=overwrite)
     else:
-        if path == DASH:
-            raise OutputError("standard output cannot take several files; name a file")
-        check_writable(path, overwrite=overwrite)
-        if path.exists() and not path.is_file():
-            raise OutputError(f"{path} is a pipe or a device, which cannot take several files; name a file")
+        check_header(path, overwrite=overwrite)
     former = _former(target)
     for folder in [FIRST] if isinstance(target, Path) else [FIRST, *folders_of(_standing(target))]:
         _check_folder(target, folder, former)  # at an address all of them now: nothing can be undone there later

@@ -80,15 +80,20 @@ def sink_together(path: Place, *, overwrite: bool) -> SinkTogether:
     return functools.partial(write_together, path, overwrite=overwrite)
 
 
-def _check(path: Place, *, overwrite: bool) -> None:
-    if isinstance(path, Address):
-        check_together(path, overwrite=overwrite)
-        return
+def check_header(path: Place, *, overwrite: bool) -> None:
+    """Raises `OutputError` where a file that names others cannot be written, before work goes into it."""
     if path == DASH:
         raise OutputError("standard output cannot take several files; name a file")
     check_writable(path, overwrite=overwrite)
     if path.exists() and not path.is_file():
         raise OutputError(f"{path} is a pipe or a device, which cannot take several files; name a file")
+
+
+def _check(path: Place, *, overwrite: bool) -> None:
+    if isinstance(path, Address):
+        check_together(path, overwrite=overwrite)
+        return
+    check_header(path, overwrite=overwrite)
     for each in chunk_files(path):
         if not overwrite or _is_no_file(each):
             raise _taken(each)
