@@ -33,12 +33,12 @@ class StoredChunk:
     """What a chunk stores.
 
     Attributes:
-        count: of its nodes.
+        start: its first node.
         properties: by name.
-        codes: the unpacked bytes of the properties of splats, by name.
+        codes: (n, ...) of the properties of splats, by name: the bytes of each splat, of differences their sums.
     """
 
-    count: int
+    start: int
     properties: Mapping[str, Property]
     codes: Mapping[str, Bytes]
 
@@ -49,11 +49,11 @@ class StoredRad:
 
     Attributes:
         header: of the file.
-        chunks: by the index of their first node.
+        chunks: in order.
     """
 
     header: RadHeader
-    chunks: Mapping[int, StoredChunk]
+    chunks: tuple[StoredChunk, ...]
 
     def like(self, options: WriteOptions) -> WriteOptions:
         """These options, and where they leave a choice open, that of the first chunk of the file.
@@ -85,7 +85,22 @@ class StoredRad:
     def keeping(self, encoder: RadEncoder, kept: NDArray[np.bool_]) -> KeepingEncoder:
         """An encoder of as many nodes that gives some the codes of the file, where its encoding is the same."""
         given = {each.name: getattr(encoder, each.name) for each in dataclasses.fields(RadEncoder)}
-        return KeepingEncoder(**given, chunks=self.chunks, kept=kept)
+        return KeepingEncoder(**given, stored=self, kept=kept)
+
+    def codes(self, name: str, start: int, stop: int) -> tuple[Property, Bytes] | None:
+        """A property of some nodes, and (n, ...) their codes; None where its coding is not the same in all chunks."""
+        found, codes = [], []
+        for chunk in self.chunks:
+            some = chunk.codes.get(name)
+            part = slice(max(start - chunk.start, 0), max(stop - chunk.start, 0))
+            if some is None:
+                return None
+            if len(some[part]):
+                found.append(chunk.properties[name])
+                codes.append(some[part])
+        if len({(each.encoding, each.min, each.max) for each in found}) != 1:
+            return None
+        return found[0], np.concatenate(codes)
 
 
 def stored(file: BinaryIO, *, beside: Beside | None = None) -> StoredRad:
@@ -99,12 +114,16 @@ def stored(file: BinaryIO, *, beside: Beside | None = None) -> StoredRad:
         FormatError: see `reading.decode`.
     """
     header = checked_header(file, beside)
-    chunks = {}
+    chunks = []
     for packed in chunks_of(file, header, beside, range(len(header.chunks))):
         count, properties = packed.header.count, {each.name: each for each in packed.header.properties}
-        codes = {row.name: packed.unpacked(properties[row.name], row, count) for row in _kept(properties)}
-        chunks[packed.header.base] = StoredChunk(count, properties, codes)
-    return StoredRad(header, chunks)
+        codes = {}
+        for row in _kept(properties):
+            each = properties[row.name]
+            flat = _flat(packed.unpacked(each, row, count), each.encoding, count)
+            codes[row.name] = np.ascontiguousarray(_by_splat(flat, row, each.encoding))
+        chunks.append(StoredChunk(packed.header.base, properties, codes))
+    return StoredRad(header, tuple(chunks))
 
 
 def _kept(properties: Mapping[str, Property]) -> list[Row]:
@@ -117,30 +136,27 @@ class KeepingEncoder(RadEncoder):
     """An encoder some of whose nodes have codes that are given.
 
     Attributes:
-        chunks: with the codes, by the index of their first node.
+        stored: has the codes; None for none.
         kept: (N,) the nodes that have these.
     """
 
-    chunks: Mapping[int, StoredChunk] = dataclasses.field(default_factory=dict)
+    stored: StoredRad | None = None
     kept: NDArray[np.bool_] = dataclasses.field(default_factory=lambda: np.zeros(0, bool))
 
     def coded(
         self, row: Row, splats: Splats, tree: LodTree | None, labels: NDArray[np.uint32] | None, start: int
     ) -> Coded:
         """A property of a chunk, in the range that it had."""
-        made, chunk = super().coded(row, splats, tree, labels, start), self.chunks.get(start)
-        if chunk is None or chunk.count != len(splats) or row.name not in chunk.codes:
+        made, stop = super().coded(row, splats, tree, labels, start), start + len(splats)
+        found = None if self.stored is None else self.stored.codes(row.name, start, stop)
+        if found is None or found[0].encoding != made.encoding:
             return made
-        each = chunk.properties[row.name]
-        if each.encoding != made.encoding:
-            return made
+        each, before = found
         low, high = (0.0 if end is None else end for end in (each.min, each.max))
         codes = CODINGS[made.encoding].encode(self.values(row, made.encoding, splats, tree, labels), low, high)
-        new = _flat(codes, made.encoding, chunk.count)
-        old = _flat(chunk.codes[row.name], made.encoding, chunk.count)
-        kept = self.kept[start : start + chunk.count]
-        _by_splat(new, row, made.encoding)[kept] = _by_splat(old, row, made.encoding)[kept]
-        return Coded(made.encoding, _stored(new, made.encoding, chunk.count), each.min, each.max)
+        flat, kept = _flat(codes, made.encoding, len(splats)), self.kept[start:stop]
+        _by_splat(flat, row, made.encoding)[kept] = before[kept]
+        return Coded(made.encoding, _stored(flat, made.encoding, len(splats)), each.min, each.max)
 
 
 def _flat(codes: NDArray[Any], encoding: str, count: int) -> Bytes:
