@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..command import COMMON, option, with_options
+from ..command import option, with_options
 from ..paths import InputPath
 from ..usage import exclude, is_given, require
 from .common import Command
@@ -46,9 +46,8 @@ def refining_options(command: Command) -> Command:
     add = functools.partial(option, heading=HEADING)
     return with_options(
         command,
-        option(
+        add(
             "--refine",
-            heading=COMMON,
             type=_Steps(1, MOST_STEPS, example=EXAMPLE_STEPS),
             is_flag=False,
             flag_value=DEFAULT,
