@@ -107,7 +107,7 @@ class Comparison:
             SparklodError: full detail covers no pixel of a frame.
         """
         total = len(path.cameras) * len(self.counts)
-        for at, row in enumerate(ordered_map(_measured, self._pictures(path, threads), min(threads, MEASURERS))):
+        for at, row in enumerate(ordered_map(measured, self._pictures(path, threads), min(threads, MEASURERS))):
             progress("compare", at + 1, total, "picture")
             yield row
 
@@ -135,7 +135,8 @@ class Comparison:
             last = frame
 
 
-def _measured(pictures: Pictures) -> Row:
+def measured(pictures: Pictures) -> Row:
+    """The row of a comparison: what was known of the pictures, and how far they are apart."""
     row, before = pictures.row, pictures.before
     tiles = []
     for name, gray in BACKGROUNDS.items():
