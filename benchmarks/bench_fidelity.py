@@ -62,7 +62,10 @@ def sources(path: Path, arguments: argparse.Namespace) -> Iterator[Source]:
 def measure(source: Source, arguments: argparse.Namespace) -> Iterator[tuple[str, Measured]]:
     """Measures one scene with every method, and with each way of splat-transform that there is."""
     drawn, suffix = source.drawn, WITH_SH * source.sh
-    sets = {name: cameras_of(name, drawn, arguments.size)[:: arguments.every] for name in arguments.cameras}
+    sets = {
+        name: cameras_of(name, drawn, arguments.size)[:: 1 if name in MOVING else arguments.every]
+        for name in arguments.cameras
+    }
     if source.sh:
         sets = dict(list(sets.items())[:1])
     for method in arguments.methods:
@@ -147,7 +150,9 @@ def parsed() -> argparse.Namespace:
     sets = "sets of cameras; the first one is that of most tables, and orbit and dolly are for popping"
     parser.add_argument("--cameras", nargs="+", choices=CAMERAS, default=["around"], help=sets)
     parser.add_argument("--popping", action="store_true", help="add the cameras orbit and dolly")
-    parser.add_argument("--every", type=int, default=1, help="take every so many cameras of a set, for a quick run")
+    parser.add_argument(
+        "--every", type=int, default=1, help="take every so many cameras of a set that does not move, for a quick run"
+    )
     parser.add_argument("--size", type=size_of, default=SIZE, help="of the pictures, such as 480x270 (default 960x540)")
     parser.add_argument("--sh", action="store_true", help="measure with spherical harmonics as well")
     text = "folder of NAME-decimate-50.ply and so on, which splat-transform made, for rows of them"

@@ -184,7 +184,6 @@ class FullDetail:
         """How far pictures of all splats of another scene are from it."""
         rows = []
         for number, (camera, full, where) in enumerate(zip(self._cameras, self._pictures, self._edges, strict=True)):
-            known: Row = {"frame": number, "time_s": camera.time, "name": "", "budget": len(scene), "share": None}
-            known["selected"] = len(scene)
+            known: Row = {"frame": number, "time_s": camera.time, "selected": len(scene)}
             rows.append(measured(Pictures(known, sparklod.render(scene, camera), full, where, None)))
         return Figures.of(rows)

@@ -153,7 +153,7 @@ def measured(pictures: Pictures) -> Row:
         row[name] = sum(values) / len(values) if values else None
     worst = min(tiles, key=lambda tile: tile.psnr)
     row |= {"worst_tile_psnr": worst.psnr, "worst_tile_x": worst.x, "worst_tile_y": worst.y}
-    return {column.name: column.rounded(row[column.name]) for column in COLUMNS}
+    return {column.name: column.rounded(row.get(column.name)) for column in COLUMNS}
 
 
 def write_charts(target: Path, rows: Sequence[Row], budgets: Sequence[Budget], title: str, *, overwrite: bool) -> None:
