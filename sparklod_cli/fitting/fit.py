@@ -23,7 +23,7 @@ from .schedule import DEFAULT_STEPS, STAGES, rates_at, shares_of
 from .settings import FitReport, FitSettings, FitStage
 
 #: Near plane at most and far plane at least, in radii of the scene, for scenes of tiny or huge units.
-NEAR, FAR = 1e-3, 100.0
+NEAR, FAR = 0.01, 100.0
 
 #: Times that nodes are given their first values for one law after another, until they keep all.
 TRIES = 4

@@ -9,8 +9,8 @@ from .kernels import adam
 from .nodes import FittedNodes, Index
 from .pictures import Picture
 
-#: Root of the mean squared error of a picture, 30 dB, at which a step is as long as the rates say. Steps are
-#: proportional to it: what is wrong with the splats of a fine cut is small, and steps of one length would hide it.
+#: Root of the mean squared error of pictures, that of 30 dB, for which the rates are. The steps of a splat are
+#: proportional to the errors of the pictures that it is in: what is wrong with the splats of a fine cut is small.
 USUAL_ERROR = 0.03
 
 
@@ -43,11 +43,7 @@ class Optimiser:
         terms = nodes.columns.sh.shape[1]
         rgb, sh = gradients.by_sh(shaded.center, camera.position, terms, shaded.rgb, found.rgb)
         columns = adam.Gradients(found.center, found.log_scale, found.turn, found.lod_opacity, rgb, sh)
-        adam.step(
-            nodes.columns, nodes.old, seen, self._slots, columns, _times(rates, error / USUAL_ERROR), self._moments
-        )
+        rates = adam.Rates(*map(np.float32, rates))
+        precision = np.float32((USUAL_ERROR / error) ** 2)
+        adam.step(nodes.columns, nodes.old, seen, self._slots, columns, rates, self._moments, precision)
         return seen
-
-
-def _times(rates: adam.Rates, factor: float) -> adam.Rates:
-    return adam.Rates(*(np.float32(rate * factor) for rate in rates))

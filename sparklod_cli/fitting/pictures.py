@@ -17,8 +17,8 @@ from .nodes import FittedNodes
 #: Least mean alpha of a picture, and least standard deviation of its colours over grey: else there is nothing to see.
 COVERED, VARIED = 0.02, 0.01
 
-#: Least mean squared error that a picture counts with, 70 dB.
-LEAST_ERROR = 1e-7
+#: Added to the mean squared error of a picture, that of 50 dB: what is better already hardly counts.
+LEAST_ERROR = 1e-5
 
 #: Cameras in a row that see too little, after which no more are tried.
 MOST_MISSES = 64
@@ -52,7 +52,7 @@ class Picture:
         """
         result = np.empty_like(image)
         pixels = image.shape[0] * image.shape[1] * 3
-        errors = [max(error, LEAST_ERROR) for error in self.errors(image)]
+        errors = [error + LEAST_ERROR for error in self.errors(image)]
         by_image(image, self.full, *(np.float32(1 / (pixels * error)) for error in errors), result)
         return result, math.sqrt(sum(errors) / 2)
 

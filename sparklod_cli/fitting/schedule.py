@@ -14,8 +14,8 @@ STAGES = 4
 #: Cuts that are drawn of what one camera sees, and the range of their shares of the leaves.
 CUTS, LEAST_SHARE, MOST_SHARE = 5, 0.01, 0.5
 
-#: Rates of the first steps, in pictures of `optimiser.USUAL_ERROR`; those of the last steps, over these.
-RATES, LAST = Rates(0.03, 0.03, 0.03, 0.03, 0.03, 0.01), 0.02
+#: Rates of the first steps, and those of the last ones over these. Measured (docs/decisions/2026-11-22-refine.md).
+RATES, LAST = Rates(0.01, 0.02, 0.005, 0.01, 0.01, 0.002), 0.02
 
 #: Steps unless given, for trees of any size. Chosen.
 DEFAULT_STEPS = 2000

@@ -13,14 +13,15 @@ from ...support.jit import kernel
 f32 = np.float32
 
 #: Decay of the first and of the second moments.
-BETA1, BETA2 = f32(0.95), f32(0.99)
+BETA1, BETA2 = f32(0.9), f32(0.99)
 
 #: Columns of the first moments: centre, in the splat's own axes and scales, ln(scale), rotation vector, D and colour.
 CENTER, SCALE, TURN, OPACITY, COLOR = 0, 3, 6, 9, 10
 FIRST = 13
 
-#: Columns of the second moments, one of each property, and of SH.
-SECOND = 6
+#: Columns of the second moments, one of each property, SH among them; and of the mean of 1 / squared error of the
+#: pictures that a splat was in.
+SECOND, PRECISION = 7, 6
 
 #: Range of D.
 LEAST_D, MOST_D = f32(0.004), f32(5)
@@ -36,8 +37,6 @@ LEAST_COLOR, MOST_COLOR = f32(-2), f32(4)
 THIN = f32(0.1)
 
 TINY = f32(1e-30)
-
-HOLD_SIZE = True
 
 #: Added to the root of a second moment. Derivatives of splats that matter are above 1e-6; the squares of those that are
 #: hidden behind others may be 0 in float32.
@@ -119,7 +118,7 @@ def moved(first, second, slot, column, of_property, gradient, rate, correction):
 
 
 @kernel(parallel=True)
-def step(nodes, old, index, slots, gradients, rates, moments):
+def step(nodes, old, index, slots, gradients, rates, moments, precision):
     """Moves the merged splats that were drawn against their gradients.
 
     Args:
@@ -130,6 +129,7 @@ def step(nodes, old, index, slots, gradients, rates, moments):
         gradients: `Gradients` of the drawn splats.
         rates: `Rates`.
         moments: `Moments`, changed.
+        precision: float32, 1 / squared error of the picture, in errors for which the rates are.
     """
     center, scale, quat, lod_opacity, rgb, sh = nodes
     first, first_sh, second, count = moments
@@ -148,7 +148,10 @@ def step(nodes, old, index, slots, gradients, rates, moments):
             continue
         count[slot] += 1
         t = f32(count[slot])
-        correction = np.sqrt(one - BETA2**t)
+        known = one - BETA2**t
+        second[slot, PRECISION] += (one - BETA2) * (precision - second[slot, PRECISION])
+        # Steps are as long as the errors that they are to mend.
+        correction = np.sqrt(known) * np.sqrt(known / second[slot, PRECISION])
         qx, qy, qz, qw = quat[node, 0], quat[node, 1], quat[node, 2], quat[node, 3]
         r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation_matrix(qx, qy, qz, qw, one)
         # The centre, in the splat's own axes and scales.
@@ -176,8 +179,6 @@ def step(nodes, old, index, slots, gradients, rates, moments):
         for c in range(3):
             was = old.scale[node, c]
             scale[node, c] = min(max(scale[node, c] * np.exp(grown[c]), was / MOST_CHANGE), was * MOST_CHANGE)
-        if HOLD_SIZE:
-            d0 = old.lod_opacity[node]
         g = gradients.turn
         ax, ay, az = moved(first, second, slot, TURN, 2, (g[i, 0], g[i, 1], g[i, 2]), rates.turn, correction)
         ax, ay, az = ax / two, ay / two, az / two
@@ -195,14 +196,6 @@ def step(nodes, old, index, slots, gradients, rates, moments):
         first[slot, OPACITY] += (one - BETA1) * (gd - first[slot, OPACITY])
         change = rates.lod_opacity * correction / (np.sqrt(v) + EPSILON) * first[slot, OPACITY]
         lod_opacity[node] = min(max(d - change * min(d, one), LEAST_D), MOST_D)
-        if HOLD_SIZE:
-            was_mean = old.scale[node, 0] + old.scale[node, 1] + old.scale[node, 2]
-            now_mean = scale[node, 0] + scale[node, 1] + scale[node, 2]
-            factor_was = one + f32(0.7) * max(d0 - one, f32(0))
-            factor_now = one + f32(0.7) * max(lod_opacity[node] - one, f32(0))
-            back = was_mean * factor_was / (now_mean * factor_now)
-            for c in range(3):
-                scale[node, c] *= back
         g = gradients.rgb
         turned = moved(first, second, slot, COLOR, 4, (g[i, 0], g[i, 1], g[i, 2]), rates.rgb, correction)
         for c in range(3):
