@@ -58,7 +58,7 @@ def fit(
     with on_threads(threads):
         fitting = _Fitting(nodes, tree, settings, threads)
         is_complete = True
-        for number in range(STAGES):
+        for number in range(STAGES if fitting.can_gain else 0):
             if not fitting.run_stage(number, progress, interrupted):
                 is_complete = False
                 break
@@ -79,9 +79,8 @@ class _Fitting:
         training, held_out = self._cameras(settings, place, seeds)
         self._training = pictures(training, self.nodes)
         self._held_out = list(itertools.islice(pictures(held_out, self.nodes), HELD_OUT))
-        can_gain = bool(self._held_out) and self.nodes.merged.size > 0
-        wanted = DEFAULT_STEPS if settings.steps is None else settings.steps
-        self._steps, self._done = wanted if can_gain else 0, 0
+        self._steps = DEFAULT_STEPS if settings.steps is None else settings.steps
+        self._done = 0
         self._optimiser = Optimiser(self.nodes)
         self._before = self._best = scores_of(self.nodes, self._held_out)
         self._kept = self.nodes.copy()
@@ -101,6 +100,11 @@ class _Fitting:
         while True:
             for at in self._random.permutation(len(cameras)):
                 yield cameras[at]
+
+    @property
+    def can_gain(self) -> bool:
+        """Whether there is anything to do, and to see."""
+        return self._steps > 0 and bool(self._held_out) and self.nodes.merged.size > 0
 
     def run_stage(self, number: int, progress: Progress, interrupted: Callable[[], bool]) -> bool:
         """Takes the steps of a stage, and keeps the nodes if that brought anything; False if it was interrupted."""
@@ -140,7 +144,7 @@ class _Fitting:
     def finish(self, is_complete: bool) -> tuple[Splats, FitReport]:
         """The best nodes, those that lost with their first values, and the report."""
         self.nodes.restore(self.nodes.merged, self._kept)
-        after = self._lawful()
+        after = self._lawful() if self.can_gain else self._before
         changed = self.nodes.changed()
         kept = float(changed[self.nodes.merged].mean()) if self.nodes.merged.size else 0.0
         report = FitReport(self._done, tuple(self._stages), self._before, after, kept, is_complete)

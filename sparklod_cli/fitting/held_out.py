@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -18,19 +17,18 @@ Scores = dict[float, float]
 
 
 def scores_of(nodes: FittedNodes, held_out: Sequence[Picture]) -> Scores:
-    """Means of pictures and of a black and a white background."""
-    return {share: _mean(nodes, held_out, share) for share in SHARES}
+    """Means of pictures and of a black and a white background; of no pictures there are none."""
+    return {share: _mean(nodes, held_out, share) for share in SHARES if held_out}
 
 
 def _mean(nodes: FittedNodes, held_out: Sequence[Picture], share: float) -> float:
-    found = []
+    found: list[float] = []
     for picture in held_out:
         _, shaded = nodes.seen(nodes.cut(picture.camera, share), picture.camera)
         found += map(psnr_of, picture.errors(draw(shaded, picture.camera, nodes.raster)))
-    return float(np.mean(found)) if found else math.nan
+    return float(np.mean(found))
 
 
 def gain(before: Scores, after: Scores) -> float:
-    """Mean gain in dB; 0 if there are no pictures."""
-    found = float(np.mean([after[share] - before[share] for share in before]))
-    return 0.0 if math.isnan(found) else found
+    """Mean gain in dB."""
+    return float(np.mean([after[share] - before[share] for share in before]))

@@ -19,6 +19,9 @@ from .settings import SHARES
 #: warns below a third, also after rounding to the steps of a format.
 LEAST_RATIO = 0.38
 
+#: Times that half of what was changed is taken back, before all is.
+HALVES = 12
+
 
 def keep_sizes(nodes: FittedNodes) -> bool:
     """Gives nodes that became too small for their children their first values, unless they were so at first.
@@ -56,19 +59,19 @@ def _ratios(columns: Columns, nodes: FittedNodes, parent: Index) -> FloatArray:
 
 
 def keep_gains(nodes: FittedNodes, held_out: Sequence[Picture], before: Scores) -> Scores:
-    """Gives the nodes that cuts of a share draw their first values if that share lost; returns the scores.
+    """Takes back half of what was changed of the nodes that cuts of a share draw, while one lost; returns the scores.
 
     Args:
         nodes: after the last step.
         held_out: pictures of full detail.
         before: scores of the nodes at first.
     """
-    for _ in SHARES:
+    for _ in range(HALVES):
         now = scores_of(nodes, held_out)
         worst = min(SHARES, key=lambda share: now[share] - before[share])
         if not now[worst] < before[worst]:
             return now
         drawn = [nodes.cut(picture.camera, worst) for picture in held_out]
-        nodes.restore(np.intersect1d(np.unique(np.concatenate(drawn)), nodes.merged))
+        nodes.halve(np.intersect1d(np.unique(np.concatenate(drawn)), nodes.merged))
     nodes.restore(nodes.merged)
     return before

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from ..cameras.camera import Camera
 from ..lod.traversal import Forest, Traversal, TreeInstance, View
 from ..model.foveation import Cones
-from ..model.gaussian import linear_opacity, lod_opacity, size_factor
+from ..model.gaussian import linear_opacity, lod_opacity, normalized_quat, size_factor
 from ..model.lod_tree import LodTree
 from ..model.sh import COEFFICIENTS
 from ..model.splats import FloatArray, Splats
@@ -70,6 +70,7 @@ class FittedNodes:
         np.maximum(found.rgb, 0, out=found.rgb)
         return seen, ShadedSplats(found.center, found.scale, found.quat_xyzw, found.lod_opacity, found.rgb)
 
+    @np.errstate(over="ignore")  # what float16 cannot hold is infinite, as in Spark
     def renew(self, index: Index) -> None:
         """Has cuts found with some nodes as they are now."""
         rows = self._forest.nodes
@@ -88,6 +89,14 @@ class FittedNodes:
         """Gives some nodes the values of other columns, or those that they had at first."""
         for now, other in zip(self.columns, columns or self.old, strict=True):
             now[index] = other[index]
+        self.renew(index)
+
+    def halve(self, index: Index) -> None:
+        """Takes back half of what was changed of some nodes."""
+        for now, old in zip(self.columns, self.old, strict=True):
+            now[index] = (now[index] + old[index]) / 2
+        turned = index[(self.columns.quat_xyzw[index] != self.old.quat_xyzw[index]).any(axis=1)]
+        self.columns.quat_xyzw[turned] = normalized_quat(self.columns.quat_xyzw[turned])
         self.renew(index)
 
     def copy(self) -> Columns:
