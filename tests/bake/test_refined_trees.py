@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from sparklod_cli.cli import run
 from sparklod_cli.codecs.formats import WRITABLE
 from sparklod_cli.codecs.gpu import lod_tree
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
+from sparklod_cli.fitting import cameras, fit
 from sparklod_cli.fitting.settings import SHARES, FitSettings
 from sparklod_cli.io import read_levels, read_scene, scene_sink
 from sparklod_cli.lod.detail_settings import DetailSettings
@@ -22,20 +24,33 @@ from sparklod_cli.lod.traversal import Forest, Traversal, TreeInstance
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import same_rows
 from sparklod_cli.scenes.finder import view_of
+from tests.conftest import FIXTURES
 from tests.lod.trees import check_tree, sorted_rows
-from tests.scenes import random_splats
 
 #: Values that are written exactly, or nearly.
 FLOATS = WriteOptions(rad=RadOptions("f32", "f32", "f32", "f32", "f32", "f32"))
 SETTINGS = BakeSettings(method="quality", suffix=".rad", options=FLOATS)
-REFINE = FitSettings(steps=20, seed=1)
+REFINE = FitSettings(steps=100, seed=1)
+
+#: Splats of the scene.
+COUNT = 2_000
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small_pictures() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cameras, "SIZE", (160, 90))
+        patch.setattr(fit, "HELD_OUT", 4)
+        yield
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A scene, its tree, and the same tree fitted, all in floats."""
+def folder(tmp_path_factory: pytest.TempPathFactory, small_pictures: None) -> Path:
+    """A part of the demo scene, and its tree, in floats."""
     folder = tmp_path_factory.mktemp("refined")
-    scene = Scene(random_splats(900, sh_degree=1, seed=4))
+    splats = read_scene(FIXTURES / "demo.ply").splats
+    near = np.argsort(np.linalg.norm(splats.center - np.median(splats.center, axis=0), axis=1), kind="stable")
+    scene = Scene(splats.take(np.sort(near[:COUNT])))
     scene_sink(folder / "scene.ply", WRITABLE[".ply"], overwrite=False)(scene, WriteOptions())
     bake(folder / "scene.ply", folder / "tree.rad", SETTINGS)
     return folder
@@ -94,7 +109,7 @@ def test_cuts_spend_their_budget(fitted: Scene, share: float) -> None:
     traversal = Traversal(
         Forest([lod_tree.unpack(lod_tree.pack(fitted.splats, fitted.tree, threads=1))]), [TreeInstance()]
     )
-    budget = int(share * 900)
+    budget = int(share * COUNT)
     for eye in ((0.0, 0.0, -6.0), (3.0, -1.0, 2.0)):
         cut = traversal.cut(view_of(Camera.look_at(eye, (0, 0, 0))), budget=budget)
         drawn = sum(map(len, cut.indices()))
