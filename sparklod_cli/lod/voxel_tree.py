@@ -7,6 +7,7 @@ one place at a time.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -222,13 +223,14 @@ class VoxelTree:
         sh = given.sh.shape[1:]
         out = Splats(*geometry, np.empty((total, 3), np.float32), np.empty((total, *sh), np.float32))
         for name in COLUMNS:
-            column, flat = getattr(given, name), getattr(out, name).reshape(total, -1)
-            fill_leaves(number, index, column.reshape(len(column), -1), flat)
+            column, filled = getattr(given, name), getattr(out, name)
+            width = math.prod(filled.shape[1:])
+            fill_leaves(number, index, column.reshape(len(column), width), filled.reshape(total, width))
         del index, given, column  # frees memory if the caller has no reference
         same, end = np.arange(total, dtype=np.uint32), len(parents)
         for batch in self.batches:
             with threads_for(batch.members) as threads:
-                for color in (out.rgb, out.sh.reshape(total, -1)):
+                for color in (out.rgb, out.sh.reshape(total, math.prod(sh))):
                     family = parents[end - batch.families : end]
                     merge_colors(family, start, count, same, weight, color, threads)
             end -= batch.families

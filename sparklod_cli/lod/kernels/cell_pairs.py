@@ -27,6 +27,9 @@ f32 = np.float32
 #: Nodes of a span: its columns, 32 KB, stay near the processor. Results do not depend on it.
 SPAN = 512
 
+#: Room between columns: with a power of two from one to the next, all of them would share a few lines of the cache.
+PADDING = 16
+
 #: Rounds of merging at a level, and the largest distance of a partner on the curve. Measured, as the next three
 #: (docs/decisions/2026-11-22-quick-again.md): fewer rounds give more nodes, a larger window takes longer.
 ROUNDS, WINDOW = 6, 3
@@ -200,22 +203,24 @@ def find_partners_in_cells(lanes, count, cell, place, largest, cost, best, at):
 def merge_span(nodes, is_first, rows, largest, begin, end, made, owner, row):
     """Merges the nodes of whole cells, those from `begin` to `end`; see `merge_in_cells`."""
     size = end - begin
-    lanes = np.empty((WIDTH, size), np.float32)
+    lanes = np.empty((WIDTH, size + PADDING), np.float32)
     a, b = np.ones(WIDTH * GROUP, np.float32), np.ones(WIDTH * GROUP, np.float32)
     cell, place, kept = np.empty(size, np.int32), np.empty(size, np.int32), np.empty(size, np.int64)
     first, second = np.empty(size // 2, np.int64), np.empty(size // 2, np.int64)
     cost, best, at = np.empty(size, np.float32), np.empty(size, np.float32), np.empty(size, np.int32)
     slot, joined, members = np.arange(size), np.arange(size), np.ones(size, np.int64)
-    number = -1
+    number = np.int32(-1)
     for i in range(size):
-        number += is_first[begin + i]
+        number += np.int32(is_first[begin + i])
         cell[i] = number
         for column in range(WIDTH):
             lanes[column, i] = rows[nodes[begin + i], column]
-    count = size
-    for _ in range(ROUNDS):
+    merges = np.empty(number + 1, np.int32)  # of each cell, in a round
+    count, families = size, begin // 2
+    for turn in range(ROUNDS):
         for i in range(count):
             place[i] = place[i - 1] + 1 if i > 0 and cell[i] == cell[i - 1] else 0
+            merges[cell[i]] = 0
         find_partners_in_cells(lanes, count, cell, place, largest, cost, best, at)
         pairs = 0
         for i in range(count):
@@ -223,8 +228,7 @@ def merge_span(nodes, is_first, rows, largest, begin, end, made, owner, row):
             if at[i] > place[i] and at[j] == place[i]:
                 first[pairs], second[pairs] = i, j
                 pairs += 1
-        if pairs == 0:
-            break
+                merges[cell[i]] += 1
         for start in range(0, pairs, GROUP):
             some = min(GROUP, pairs - start)
             for column in range(WIDTH):
@@ -235,30 +239,34 @@ def merge_span(nodes, is_first, rows, largest, begin, end, made, owner, row):
             for column in range(WIDTH):
                 for k in range(some):
                     lanes[column, first[start + k]] = a[column * GROUP + k]
+        for i in range(count):
+            kept[i] = i
         for pair in range(pairs):
             i, j = first[pair], second[pair]
             joined[slot[j]] = slot[i]
             members[slot[i]] += members[slot[j]]
-            cell[j] = -1
+            kept[j] = -1
         left = 0
         for i in range(count):
-            if cell[i] >= 0:
+            if kept[i] < 0:
+                continue
+            if merges[cell[i]] > 0 and turn < ROUNDS - 1:
                 cell[left], slot[left], kept[left] = cell[i], slot[i], i
                 left += 1
+                continue
+            # Without a merge, its cell would not change in another round.
+            trace = lanes[COVARIANCE, i] + lanes[COVARIANCE + 1, i] + lanes[COVARIANCE + 2, i]
+            many = members[slot[i]]
+            if many >= LEAST_CHILDREN or (many > 1 and trace <= PATIENCE * largest):
+                finish_row(lanes, i, rows[made + families])
+                row[begin + slot[i]] = made + families
+                families += 1
+            else:
+                members[slot[i]] = 0
         for column in range(WIDTH):
             for i in range(left):
                 lanes[column, i] = lanes[column, kept[i]]
         count = left
-    families = begin // 2
-    for i in range(count):
-        trace = lanes[COVARIANCE, i] + lanes[COVARIANCE + 1, i] + lanes[COVARIANCE + 2, i]
-        many = members[slot[i]]
-        if many >= LEAST_CHILDREN or (many > 1 and trace <= PATIENCE * largest):
-            finish_row(lanes, i, rows[made + families])
-            row[begin + slot[i]] = made + families
-            families += 1
-        else:
-            members[slot[i]] = 0
     for i in range(size):
         joined[i] = joined[joined[i]]  # final, as it comes before
         owner[begin + i] = begin + (joined[i] if members[joined[i]] > 0 else i)
