@@ -107,7 +107,7 @@ class Comparison:
             SparklodError: full detail covers no pixel of a frame.
         """
         total = len(path.cameras) * len(self.counts)
-        for at, row in enumerate(ordered_map(_measured, self._pictures(path, threads), min(threads, MEASURERS))):
+        for at, row in enumerate(ordered_map(measured, self._pictures(path, threads), min(threads, MEASURERS))):
             progress("compare", at + 1, total, "picture")
             yield row
 
@@ -135,7 +135,8 @@ class Comparison:
             last = frame
 
 
-def _measured(pictures: Pictures) -> Row:
+def measured(pictures: Pictures) -> Row:
+    """The row of a comparison: what was known of the pictures, and how far they are apart."""
     row, before = pictures.row, pictures.before
     tiles = []
     for name, gray in BACKGROUNDS.items():
@@ -152,7 +153,7 @@ def _measured(pictures: Pictures) -> Row:
         row[name] = sum(values) / len(values) if values else None
     worst = min(tiles, key=lambda tile: tile.psnr)
     row |= {"worst_tile_psnr": worst.psnr, "worst_tile_x": worst.x, "worst_tile_y": worst.y}
-    return {column.name: column.rounded(row[column.name]) for column in COLUMNS}
+    return {column.name: column.rounded(row.get(column.name)) for column in COLUMNS}
 
 
 def write_charts(target: Path, rows: Sequence[Row], budgets: Sequence[Budget], title: str, *, overwrite: bool) -> None:

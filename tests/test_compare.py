@@ -20,7 +20,7 @@ from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.cameras.path import CameraPath
 from sparklod_cli.cameras.pose import look_at
 from sparklod_cli.cli import run as program
-from sparklod_cli.compare import Comparison, _measured
+from sparklod_cli.compare import Comparison, measured
 from sparklod_cli.images.metrics import MOST_PSNR, on_background
 from sparklod_cli.lod.budget import parse_budgets
 from sparklod_cli.lod.settings import LodSettings
@@ -148,7 +148,7 @@ def test_a_change_of_the_cut_pops_by_what_it_changes(twice: Scenes) -> None:
     changed = dataclasses.replace(second, before=first)
     both = (on_background(first.image, gray) - on_background(second.image, gray) for gray in (0.0, 1.0))
     by_hand = 255 * np.mean([math.sqrt((change.astype(np.float64) ** 2).mean()) for change in both])
-    assert _measured(changed)["popping"] == pytest.approx(by_hand, abs=1e-4)
+    assert measured(changed)["popping"] == pytest.approx(by_hand, abs=1e-4)
     assert by_hand > 1
 
 

@@ -19,6 +19,10 @@ TILE, LANES = 16, 8
 #: A tile is finished when no pixel has a transmittance of this or more, 1/40 of an 8-bit step. Chosen.
 OPAQUE = f32(1e-4)
 
+#: Bound of what rounding changes z^2 by, as a share of A times the squared half width of the box. Chosen: some twenty
+#: roundings of float32.
+ROUNDING = f32(2.5e-7)
+
 #: Number of splats between two checks for OPAQUE. Chosen.
 CHECK_EVERY = 16
 
@@ -132,25 +136,89 @@ def is_opaque(pixels, rows, columns):
 
 
 @kernel(inline=True)
+def box_in_tile(row, left, top, rows, columns):
+    """The part of a tile that the box of a splat covers.
+
+    Args:
+        row: the splat, a row of `screen`.
+        left, top: pixels left of and above the tile.
+        rows, columns: of the tile's pixels.
+
+    Returns:
+        x, y: the splat's centre from the middle of the tile's first pixel, pixels, float32.
+        first, last: rows of pixels, the last excluded.
+        begin, end: columns of blocks of LANES pixels, the last excluded.
+    """
+    x, y = row[X] - f32(left) - f32(0.5), row[Y] - f32(top) - f32(0.5)
+    first = max(0, math.ceil(y - row[HALF_HEIGHT]))
+    last = min(rows, math.floor(y + row[HALF_HEIGHT]) + 1)
+    begin = max(0, math.ceil(x - row[HALF_WIDTH])) // LANES
+    end = (min(columns, math.floor(x + row[HALF_WIDTH]) + 1) + LANES - 1) // LANES
+    return x, y, first, last, begin, end
+
+
+@kernel(inline=True)
+def tilt_of(row):
+    """The shape of a splat's ellipse, for `lines_of`; float32, pixels.
+
+    Returns:
+        lean: x of the ellipse's lowest point.
+        slope: y by x of the middle between its upper and lower side.
+        tall: half its height at x = 0.
+        narrow: 1 / half its width squared.
+        slack: 1 and what rounding may add to z^2 / END.
+    """
+    a, b, c, wide2 = row[A], row[B], row[C], row[HALF_WIDTH] * row[HALF_WIDTH]
+    inverse = f32(1) / (a * c)
+    return (
+        -b * c * inverse * row[HALF_HEIGHT],
+        -b * a * inverse,
+        np.sqrt(row[END] * a * inverse),
+        f32(1) / wide2,
+        f32(1.01) + ROUNDING * a * wide2,
+    )
+
+
+@kernel(inline=True)
+def lines_of(x, y, lean, slope, tall, narrow, slack, first, last):
+    """Rows of pixels in which a splat may be drawn in a column of blocks: first, and last excluded.
+
+    The ellipse of an elongated splat fills half its box or less. Its side is lowest in the column at its lowest point,
+    or else at the column's nearer edge.
+
+    Args:
+        x, y: the splat's centre from the middle of the column's first pixel, pixels.
+        lean, slope, tall, narrow, slack: of `tilt_of`.
+        first, last: rows of the splat's box.
+    """
+    left, right = -x, f32(LANES - 1) - x
+    low, high = min(max(lean, left), right), min(max(-lean, left), right)
+    below = y + slope * low + tall * np.sqrt(max(slack - low * low * narrow, f32(0)))
+    above = y + slope * high - tall * np.sqrt(max(slack - high * high * narrow, f32(0)))
+    return max(first, np.int64(above)), min(last, np.int64(below) + 2)
+
+
+@kernel(inline=True)
 def draw_tile(screen, start, splats, tile, across, design, least, image):
-    """Blends the splats of a tile, from near to far; see `draw_tiles`."""
+    """Blends the splats of a tile, from near to far, see `draw_tiles`; returns where in `splats` it stopped."""
     height, width = image.shape[:2]
     left, top = tile % across * TILE, tile // across * TILE
     pixels = np.zeros((TILE, TILE // LANES, 4, LANES), np.float32)
     pixels[:, :, 0] = 1
     rows = min(TILE, height - top)
     columns = min(TILE, width - left)
+    stop = start[tile + 1]
     for entry in range(start[tile], start[tile + 1]):
         row = screen[splats[entry]]
-        x, y = row[X] - f32(left) - f32(0.5), row[Y] - f32(top) - f32(0.5)
-        first = max(0, math.ceil(y - row[HALF_HEIGHT]))
-        last = min(rows, math.floor(y + row[HALF_HEIGHT]) + 1)
-        begin = max(0, math.ceil(x - row[HALF_WIDTH])) // LANES
-        end = (min(columns, math.floor(x + row[HALF_WIDTH]) + 1) + LANES - 1) // LANES
-        for line in range(first, last):
-            for block in range(begin, end):
-                blend_lanes(pixels[line, block], row, x - f32(LANES * block), f32(line) - y, design, least)
+        x, y, first, last, begin, end = box_in_tile(row, left, top, rows, columns)
+        lean, slope, tall, narrow, slack = tilt_of(row)
+        for block in range(begin, end):
+            away = x - f32(LANES * block)
+            top_line, bottom_line = lines_of(away, y, lean, slope, tall, narrow, slack, first, last)
+            for line in range(top_line, bottom_line):
+                blend_lanes(pixels[line, block], row, away, f32(line) - y, design, least)
         if (entry - start[tile]) % CHECK_EVERY == CHECK_EVERY - 1 and is_opaque(pixels, rows, columns):
+            stop = entry + 1
             break
     for line in range(rows):
         for i in range(columns):
@@ -159,18 +227,20 @@ def draw_tile(screen, start, splats, tile, across, design, least, image):
             image[top + line, left + i, 1] = lanes[2, i % LANES]
             image[top + line, left + i, 2] = lanes[3, i % LANES]
             image[top + line, left + i, 3] = f32(1) - lanes[0, i % LANES]
+    return stop
 
 
 @kernel(parallel=True, contract=True)
-def draw_tiles(screen, start, splats, across, down, design, least, image):
+def draw_tiles(screen, start, splats, across, design, least, image, stop):
     """Blends the splats of each tile, from near to far.
 
     Args:
         screen, start, splats: of `sort_into_tiles`.
-        across, down: numbers of tiles.
+        across: number of tiles in a row of them.
         design: merged splats have the falloff `shifted`, that of Spark's LoD design.
         least: float32, least alpha that is drawn.
         image: (height, width, 4) float32, filled: red, green and blue, premultiplied by alpha, and alpha.
+        stop: (tiles,) int64, filled: up to where in `splats` each tile was drawn; it is opaque before the rest.
     """
-    for tile in prange(across * down):
-        draw_tile(screen, start, splats, tile, across, design, least, image)
+    for tile in prange(len(stop)):
+        stop[tile] = draw_tile(screen, start, splats, tile, across, design, least, image)
