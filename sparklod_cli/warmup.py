@@ -46,9 +46,9 @@ class Job:
 JOBS = {
     "quick": Job(
         (
-            *("geometry.find_bounds", "geometry.gather_rows", "group.level_keys", "group.split_cells"),
-            *("merge.merge_groups", "final_order.fill_geometry", "final_order.fill_leaves", "final_order.merge_colors"),
-            *("sort.cell_words", "sort.sort_pass"),
+            *("geometry.find_bounds", "group.level_keys", "cell_pairs.merge_in_cells", "cell_pairs.split_families"),
+            *("final_order.fill_leaves", "final_order.merge_colors"),
+            *("node_rows.fill_leaf_rows", "node_rows.fill_merged_splats", "sort.cell_words", "sort.sort_pass"),
         ),
         ("build-lod scene.ply -o quick.spz",),
     ),

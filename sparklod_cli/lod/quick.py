@@ -1,8 +1,10 @@
 """Quick-LoD: a tree of merged splats from voxel grids that grow by a constant factor.
 
-The method is Spark's ("Quick LoD algorithm"). A splat of size s = 2 * max(scale) belongs to level ceil(log_base(s)),
-whose cells have edges of base ** level. From the finest level up, the splats of a level join the survivors of the level
-below, and all that share a cell become the children of one merged node.
+The levels are those of Spark's method ("Quick LoD algorithm"): a splat of size s = 2 * max(scale) belongs to level
+ceil(log_base(s)), and from the finest level up, the splats of a level join the survivors of the level below. There, all
+nodes that share a cell become one. Here, cells are wider, and in each the cheapest pairs of neighbours merge for a few
+rounds, up to a size that grows with the level; what became one node is a family (`kernels/cell_pairs.py`).
+docs/decisions/2026-11-22-quick-again.md has the reasons, and the alternatives that were tried.
 
 For speed, leaves are sorted once, by level and Morton code, into rows with all data that a merge reads, so that each
 level reads neighbouring memory. A level is a radix sort of its cells and one parallel merge. As the nodes of a level
@@ -17,10 +19,9 @@ from ..support.defaults import DEFAULT_BASE, MAX_BASE, MIN_BASE
 from ..support.jit import threads_for
 from ..support.progress import Progress, silent
 from .check import check, check_setting
-from .kernels.geometry import SplatColumns
 from .voxel_grid import VoxelGrid
 from .voxel_growth import Arrivals, grow
-from .voxel_rows import joining, sorted_leaves
+from .voxel_rows import joining, leaf_rows, sorted_leaves
 from .voxel_tree import VoxelTree
 
 
@@ -49,11 +50,8 @@ def build(splats: Splats, base: float = DEFAULT_BASE, *, progress: Progress = si
     with threads_for(n) as threads:
         grid = VoxelGrid.of(bounds, base)
         index, joins = sorted_leaves(splats.center, splats.scale, grid, threads)
-        columns = SplatColumns(splats.center, splats.scale, splats.quat_xyzw, splats.opacity)
-        arrivals = Arrivals(n, joining(index, joins, columns))
-        rgb, sh = splats.rgb, splats.sh
-        del splats, columns  # the rows have the rest; frees the memory if the caller has no reference
-        tree = VoxelTree(n, n)
+        arrivals = Arrivals(n, joining(index, joins, lambda some: leaf_rows(some, splats, grid.space)))
+        tree = VoxelTree(n, n, grid.space)
         ((_, root),) = grow(tree, grid, arrivals, None, progress)
-        final = tree.finish(root, index, rgb, sh)
+        final = tree.finish(root, index, splats)
     return final.nodes, final.tree

@@ -1,4 +1,8 @@
-"""The cells of the quick builder: one grid a level for the whole scene, whatever part of it is built."""
+"""The cells of the quick builder: one grid a level for the whole scene, whatever part of it is built.
+
+Nodes of a level are about base ** level large. A cell is wider, so that it holds several of them to choose from, and is
+divided into parts, along which its nodes are sorted. From level to level the grid is shifted, and its seams with it.
+"""
 
 from __future__ import annotations
 
@@ -11,10 +15,29 @@ from numpy.typing import NDArray
 from ..model.splats import FloatArray
 from .check import Bounds
 from .kernels.group import level_keys
-from .kernels.sort import AXIS_BITS, Keys
+from .kernels.node_rows import Space
+from .kernels.sort import PART_BITS, Keys, Parts
 
-#: Largest cell coordinate: they are int64, and their differences must be, too. No level is finer than this allows.
-MAX_CELL = 2.0**61
+#: Largest coordinate in steps of a level: parts are half a step wide, their coordinates int64, and so must be their
+#: differences. No level is finer than this allows.
+MAX_STEPS = 2.0**59
+
+#: Edge of a cell in steps of its level. Chosen; 8 is no better (docs/decisions/2026-11-22-quick-again.md).
+CELL = 4
+
+#: Parts of a cell on an axis.
+PARTS = 1 << PART_BITS
+
+#: The grid is shifted from level to level by these shares of a cell on the three axes: powers of the golden section,
+#: so that seams hardly ever recur.
+SHIFT = (0.38196601, 0.76393202, 0.14589803)
+
+#: The largest size of a merged node, in steps of its level; a node's size is about 2 * sqrt(trace of its covariance /
+#: 3). Chosen; what matters is the number of rounds (`kernels/cell_pairs.py`).
+LIMIT = 0.7
+
+#: Largest coordinate and size, units: float32 holds its square. Chosen.
+FARTHEST = 1e15
 
 #: Bits per axis of the Morton codes that leaves are sorted by: 51 bits, and at most 11 for the level (sizes are
 #: float32, the base is at least 1.1), fit a uint64.
@@ -31,6 +54,7 @@ class VoxelGrid:
         coarsest: power of the base that no splat is larger than.
         low, high: corners of the box of all centres, world units.
         largest: size of the largest splat, world units.
+        unit: length of a unit of node rows, world units; a power of two, so that centres are divided by it exactly.
     """
 
     base: float
@@ -39,41 +63,57 @@ class VoxelGrid:
     low: tuple[float, float, float]
     high: tuple[float, float, float]
     largest: float
+    unit: float
 
     @classmethod
     def of(cls, bounds: Bounds, base: float) -> VoxelGrid:
         """The grid of a scene with these bounds."""
         farthest = float(np.abs([bounds.low, bounds.high]).max())
-        finest = math.floor(math.log(max(bounds.smallest, farthest / MAX_CELL), base))
+        finest = math.floor(math.log(max(bounds.smallest, farthest / MAX_STEPS), base))
         coarsest = max(finest + 1, math.ceil(math.log(bounds.largest, base)) + 1)
         low, high = ((float(x), float(y), float(z)) for x, y, z in (bounds.low, bounds.high))
-        return cls(base, finest, coarsest, low, high, bounds.largest)
+        middle = math.sqrt(bounds.smallest) * math.sqrt(bounds.largest)
+        unit = 2.0 ** round(math.log2(max(middle, farthest / FARTHEST, bounds.largest / FARTHEST)))
+        return cls(base, finest, coarsest, low, high, bounds.largest, unit)
+
+    @property
+    def space(self) -> Space:
+        """The coordinates of node rows."""
+        return Space(np.zeros(3), np.float64(self.unit))
 
     @property
     def steps(self) -> NDArray[np.float64]:
-        """The edges of the cells of all levels that a splat can belong to."""
+        """The steps of all levels that a splat can belong to, world units."""
         return self.base ** np.arange(self.finest, self.coarsest + 1, dtype=np.float64)
 
     def step(self, level: int) -> np.float64:
-        """The edge of the cells of any level."""
-        return np.float64(np.float64(self.base) ** (self.finest + level))
+        """The step of any level, in units."""
+        return np.float64(np.float64(self.base) ** (self.finest + level) / self.unit)
 
-    def cells(self, level: int) -> tuple[np.float64, NDArray[np.int64], int]:
-        """The edge of the cells of a level, the lowest cell (3,), and the number of bits of the largest offset from it.
+    def largest_trace(self, level: int) -> np.float32:
+        """The largest trace of the covariance of a node that is merged at a level, units squared; may be infinite."""
+        size = LIMIT * float(self.step(level))
+        return np.float32(0.75 * size * size if size < FARTHEST**1.2 else math.inf)
 
-        A mean is in the box of its terms, so the scene's box bounds the cells of all levels.
-        """
-        step = self.step(level)
-        low_cell = np.floor(np.array(self.low) / step).astype(np.int64)
-        return (
-            step,
-            low_cell,
-            int((np.floor(np.array(self.high) / step).astype(np.int64) - low_cell).max()).bit_length(),
-        )
+    def shift(self, level: int) -> NDArray[np.int64]:
+        """(3,) parts, fewer than a cell has, by which the grid of a level is shifted."""
+        return np.floor(np.array(SHIFT) * level % 1 * PARTS).astype(np.int64)
 
-    def words(self, level: int) -> int:
-        """The number of 63-bit words of the Morton codes of a level's cells."""
-        return max(1, -(-self.cells(level)[2] // AXIS_BITS))
+    def part_edge(self, level: int) -> np.float64:
+        """Edge of the parts of a level, in units."""
+        return self.step(level) * np.float64(CELL / PARTS)
+
+    def box(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """The corners of the box of all centres, in units, as rows hold them."""
+        low, high = (np.array(corner) / self.unit for corner in (self.low, self.high))
+        return low.astype(np.float32).astype(np.float64), high.astype(np.float32).astype(np.float64)
+
+    def parts(self, level: int) -> Parts:
+        """The parts of a level. A mean is in the box of its terms, so the scene's box bounds those of all levels."""
+        edge, shift = self.part_edge(level), self.shift(level)
+        low, high = (np.floor(corner / edge).astype(np.int64) for corner in self.box())
+        lowest = (low - shift) // PARTS * PARTS + shift
+        return Parts(edge, lowest, int((high - lowest).max()).bit_length())
 
     def leaf_keys(self, center: FloatArray, scale: FloatArray) -> tuple[Keys, NDArray[np.int32], int]:
         """Keys that order splats by level and along a curve, (n,) their levels, and the number of bits of a key."""

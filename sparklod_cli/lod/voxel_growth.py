@@ -15,14 +15,10 @@ from numpy.typing import NDArray
 
 from ..support.jit import threads_for
 from ..support.progress import Progress
-from .kernels.geometry import CENTER
 from .kernels.sort import Nodes, sort_by_cell
 from .margins import Margins
 from .voxel_grid import VoxelGrid
 from .voxel_tree import Rows, VoxelTree
-
-#: The last nodes get one parent: no more of them than these, which may be a block of 2 x 2 x 2 cells.
-LAST_NODES = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +28,8 @@ class Arrivals:
     Attributes:
         splats: number of splats that join at the level of their size.
         joining: rows of those splats by level, each along the curve.
-        waiting: rows of other nodes by the level that they wait for; each has a cell of the level below for itself.
+        waiting: rows of other nodes by the level that they wait for; all nodes in a cell of the level below come from
+            one stage, in their order.
     """
 
     splats: int
@@ -60,8 +57,8 @@ def grow(
     while True:
         if level in arrivals.waiting:
             active = tree.join(active, arrivals.waiting.pop(level))
-            active = _by_cell(tree, grid, level - 1, active)[0]
-        if level > grid.last_level and not arrivals.waiting and _are_last(tree, active, grid.step(level - 1)):
+            active = _by_cell(tree, grid, level - 1, active, within=False)[0]
+        if level > grid.last_level and not arrivals.waiting and len(active) <= 1:
             break
         if margins is not None:
             margins.widen(level)
@@ -74,29 +71,20 @@ def grow(
             del rows
             progress("building", joined, arrivals.splats, "splat")
         if margins is not None:
-            active, outside = margins.split(active, tree.geometry)
+            active, outside = margins.split(active, tree.nodes)
             left.append((level, tree.take(outside)))
         if len(active) > 1:
             with threads_for(len(active)):
                 active = tree.tidy(active)
-                active = tree.merge_cells(level, *_by_cell(tree, grid, level, active))
+                active = tree.merge_cells(level, *_by_cell(tree, grid, level, active), grid.largest_trace(level))
         level += 1
-    if margins is None and len(active) > 1:
-        active = tree.merge(level, 0, active, np.array([0, len(active)]))
     left.append((level, tree.take(active)))
     return left + list(arrivals.joining.items()) + list(arrivals.waiting.items())
 
 
-def _by_cell(tree: VoxelTree, grid: VoxelGrid, level: int, nodes: Nodes) -> tuple[Nodes, NDArray[np.bool_]]:
+def _by_cell(
+    tree: VoxelTree, grid: VoxelGrid, level: int, nodes: Nodes, *, within: bool = True
+) -> tuple[Nodes, NDArray[np.bool_]]:
     """`sort_by_cell` of the cells of a level."""
-    step, low_cell, axis_bits = grid.cells(level)
     with threads_for(len(nodes)) as threads:
-        return sort_by_cell(tree.geometry, nodes, step, low_cell, axis_bits, threads)
-
-
-def _are_last(tree: VoxelTree, nodes: Nodes, step: np.float64) -> bool:
-    """Whether nodes lie in a block of 2 x 2 x 2 cells, so that they get one parent."""
-    if len(nodes) > LAST_NODES:
-        return False
-    cell = np.floor(tree.geometry[nodes, CENTER : CENTER + 3].astype(np.float64) / step)
-    return len(nodes) == 0 or bool(np.ptp(cell, axis=0).max() <= 1)
+        return sort_by_cell(tree.nodes, nodes, grid.parts(level), threads, within=within)

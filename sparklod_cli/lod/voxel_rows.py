@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
-from ..model.splats import FloatArray
-from .kernels.geometry import SplatColumns, gather_rows
+from ..model.splats import FloatArray, Splats
+from .kernels.geometry import SplatColumns
+from .kernels.node_rows import Space, fill_leaf_rows
+from .kernels.pair_cost import WIDTH
 from .kernels.sort import Nodes, sort_by_key
 from .voxel_grid import VoxelGrid
 from .voxel_tree import Offsets, Rows
@@ -33,28 +37,33 @@ def sorted_leaves(
     return sort_by_key(keys, order, bits, threads)[1], ends
 
 
-def joining(index: Nodes, ends: Offsets, columns: SplatColumns) -> dict[int, Rows]:
+def joining(index: Nodes, ends: Offsets, of: Callable[[Nodes], FloatArray]) -> dict[int, Rows]:
     """Rows of splats by level.
 
     Args:
         index: (n,) the splat of each row; rows are numbered in this order.
         ends: where each level ends.
-        columns: of the splats.
+        of: returns the node rows of splats.
     """
     found, begin = {}, 0
     for level, end in enumerate(ends.tolist()):
         if end > begin:
-            found[level] = rows_of(index[begin:end], begin, columns)
+            found[level] = numbered(of(index[begin:end]), begin)
         begin = end
     return found
 
 
-def rows_of(index: Nodes, number: int, columns: SplatColumns) -> Rows:
-    """Rows of some splats, numbered from `number` on."""
-    rows = Rows.empty(len(index))
-    gather_rows(index, columns, rows.geometry, rows.weight)
-    rows.number[:] = np.arange(number, number + len(index), dtype=np.uint32)
-    rows.count[:] = 0
+def numbered(nodes: FloatArray, number: int) -> Rows:
+    """Rows of nodes that are given, numbered from `number` on."""
+    numbers = np.arange(number, number + len(nodes), dtype=np.uint32)
+    return Rows(nodes, numbers, np.zeros(len(nodes), np.uint16))
+
+
+def leaf_rows(index: Nodes, splats: Splats, space: Space) -> FloatArray:
+    """(n, WIDTH) node rows of some splats."""
+    rows, size = np.empty((len(index), WIDTH), np.float32), np.empty(len(index), np.float32)
+    columns = SplatColumns(splats.center, splats.scale, splats.quat_xyzw, splats.opacity)
+    fill_leaf_rows(index, columns, splats.rgb, space, rows, size)
     return rows
 
 

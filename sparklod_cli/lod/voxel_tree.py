@@ -7,25 +7,22 @@ one place at a time.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..model.lod_tree import MAX_CHILDREN, LodTree
-from ..model.splats import FloatArray, Splats
+from ..model.lod_tree import LodTree
+from ..model.splats import COLUMNS, FloatArray, Splats
 from ..support.jit import threads_for
 from ..support.parallel import blocks_of
-from .kernels.final_order import fill_geometry, fill_leaves, merge_colors
-from .kernels.geometry import WIDTH
-from .kernels.group import split_cells
-from .kernels.merge import merge_groups
+from .kernels.cell_pairs import merge_in_cells, split_families
+from .kernels.final_order import fill_leaves, merge_colors
+from .kernels.node_rows import Space, fill_merged_splats
+from .kernels.pair_cost import WEIGHT, WIDTH
 from .kernels.sort import Keys, Nodes
-
-#: Factor for the scales of merged splats: the profile of a splat with D above 1 is wider than its scale, and tails of
-#: neighbours add up. Measured: 0.95 gains up to 0.7 dB over 1 (docs/decisions/2026-11-21-fidelity.md).
-SHRINK = np.float32(0.95)
 
 #: In place of the number of a node that was given, for a node that was made.
 MADE = np.uint32(0xFFFFFFFF)
@@ -41,26 +38,24 @@ class Rows:
     """What is known of n nodes without a parent.
 
     Attributes:
-        geometry: (n, WIDTH) float32 rows of `kernels/geometry.py`.
-        weight: (n,) float64, opacity * area.
+        node: (n, WIDTH) float32 node rows of `kernels/pair_cost.py`.
         number: (n,) uint32 of a node that was given, as the caller counts them; of a node that was made, where its
             children begin, as a distance from the end of the final order.
         count: (n,) uint16 children that it was given here; 0 for a node that was given.
     """
 
-    geometry: FloatArray
-    weight: NDArray[np.float64]
+    node: FloatArray
     number: NDArray[np.uint32]
     count: NDArray[np.uint16]
 
     def __len__(self) -> int:
-        return len(self.weight)
+        return len(self.number)
 
     @classmethod
     def empty(cls, size: int) -> Rows:
         """Room for nodes."""
-        geometry, weight = np.empty((size, WIDTH), np.float32), np.empty(size, np.float64)
-        return cls(geometry, weight, np.empty(size, np.uint32), np.empty(size, np.uint16))
+        node = np.empty((size, WIDTH), np.float32)
+        return cls(node, np.empty(size, np.uint32), np.empty(size, np.uint16))
 
     @classmethod
     def concat(cls, parts: list[Rows]) -> Rows:
@@ -69,7 +64,7 @@ class Rows:
 
     def take(self, nodes: Nodes | slice) -> Rows:
         """Some of the nodes."""
-        return Rows(self.geometry[nodes], self.weight[nodes], self.number[nodes], self.count[nodes])
+        return Rows(self.node[nodes], self.number[nodes], self.count[nodes])
 
     def shrink(self, size: int) -> None:
         """Gives memory back but for the first rows. Nobody may have a view of them."""
@@ -80,8 +75,7 @@ class Rows:
     def put(self, start: int, rows: Rows) -> None:
         """Overwrites rows from `start` on."""
         part = slice(start, start + len(rows))
-        self.geometry[part], self.weight[part] = rows.geometry, rows.weight
-        self.number[part], self.count[part] = rows.number, rows.count
+        self.node[part], self.number[part], self.count[part] = rows.node, rows.number, rows.count
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,14 +84,12 @@ class Batch:
 
     Attributes:
         level: of their cells.
-        fold: 0 where a cell has one node afterwards; otherwise the number of the fold, from 1.
         families: number of nodes that were made.
         members: number of their children.
         keys: (families, words) Morton codes of their cells, the highest word first; empty if nobody wants them.
     """
 
     level: int
-    fold: int
     families: int
     members: int
     keys: Keys
@@ -112,15 +104,18 @@ class VoxelTree:
         total: number of nodes that have been written.
     """
 
-    def __init__(self, given: int, leaves: int, keys: Callable[[int, FloatArray], Keys] | None = None) -> None:
+    def __init__(
+        self, given: int, leaves: int, space: Space, keys: Callable[[int, FloatArray], Keys] | None = None
+    ) -> None:
         """A tree without nodes.
 
         Args:
             given: number of nodes that will be given.
             leaves: see above.
+            space: coordinates of node rows.
             keys: returns the keys of a batch, by the level and the rows of the nodes made; None if nobody wants them.
         """
-        self.leaves, self.batches, self.total, self._keys = leaves, list[Batch](), 0, keys
+        self.leaves, self.batches, self.total, self._space, self._keys = leaves, list[Batch](), 0, space, keys
         self._rows, self._used = Rows.empty(0), 0
         # Twice the nodes are the most that there will be; memory that is not written to is not taken.
         size = 2 * given
@@ -130,9 +125,9 @@ class VoxelTree:
         self._count = np.empty(size, np.uint16)
 
     @property
-    def geometry(self) -> FloatArray:
+    def nodes(self) -> FloatArray:
         """Rows of the nodes without a parent."""
-        return self._rows.geometry
+        return self._rows.node
 
     def take(self, nodes: Nodes) -> Rows:
         """Copies of some of them."""
@@ -174,73 +169,42 @@ class VoxelTree:
         self._used = len(order)
         return place[active]
 
-    def merge(self, level: int, fold: int, members: Nodes, first: Offsets) -> Nodes:
-        """Merges each group of members into one node; returns the new nodes."""
-        count = len(first) - 1
-        made = slice(self._used, self._used + count)
-        if count:
-            merge_groups(members, first, self._rows.geometry, self._rows.weight, self._used)
+    def merge_cells(self, level: int, nodes: Nodes, is_first: NDArray[np.bool_], largest: np.float32) -> Nodes:
+        """Merges the nodes of each cell, as `kernels.cell_pairs.merge_in_cells`; returns the nodes without a parent."""
+        owner, row = merge_in_cells(nodes, is_first, self._rows.node, largest, self._used)
+        members, first, made, survivors = split_families(nodes, owner, row)
+        del owner, row
+        if len(made):
             self.write(members)
             self._rows.number[made] = self.total - first[:-1]
             self._rows.count[made] = np.diff(first)
-            keys = self._keys(level, self._rows.geometry[made]) if self._keys else np.empty((0, 0), np.uint64)
-            self.batches.append(Batch(level, fold, count, len(members), keys))
-            self._used += count
-        return np.arange(made.start, made.stop, dtype=np.uint32)
+            keys = self._keys(level, self._rows.node[made]) if self._keys else np.empty((0, 0), np.uint64)
+            self.batches.append(Batch(level, len(made), len(members), keys))
+            self._used += len(nodes) // 2
+        return survivors
 
     def write(self, nodes: Nodes) -> None:
         """Puts nodes before all that have been written."""
         end = len(self._weight) - self.total
         part = slice(end - len(nodes), end)
-        scale, rows = self._scale[part], self._rows
-        fill_geometry(
-            *(nodes, rows.geometry, 1 << 32, SHRINK),
-            *(self._center[part], scale, self._quat[part], self._opacity[part]),
-        )
-        self._weight[part] = rows.weight[nodes]
+        rows, count = self._rows, len(nodes)
+        self._weight[part] = rows.node[nodes, WEIGHT]
         self._number[part], self._count[part] = rows.number[nodes], rows.count[nodes]
-        scale[(self._count[part] > 0) | (self._number[part] >= self.leaves)] *= SHRINK
-        self.total += len(nodes)
+        is_merged = (self._count[part] > 0) | (self._number[part] >= self.leaves)
+        at = np.where(is_merged, np.arange(1, count + 1, dtype=np.uint32), np.uint32(0))
+        columns = self._center[part], self._scale[part], self._quat[part], self._opacity[part]
+        fill_merged_splats(at, 1, nodes, rows.node, self._space, *columns)
+        self.total += count
 
-    def merge_cells(self, level: int, nodes: Nodes, is_first: NDArray[np.bool_]) -> Nodes:
-        """Merges the nodes of each cell with more than one; returns the node that each cell then has."""
-        before = self._used
-        members, first, survivors = split_cells(nodes, is_first, before)
-        fold = 0
-        while len(first) > 1 and np.diff(first).max() > MAX_CHILDREN:
-            fold += 1
-            members, first = self._fold_oversized(level, fold, members, first)
-        if fold:
-            survivors[survivors >= before] += self._used - before
-        self.merge(level, 0, members, first)
-        return survivors
-
-    def _fold_oversized(self, level: int, fold: int, members: Nodes, first: Offsets) -> tuple[Nodes, Offsets]:
-        """Groups members of oversized groups into intermediate nodes of equal shares, at most MAX_CHILDREN each."""
-        count = np.diff(first)
-        big = np.flatnonzero(count > MAX_CHILDREN)
-        shares = [np.linspace(0, count[g], -(-count[g] // MAX_CHILDREN) + 1).astype(np.int64) for g in big]
-        starts = [np.zeros(1, np.int64)]
-        for share in shares:
-            starts.append(starts[-1][-1] + share[1:])
-        whole = np.concatenate([members[first[g] : first[g + 1]] for g in big])
-        made = self.merge(level, fold, whole, np.concatenate(starts))
-        parts, at, done = [], 0, 0
-        for g, share in zip(big, shares, strict=True):
-            parts += [members[at : first[g]], made[done : done + len(share) - 1]]
-            at, done = first[g + 1], done + len(share) - 1
-        count[big] = [len(share) - 1 for share in shares]
-        return np.concatenate([*parts, members[at:]]), np.concatenate([[0], np.cumsum(count)])
-
-    def finish(self, tops: Rows, index: Nodes, rgb: FloatArray, sh: FloatArray) -> Final:
+    def finish(self, tops: Rows, index: Nodes, given: Splats) -> Final:
         """The nodes as they are drawn: those without a parent, then the children of the batches, last batch first.
 
         Colours are merged here, where those of siblings are adjacent. The tree is of no use afterwards.
 
         Args:
             tops: the nodes without a parent.
-            index: (given,) row of the colours of each node that was given.
-            rgb, sh: colours.
+            index: (given,) which of the splats each node that was given is.
+            given: splats, as they are drawn.
         """
         self._rows = tops
         self.write(np.arange(len(tops), dtype=np.uint32))
@@ -255,17 +219,18 @@ class VoxelTree:
         owner[start[inner]] = inner + np.uint32(1)
         parents = owner[owner > 0] - np.uint32(1)
         del owner, inner
-        columns = 3 * sh.shape[1]
         geometry = self._center[part], self._scale[part], self._quat[part], self._opacity[part]
-        out = Splats(*geometry, np.empty((total, 3), np.float32), np.empty((total, *sh.shape[1:]), np.float32))
-        flat_sh = out.sh.reshape(total, columns)
-        fill_leaves(number, index, rgb, out.rgb)
-        fill_leaves(number, index, sh.reshape(len(sh), columns), flat_sh)
-        del index, rgb, sh  # frees memory if the caller has no reference
+        sh = given.sh.shape[1:]
+        out = Splats(*geometry, np.empty((total, 3), np.float32), np.empty((total, *sh), np.float32))
+        for name in COLUMNS:
+            column, filled = getattr(given, name), getattr(out, name)
+            width = math.prod(filled.shape[1:])
+            fill_leaves(number, index, column.reshape(len(column), width), filled.reshape(total, width))
+        del index, given, column  # frees memory if the caller has no reference
         same, end = np.arange(total, dtype=np.uint32), len(parents)
         for batch in self.batches:
             with threads_for(batch.members) as threads:
-                for color in (out.rgb, flat_sh):
+                for color in (out.rgb, out.sh.reshape(total, math.prod(sh))):
                     family = parents[end - batch.families : end]
                     merge_colors(family, start, count, same, weight, color, threads)
             end -= batch.families

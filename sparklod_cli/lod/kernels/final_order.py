@@ -6,29 +6,6 @@ import numpy as np
 from numba import prange
 
 from ...support.jit import kernel
-from .geometry import CENTER, OPACITY, QUAT, SCALE
-
-
-@kernel(parallel=True)
-def fill_geometry(order, geometry, leaves, shrink, center, scale, quat, opacity):
-    """Fills the geometry of splats in final order: splat i from geometry[order[i]].
-
-    Args:
-        order: (M,) uint32, the node of each final index.
-        geometry: rows of `geometry.py`.
-        leaves: number of leaves; rows from there on are merged nodes.
-        shrink: float32, factor for the scales of merged nodes.
-        center, scale, quat, opacity: columns of M splats, filled.
-    """
-    for i in prange(len(order)):
-        j = order[i]
-        factor = shrink if j >= leaves else np.float32(1)
-        for k in range(3):
-            center[i, k] = geometry[j, CENTER + k]
-            scale[i, k] = geometry[j, SCALE + k] * factor
-        for k in range(4):
-            quat[i, k] = geometry[j, QUAT + k]
-        opacity[i] = geometry[j, OPACITY]
 
 
 @kernel(parallel=True)

@@ -1,8 +1,4 @@
-"""The quick builder's node rows, and surfaces and bounds of splats.
-
-The quick builder reads centre, scale, rotation and opacity of a node together, so they are stored together: one row of
-11 float32 per node. Leaves come first, sorted so that neighbours in space are so in memory; merged nodes follow.
-"""
+"""Surfaces and bounds of splats."""
 
 from __future__ import annotations
 
@@ -14,11 +10,6 @@ from numba import prange
 
 from ...model.gaussian import THOMSEN_P
 from ...support.jit import kernel
-
-CENTER, SCALE, QUAT, OPACITY, WIDTH = 0, 3, 6, 10, 11  # first column of each, and the number of columns
-
-#: Rows gathered before their areas are computed, so that cache misses overlap; results do not depend on it.
-BLOCK = 256
 
 #: The largest float32, world units: centres and scales of merged splats are clamped to it.
 LARGEST = float(np.finfo(np.float32).max)
@@ -90,33 +81,3 @@ def find_bounds(center, scale, blocks):
             low[0, k] = min(low[0, k], low[c, k])
             high[0, k] = max(high[0, k], high[c, k])
     return low[0, :3], high[0, :3], 2 * low[0, 3], 2 * high[0, 3]
-
-
-@kernel(parallel=True)
-def gather_rows(index, splats, geometry, weight):
-    """Fills row i of geometry, and weight[i], from splat index[i].
-
-    Args:
-        index: (n,) uint32.
-        splats: `SplatColumns`.
-        geometry: (at least n, WIDTH) float32, the first n rows are filled.
-        weight: (at least n,) float64, opacity * area; the first n are filled.
-    """
-    center, scale, quat, opacity = splats
-    n = len(index)
-    for block in prange((n + BLOCK - 1) // BLOCK):
-        begin, end = block * BLOCK, min(n, block * BLOCK + BLOCK)
-        for i in range(begin, end):
-            for k in range(3):
-                geometry[i, CENTER + k] = center[index[i], k]
-        for i in range(begin, end):
-            for k in range(3):
-                geometry[i, SCALE + k] = scale[index[i], k]
-        for i in range(begin, end):
-            for k in range(4):
-                geometry[i, QUAT + k] = quat[index[i], k]
-        for i in range(begin, end):
-            geometry[i, OPACITY] = opacity[index[i]]
-        for i in range(begin, end):
-            area = ellipsoid_area(geometry[i, SCALE], geometry[i, SCALE + 1], geometry[i, SCALE + 2])
-            weight[i] = geometry[i, OPACITY] * area

@@ -1,4 +1,4 @@
-"""Levels and cells of the quick builder: the sort keys of splats, cells with more than one node, and known cells."""
+"""Levels and regions of the quick builder: the sort keys of splats, and nodes in a box."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from numba import prange
 
 from ...support.jit import kernel
-from .geometry import CENTER
+from .pair_cost import CENTER
 from .sort import morton_code
 
 
@@ -48,51 +48,12 @@ def level_keys(center, scale, steps, grid, low, cell_bits):
 
 
 @kernel()
-def split_cells(nodes, is_first, next_node):
-    """Separates cells with one node from cells with more, whose nodes will be merged.
-
-    Args:
-        nodes: (n,) uint32, sorted by cell.
-        is_first: (n,) bool, true where a cell begins.
-        next_node: the node that the first cell with more than one will be merged into; the next cell's is one more.
-
-    Returns:
-        members: (C,) uint32, the nodes of all cells with more than one.
-        first: (G + 1,) int64, where each such cell begins in `members`.
-        survivors: (S,) uint32, the node that each cell has afterwards, in order.
-    """
-    n = len(nodes)
-    members = np.empty(n, np.uint32)
-    first = np.empty(n // 2 + 1, np.int64)
-    survivors = np.empty(n, np.uint32)
-    used = groups = cells = 0
-    first[0] = 0
-    i = 0
-    while i < n:
-        j = i + 1
-        while j < n and not is_first[j]:
-            j += 1
-        if j - i == 1:
-            survivors[cells] = nodes[i]
-        else:
-            survivors[cells] = next_node + groups
-            for k in range(i, j):
-                members[used] = nodes[k]
-                used += 1
-            groups += 1
-            first[groups] = used
-        cells += 1
-        i = j
-    return members[:used], first[: groups + 1], survivors[:cells]
-
-
-@kernel()
 def split_box(nodes, geometry, below, above):
     """Separates nodes whose centres lie between two corners from the others.
 
     Args:
         nodes: (n,) uint32 rows of geometry.
-        geometry: rows of `geometry.py`.
+        geometry: node rows of `pair_cost.py`.
         below, above: (3,) float32; centres between them on all axes are inside.
 
     Returns:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numba import prange
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 
 from ...model.splats import FloatArray
 from ...support.jit import kernel
-from .geometry import CENTER
+from .pair_cost import CENTER
 
 Keys = NDArray[np.uint64]
 Nodes = NDArray[np.uint32]
@@ -21,6 +22,29 @@ AXIS_BITS = 21
 #: Bits that one pass of the radix sort sorts by: 2048 counters fit the first-level cache. Measured against 8, 9 and 12;
 #: results do not depend on it.
 DIGIT_BITS = 11
+
+#: Bits per axis of the parts of a cell: 8 x 8 x 8 of them.
+PART_BITS = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Parts:
+    """The parts of the cells of a level, in units of `node_rows.Space`.
+
+    Attributes:
+        step: edge of a part; that of a cell is 2 ** PART_BITS times it.
+        low: (3,) int64, the lowest part of the scene's lowest cell: the origin of offsets.
+        axis_bits: number of bits of the largest offset of a part, up to 63.
+    """
+
+    step: np.float64
+    low: NDArray[np.int64]
+    axis_bits: int
+
+    @property
+    def words(self) -> int:
+        """The number of 63-bit words of the Morton codes of parts."""
+        return max(1, -(-self.axis_bits // AXIS_BITS))
 
 
 @kernel()
@@ -54,7 +78,7 @@ def cell_words(geometry, nodes, step, low, word):
     """One 63-bit word of the Morton code of each node's cell.
 
     Args:
-        geometry: rows of `geometry.py`.
+        geometry: node rows of `pair_cost.py`; or any whose first columns are the centre.
         nodes: (n,) uint32 rows of it.
         step: edge of a cell, float64.
         low: (3,) int64, the lowest cell on each axis, so that offsets from it are not negative.
@@ -120,27 +144,32 @@ def sort_by_key(keys: Keys, values: Nodes, key_bits: int, blocks: int) -> tuple[
 
 
 def sort_by_cell(
-    geometry: FloatArray, nodes: Nodes, step: float, low: NDArray[np.int64], axis_bits: int, blocks: int
+    geometry: FloatArray, nodes: Nodes, grid: Parts, blocks: int, *, within: bool = True
 ) -> tuple[Nodes, NDArray[np.bool_]]:
-    """Sorts nodes in the Morton order of their cells.
+    """Sorts nodes in the Morton order of their cells and, within a cell, of its parts.
 
     Args:
-        geometry, nodes, step, low: as for `cell_words`.
-        axis_bits: number of bits of the largest cell offset, up to 63.
+        geometry, nodes: as for `cell_words`.
+        grid: of the parts.
         blocks: ranges to process in parallel; the result does not depend on it.
+        within: whether to sort within cells, too; otherwise a cell's nodes stay in their order.
 
     Returns:
         nodes: (n,) uint32, sorted.
         is_first: (n,) bool, true at the first node of each cell.
     """
-    words = max(1, -(-axis_bits // AXIS_BITS))
+    axis_bits, words, in_cell = grid.axis_bits, grid.words, np.uint64(3 * PART_BITS)
     is_first = np.zeros(len(nodes), np.bool_)
     is_first[:1] = True
     for word in range(words):
-        keys = cell_words(geometry, nodes, step, low, word)
+        keys = cell_words(geometry, nodes, grid.step, grid.low, word)
+        if word == 0 and not within:
+            keys &= ~((np.uint64(1) << in_cell) - np.uint64(1))
         keys, nodes = sort_by_key(keys, nodes.copy(), 3 * min(axis_bits - AXIS_BITS * word, AXIS_BITS), blocks)
     for word in range(words):
         if words > 1:  # `keys` holds the last word only
-            keys = cell_words(geometry, nodes, step, low, word)
+            keys = cell_words(geometry, nodes, grid.step, grid.low, word)
+        if word == 0:
+            keys = keys >> in_cell
         is_first[1:] |= keys[1:] != keys[:-1]
     return nodes, is_first

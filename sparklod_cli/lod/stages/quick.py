@@ -15,13 +15,12 @@ from ...support.defaults import MAX_BASE, MIN_BASE
 from ...support.jit import threads_for
 from ...support.progress import Progress, silent
 from ..check import Bounds, check_setting
-from ..kernels.geometry import CENTER, OPACITY, QUAT, SCALE, SplatColumns
-from ..kernels.sort import Keys, Nodes, cell_words, sort_by_key
+from ..kernels.sort import PART_BITS, Keys, Nodes, cell_words, sort_by_key
 from ..margins import Margins
 from ..voxel_grid import VoxelGrid
 from ..voxel_growth import Arrivals, grow
-from ..voxel_rows import by_level, joining, rows_of, sorted_leaves
-from ..voxel_tree import MADE, SHRINK, Batch, Final, Offsets, Rows, VoxelTree
+from ..voxel_rows import by_level, joining, leaf_rows, numbered, sorted_leaves
+from ..voxel_tree import MADE, Final, Offsets, Rows, VoxelTree
 from .records import NO_FAMILY, STAGE_BITS, Families, Pending, Region, Survey
 
 #: Level of splats that have not joined the tree yet: they do so at the level of their size.
@@ -29,9 +28,6 @@ NEW = -1
 
 #: More than the levels of any scene: sizes and distances of float32 span 2 ** 278, and the base is at least 1.1.
 LEVELS = 4096
-
-#: More than the folds of a cell, each of which leaves at most half of the nodes.
-FOLDS = 64
 
 
 def plan(survey: Survey, setting: float) -> VoxelGrid:
@@ -47,9 +43,17 @@ def plan(survey: Survey, setting: float) -> VoxelGrid:
 def leaves(splats: Splats, index: NDArray[np.int64], plan: VoxelGrid) -> Pending:
     """Splats that have not joined the tree."""
     n = len(splats)
-    columns = {name: getattr(splats, name) for name in COLUMNS}
+    rows = leaf_rows(np.arange(n, dtype=np.uint32), splats, plan.space)
     level, family = np.full(n, NEW, np.int32), np.full(n, NO_FAMILY, np.int64)
-    return Pending({**columns, "weight": np.zeros(n), "level": level, "index": index, "family": family})
+    return Pending(
+        {
+            **{name: getattr(splats, name) for name in COLUMNS},
+            "rows": rows,
+            "level": level,
+            "index": index,
+            "family": family,
+        }
+    )
 
 
 def advance(
@@ -63,13 +67,12 @@ def advance(
     del pending
     with threads_for(len(given["level"])) as threads:
         pick, joins, arrivals, leaves = _arrivals(given, plan, threads)
-        for name in ("center", "scale", "quat_xyzw", "opacity", "weight"):
-            del given[name]  # the rows have them; frees the memory if the caller has no reference
-        tree = VoxelTree(len(pick), leaves, partial(_keys, plan))
+        del given["rows"]  # the arrivals have them; frees the memory if the caller has no reference
+        tree = VoxelTree(len(pick), leaves, plan.space, partial(_keys, plan))
         margins = Margins(plan, region.low, region.high) if region else None
         left = grow(tree, plan, arrivals, margins, progress)
         tops = Rows.concat([rows for _, rows in left])
-        final = tree.finish(tops, pick, given["rgb"], given["sh"])
+        final = tree.finish(tops, pick, Splats(**{name: given[name] for name in COLUMNS}))
     waits = np.repeat(np.array([level for level, _ in left], np.int32), [len(rows) for _, rows in left])
     was_given = tops.count == 0
     family = np.full(len(final.tree), NO_FAMILY, np.int64)
@@ -82,27 +85,23 @@ def advance(
     index = np.full(len(tops), -1, np.int64)
     index[is_new] = given["index"][pick[tops.number[is_new]]]
     handed_on = {
-        "center": tops.geometry[:, CENTER:SCALE].copy(),
-        "scale": tops.geometry[:, SCALE:QUAT].copy(),
-        "quat_xyzw": tops.geometry[:, QUAT:OPACITY].copy(),
-        "opacity": tops.geometry[:, OPACITY].copy(),
-        "rgb": final.nodes.rgb[: len(tops)].copy(),
-        "sh": final.nodes.sh[: len(tops)].copy(),
-        "weight": tops.weight,
+        **{name: column.copy() for name, column in _drawn(final.nodes.take(slice(len(tops)))).items()},
+        "rows": tops.node,
         "level": np.where(is_new, np.int32(NEW), waits),
         "index": index,
         "family": family[: len(tops)].copy(),
     }
-    return _families(tree, final, family, len(tops), plan.words(0)), Pending(handed_on)
+    return _families(tree, final, family, len(tops), plan.parts(0).words), Pending(handed_on)
 
 
 def root(pending: Pending) -> tuple[Splats, int]:
     """The one node that is left, as it is drawn, and the number of its family."""
-    columns = {name: pending.columns[name] for name in COLUMNS}
-    family = int(pending.columns["family"][0])
-    if family != NO_FAMILY:
-        columns["scale"] = columns["scale"] * SHRINK
-    return Splats(**columns), family
+    return Splats(**{name: pending.columns[name] for name in COLUMNS}), int(pending.columns["family"][0])
+
+
+def _drawn(splats: Splats) -> dict[str, FloatArray]:
+    """Columns of `Pending` that tell how nodes are drawn."""
+    return {name: getattr(splats, name) for name in COLUMNS}
 
 
 def _arrivals(given: Mapping[str, NDArray[Any]], grid: VoxelGrid, threads: int) -> tuple[Nodes, Offsets, Arrivals, int]:
@@ -113,7 +112,6 @@ def _arrivals(given: Mapping[str, NDArray[Any]], grid: VoxelGrid, threads: int) 
     """
     is_new = given["level"] == NEW
     new, old = (np.flatnonzero(mask).astype(np.uint32) for mask in (is_new, ~is_new))
-    columns = SplatColumns(given["center"], given["scale"], given["quat_xyzw"], given["opacity"])
     index, order = given["index"][new], None
     if (np.diff(index) < 0).any():
         order = np.arange(len(new), dtype=np.uint32)
@@ -123,32 +121,29 @@ def _arrivals(given: Mapping[str, NDArray[Any]], grid: VoxelGrid, threads: int) 
     order, joins = sorted_leaves(center, scale, grid, threads, order)
     new = new[order]
     is_merged = given["family"][old] != NO_FAMILY
-    old = np.concatenate([old[~is_merged], old[is_merged]])
-    survivors = rows_of(old, len(new), columns)
     merged = len(old) - int(np.count_nonzero(is_merged))
-    survivors.weight[merged:] = given["weight"][old[merged:]]  # not that of the rounded opacity
-    waiting = {level: survivors.take(at) for level, at in by_level(given["level"][old])}
-    arrivals = Arrivals(len(new), joining(new, joins, columns), waiting)
+    place = old
+    old = np.concatenate([old[~is_merged], old[is_merged]])
+    survivors = numbered(given["rows"][old], len(new))
+    number = np.empty(len(old), np.uint32)  # among the survivors, of each in the order of the stages
+    number[np.searchsorted(place, old)] = np.arange(len(old), dtype=np.uint32)
+    waiting = {level: survivors.take(number[at]) for level, at in by_level(given["level"][place])}
+    arrivals = Arrivals(len(new), joining(new, joins, lambda some: given["rows"][some]), waiting)
     return np.concatenate([new, old]), joins, arrivals, len(new) + merged
 
 
 def _keys(grid: VoxelGrid, level: int, rows: FloatArray) -> Keys:
     """Morton codes of the cells of a level that rows are in, the highest word first."""
-    step, low_cell, _ = grid.cells(level)
-    nodes = np.arange(len(rows), dtype=np.uint32)
-    words = [cell_words(rows, nodes, step, low_cell, word) for word in reversed(range(grid.words(0)))]
-    return np.stack(words, axis=1)
-
-
-def _number(batch: Batch) -> int:
-    """The number of a batch in the tree: coarse levels first, folds after the batches that they are merged in."""
-    return (LEVELS - batch.level) * FOLDS + (FOLDS - batch.fold if batch.fold else 0)
+    parts, nodes = grid.parts(level), np.arange(len(rows), dtype=np.uint32)
+    words = [cell_words(rows, nodes, parts.step, parts.low, word) for word in range(grid.parts(0).words)]
+    words[0] &= ~np.uint64((1 << 3 * PART_BITS) - 1)
+    return np.stack(words[::-1], axis=1)
 
 
 def _families(tree: VoxelTree, final: Final, family: NDArray[np.int64], tops: int, words: int) -> Families:
     """The families of a stage, from its nodes and the number of the family of each; the first are without a parent."""
     batches = tree.batches[::-1]
-    number = np.array([_number(batch) for batch in batches], np.int32)
+    number = np.array([LEVELS - batch.level for batch in batches], np.int32)  # coarse levels first
     parents = final.nodes.take(final.parents)
     return Families(
         batch=np.repeat(number, [batch.families for batch in batches]),

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sparklod_cli.lod import quick, voxel_tree
+from sparklod_cli.lod import quick
 from sparklod_cli.lod.builders import BUILDERS
 from sparklod_cli.lod.stages import quick as staged_quick
 from sparklod_cli.lod.stages.records import Region
@@ -61,16 +61,6 @@ def test_the_tree_in_stages_is_the_tree_in_memory(seed: int, base: float) -> Non
     rng = random.Random(seed)
     splats = scene(rng)
     check(splats, base, random_division(rng, splats.center, base))
-
-
-@given(st.integers(0, 2**32 - 1), st.integers(3, 9))
-@settings(max_examples=25, deadline=None)
-def test_so_are_the_folds_of_cells_with_too_many_nodes(seed: int, most: int) -> None:
-    rng = random.Random(seed)
-    splats = scene(rng)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(voxel_tree, "MAX_CHILDREN", most)
-        check(splats, 1.5, random_division(rng, splats.center, 1.5))
 
 
 @pytest.mark.parametrize("name", hard_cases())

@@ -1,0 +1,344 @@
+"""Merges the nodes of each cell of the quick builder's grid: the cheapest pairs of neighbours, round by round.
+
+A cell's nodes lie along a curve. In each round, every node looks for its cheapest partner among the next few on either
+side, in its own cell only, and pairs that chose each other become one node that covers the union of both. What was
+merged into one node during all rounds of a level becomes one family. As nothing outside of a cell matters, a tree can
+be built in parts.
+
+Node rows are those of `pair_cost.py`. The cells of a span of nodes are worked on together, in columns, so that LLVM
+vectorizes over nodes; results do not depend on how cells are put together.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import prange
+
+from ...support.fast_math import exp2
+from ...support.jit import kernel
+from .geometry import ellipsoid_area
+from .pair_cost import COVARIANCE, COVERED, DENSITY, LOG_DET, NEVER, WEIGHT, WIDTH, log_det, pair_costs
+from .pair_merge import semi_axes
+
+f32 = np.float32
+
+#: Nodes of a span: its columns, 32 KB, stay near the processor. Results do not depend on it.
+SPAN = 512
+
+#: Room between columns: with a power of two from one to the next, all of them would share a few lines of the cache.
+PADDING = 16
+
+#: Rounds of merging at a level, and the largest distance of a partner on the curve. Measured, as the next three
+#: (docs/decisions/2026-11-22-quick-again.md): fewer rounds give more nodes, a larger window takes longer.
+ROUNDS, WINDOW = 6, 3
+
+#: A family has at least this many children, or waits for the next level, where it may get more.
+LEAST_CHILDREN = 5
+
+#: A family does not wait if its variance is at most this share of the largest of the level. This bounds how often
+#: nodes merge in vain.
+PATIENCE = f32(0.15)
+
+#: The largest finite float32: cost of any pair in a cell without a limit, so that no cost keeps a tree from ending.
+LARGEST_COST = np.finfo(np.float32).max
+
+#: Two nodes do not overlap from this exponent on: e^-30 is 1e-13, and coverage is a float32. Chosen.
+MAX_EXPONENT = f32(30)
+
+#: Bound of an offset over the length of both nodes' spread, where they do not overlap any more, and of a density, far
+#: above that of any profile, so that products stay within float32. Chosen.
+FARTHEST, DENSEST = f32(1e4), f32(1e4)
+
+#: Least trace of a covariance here, units squared. Chosen.
+LEAST_TRACE = f32(1e-30)
+
+#: Pairs that are united side by side. Results do not depend on it.
+GROUP = 64
+
+#: The area of an ellipsoid over the root of the sum of its covariance's principal minors, if that is a sphere.
+AREA_OF_MINORS = f32(4 * math.pi / math.sqrt(3))
+
+LOG2_E = f32(math.log2(math.e))
+
+
+@kernel(inline=True)
+def on_plane(axx, ayy, axy, bxx, byy, bxy, x, y, density_a, density_b):
+    """Coverage on a plane, divided by 2 pi, of two Gaussians' overlap, and of both; float32.
+
+    Args:
+        axx, ayy, axy, bxx, byy, bxy: their covariances on the plane.
+        x, y: from one centre to the other.
+        density_a, density_b: their heights.
+    """
+    area_a = math.sqrt(max(axx * ayy - axy * axy, f32(0)))
+    area_b = math.sqrt(max(bxx * byy - bxy * bxy, f32(0)))
+    xx, yy, xy = axx + bxx, ayy + byy, axy + bxy
+    det = max(xx * yy - xy * xy, LEAST_TRACE)
+    power = f32(0.5) * max(yy * x * x - f32(2) * xy * x * y + xx * y * y, f32(0)) / det
+    both = area_a * area_b / math.sqrt(det) * exp2(-LOG2_E * min(power, MAX_EXPONENT))
+    area_a, area_b = density_a * area_a, density_b * area_b
+    return min(density_a * density_b * both, min(area_a, area_b)), area_a + area_b
+
+
+@kernel()
+def unite(a, b):
+    """Replaces nodes by the unions of each with another one.
+
+    The overlap of two nodes covers a share h of what both cover, at most 0.5, which is measured on the planes of the
+    three axes. It is in the middle, and about half as wide as the two: its moments are those of the union less. What
+    stays, ((1 - h / 2) (u P + v Q) + u v d d^T) / (1 - h), is always a covariance; u and v are the nodes' shares of the
+    coverage, P and Q their covariances, d is the offset from one to the other.
+
+    Args:
+        a: (WIDTH * GROUP,) float32 columns of node rows, one after the other; replaced.
+        b: (WIDTH * GROUP,) float32, of the nodes that they are united with.
+    """
+    # The stride and the number of nodes are constants, so that LLVM vectorizes without a doubt about what overlaps.
+    for i in range(GROUP):
+        px, py, pz = a[i], a[GROUP + i], a[2 * GROUP + i]
+        pxx, pyy, pzz = a[3 * GROUP + i], a[4 * GROUP + i], a[5 * GROUP + i]
+        pxy, pxz, pyz = a[6 * GROUP + i], a[7 * GROUP + i], a[8 * GROUP + i]
+        qxx, qyy, qzz = b[3 * GROUP + i], b[4 * GROUP + i], b[5 * GROUP + i]
+        qxy, qxz, qyz = b[6 * GROUP + i], b[7 * GROUP + i], b[8 * GROUP + i]
+        dx, dy, dz = b[i] - px, b[GROUP + i] - py, b[2 * GROUP + i] - pz
+        # The overlap, in units of both nodes' spread, so that products stay within float32.
+        s = f32(1) / (pxx + pyy + pzz + qxx + qyy + qzz + LEAST_TRACE)
+        root = math.sqrt(s)
+        x = min(max(dx * root, -FARTHEST), FARTHEST)
+        y = min(max(dy * root, -FARTHEST), FARTHEST)
+        z = min(max(dz * root, -FARTHEST), FARTHEST)
+        high_a, high_b = min(a[DENSITY * GROUP + i], DENSEST), min(b[DENSITY * GROUP + i], DENSEST)
+        on_z, alone_z = on_plane(pxx * s, pyy * s, pxy * s, qxx * s, qyy * s, qxy * s, x, y, high_a, high_b)
+        on_y, alone_y = on_plane(pxx * s, pzz * s, pxz * s, qxx * s, qzz * s, qxz * s, x, z, high_a, high_b)
+        on_x, alone_x = on_plane(pyy * s, pzz * s, pyz * s, qyy * s, qzz * s, qyz * s, y, z, high_a, high_b)
+        hidden = min((on_x + on_y + on_z) / max(alone_x + alone_y + alone_z, LEAST_TRACE), f32(0.5))
+        # The union.
+        total = a[COVERED * GROUP + i] + b[COVERED * GROUP + i]
+        u, v = a[COVERED * GROUP + i] / total, b[COVERED * GROUP + i] / total
+        left = f32(1) / (f32(1) - hidden)
+        own, apart = (f32(1) - f32(0.5) * hidden) * left, u * v * left
+        xx, yy, zz = own * (u * pxx + v * qxx), own * (u * pyy + v * qyy), own * (u * pzz + v * qzz)
+        xy, xz, yz = own * (u * pxy + v * qxy), own * (u * pxz + v * qxz), own * (u * pyz + v * qyz)
+        xx, yy, zz = xx + apart * dx * dx, yy + apart * dy * dy, zz + apart * dz * dz
+        xy, xz, yz = xy + apart * dx * dy, xz + apart * dx * dz, yz + apart * dy * dz
+        # A mean that rounding cannot put outside of the two, and so of their cell.
+        qx, qy, qz = b[i], b[GROUP + i], b[2 * GROUP + i]
+        a[i] = min(max(u * px + v * qx, min(px, qx)), max(px, qx))
+        a[GROUP + i] = min(max(u * py + v * qy, min(py, qy)), max(py, qy))
+        a[2 * GROUP + i] = min(max(u * pz + v * qz, min(pz, qz)), max(pz, qz))
+        a[3 * GROUP + i], a[4 * GROUP + i], a[5 * GROUP + i] = xx, yy, zz
+        a[6 * GROUP + i], a[7 * GROUP + i], a[8 * GROUP + i] = xy, xz, yz
+        weight = a[WEIGHT * GROUP + i] + b[WEIGHT * GROUP + i]
+        first, second = a[WEIGHT * GROUP + i] / weight, b[WEIGHT * GROUP + i] / weight
+        a[9 * GROUP + i] = first * a[9 * GROUP + i] + second * b[9 * GROUP + i]
+        a[10 * GROUP + i] = first * a[10 * GROUP + i] + second * b[10 * GROUP + i]
+        a[11 * GROUP + i] = first * a[11 * GROUP + i] + second * b[11 * GROUP + i]
+        a[LOG_DET * GROUP + i] = log_det(xx, yy, zz, xy, xz, yz)
+        covered = total * (f32(1) - hidden)
+        a[COVERED * GROUP + i] = covered
+        a[WEIGHT * GROUP + i] = weight
+        # The area of an ellipsoid within 16 %, from the sum of its squared projections; `finish_row` has a better one.
+        s = f32(1) / (xx + yy + zz + LEAST_TRACE)
+        xx, yy, zz, xy, xz, yz = xx * s, yy * s, zz * s, xy * s, xz * s, yz * s
+        minors = max(xx * yy - xy * xy, f32(0)) + max(xx * zz - xz * xz, f32(0)) + max(yy * zz - yz * yz, f32(0))
+        area = AREA_OF_MINORS * math.sqrt(minors) / s
+        a[DENSITY * GROUP + i] = min(covered / max(area, LEAST_TRACE), DENSEST)
+
+
+@kernel()
+def finish_row(lanes, i, row):
+    """Fills the node row of node i, with the density of its coverage over the area of its ellipsoid."""
+    for column in range(WIDTH):
+        row[column] = lanes[column, i]
+    large, middle, small = semi_axes(
+        np.float64(row[COVARIANCE]),
+        np.float64(row[COVARIANCE + 1]),
+        np.float64(row[COVARIANCE + 2]),
+        np.float64(row[COVARIANCE + 3]),
+        np.float64(row[COVARIANCE + 4]),
+        np.float64(row[COVARIANCE + 5]),
+    )
+    row[DENSITY] = min(np.float64(row[COVERED]) / ellipsoid_area(large, middle, small), LARGEST_COST)
+
+
+@kernel()
+def find_partners_in_cells(lanes, count, cell, place, largest, cost, best, at):
+    """Fills the cheapest partner of each node of a span, by its place in the cell, or -1.
+
+    Among equal costs, that partner wins whose place differs from the node's in the lowest bits, so that among many
+    equal nodes half choose each other.
+
+    Args:
+        lanes: (WIDTH, at least count) float32 columns of node rows.
+        count: number of nodes.
+        cell, place: (count,) int32 number of each node's cell, and place of the node in it.
+        largest: largest trace of the covariance of a pair, units squared.
+        cost, best, at: (at least count,) filled; `best` with the costs.
+    """
+    most = f32(LARGEST_COST) if largest == NEVER else NEVER
+    for i in range(count):
+        best[i], at[i] = NEVER, -1
+    for step in range(1, min(WINDOW, count - 1) + 1):
+        pairs = count - step
+        pair_costs(lanes, step, pairs, largest, cost)
+        for i in range(pairs):
+            price = cost[i] if cost[i] < most else most  # also where it is not a number
+            cost[i] = price if cell[i] == cell[i + step] else NEVER
+        for i in range(pairs):
+            own, new = place[i], np.int32(place[i] + step)
+            lower = (cost[i] < best[i]) | ((cost[i] == best[i]) & ((own ^ new) < (own ^ at[i])))
+            best[i] = cost[i] if lower else best[i]
+            at[i] = new if lower else at[i]
+        for i in range(pairs):
+            j = i + step
+            own, new = place[j], np.int32(place[j] - step)
+            lower = (cost[i] < best[j]) | ((cost[i] == best[j]) & ((own ^ new) < (own ^ at[j])))
+            best[j] = cost[i] if lower else best[j]
+            at[j] = new if lower else at[j]
+
+
+@kernel()
+def merge_span(nodes, is_first, rows, largest, begin, end, made, owner, row):
+    """Merges the nodes of whole cells, those from `begin` to `end`; see `merge_in_cells`."""
+    size = end - begin
+    lanes = np.empty((WIDTH, size + PADDING), np.float32)
+    a, b = np.ones(WIDTH * GROUP, np.float32), np.ones(WIDTH * GROUP, np.float32)
+    cell, place, kept = np.empty(size, np.int32), np.empty(size, np.int32), np.empty(size, np.int64)
+    first, second = np.empty(size // 2, np.int64), np.empty(size // 2, np.int64)
+    cost, best, at = np.empty(size, np.float32), np.empty(size, np.float32), np.empty(size, np.int32)
+    slot, joined, members = np.arange(size), np.arange(size), np.ones(size, np.int64)
+    number = np.int32(-1)
+    for i in range(size):
+        number += np.int32(is_first[begin + i])
+        cell[i] = number
+        for column in range(WIDTH):
+            lanes[column, i] = rows[nodes[begin + i], column]
+    merges = np.empty(number + 1, np.int32)  # of each cell, in a round
+    count, families = size, begin // 2
+    for turn in range(ROUNDS):
+        for i in range(count):
+            place[i] = place[i - 1] + 1 if i > 0 and cell[i] == cell[i - 1] else 0
+            merges[cell[i]] = 0
+        find_partners_in_cells(lanes, count, cell, place, largest, cost, best, at)
+        pairs = 0
+        for i in range(count):
+            j = i + at[i] - place[i]
+            if at[i] > place[i] and at[j] == place[i]:
+                first[pairs], second[pairs] = i, j
+                pairs += 1
+                merges[cell[i]] += 1
+        for start in range(0, pairs, GROUP):
+            some = min(GROUP, pairs - start)
+            for column in range(WIDTH):
+                for k in range(some):
+                    a[column * GROUP + k] = lanes[column, first[start + k]]
+                    b[column * GROUP + k] = lanes[column, second[start + k]]
+            unite(a, b)
+            for column in range(WIDTH):
+                for k in range(some):
+                    lanes[column, first[start + k]] = a[column * GROUP + k]
+        for i in range(count):
+            kept[i] = i
+        for pair in range(pairs):
+            i, j = first[pair], second[pair]
+            joined[slot[j]] = slot[i]
+            members[slot[i]] += members[slot[j]]
+            kept[j] = -1
+        left = 0
+        for i in range(count):
+            if kept[i] < 0:
+                continue
+            if merges[cell[i]] > 0 and turn < ROUNDS - 1:
+                cell[left], slot[left], kept[left] = cell[i], slot[i], i
+                left += 1
+                continue
+            # Without a merge, its cell would not change in another round.
+            trace = lanes[COVARIANCE, i] + lanes[COVARIANCE + 1, i] + lanes[COVARIANCE + 2, i]
+            many = members[slot[i]]
+            if many >= LEAST_CHILDREN or (many > 1 and trace <= PATIENCE * largest):
+                finish_row(lanes, i, rows[made + families])
+                row[begin + slot[i]] = made + families
+                families += 1
+            else:
+                members[slot[i]] = 0
+        for column in range(WIDTH):
+            for i in range(left):
+                lanes[column, i] = lanes[column, kept[i]]
+        count = left
+    for i in range(size):
+        joined[i] = joined[joined[i]]  # final, as it comes before
+        owner[begin + i] = begin + (joined[i] if members[joined[i]] > 0 else i)
+
+
+@kernel(parallel=True)
+def merge_in_cells(nodes, is_first, rows, largest, made):
+    """Merges nodes with others of their cell, and fills the rows of the nodes that become parents.
+
+    Args:
+        nodes: (n,) uint32 rows, by cell and then along a curve.
+        is_first: (n,) bool, true where a cell begins.
+        rows: node rows; up to n // 2 of them, from `made` on, are filled.
+        largest: float32, largest trace of the covariance of a merged node, units squared.
+        made: the first row to fill.
+
+    Returns:
+        owner: (n,) int64, the place in `nodes` of the first member of each node's family, or its own.
+        row: (n,) uint32, the row of each family, at the place of its first member.
+    """
+    n = len(nodes)
+    owner, row = np.empty(n, np.int64), np.zeros(n, np.uint32)
+    for span in prange((n + SPAN - 1) // SPAN):
+        begin, end = span * SPAN, min(n, span * SPAN + SPAN)
+        while begin < end and not is_first[begin]:
+            begin += 1
+        if begin < end:
+            while end < n and not is_first[end]:
+                end += 1
+            merge_span(nodes, is_first, rows, largest, begin, end, made, owner, row)
+    return owner, row
+
+
+@kernel()
+def split_families(nodes, owner, row):
+    """Separates the members of families from the nodes that are left as they are.
+
+    Args:
+        nodes: (n,) uint32 rows.
+        owner, row: of `merge_in_cells`.
+
+    Returns:
+        members: (C,) uint32, the members of one family after the other, in the order of their first members.
+        first: (F + 1,) int64, where each family begins in `members`.
+        made: (F,) uint32 rows of the families.
+        survivors: (S,) uint32, the nodes without a parent: a family's node replaces the first of its members.
+    """
+    n = len(nodes)
+    size = np.zeros(n, np.int64)
+    for i in range(n):
+        size[owner[i]] += 1
+    begin = np.empty(n, np.int64)
+    used = families = left = 0
+    for i in range(n):
+        left += size[i] > 0
+        if size[i] > 1:
+            begin[i] = used
+            used += size[i]
+            families += 1
+    members, first = np.empty(used, np.uint32), np.zeros(families + 1, np.int64)
+    made, survivors = np.empty(families, np.uint32), np.empty(left, np.uint32)
+    family = survivor = 0
+    for i in range(n):
+        own = owner[i]
+        if size[own] > 1:
+            members[begin[own]] = nodes[i]
+            begin[own] += 1
+        if own == i:
+            survivors[survivor] = nodes[i]
+            if size[i] > 1:
+                survivors[survivor] = made[family] = row[i]
+                family += 1
+                first[family] = first[family - 1] + size[i]
+            survivor += 1
+    return members, first, made, survivors
