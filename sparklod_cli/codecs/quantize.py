@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..model.gaussian import normalized_quat
-from ..model.sh import SH_C0
+from ..model.sh import COEFFICIENTS, SH_C0
 from ..model.splats import FloatArray
 
 Bytes = NDArray[np.uint8]
@@ -22,8 +22,8 @@ SCALE_STEPS, SCALE_OFFSET = 16, 10
 #: Bytes of colours, as SPZ defines them: an SH DC coefficient is multiplied by this, around one half.
 COLOR_GAIN = 0.15
 
-#: Upper bits kept of the SH bytes of each degree, as Niantic's library writes them.
-SH_BITS = (5, 4, 4)
+#: Fewest bits kept of the SH bytes of all degrees but the first, and of the first, as Niantic's library writes them.
+LEAST_SH_BITS, LEAST_SH_BITS_1 = 4, 5
 
 #: Largest code of signed 24-bit fixed point.
 FIXED24_MAX = 2**23 - 1
@@ -153,17 +153,22 @@ def decode_color(codes: Bytes) -> FloatArray:
     return (codes.astype(np.float32) / 255 - np.float32(0.5)) * np.float32(SH_C0 / COLOR_GAIN) + np.float32(0.5)
 
 
-def encode_sh(sh: FloatArray) -> Bytes:
-    """(N, K, 3) coefficients to bytes, rounded to the middle of buckets of 8 or 16 codes; the range is -1..0.99."""
-    degree = np.repeat([0, 1, 2], [3, 5, 7])[: sh.shape[1]]
-    bucket = (2.0 ** (8 - np.array(SH_BITS)))[degree].astype(np.float32)[:, None]
+def encode_sh(sh: FloatArray, bits: int = LEAST_SH_BITS) -> Bytes:
+    """(N, K, 3) coefficients to bytes, rounded to multiples of 2 ** (8 - bits) codes; the range is -1..0.99.
+
+    Args:
+        sh: coefficients.
+        bits: upper bits kept of each byte, `LEAST_SH_BITS` to 8; degree 1 keeps `LEAST_SH_BITS_1` at least. The codes of
+            fewer bits are among those of more.
+    """
+    first = np.arange(sh.shape[1]) < COEFFICIENTS[1]
+    bucket = np.exp2(8 - np.where(first, max(bits, LEAST_SH_BITS_1), bits)).astype(np.float32)[:, None]
     with np.errstate(over="ignore"):
-        codes = np.rint(sh * 128) + 128
-        return _to_byte(np.floor((codes + bucket / 2) / bucket) * bucket)
+        return _to_byte(np.rint(sh * (128 / bucket)) * bucket + 128)
 
 
 def decode_sh(codes: Bytes) -> FloatArray:
-    """Largest error inside the range: 1 / 32 + 1 / 256 for degree 1, 1 / 16 + 1 / 256 above."""
+    """Largest error inside the range, of `LEAST_SH_BITS`: 1 / 32 for degree 1, 1 / 16 above; half for each bit more."""
     return (codes.astype(np.float32) - 128) / 128
 
 
