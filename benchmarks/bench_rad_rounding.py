@@ -14,7 +14,8 @@ from pathlib import Path
 
 import numpy as np
 from bench_build import machine
-from bench_fidelity import cameras_around, count_of, difference, head, line
+from fidelity_report import head, line
+from fidelity_views import cameras_of, count_of, difference
 from scenes import load
 
 import sparklod_cli as sparklod
@@ -99,7 +100,7 @@ FILES = (
 def measure(path: Path, method: str, size: tuple[int, int], views: int) -> None:
     """Prints a row for each way."""
     tree = sparklod.build_lod(sparklod.Scene(load(path)), method=method)
-    every = cameras_around(tree)
+    every = cameras_of("around", tree)
     cameras = [resized(camera, size) for camera in every[:: max(1, len(every) // views)]][:views]
     leaves = int(np.count_nonzero(tree.tree.is_leaf))
     settings = sparklod.LodSettings(foveation=sparklod.Cones(), pixel_scale_limit=0.0)

@@ -11,7 +11,8 @@ from pathlib import Path
 
 import numpy as np
 from bench_build import machine
-from bench_fidelity import Image, cameras_around, head, line
+from fidelity_report import head, line
+from fidelity_views import Image, cameras_of
 from numpy.typing import NDArray
 
 import sparklod_cli as sparklod
@@ -119,7 +120,7 @@ def main() -> None:
         print("\nPSNR of cuts with a palette against the same cuts without, in dB, means of the cameras:\n")
         head(["scene", "codes", "weights", *(f"{share:.0%}" for share in BUDGETS)])
         for path, (scene, tree) in trees.items():
-            cameras = cameras_around(scene)[::3]
+            cameras = cameras_of("around", scene)[::3]
             full = pictures(tree, cameras, len(scene))
             for count in arguments.codes:
                 for name, weight in (("equal", None), ("as seen", visible_weight(tree.splats))):

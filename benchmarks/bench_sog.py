@@ -13,7 +13,8 @@ from pathlib import Path
 
 import numpy as np
 from bench_build import machine
-from bench_fidelity import Image, cameras_around, difference, head, line
+from fidelity_report import head, line
+from fidelity_views import Image, cameras_of, difference
 from numpy.typing import NDArray
 from scenes import load, write_ply
 
@@ -70,7 +71,7 @@ def measure(path: Path, arguments: argparse.Namespace, folder: Path) -> None:
     source = folder / "source.ply"
     write_ply(source, splats)
     scene = sparklod.read(source)
-    cameras = cameras_around(scene)[:: arguments.every]
+    cameras = cameras_of("around", scene)[:: arguments.every]
     full = pictures(scene, cameras)
     ways: dict[str, Callable[[Path, Path], None]] = {"splat-transform": splat_transform, "ours": ours}
     seconds: dict[str, list[float]] = {name: [] for name in ways}

@@ -3,7 +3,8 @@
 // each run.
 //
 // BUILDER is "tiny" (base 1.5; the default) or "quality" (the Bhattacharyya builder, base 1.75). FOLDER receives the tree as
-// raw files of uint32, four a node: ext0.u32 and ext1.u32, its ExtSplats, and lod_tree.u32.
+// raw files of uint32, four a node: ext0.u32 and ext1.u32, its ExtSplats, lod_tree.u32, and where there are spherical
+// harmonics sh1.u32, sh2.u32, sh3a.u32 and sh3b.u32.
 import fs from 'node:fs';
 import path from 'node:path';
 import vm from 'node:vm';
@@ -37,7 +38,9 @@ send({ name: 'init-wasm', module: await WebAssembly.compile(wasm) });
 await new Promise((resolve) => setTimeout(resolve, 300));
 
 function keep({ numSplats, extArrays, extra }) {
-  for (const [name, words] of Object.entries({ ext0: extArrays[0], ext1: extArrays[1], lod_tree: extra.lodTree }))
+  const { sh1, sh2, sh3a, sh3b } = extra;
+  const arrays = { ext0: extArrays[0], ext1: extArrays[1], lod_tree: extra.lodTree, sh1, sh2, sh3a, sh3b };
+  for (const [name, words] of Object.entries(arrays).filter(([, words]) => words))
     fs.writeFileSync(path.join(folder, `${name}.u32`), words.subarray(0, 4 * numSplats)); // Spark allocates more rows than it uses
 }
 

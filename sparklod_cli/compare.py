@@ -3,11 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from .cameras.path import CameraPath
-from .images.metrics import check_covered, on_background, psnr, ssim, worst_tile
+from .images.metrics import (
+    BACKGROUNDS,
+    Mask,
+    check_covered,
+    edge_psnr,
+    edges,
+    on_background,
+    popping,
+    psnr,
+    ssim,
+    worst_tile,
+)
 from .io import write_whole
 from .lod.budget import Budget
 from .lod.settings import LodSettings
@@ -26,6 +37,25 @@ from .tables.statistics import numbers
 
 #: Threads that measure pictures; each has a few that wait, which take memory.
 MEASURERS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Pictures:
+    """A cut's picture and that of full detail, of one camera.
+
+    Attributes:
+        row: what is known of them so far.
+        image, full: (H, W, 4) of the cut and of full detail.
+        edges: (H, W) where full detail has edges.
+        before: the pictures, of the same budget, that they follow in a movement; None for the first. Those have no
+            `before`, so that no more than two frames are kept.
+    """
+
+    row: Row
+    image: Image
+    full: Image
+    edges: Mask
+    before: Pictures | None
 
 
 class Comparison:
@@ -69,23 +99,26 @@ class Comparison:
     def run(self, path: CameraPath, *, threads: int = 1, progress: Progress = silent) -> Iterator[Row]:
         """Rows of `tables.comparison.COLUMNS`: for each camera one for each budget.
 
+        Cells of `popping` are empty where a camera does not follow the one before it (`CameraPath.follows`).
+
         Pictures are drawn one after the other, each on all the threads; meanwhile others are measured.
 
         Raises:
             SparklodError: full detail covers no pixel of a frame.
         """
         total = len(path.cameras) * len(self.counts)
-        for at, row in enumerate(ordered_map(_measured, self._pictures(path, threads), min(threads, MEASURERS))):
+        for at, row in enumerate(ordered_map(measured, self._pictures(path, threads), min(threads, MEASURERS))):
             progress("compare", at + 1, total, "picture")
             yield row
 
-    def _pictures(self, path: CameraPath, threads: int) -> Iterator[tuple[Row, Image, Image]]:
-        """What is known of a row, its picture, and that of full detail."""
-        for number, camera in zip(path.numbers, path.cameras, strict=True):
+    def _pictures(self, path: CameraPath, threads: int) -> Iterator[Pictures]:
+        last: list[Pictures] = []
+        for at, (number, camera) in enumerate(zip(path.numbers, path.cameras, strict=True)):
             with on_threads(threads):
                 full = self._full.draw(camera).image
             check_covered(full, f"full detail in frame {number}")
-            for count, renderer in zip(self.counts, self._cuts, strict=True):
+            where, follows, frame = edges(full), path.follows(at), []
+            for which, (count, renderer) in enumerate(zip(self.counts, self._cuts, strict=True)):
                 with on_threads(threads):
                     drawn = renderer.draw(camera)
                 row: Row = {
@@ -96,21 +129,31 @@ class Comparison:
                     "share": count / self.leaves,
                     "selected": drawn.splats,
                 }
-                yield row, drawn.image, full
+                before = replace(last[which], before=None) if follows else None
+                frame.append(Pictures(row, drawn.image, full, where, before))
+                yield frame[-1]
+            last = frame
 
 
-def _measured(picture: tuple[Row, Image, Image]) -> Row:
-    row, image, full = picture
+def measured(pictures: Pictures) -> Row:
+    """The row of a comparison: what was known of the pictures, and how far they are apart."""
+    row, before = pictures.row, pictures.before
     tiles = []
-    for name, gray in (("black", 0.0), ("white", 1.0)):
-        a, b = on_background(image, gray), on_background(full, gray)
+    for name, gray in BACKGROUNDS.items():
+        a, b = on_background(pictures.image, gray), on_background(pictures.full, gray)
         row[f"psnr_{name}"], row[f"ssim_{name}"] = psnr(a, b), ssim(a, b)
+        row[f"edge_psnr_{name}"] = edge_psnr(a, b, pictures.edges)
+        row[f"popping_{name}"] = None
+        if before is not None:
+            earlier = on_background(before.image, gray), on_background(before.full, gray)
+            row[f"popping_{name}"] = popping(a, b, *earlier)
         tiles.append(worst_tile(a, b))
-    for name in ("psnr", "ssim"):
-        row[name] = sum(numbers([row], f"{name}_black") + numbers([row], f"{name}_white")) / 2
+    for name in ("psnr", "ssim", "edge_psnr", "popping"):
+        values = numbers([row], f"{name}_black") + numbers([row], f"{name}_white")
+        row[name] = sum(values) / len(values) if values else None
     worst = min(tiles, key=lambda tile: tile.psnr)
     row |= {"worst_tile_psnr": worst.psnr, "worst_tile_x": worst.x, "worst_tile_y": worst.y}
-    return {column.name: column.rounded(row[column.name]) for column in COLUMNS}
+    return {column.name: column.rounded(row.get(column.name)) for column in COLUMNS}
 
 
 def write_charts(target: Path, rows: Sequence[Row], budgets: Sequence[Budget], title: str, *, overwrite: bool) -> None:

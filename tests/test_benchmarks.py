@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
+import json
 import subprocess
 import sys
+from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
 from tests.conftest import ROOT
@@ -35,3 +40,84 @@ def test_the_model_of_workers_keeps_to_what_tasks_need(workers: int, seconds: fl
     blocks = [{"name": f"block/{number}", "needs": needs, "seconds": 4} for number in range(2)]
     join = {"name": "join", "needs": ["block/0", "block/1", "unknown"], "seconds": 2}
     assert report.makespan([*parts, *blocks, join], workers) == seconds
+
+
+@pytest.fixture
+def benchmark_module(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Imports a module of the benchmarks by its name."""
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    return importlib.import_module
+
+
+#: By budget, what pictures of a tree come to.
+FIGURES: dict[str, dict[str, float | None]] = {
+    "2%": {"psnr": 20.0, "ssim": 0.5, "edge_psnr": None, "popping": None, "popping_max": None},
+    "5%": {"psnr": 30.0, "ssim": 0.75, "edge_psnr": 15.0, "popping": 2.0, "popping_max": 3.0},
+}
+
+
+def record(*cameras: str) -> dict[str, Any]:
+    """What `bench_fidelity.py` writes of two builders of one scene, the second of which has 1 more in every figure."""
+    views = dict.fromkeys(cameras, FIGURES)
+    more = {budget: {name: value and value + 1 for name, value in each.items()} for budget, each in FIGURES.items()}
+    methods = {
+        "spark-quality": {"nodes": 30, "leaves": 20, "seconds": [4.0], "views": views},
+        "quality": {"nodes": 28, "leaves": 20, "seconds": [3.0, 2.0, 1.0], "views": dict.fromkeys(cameras, more)},
+    }
+    settings = {"machine": "a machine", "size": [8, 8], "budgets": ["2%", "5%"], "budgets_of_paths": ["5%"]}
+    return settings | {"cameras": list(cameras), "moving": ["orbit"], "scenes": {"a.ply": methods}}
+
+
+def test_tables_of_fidelity_say_what_was_measured(benchmark_module: Any) -> None:
+    told = benchmark_module("fidelity_report").tables(record("around", "near", "orbit"))
+    assert set(told) == {"builders", "differences", "edges", "ssim", "cameras", "popping"}
+    assert "| a.ply | Spark quality | 1.50 | 20.00 | 30.00 | 4.000 |" in told["builders"]
+    assert "| a.ply | our quality | 1.40 | 21.00 | 31.00 | 2.000 |" in told["builders"]
+    assert told["differences"].endswith("| a.ply | our quality - Spark quality | +1.00 | +1.00 | 2.00x |")
+    assert "| a.ply | Spark quality |  | 15.00 |" in told["edges"]
+    assert "| a.ply | near | our quality - Spark quality | +1.00 | +1.00 |" in told["cameras"]
+    assert "| a.ply | our quality | 3.00 / 4.00 |" in told["popping"]
+
+
+def test_tables_of_fidelity_go_between_their_marks(benchmark_module: Any, tmp_path: Path) -> None:
+    report = benchmark_module("fidelity_report")
+    page = tmp_path / "page.md"
+    page.write_text("before\n<!-- table: ssim -->\nold\n<!-- end of table -->\nafter\n")
+    report.put_into(page, {"ssim": "| new |"})
+    assert page.read_text() == "before\n<!-- table: ssim -->\n| new |\n<!-- end of table -->\nafter\n"
+    with pytest.raises(SystemExit, match="no place for the table 'edges'"):
+        report.put_into(page, {"edges": "| new |"})
+
+
+def test_the_page_about_fidelity_has_a_place_for_every_table(benchmark_module: Any, tmp_path: Path) -> None:
+    report = benchmark_module("fidelity_report")
+    page = tmp_path / "fidelity.md"
+    page.write_text((ROOT / "docs" / "fidelity.md").read_text())
+    told = report.tables(record("around", "near", "orbit", "around SH"))
+    assert len(told) == 8
+    report.put_into(page, told)
+    assert all(table in page.read_text() for table in told.values())
+
+
+def test_records_of_several_runs_add_up(benchmark_module: Any, tmp_path: Path) -> None:
+    for name, cameras in (("a.json", ("around", "orbit")), ("b.json", ("near",))):
+        (tmp_path / name).write_text(json.dumps(record(*cameras)))
+    whole = benchmark_module("fidelity_report").merged([tmp_path / "a.json", tmp_path / "b.json"])
+    assert set(whole["scenes"]["a.ply"]["quality"]["views"]) == {"around", "orbit", "near"}
+    assert whole["cameras"] == ["around", "orbit", "near"]
+
+
+def test_the_scene_of_thin_things_is_the_same_for_a_seed_and_thin(benchmark_module: Any) -> None:
+    make = benchmark_module("fine_structure").fine_structure
+    splats, again, other = make(), make(), make(1)
+    assert 50_000 < len(splats) < 150_000
+    for name in ("center", "scale", "quat_xyzw", "opacity", "rgb"):
+        column = getattr(splats, name)
+        assert np.isfinite(column).all()
+        assert (column == getattr(again, name)).all()
+    assert len(other) != len(splats) or (other.center != splats.center).any()
+    assert np.allclose(np.linalg.norm(splats.quat_xyzw, axis=1), 1, atol=1e-6)
+    assert splats.scale.min() > 0
+    assert 0 < splats.opacity.min() <= splats.opacity.max() < 1
+    ratio = splats.scale.max(axis=1) / splats.scale.min(axis=1)
+    assert np.mean(ratio > 3) > 0.5, "most splats are far longer than wide"

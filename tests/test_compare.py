@@ -14,12 +14,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import sparklod_cli as sparklod
 from sparklod_cli import bake
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.cameras.path import CameraPath
 from sparklod_cli.cameras.pose import look_at
 from sparklod_cli.cli import run as program
-from sparklod_cli.compare import Comparison
+from sparklod_cli.compare import Comparison, measured
 from sparklod_cli.images.metrics import MOST_PSNR, on_background
 from sparklod_cli.lod.budget import parse_budgets
 from sparklod_cli.lod.settings import LodSettings
@@ -77,13 +78,14 @@ def test_a_budget_of_all_splats_is_full_detail(twice: Scenes) -> None:
     for row in rows(twice, "100%,150%,1M"):
         assert row["psnr_black"] == row["psnr_white"] == row["psnr"] == row["worst_tile_psnr"] == MOST_PSNR
         assert row["ssim_black"] == row["ssim_white"] == row["ssim"] == 1
+        assert row["edge_psnr_black"] == row["edge_psnr_white"] == row["edge_psnr"] == MOST_PSNR
     for row in rows(twice, "100%", lod=dataclasses.replace(LOD, continuous=1.25)):
         assert (row["psnr"], row["ssim"]) == (MOST_PSNR, 1)
 
 
 def test_larger_budgets_come_nearer_to_full_detail(twice: Scenes) -> None:
     table = rows(twice, "5%,15%,40%,80%")
-    for name in ("psnr", "ssim"):
+    for name in ("psnr", "ssim", "edge_psnr"):
         means = [np.mean(column(group, name)) for group in rows_by_budget(table, 4)]
         assert means == sorted(means)
         assert means[0] < means[-1]
@@ -104,8 +106,73 @@ def test_rows_tell_what_was_drawn(twice: Scenes, width: float | None) -> None:
         assert selected <= budget if width is None else budget <= selected <= 4 * budget
         assert psnr == pytest.approx(np.mean([row["psnr_black"], row["psnr_white"]]), abs=1e-3)
         assert row["ssim"] == pytest.approx(np.mean([row["ssim_black"], row["ssim_white"]]), abs=1e-5)
+        assert row["edge_psnr"] == pytest.approx(np.mean([row["edge_psnr_black"], row["edge_psnr_white"]]), abs=1e-3)
+        assert row["edge_psnr"] < psnr, "edges differ most"
         assert row["worst_tile_psnr"] <= min(row["psnr_black"], row["psnr_white"]) + 1e-3
         assert row["worst_tile_x"] in (0, 64) and row["worst_tile_y"] in (0, 64)
+
+
+def film(count: int, step: float, *, size: tuple[int, int] = (96, 70), jump: int = -1) -> CameraPath:
+    """Cameras in steps of so many radians around the scene; from one on, they stand opposite."""
+    cameras = []
+    for at in range(count):
+        turn = step * at + math.pi * (jump >= 0 and at >= jump)
+        pose = look_at((1.5 + 6 * math.sin(turn), -1.0, -6 * math.cos(turn)), (1.5, 0, 0.5), (0.0, -1.0, 0.0))
+        cameras.append(Camera(pose, *size, (80.0, 80.0), (size[0] / 2, size[1] / 2), at / 10))
+    return CameraPath(tuple(cameras), "a test", (), tuple(range(count)))
+
+
+def popped(scenes: Scenes, budgets: str, path: CameraPath, *, threads: int = 1) -> list[list[Any]]:
+    """The popping of each budget."""
+    given = parse_budgets(budgets)
+    table = list(Comparison(scenes, LOD, given, RENDER).run(path, threads=threads))
+    return [column(group, "popping") for group in rows_by_budget(table, len(given))]
+
+
+def test_full_detail_does_not_pop(twice: Scenes) -> None:
+    coarse, full = popped(twice, "10%,100%", film(4, 0.05))
+    assert full == [None, 0, 0, 0]
+    assert coarse[0] is None
+    assert min(coarse[1:]) > 0
+
+
+def test_a_camera_that_stands_still_sees_no_popping(twice: Scenes) -> None:
+    assert popped(twice, "10%", film(3, 0.0)) == [[None, 0, 0]]
+
+
+def test_a_change_of_the_cut_pops_by_what_it_changes(twice: Scenes) -> None:
+    """Two frames of one camera, but of different budgets: what differs are the pictures of the two cuts."""
+    path = film(2, 0.0)
+    coarse, fine = (Comparison(twice, LOD, parse_budgets(text), RENDER) for text in ("10%", "40%"))
+    (first, _), (_, second) = (list(each._pictures(path, 1)) for each in (coarse, fine))
+    changed = dataclasses.replace(second, before=first)
+    both = (on_background(first.image, gray) - on_background(second.image, gray) for gray in (0.0, 1.0))
+    by_hand = 255 * np.mean([math.sqrt((change.astype(np.float64) ** 2).mean()) for change in both])
+    assert measured(changed)["popping"] == pytest.approx(by_hand, abs=1e-4)
+    assert by_hand > 1
+
+
+def test_only_frames_that_follow_each_other_pop(twice: Scenes) -> None:
+    (values,) = popped(twice, "10%", film(6, 0.05, jump=3))
+    assert [value is None for value in values] == [True, False, False, True, False, False]
+    assert popped(twice, "10%", path_of(3)) == [[None] * 3], "views around a scene"
+
+
+def test_popping_does_not_depend_on_threads(twice: Scenes) -> None:
+    assert popped(twice, "10%,50%", film(5, 0.05)) == popped(twice, "10%,50%", film(5, 0.05), threads=3)
+
+
+def test_summaries_leave_empty_cells_out(twice: Scenes) -> None:
+    table = list(Comparison(twice, LOD, parse_budgets("10%,50%"), RENDER).run(film(3, 0.05)))
+    for at, each in enumerate(summarize(table, ["10%", "50%"])):
+        values = column(table[at::2], "popping")[1:]
+        assert (each.popping, each.popping_max) == (pytest.approx(np.mean(values)), max(values))
+        assert each.popping_frame == 1 + values.index(max(values))
+        assert each.edge_psnr == pytest.approx(np.mean(column(table[at::2], "edge_psnr")))
+        assert each.edge_psnr_min == min(column(table[at::2], "edge_psnr"))
+    empty = [row | {"popping": None, "edge_psnr": None} for row in table]
+    for each in summarize(empty, ["10%", "50%"]):
+        assert each.popping is each.popping_max is each.popping_frame is each.edge_psnr is each.edge_psnr_min is None
 
 
 def test_threads_do_not_change_a_comparison(twice: Scenes) -> None:
@@ -203,6 +270,39 @@ def test_assertions_about_missing_columns_or_budgets_are_refused(
     status, out, err = run(capsys, "--assert", text)
     assert (status, out) == (2, "")
     assert message in err
+
+
+def test_popping_is_said_and_asserted_along_a_path(capsys: pytest.CaptureFixture[str]) -> None:
+    film = ("render", TREE, "--dolly", "--seconds", 0.2, "--size", "96x70", "--compare", "--budget", "2%,50%")
+    asserts = ("--assert", "2%:popping_max>0.01", "--assert", "popping<0.001", "--assert", "edge_psnr_min>1")
+    assert program([*map(str, film), "--json", *asserts]) == 3
+    out, err = capsys.readouterr()
+    summary = json.loads(out)
+    assert [each["held"] for each in summary["asserts"]] == [True, False, True]
+    assert 0 < summary["budgets"][1]["popping"] < summary["budgets"][0]["popping"]
+    assert err.splitlines()[1].split()[:8] == ["budget", "splats", "PSNR", "least", "SSIM", "edges", "popping", "most"]
+    assert max(map(len, err.splitlines()[:4])) <= 100
+
+
+def test_an_assertion_about_popping_of_single_views_says_why_there_is_none(capsys: pytest.CaptureFixture[str]) -> None:
+    status, _, err = run(capsys, "--assert", "popping<1")
+    assert status == 1
+    assert "popping is empty" in err and "turns" in err
+
+
+def test_a_scene_without_edges_has_no_psnr_of_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A haze: splats so faint that nothing in the picture is steep."""
+    scene = sparklod.read(FIXTURES / "sh3.ply")
+    faint = dataclasses.replace(scene.splats, opacity=scene.splats.opacity * np.float32(0.01))
+    sparklod.write(tmp_path / "haze.spz", sparklod.build_lod(sparklod.Scene(faint)))
+    asserts = ("--assert", "edge_psnr>1")
+    command = ("render", tmp_path / "haze.spz", "--size", "96x70", "--compare", "--budget", "10%")
+    assert program([*map(str, command)]) == 0
+    said = capsys.readouterr()
+    assert [row["edge_psnr"] for row in csv.DictReader(io.StringIO(said.out))] == [""]
+    assert said.err.splitlines()[-1].split()[5] == "-"
+    assert program([*map(str, command), *asserts]) == 1
+    assert "edge_psnr is empty: full detail has no edges" in capsys.readouterr().err
 
 
 def test_a_chart_of_a_comparison_is_a_picture(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

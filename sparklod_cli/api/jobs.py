@@ -201,7 +201,7 @@ def compare_files(
     """
     from ..compare import Comparison, write_charts
     from ..tables.assertions import check
-    from ..tables.comparison import rows_by_budget, summarize
+    from ..tables.comparison import EMPTY, rows_by_budget, summarize
 
     scenes = files.read(trees_only=True)
     path = files.path(lambda: scenes)
@@ -225,7 +225,7 @@ def compare_files(
     if plot is not None:
         write_charts(plot, rows, budgets, scenes.title, overwrite=overwrite)
     groups = rows_by_budget(rows, len(budgets))
-    outcomes = [each for at, what in asserts for each in check([what], rows if at is None else groups[at])]
+    outcomes = [each for at, what in asserts for each in check([what], rows if at is None else groups[at], empty=EMPTY)]
     summary = summarize(rows, [budget.text for budget in budgets])
     return Compared(len(rows), path, comparison.leaves, summary, outcomes)
 

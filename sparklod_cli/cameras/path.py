@@ -30,6 +30,10 @@ GENERATED = {
 }
 
 
+#: Most that a camera turns from one frame of a movement to the next, degrees: a quarter of the default field of view.
+MOST_TURN = 15.0
+
+
 @dataclass(frozen=True, repr=False)
 class CameraPath:
     """Cameras in the order of a path.
@@ -54,6 +58,22 @@ class CameraPath:
 
     def __getitem__(self, index: int) -> Camera:
         return self.cameras[index]
+
+    def follows(self, index: int) -> bool:
+        """Whether a camera goes on from where the one before it was, as frames of a movement do.
+
+        It does if its time is later, its picture has the same size, and it is turned by no more than `MOST_TURN`.
+        Cameras of single views have no times of their own, and those around an object are turned by more.
+        """
+        if index == 0:
+            return False
+        before, camera = self.cameras[index - 1], self.cameras[index]
+        turn = before.camera_to_world[:3, :3].T @ camera.camera_to_world[:3, :3]
+        return (
+            camera.time > before.time
+            and (camera.width, camera.height) == (before.width, before.height)
+            and (float(np.trace(turn)) - 1) / 2 >= math.cos(math.radians(MOST_TURN))
+        )
 
     def __repr__(self) -> str:
         return f"CameraPath({len(self.cameras):,} camera{'s' * (len(self.cameras) != 1)} of {self.format})"

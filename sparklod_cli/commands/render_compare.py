@@ -129,14 +129,21 @@ def _report(console: Console, asked: RenderOptions, compared: Compared, about: S
 
 
 def lines(summary: Sequence[BudgetSummary], path: CameraPath, leaves: int) -> Iterator[str]:
-    """The summary as a person reads it."""
+    """The summary as a person reads it; with popping where frames follow each other."""
     sizes = list(dict.fromkeys((camera.width, camera.height) for camera in path.cameras))
     size = f"{sizes[0][0]} x {sizes[0][1]}" + (" and others" if len(sizes) > 1 else "")
     yield f"  {count_of(len(path.cameras), 'frame')} of {size}, against {count_of(leaves, 'splat')}, on black and white"
-    yield f"  {'budget':>8} {'splats':>11} {'PSNR':>7} {'least':>7} {'SSIM':>7} {'least':>7}   worst tile"
+    pops = any(each.popping is not None for each in summary)
+    head = f" {'popping':>7} {'most':>5}" if pops else ""
+    yield f"  {'budget':>8} {'splats':>11} {'PSNR':>6} {'least':>6} {'SSIM':>6} {'edges':>6}{head}   worst tile"
     for each in summary:
+        popped = f" {_or_dash(each.popping):>7} {_or_dash(each.popping_max):>5}" if pops else ""
         yield (
-            f"  {each.text:>8} {round(each.selected):>11,} {each.psnr:>7.2f} {each.psnr_min:>7.2f}"
-            f" {each.ssim:>7.4f} {each.ssim_min:>7.4f}   {each.worst_tile_psnr:.2f}"
+            f"  {each.text:>8} {round(each.selected):>11,} {each.psnr:>6.2f} {each.psnr_min:>6.2f} {each.ssim:>6.4f}"
+            f" {_or_dash(each.edge_psnr):>6}{popped}   {each.worst_tile_psnr:.2f}"
             f" at {each.worst_tile_x}, {each.worst_tile_y} of frame {each.worst_frame:,}"
         )
+
+
+def _or_dash(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"

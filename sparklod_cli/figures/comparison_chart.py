@@ -30,7 +30,9 @@ Series = tuple[str, Sequence[Row]]
 
 
 def plot(series: Sequence[Series], title: str) -> bytes:
-    """The PNG of charts: PSNR and SSIM by budget and along the path.
+    """The PNG of charts: PSNR, SSIM and PSNR of edges by budget, PSNR, worst tile and popping along the path.
+
+    A chart of which no frame has a value, such as popping of single views, stays away.
 
     Args:
         series: one for each budget, all of the same frames.
@@ -53,14 +55,16 @@ def plot(series: Sequence[Series], title: str) -> bytes:
 
 def _charts(matplotlib: ModuleType, series: Sequence[Series]) -> NDArray[np.uint8]:
     groups = [rows for _, rows in series]
-    figure = matplotlib.figure.Figure((WIDTH / DPI, 2 * ROW / DPI), DPI, layout="constrained")
+    figure = matplotlib.figure.Figure((WIDTH / DPI, 3 * ROW / DPI), DPI, layout="constrained")
     canvas = matplotlib.backends.backend_agg.FigureCanvasAgg(figure)
     figure.get_layout_engine().set(rect=(0.012, 0.008, 0.976, 0.992), wspace=0.05, hspace=0.05)
-    grid = figure.subplots(2, 2)
+    grid = figure.subplots(3, 2)
     _by_budget(matplotlib, grid[0, 0], groups, "psnr", "PSNR by budget", "dB")
     _by_budget(matplotlib, grid[0, 1], groups, "ssim", "SSIM by budget", "")
-    _by_frame(grid[1, 0], series, "psnr", "PSNR along the path", "dB")
-    _by_frame(grid[1, 1], series, "worst_tile_psnr", "PSNR of the worst tile", "dB")
+    _by_budget(matplotlib, grid[1, 0], groups, "edge_psnr", "PSNR of edges by budget", "dB")
+    _by_frame(grid[1, 1], series, "psnr", "PSNR along the path", "dB")
+    _by_frame(grid[2, 0], series, "worst_tile_psnr", "PSNR of the worst tile", "dB")
+    _by_frame(grid[2, 1], series, "popping", "Popping along the path", "steps of 8 bits")
     canvas.draw()
     pixels: NDArray[np.uint8] = np.asarray(canvas.buffer_rgba())[..., :3].copy()
     return pixels
@@ -70,6 +74,9 @@ def _by_budget(
     matplotlib: ModuleType, axes: Axes, groups: Sequence[Sequence[Row]], name: str, title: str, unit: str
 ) -> None:
     """Mean over the frames, in all and on either background, and the range from the lowest to the highest frame."""
+    if not all(numbers(rows, name) for rows in groups):
+        axes.set_visible(False)
+        return
     groups = sorted(groups, key=lambda rows: numbers(rows, "share")[0])
     share = np.array([numbers(rows, "share")[0] for rows in groups])
     cells = np.array([numbers(rows, name) for rows in groups])
@@ -91,6 +98,9 @@ def _by_budget(
 
 def _by_frame(axes: Axes, series: Sequence[Series], name: str, title: str, unit: str) -> None:
     """One line for each budget."""
+    if not any(numbers(rows, name) for _, rows in series):
+        axes.set_visible(False)
+        return
     for at, (budget, rows) in enumerate(series):
         frames = Frames(rows)
         axes.plot(frames.x, frames.column(name), color=COLORS[at % len(COLORS)], linewidth=1.4, label=budget)

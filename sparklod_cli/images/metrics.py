@@ -1,4 +1,4 @@
-"""Differences of two images: PSNR, SSIM, and the tile that differs most."""
+"""Differences of two images: PSNR, that of edges alone, SSIM, the tile that differs most, and popping."""
 
 from __future__ import annotations
 
@@ -14,6 +14,12 @@ from ..support.errors import SparklodError
 #: (H, W, C), 0..1.
 Image = NDArray[np.floating[Any]]
 
+#: (H, W), which pixels count.
+Mask = NDArray[np.bool_]
+
+#: Grays that pictures are compared on, by name.
+BACKGROUNDS = {"black": 0.0, "white": 1.0}
+
 #: Largest PSNR, dB, which identical images get: theirs is infinite, and tables, means and assertions need a number. It
 #: is far above the 59 dB of an image rounded to 8 bits.
 MOST_PSNR = 100.0
@@ -24,6 +30,17 @@ TILE = 64
 #: SSIM as Wang, Bovik, Sheikh and Simoncelli defined it in 2004: standard deviation and width in pixels of its Gaussian
 #: window, and the constants that stabilize the division in dark and flat places, for images of 0..1.
 SIGMA, WINDOW, C1, C2 = 1.5, 11, 0.01**2, 0.03**2
+
+#: Weights of red, green and blue in the luminance that edges are found in: those of Rec. 709.
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
+
+#: Scharr's operator: a difference along one axis, smoothed by these weights along the other, which makes its length
+#: nearly the same in all directions. So scaled, a ramp that rises by g a pixel has the gradient g.
+SCHARR = (3 / 32, 10 / 32, 3 / 32)
+
+#: Least gradient of an edge, luminance a pixel. A step has half of its height on either side, so steps of a fifth of
+#: the range from black to white are edges; shades and soft textures are not.
+EDGE = 0.1
 
 #: Rows that are smoothed at a time, few enough for the processor's cache.
 STRIP = 32
@@ -74,6 +91,51 @@ def psnr(a: Image, b: Image) -> float:
         a, b: (H, W, C) of the same shape, 0..1.
     """
     return psnr_of(float(np.mean(_squared_error(a, b))))
+
+
+def edges(image: Image) -> Mask:
+    """(H, W) where a picture with premultiplied alpha has an edge, on black or on white, and the pixels around it.
+
+    An edge is a pixel whose luminance has a gradient of at least `EDGE`; the pixels around it are its eight neighbours.
+
+    Args:
+        image: (H, W, 4).
+    """
+    strong = np.zeros(image.shape[:2], bool)
+    for gray in BACKGROUNDS.values():
+        strong |= _gradient(on_background(image, gray).astype(np.float32, copy=False) @ LUMINANCE) >= EDGE
+    rows = strong.copy()
+    rows[1:] |= strong[:-1]
+    rows[:-1] |= strong[1:]
+    wide = rows.copy()
+    wide[:, 1:] |= rows[:, :-1]
+    wide[:, :-1] |= rows[:, 1:]
+    return wide
+
+
+def edge_psnr(a: Image, b: Image, where: Mask) -> float | None:
+    """PSNR in dB over some pixels alone, at most `MOST_PSNR`; None where there is no such pixel.
+
+    Args:
+        a, b: (H, W, C) of the same shape, 0..1.
+        where: (H, W) of `edges`.
+    """
+    return psnr_of(float(np.mean(_squared_error(a[where], b[where])))) if where.any() else None
+
+
+def popping(a: Image, b: Image, a_before: Image, b_before: Image) -> float:
+    """Root mean square of how much the error of a picture changes from frame to frame, in steps of 8 bits.
+
+    The error is `a - b`; its change, (a - a_before) - (b - b_before), is what changes in `a` beyond what does in `b`.
+
+    Args:
+        a, b: (H, W, C) of the same shape, 0..1: a frame, and what it should be.
+        a_before, b_before: the same of the frame before.
+    """
+    change = np.subtract(a, b, dtype=np.float64)
+    change -= a_before
+    change += b_before
+    return 255 * math.sqrt(float(np.mean(change * change)))
 
 
 def worst_tile(a: Image, b: Image, size: int = TILE) -> Tile:
@@ -139,6 +201,16 @@ def _smoothed(image: Image, taps: list[NDArray[np.float64]]) -> Image:
         for part, weight in zip(shifted[1:], weights[1:], strict=True):
             image += part * weight
     return image
+
+
+def _gradient(luminance: Image) -> Image:
+    """(H, W) length of the gradient of a picture (H, W), a pixel; beyond its borders it goes on as it ends."""
+    padded = np.pad(luminance, 1, mode="edge")
+    first, middle, last = SCHARR
+    down = first * padded[:, :-2] + middle * padded[:, 1:-1] + last * padded[:, 2:]
+    across = first * padded[:-2] + middle * padded[1:-1] + last * padded[2:]
+    length: Image = np.hypot(down[2:] - down[:-2], across[:, 2:] - across[:, :-2])
+    return length
 
 
 def _squared_error(a: Image, b: Image) -> NDArray[np.float64]:

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from ..cameras.path import MOST_TURN
 from .columns import FRAME, Column, Row
 from .statistics import numbers, statistic
 
@@ -20,10 +21,25 @@ COLUMNS = (
     Column("ssim_black", float, ".5f", "", "SSIM against full detail, both on black; 1 if they are the same"),
     Column("ssim_white", float, ".5f", "", "the same on white"),
     Column("ssim", float, ".5f", "", "mean of the two"),
+    Column("edge_psnr_black", float, ".3f", "dB", "PSNR at the edges of full detail, on black; empty if it has none"),
+    Column("edge_psnr_white", float, ".3f", "dB", "the same on white"),
+    Column("edge_psnr", float, ".3f", "dB", "mean of the two"),
     Column("worst_tile_psnr", float, ".3f", "dB", "PSNR of the tile of 64 x 64 pixels that is farthest off, on either"),
     Column("worst_tile_x", int, "", "px", "its left side"),
     Column("worst_tile_y", int, "", "px", "its upper side"),
+    Column("popping_black", float, ".4f", "8 bits", "change since the last frame beyond that of full detail, on black"),
+    Column("popping_white", float, ".4f", "8 bits", "the same on white"),
+    Column("popping", float, ".4f", "8 bits", "mean of the two; empty where a frame follows none"),
 )
+
+#: Why all cells of a column may be empty.
+EMPTY = {
+    **dict.fromkeys(
+        ("popping_black", "popping_white", "popping"),
+        f"no frame follows another; a path has times, and turns by at most {MOST_TURN:g} degrees a frame",
+    ),
+    **dict.fromkeys(("edge_psnr_black", "edge_psnr_white", "edge_psnr"), "full detail has no edges in any frame"),
+}
 
 
 @dataclass(frozen=True)
@@ -37,8 +53,11 @@ class BudgetSummary:
         selected: mean.
         psnr, psnr_min, psnr_max, psnr_black, psnr_white: dB; means but for the least and the most.
         ssim, ssim_min: mean and least.
+        edge_psnr, edge_psnr_min: dB, mean and least of the frames that have edges; None if none has.
         worst_tile_psnr: the least, dB.
         worst_frame, worst_tile_x, worst_tile_y: where that is.
+        popping, popping_max: mean and most, in steps of 8 bits; None if no frame follows another.
+        popping_frame: the frame that has the most; None as well.
     """
 
     text: str
@@ -53,10 +72,15 @@ class BudgetSummary:
     psnr_white: float
     ssim: float
     ssim_min: float
+    edge_psnr: float | None
+    edge_psnr_min: float | None
     worst_tile_psnr: float
     worst_frame: int
     worst_tile_x: int
     worst_tile_y: int
+    popping: float | None
+    popping_max: float | None
+    popping_frame: int | None
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
@@ -78,6 +102,11 @@ def _summary(text: str, rows: Sequence[Row]) -> BudgetSummary:
     def of(name: str, which: str = "mean") -> float:
         return float(f"{statistic(which, numbers(rows, name)):.9g}")
 
+    def of_some(name: str, which: str = "mean") -> float | None:
+        return of(name, which) if numbers(rows, name) else None
+
+    popped = [row for row in rows if row["popping"] is not None]
+    most = max(popped, key=lambda row: numbers([row], "popping")[0], default=None)
     worst = min(rows, key=lambda row: numbers([row], "worst_tile_psnr")[0])
     first = rows[0]
     return BudgetSummary(
@@ -93,7 +122,12 @@ def _summary(text: str, rows: Sequence[Row]) -> BudgetSummary:
         psnr_white=of("psnr_white"),
         ssim=of("ssim"),
         ssim_min=of("ssim", "min"),
+        edge_psnr=of_some("edge_psnr"),
+        edge_psnr_min=of_some("edge_psnr", "min"),
         worst_tile_psnr=of("worst_tile_psnr", "min"),
+        popping=of_some("popping"),
+        popping_max=of_some("popping", "max"),
+        popping_frame=None if most is None else int(numbers([most], "frame")[0]),
         **{
             name: int(numbers([worst], column)[0])
             for name, column in (

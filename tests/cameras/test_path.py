@@ -241,6 +241,26 @@ def test_views_of_supersplat_where_there_is_no_animation() -> None:
     assert one.cameras[0].camera_to_world[1, 1] > 0, "y is up in SuperSplat"
 
 
+@pytest.mark.parametrize(("degrees", "follows"), [(0, True), (14.9, True), (15.1, False), (180, False)])
+def test_a_camera_follows_another_if_it_turns_little(degrees: float, follows: bool) -> None:
+    turn = math.radians(degrees)
+    ahead = [[0, 0, 1], [math.sin(turn), 0, math.cos(turn)], [math.sin(turn), 0, math.cos(turn)]]
+    path = own(frames=[{"eye": [at, 0, 0], "target": [at + x, y, z]} for at, (x, y, z) in enumerate(ahead)])
+    assert [path.follows(at) for at in range(3)] == [False, follows, True]
+
+
+def test_rolls_other_sizes_and_cameras_without_later_times_do_not_follow() -> None:
+    eye: dict[str, Any] = {"eye": [0, 0, 0], "target": [0, 0, 1]}
+    for other, follows in (
+        ({"up": [0.1, -1, 0]}, True),
+        ({"up": [0.5, -1, 0]}, False),
+        ({"size": [640, 480]}, False),
+        ({"time": 0.0}, False),
+        ({"time": 0.1}, True),
+    ):
+        assert own(frames=[eye | {"time": 0.0}, eye | {"time": 1.0} | other]).follows(1) is follows, other
+
+
 def test_eye_and_target_quaternion_and_flat_matrix_give_the_same_pose() -> None:
     """Eye, target and up; position and quaternion; a flat matrix."""
     known = KNOWN[3]

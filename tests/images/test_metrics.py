@@ -7,7 +7,19 @@ import math
 import numpy as np
 import pytest
 
-from sparklod_cli.images.metrics import C1, MOST_PSNR, Tile, psnr, ssim, worst_tile
+from sparklod_cli.images.metrics import (
+    C1,
+    EDGE,
+    MOST_PSNR,
+    Tile,
+    edge_psnr,
+    edges,
+    on_background,
+    popping,
+    psnr,
+    ssim,
+    worst_tile,
+)
 
 
 def pictures(height: int = 45, width: int = 37, noise: float = 0.1, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -120,3 +132,89 @@ def test_a_tile_at_the_edge_counts_its_own_pixels_alone() -> None:
 def test_the_worst_tile_of_the_same_image_is_the_first() -> None:
     a, _ = pictures()
     assert worst_tile(a, a) == Tile(MOST_PSNR, 0, 0)
+
+
+def covered(gray: np.ndarray, alpha: float | np.ndarray = 1.0) -> np.ndarray:
+    """(H, W, 4) a picture of grays (H, W), premultiplied."""
+    alpha = np.broadcast_to(alpha, gray.shape)
+    return np.dstack([*[gray * alpha] * 3, alpha]).astype(np.float32)
+
+
+def edges_as_written(image: np.ndarray) -> np.ndarray:
+    """Scharr's operator at each pixel, on both backgrounds, and the neighbours of what is strong."""
+    kernel = np.array([[-3, 0, 3], [-10, 0, 10], [-3, 0, 3]]) / 32
+    height, width = image.shape[:2]
+    found = np.zeros((height, width), bool)
+    for gray in (0.0, 1.0):
+        light = np.pad(on_background(image, gray).astype(np.float64) @ [0.2126, 0.7152, 0.0722], 1, mode="edge")
+        for y in range(height):
+            for x in range(width):
+                near = light[y : y + 3, x : x + 3]
+                found[y, x] |= math.hypot((near * kernel).sum(), (near * kernel.T).sum()) >= EDGE
+    wide = np.zeros_like(found)
+    for y, x in np.argwhere(found):
+        wide[max(y - 1, 0) : y + 2, max(x - 1, 0) : x + 2] = True
+    return wide
+
+
+def test_edges_are_where_the_formula_has_them() -> None:
+    rng = np.random.default_rng(1)
+    image = covered(*rng.uniform(0, 1, (2, 30, 41)).round(1) * (rng.uniform(size=(2, 30, 41)) < 0.1))
+    found = edges(image)
+    assert (found == edges_as_written(image)).all()
+    assert 0.2 < found.mean() < 0.9
+
+
+@pytest.mark.parametrize("height", [0.19, 0.21])
+def test_steps_of_a_fifth_of_the_range_are_edges(height: float) -> None:
+    image = np.full((20, 30), 0.4)
+    image[:, 15:] += height
+    for turned in (image, image.T):
+        where = edges(covered(turned))
+        along = where if turned is image else where.T
+        assert along.any(axis=0).nonzero()[0].tolist() == ([] if height < 0.2 else [13, 14, 15, 16])
+
+
+def test_a_slope_is_an_edge_where_it_is_steep_in_any_direction() -> None:
+    y, x = np.mgrid[:60, :60] / 1.0
+    for angle in np.linspace(0, math.pi, 9):
+        ramp = math.cos(angle) * x + math.sin(angle) * y
+        for slope, strong in ((0.98, False), (1.02, True)):
+            light = 0.5 + slope * EDGE * (ramp - ramp.mean())
+            inside = edges(covered(np.clip(light, 0, 1)))[(light > 0.2) & (light < 0.8)]
+            assert inside.all() if strong else not inside.any(), angle
+
+
+def test_a_silhouette_is_an_edge_on_either_background() -> None:
+    """White splats have none on white, but do on black."""
+    alpha = np.zeros((20, 20))
+    alpha[5:15, 5:15] = 1
+    for gray in (0.0, 1.0):
+        assert edges(covered(np.full((20, 20), gray), alpha))[4, 10]
+
+
+def test_psnr_of_edges_counts_their_pixels_alone() -> None:
+    a, b = pictures()
+    where = np.zeros(a.shape[:2], bool)
+    assert edge_psnr(a, b, where) is None
+    where[10:20, 5:9] = True
+    assert edge_psnr(a, b, where) == pytest.approx(psnr(a[10:20, 5:9], b[10:20, 5:9]))
+    assert edge_psnr(a, a, where) == MOST_PSNR
+    assert edge_psnr(a, b, ~np.zeros_like(where)) == pytest.approx(psnr(a, b))
+
+
+def test_popping_is_the_change_of_the_error() -> None:
+    a, b = pictures(seed=1)
+    c, d = pictures(seed=2)
+    assert popping(a, b, a, b) == 0
+    assert popping(a, a, c, c) == 0, "full detail"
+    assert popping(a, b, c, d) == pytest.approx(255 * math.sqrt((((a - b) - (c - d)) ** 2).mean()))
+    assert popping(a, b, c, d) == pytest.approx(popping(c, d, a, b))
+    assert popping(a + 0.1, b + 0.1, c, d) == pytest.approx(popping(a, b, c, d)), "light that goes on in both"
+
+
+def test_a_planted_pop_has_its_size() -> None:
+    a, b = pictures(40, 50)
+    popped = a.copy()
+    popped[10:20, 10:30] += 8 / 255  # a tenth of the pixels
+    assert popping(popped, b, a, b) == pytest.approx(8 * math.sqrt(0.1))

@@ -45,14 +45,20 @@ class Drawn:
     Attributes:
         rgba: (height, width, 4) float64, premultiplied by alpha.
         unsure: (height, width) whether a splat ends so near to the pixel that float32 may decide otherwise.
+        where: by the index of each splat that is drawn, from far to near, (height, width) whether it is there.
     """
 
     rgba: np.ndarray
     unsure: np.ndarray
+    where: dict[int, np.ndarray]
 
 
-def picture(splats: ShadedSplats, camera: Camera, settings: RasterSettings) -> Drawn:
-    """Draws splats from far to near, each over the whole picture."""
+def picture(splats: ShadedSplats, camera: Camera, settings: RasterSettings, held: Drawn | None = None) -> Drawn:
+    """Draws splats from far to near, each over the whole picture.
+
+    Args:
+        held: a picture of the same splats before a small change: they are drawn in its order and end where its do.
+    """
     to_camera = np.linalg.inv(camera.camera_to_world)
     (fx, fy), (cx, cy), width, height = camera.focal, camera.principal, camera.width, camera.height
     centers = splats.center.astype(np.float64) @ to_camera[:3, :3].T + to_camera[:3, 3]
@@ -60,7 +66,8 @@ def picture(splats: ShadedSplats, camera: Camera, settings: RasterSettings) -> D
     key = np.linalg.norm(centers, axis=1) if settings.sort == "radial" else -centers[:, 2]
     pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1)
     rgba, unsure = np.zeros((height, width, 4)), np.zeros((height, width), bool)
-    for i in np.argsort(-key, kind="stable"):
+    where: dict[int, np.ndarray] = {}
+    for i in np.argsort(-key, kind="stable") if held is None else held.where:
         (x, y, z), d = centers[i], min(float(splats.lod_opacity[i]), 5)
         if not settings.near < -z < settings.far or not d >= 0.5 / 255:
             continue
@@ -80,9 +87,10 @@ def picture(splats: ShadedSplats, camera: Camera, settings: RasterSettings) -> D
         unsure |= abs(z2 / deviations**2 - 1) < 2e-4
         unsure |= inside & (min(abs(strength * 255 - 0.5), 1) < 0.01)
         unsure |= inside & (abs(alpha * 255 - 0.5) < 0.01)
-        alpha = np.where(inside & (alpha >= 0.5 / 255) & (strength >= 0.5 / 255), alpha, 0)[..., None]
+        where[i] = inside & (alpha >= 0.5 / 255) & (strength >= 0.5 / 255) if held is None else held.where[i]
+        alpha = np.where(where[i], alpha, 0)[..., None]
         rgba = np.minimum(alpha * [*splats.rgb[i].astype(np.float64), 1], 1) + (1 - alpha) * rgba
-    return Drawn(rgba, unsure)
+    return Drawn(rgba, unsure, where)
 
 
 def _falloff(z2: np.ndarray, d: float, profile: str) -> np.ndarray:

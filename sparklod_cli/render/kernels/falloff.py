@@ -28,16 +28,31 @@ LEAST_EXPONENT = f32(-120)
 
 
 @kernel(inline=True)
+def gauss(z2):
+    """exp(-z^2 / 2)."""
+    return exp2(MINUS_HALF_LOG2E * z2)
+
+
+@kernel(inline=True)
 def plain(z2, opacity):
     """Alpha of a splat with D up to 1: D * exp(-z^2 / 2)."""
-    return opacity * exp2(MINUS_HALF_LOG2E * z2)
+    return opacity * gauss(z2)
+
+
+@kernel(inline=True)
+def merged_parts(z2, power):
+    """g = exp(-z^2 / 2), r = 1 - g, log2(r), and r ** power, which is 1 - alpha of a splat with D above 1."""
+    g = gauss(z2)
+    rest = max(f32(1) - g, LEAST_REST)
+    log = log2(rest)
+    return g, rest, log, exp2(max(power * log, LEAST_EXPONENT))
 
 
 @kernel(inline=True)
 def merged(z2, power):
     """Alpha of a splat with D above 1: 1 - (1 - exp(-z^2 / 2)) ** power."""
-    rest = max(f32(1) - exp2(MINUS_HALF_LOG2E * z2), LEAST_REST)
-    return f32(1) - exp2(max(power * log2(rest), LEAST_EXPONENT))
+    _, _, _, through = merged_parts(z2, power)
+    return f32(1) - through
 
 
 @kernel(inline=True)

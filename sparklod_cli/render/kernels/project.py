@@ -93,6 +93,48 @@ class Limits(NamedTuple):
 
 
 @kernel(inline=True)
+def in_camera(m, x, y, z):
+    """A point in the axes of a camera: right, down and forward; `m` is its (3, 4) world to camera."""
+    return (
+        m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3],
+        m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3],
+        m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3],
+    )
+
+
+@kernel(inline=True)
+def jacobian(lens, inverse, dx, dy):
+    """Pixels per unit of a camera's axes at a point: x by right, y by down, x and y by forward.
+
+    Args:
+        lens: `Lens`.
+        inverse: 1 / depth of the point.
+        dx, dy: from the principal point to the point, pixels.
+    """
+    return lens.focal_x * inverse, lens.focal_y * inverse, -dx * inverse, -dy * inverse
+
+
+@kernel(inline=True)
+def per_world_unit(m, row, sideways, forward):
+    """Pixels per unit of the world's axes, of pixels per unit of axis `row` of a camera and of its forward axis."""
+    return (
+        sideways * m[row, 0] + forward * m[2, 0],
+        sideways * m[row, 1] + forward * m[2, 1],
+        sideways * m[row, 2] + forward * m[2, 2],
+    )
+
+
+@kernel(inline=True)
+def turned(t, r):
+    """Three pixels per world unit t along the axes of a splat of rotation r, 9 elements row by row."""
+    return (
+        t[0] * r[0] + t[1] * r[3] + t[2] * r[6],
+        t[0] * r[1] + t[1] * r[4] + t[2] * r[7],
+        t[0] * r[2] + t[1] * r[5] + t[2] * r[8],
+    )
+
+
+@kernel(inline=True)
 def project_splat(splats, i, world_to_camera, lens, limits, radial, row):
     """A splat on the screen, as Spark's vertex shader projects it.
 
@@ -112,9 +154,7 @@ def project_splat(splats, i, world_to_camera, lens, limits, radial, row):
     m = world_to_camera
     d = min(lod_opacity[i], MAX_D)
     x, y, z = center[i, 0], center[i, 1], center[i, 2]
-    u = m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]
-    v = m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]
-    w = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
+    u, v, w = in_camera(m, x, y, z)
     if not (w > limits.near and w < limits.far and d >= limits.min_alpha):
         return NOT_SEEN
     inverse = f32(1) / w
@@ -126,24 +166,15 @@ def project_splat(splats, i, world_to_camera, lens, limits, radial, row):
         return NOT_SEEN
     # T: Jacobian of the projection, times the rotation into the camera. With the splat's rotation R and scales S,
     # the covariance on the screen is (T R S) (T R S)^T; p and q are the rows of T R S.
-    jx, jy = lens.focal_x * inverse, lens.focal_y * inverse
-    kx, ky = -dx * inverse, -dy * inverse
-    t00, t01, t02 = jx * m[0, 0] + kx * m[2, 0], jx * m[0, 1] + kx * m[2, 1], jx * m[0, 2] + kx * m[2, 2]
-    t10, t11, t12 = jy * m[1, 0] + ky * m[2, 0], jy * m[1, 1] + ky * m[2, 1], jy * m[1, 2] + ky * m[2, 2]
-    qx, qy, qz, qw = quat[i, 0], quat[i, 1], quat[i, 2], quat[i, 3]
+    jx, jy, kx, ky = jacobian(lens, inverse, dx, dy)
+    across, down = per_world_unit(m, 0, jx, kx), per_world_unit(m, 1, jy, ky)
     one = f32(1)
-    r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation_matrix(qx, qy, qz, qw, one)
+    rotation = rotation_matrix(quat[i, 0], quat[i, 1], quat[i, 2], quat[i, 3], one)
     sx, sy, sz = scale[i, 0], scale[i, 1], scale[i, 2]
-    p0, p1, p2 = (
-        (t00 * r00 + t01 * r10 + t02 * r20) * sx,
-        (t00 * r01 + t01 * r11 + t02 * r21) * sy,
-        (t00 * r02 + t01 * r12 + t02 * r22) * sz,
-    )
-    q0, q1, q2 = (
-        (t10 * r00 + t11 * r10 + t12 * r20) * sx,
-        (t10 * r01 + t11 * r11 + t12 * r21) * sy,
-        (t10 * r02 + t11 * r12 + t12 * r22) * sz,
-    )
+    px, py, pz = turned(across, rotation)
+    qx, qy, qz = turned(down, rotation)
+    p0, p1, p2 = px * sx, py * sy, pz * sz
+    q0, q1, q2 = qx * sx, qy * sy, qz * sz
     a, b, c = p0 * p0 + p1 * p1 + p2 * p2, p0 * q0 + p1 * q1 + p2 * q2, q0 * q0 + q1 * q1 + q2 * q2
     # Determinants before and after the blur as sums of terms >= 0: for needles, a * c - b * b would cancel.
     before = (p0 * q1 - p1 * q0) ** 2 + (p0 * q2 - p2 * q0) ** 2 + (p1 * q2 - p2 * q1) ** 2

@@ -132,25 +132,45 @@ def is_opaque(pixels, rows, columns):
 
 
 @kernel(inline=True)
+def box_in_tile(row, left, top, rows, columns):
+    """The part of a tile that the box of a splat covers.
+
+    Args:
+        row: the splat, a row of `screen`.
+        left, top: pixels left of and above the tile.
+        rows, columns: of the tile's pixels.
+
+    Returns:
+        x, y: the splat's centre from the middle of the tile's first pixel, pixels, float32.
+        first, last: rows of pixels, the last excluded.
+        begin, end: blocks of LANES pixels, the last excluded.
+    """
+    x, y = row[X] - f32(left) - f32(0.5), row[Y] - f32(top) - f32(0.5)
+    first = max(0, math.ceil(y - row[HALF_HEIGHT]))
+    last = min(rows, math.floor(y + row[HALF_HEIGHT]) + 1)
+    begin = max(0, math.ceil(x - row[HALF_WIDTH])) // LANES
+    end = (min(columns, math.floor(x + row[HALF_WIDTH]) + 1) + LANES - 1) // LANES
+    return x, y, first, last, begin, end
+
+
+@kernel(inline=True)
 def draw_tile(screen, start, splats, tile, across, design, least, image):
-    """Blends the splats of a tile, from near to far; see `draw_tiles`."""
+    """Blends the splats of a tile, from near to far, see `draw_tiles`; returns where in `splats` it stopped."""
     height, width = image.shape[:2]
     left, top = tile % across * TILE, tile // across * TILE
     pixels = np.zeros((TILE, TILE // LANES, 4, LANES), np.float32)
     pixels[:, :, 0] = 1
     rows = min(TILE, height - top)
     columns = min(TILE, width - left)
+    stop = start[tile + 1]
     for entry in range(start[tile], start[tile + 1]):
         row = screen[splats[entry]]
-        x, y = row[X] - f32(left) - f32(0.5), row[Y] - f32(top) - f32(0.5)
-        first = max(0, math.ceil(y - row[HALF_HEIGHT]))
-        last = min(rows, math.floor(y + row[HALF_HEIGHT]) + 1)
-        begin = max(0, math.ceil(x - row[HALF_WIDTH])) // LANES
-        end = (min(columns, math.floor(x + row[HALF_WIDTH]) + 1) + LANES - 1) // LANES
+        x, y, first, last, begin, end = box_in_tile(row, left, top, rows, columns)
         for line in range(first, last):
             for block in range(begin, end):
                 blend_lanes(pixels[line, block], row, x - f32(LANES * block), f32(line) - y, design, least)
         if (entry - start[tile]) % CHECK_EVERY == CHECK_EVERY - 1 and is_opaque(pixels, rows, columns):
+            stop = entry + 1
             break
     for line in range(rows):
         for i in range(columns):
@@ -159,18 +179,20 @@ def draw_tile(screen, start, splats, tile, across, design, least, image):
             image[top + line, left + i, 1] = lanes[2, i % LANES]
             image[top + line, left + i, 2] = lanes[3, i % LANES]
             image[top + line, left + i, 3] = f32(1) - lanes[0, i % LANES]
+    return stop
 
 
 @kernel(parallel=True, contract=True)
-def draw_tiles(screen, start, splats, across, down, design, least, image):
+def draw_tiles(screen, start, splats, across, design, least, image, stop):
     """Blends the splats of each tile, from near to far.
 
     Args:
         screen, start, splats: of `sort_into_tiles`.
-        across, down: numbers of tiles.
+        across: number of tiles in a row of them.
         design: merged splats have the falloff `shifted`, that of Spark's LoD design.
         least: float32, least alpha that is drawn.
         image: (height, width, 4) float32, filled: red, green and blue, premultiplied by alpha, and alpha.
+        stop: (tiles,) int64, filled: up to where in `splats` each tile was drawn; it is opaque before the rest.
     """
-    for tile in prange(across * down):
-        draw_tile(screen, start, splats, tile, across, design, least, image)
+    for tile in prange(len(stop)):
+        stop[tile] = draw_tile(screen, start, splats, tile, across, design, least, image)

@@ -13,6 +13,32 @@ f32 = np.float32
 C1, C2, C3 = f32(SH_C1), tuple(map(f32, SH_C2)), tuple(map(f32, SH_C3))
 
 
+@kernel(inline=True)
+def second(x, y, z):
+    """The spherical harmonics of degree 2 in a unit direction."""
+    return (
+        C2[0] * x * y,
+        C2[1] * y * z,
+        C2[2] * (f32(2) * z * z - x * x - y * y),
+        C2[3] * x * z,
+        C2[4] * (x * x - y * y),
+    )
+
+
+@kernel(inline=True)
+def third(x, y, z):
+    """The spherical harmonics of degree 3 in a unit direction."""
+    return (
+        C3[0] * y * (f32(3) * x * x - y * y),
+        C3[1] * x * y * z,
+        C3[2] * y * (f32(4) * z * z - x * x - y * y),
+        C3[3] * z * (f32(2) * z * z - f32(3) * x * x - f32(3) * y * y),
+        C3[4] * x * (f32(4) * z * z - x * x - y * y),
+        C3[5] * z * (x * x - y * y),
+        C3[6] * x * (x * x - f32(3) * y * y),
+    )
+
+
 @kernel(parallel=True)
 def add_sh(center, sh, eye, degree, rgb):
     """Adds the terms of degree 1 and above to colours.
@@ -33,21 +59,47 @@ def add_sh(center, sh, eye, degree, rgb):
         for c in range(3):
             value = C1 * (-y * sh[i, 0, c] + z * sh[i, 1, c] - x * sh[i, 2, c])
             if degree > 1:
-                value += (
-                    C2[0] * x * y * sh[i, 3, c]
-                    + C2[1] * y * z * sh[i, 4, c]
-                    + C2[2] * (f32(2) * z * z - x * x - y * y) * sh[i, 5, c]
-                    + C2[3] * x * z * sh[i, 6, c]
-                    + C2[4] * (x * x - y * y) * sh[i, 7, c]
-                )
+                b3, b4, b5, b6, b7 = second(x, y, z)
+                value += b3 * sh[i, 3, c] + b4 * sh[i, 4, c] + b5 * sh[i, 5, c] + b6 * sh[i, 6, c] + b7 * sh[i, 7, c]
             if degree > 2:
+                b8, b9, b10, b11, b12, b13, b14 = third(x, y, z)
                 value += (
-                    C3[0] * y * (f32(3) * x * x - y * y) * sh[i, 8, c]
-                    + C3[1] * x * y * z * sh[i, 9, c]
-                    + C3[2] * y * (f32(4) * z * z - x * x - y * y) * sh[i, 10, c]
-                    + C3[3] * z * (f32(2) * z * z - f32(3) * x * x - f32(3) * y * y) * sh[i, 11, c]
-                    + C3[4] * x * (f32(4) * z * z - x * x - y * y) * sh[i, 12, c]
-                    + C3[5] * z * (x * x - y * y) * sh[i, 13, c]
-                    + C3[6] * x * (x * x - f32(3) * y * y) * sh[i, 14, c]
+                    b8 * sh[i, 8, c]
+                    + b9 * sh[i, 9, c]
+                    + b10 * sh[i, 10, c]
+                    + b11 * sh[i, 11, c]
+                    + b12 * sh[i, 12, c]
+                    + b13 * sh[i, 13, c]
+                    + b14 * sh[i, 14, c]
                 )
             rgb[i, c] += value
+
+
+@kernel(parallel=True)
+def sh_gradients(center, eye, by_rgb, by_sh):
+    """Derivatives by coefficients of degree 1 and above: the basis in a splat's direction, times those by its colour.
+
+    Args:
+        center, eye: of `add_sh`.
+        by_rgb: (N, 3) float32 derivatives by colours.
+        by_sh: (N, K, 3) float32, filled, K = 3, 8 or 15.
+    """
+    coefficients = by_sh.shape[1]
+    for i in prange(len(center)):
+        x, y, z = center[i, 0] - eye[0], center[i, 1] - eye[1], center[i, 2] - eye[2]
+        length = np.sqrt(x * x + y * y + z * z)
+        if length == 0:
+            by_sh[i] = 0
+            continue
+        x, y, z = x / length, y / length, z / length
+        for c in range(3):
+            by = by_rgb[i, c]
+            by_sh[i, 0, c], by_sh[i, 1, c], by_sh[i, 2, c] = -C1 * y * by, C1 * z * by, -C1 * x * by
+            if coefficients > 3:
+                values = second(x, y, z)
+                for k in range(5):
+                    by_sh[i, 3 + k, c] = values[k] * by
+            if coefficients > 8:
+                more = third(x, y, z)
+                for k in range(7):
+                    by_sh[i, 8 + k, c] = more[k] * by

@@ -1,0 +1,164 @@
+"""Trees that `bench_fidelity.py` measures: Spark's, ours, and what splat-transform decimates."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+import sparklod_cli as sparklod
+
+#: What builds trees, by what it is called in tables.
+METHODS = {
+    "spark-tiny": "Spark tiny",
+    "spark-quality": "Spark quality",
+    "quick": "our quick",
+    "quality": "our quality",
+    "refined": "our quality, refined",
+}
+
+#: Percent of the splats that splat-transform left, and its ways to get there.
+SHARES = (50, 25, 10, 5)
+WAYS = ("decimate", "decimate-adaptive")
+
+#: Arrays of Spark's SH, four words a splat, those of its degree and below.
+SH_ARRAYS = ("sh1", "sh2", "sh3a", "sh3b")
+
+
+AnyScene = TypeVar("AnyScene", sparklod.Scene, sparklod.Tree)
+
+
+@dataclass(frozen=True)
+class Source:
+    """A scene, and how trees of it are built.
+
+    Attributes:
+        path: its file, for Spark.
+        scene: with all of its spherical harmonics.
+        sh: pictures are drawn with them.
+        runs: of each builder that is timed.
+        growth: of our quality builder.
+        steps: of refining; None for as many as suit the tree.
+    """
+
+    path: Path
+    scene: sparklod.Scene
+    sh: bool
+    runs: int
+    growth: float
+    steps: int | None
+
+    @property
+    def drawn(self) -> sparklod.Scene:
+        """The scene as it is drawn: with or without spherical harmonics."""
+        return self.scene if self.sh else without_sh(self.scene)
+
+
+@dataclass(frozen=True)
+class Built:
+    """A tree as a viewer holds it, and how long building it took.
+
+    Attributes:
+        tree: with spherical harmonics only if they are drawn.
+        seconds: of each run.
+    """
+
+    tree: sparklod.Tree
+    seconds: list[float]
+
+
+def build(source: Source, method: str) -> Built:
+    """The tree of a method, one of `METHODS`."""
+    if method.startswith("spark-"):
+        return _sparks(source, method.removeprefix("spark-"))
+    return _ours(source, method)
+
+
+def without_sh(scene: sparklod.Scene) -> sparklod.Scene:
+    """A scene without spherical harmonics."""
+    return sparklod.Scene(scene.splats.with_max_sh(0), antialiased=scene.antialiased)
+
+
+def _sparks(source: Source, builder: str) -> Built:
+    """A tree of one of Spark's builders, as its memory holds it."""
+    with tempfile.TemporaryDirectory() as folder:
+        program = Path(__file__).with_name("spark_build.mjs")
+        command = ["node", str(program), str(source.path), str(source.runs), builder, folder]
+        result = subprocess.run(command, capture_output=True, text=True, check=False)
+        if result.returncode:
+            raise SystemExit(f"Spark failed on {source.path}: {result.stderr.strip()}")
+        names = ["ext0", "ext1", "lod_tree"]
+        if source.sh:
+            names += [name for name in SH_ARRAYS if Path(folder, f"{name}.u32").is_file()]
+        words = {name: np.fromfile(Path(folder, f"{name}.u32"), np.uint32).reshape(-1, 4) for name in names}
+    tree = sparklod.unpack(words)
+    assert isinstance(tree, sparklod.Tree)
+    return Built(tree, [json.loads(line)["build"] for line in result.stdout.splitlines()])
+
+
+def _ours(source: Source, method: str) -> Built:
+    """A tree of one of our builders, as its file holds it; spherical harmonics as Spark holds those of the file."""
+    refined = method == "refined"
+    make: Callable[[sparklod.Scene], sparklod.Tree] = (
+        (lambda scene: _refined(scene, source))
+        if refined
+        else lambda scene: sparklod.build_lod(scene, method=method, growth=source.growth)
+    )
+    seconds = []
+    for run in range(0 if refined else source.runs + 1):
+        start = time.perf_counter()
+        make(source.scene)
+        if run:  # the first may have to compile
+            seconds.append(time.perf_counter() - start)
+    start = time.perf_counter()
+    tree = make(source.drawn)
+    seconds = seconds or [time.perf_counter() - start]
+    with tempfile.TemporaryDirectory() as folder:
+        written = sparklod.read(sparklod.write(Path(folder, "tree.spz"), tree).path)
+    assert isinstance(written, sparklod.Tree)
+    return Built(_held(written) if source.sh else written, seconds)
+
+
+def _refined(scene: sparklod.Scene, source: Source) -> sparklod.Tree:
+    """A tree of our quality builder whose merged splats are fitted to pictures of the scene."""
+    from sparklod_cli.fitting.fit import fit
+    from sparklod_cli.fitting.settings import FitSettings
+    from sparklod_cli.support.parallel import processors
+
+    tree = sparklod.build_lod(scene, method="quality", growth=source.growth)
+    settings = FitSettings(source.steps)
+    splats, _ = fit(tree.splats, tree.tree, settings, antialiased=scene.antialiased, threads=processors())
+    return dataclasses.replace(tree, splats=splats)
+
+
+def _held(scene: AnyScene) -> AnyScene:
+    """A scene or a tree with those spherical harmonics that Spark holds of it in `ExtSplats`."""
+    held = sparklod.unpack(sparklod.pack(scene, "ext")).splats
+    return dataclasses.replace(scene, splats=dataclasses.replace(scene.splats, sh=held.sh))
+
+
+def decimated(folder: Path, name: str, *, sh: bool = False) -> Iterator[tuple[str, list[sparklod.Scene]]]:
+    """Each way of splat-transform whose files are all there, and its scenes, in the order of `SHARES`.
+
+    Spherical harmonics are left out, or as Spark holds them.
+    """
+    for way in WAYS:
+        files = [folder / f"{name}-{way}-{share}.ply" for share in SHARES]
+        if all(file.is_file() for file in files):
+            scenes = [sparklod.read(file) for file in files]
+            yield way, [_held(scene) if sh else without_sh(scene) for scene in scenes]
+
+
+def seconds_of_decimations(folder: Path) -> dict[tuple[str, str, int], float]:
+    """Seconds that splat-transform took, by scene, way and percent: the lines of times.txt."""
+    file = folder / "times.txt"
+    rows = [row.split() for row in file.read_text(encoding="utf-8").splitlines()] if file.is_file() else []
+    return {(scene, way, int(share)): float(seconds) for scene, way, share, seconds in rows}
