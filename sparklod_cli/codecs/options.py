@@ -59,8 +59,8 @@ class WriteOptions:
         compression_level: of SPZ and RAD, 1 (fast) to 9 (small).
         rad: of RAD.
         sog: of SOG.
-        sh_bits: upper bits kept of each SH byte of SPZ, 4 to 8; None for as many as suit the scene, see `sh_bits`. Merged
-            splats keep 4, and 5 of degree 1, which also is what other writers do.
+        sh_bits: upper bits kept of each SH byte of SPZ, 4 to 8; None for as many as suit the scene, see `sh_bits`.
+            Merged splats keep 4, and 5 of degree 1, as other writers do with all splats.
     """
 
     spz_version: int | None = None

@@ -158,8 +158,8 @@ def encode_sh(sh: FloatArray, bits: int = LEAST_SH_BITS) -> Bytes:
 
     Args:
         sh: coefficients.
-        bits: upper bits kept of each byte, `LEAST_SH_BITS` to 8; degree 1 keeps `LEAST_SH_BITS_1` at least. The codes of
-            fewer bits are among those of more.
+        bits: upper bits kept of each byte, `LEAST_SH_BITS` to 8; degree 1 keeps `LEAST_SH_BITS_1` at least. The codes
+            of fewer bits are among those of more.
     """
     first = np.arange(sh.shape[1]) < COEFFICIENTS[1]
     bucket = np.exp2(8 - np.where(first, max(bits, LEAST_SH_BITS_1), bits)).astype(np.float32)[:, None]

@@ -96,7 +96,7 @@ def encoder(
     Raises:
         ValueError: the options are not settled.
     """
-    if None in (options.spz_version, options.fractional_bits, options.sh_bits):
+    if options.spz_version is None or options.fractional_bits is None or options.sh_bits is None:
         raise ValueError("the options leave choices open; `settled` makes them")
     if isinstance(scene, NodeStream):
         count, sh_degree, tree = scene.count, scene.sh_degree, True

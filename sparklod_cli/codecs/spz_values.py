@@ -1,4 +1,4 @@
-"""What the columns of splats become before each is coded by itself: SPZ rounds them so that errors make up for another."""
+"""What splats become before each column is coded by itself: the rounding of one is made up for in another."""
 
 from __future__ import annotations
 

@@ -21,8 +21,8 @@ from .binades import Binades
 from .magnitudes import Magnitudes
 from .sh_bits import ShBytes
 
-#: What can be counted: the largest coordinate, the largest scale of each leaf, the SH bytes of leaves, and the magnitudes
-#: of columns.
+#: What can be counted: the largest coordinate, the largest scale of each leaf, the SH bytes of leaves, and the
+#: magnitudes of columns.
 ALL = frozenset(("reach", "leaf_scale", "leaf_sh", "rgb", "scale", "sh"))
 
 

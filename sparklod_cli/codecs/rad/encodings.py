@@ -38,7 +38,7 @@ class Coding(NamedTuple):
     def rounded(self, values: NDArray[Any], low: float, high: float) -> NDArray[Any]:
         """(N, numbers) values as they are decoded."""
         codes = np.ascontiguousarray(self.encode(values, low, high)).reshape(-1).view(np.uint8)
-        return np.ascontiguousarray(self.decode(codes, *values.shape, low, high))
+        return np.ascontiguousarray(self.decode(codes, len(values), values.shape[1], low, high))
 
 
 def _plain(code: str, most: np.float32 | None = None) -> Coding:
