@@ -15,6 +15,9 @@ from ..model.splats import FloatArray
 #: more is larger than any code, such as a sky, and shrinks: a denser middle would not be more like it.
 MOST_GROWTH = 1.125
 
+#: Smallest factor, of what is smaller than any code: a pixel shows it all the same.
+LEAST_GROWTH = 1 / 16
+
 #: Euler's constant, of the harmonic numbers.
 _EULER = 0.5772156649015329
 
@@ -45,7 +48,7 @@ def kept(opacity: FloatArray, scale: FloatArray, rounded: FloatArray, blur: floa
     """
     area = faces(rounded, blur)
     with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = np.where(area > 0, np.minimum(faces(scale, blur) / area, MOST_GROWTH), 1)
+        ratio = np.where(area > 0, np.clip(faces(scale, blur) / area, LEAST_GROWTH, MOST_GROWTH), 1)
     faint = opacity <= 1
     wide = opacity.astype(np.float64)
     most = np.maximum(wide, 1)

@@ -86,7 +86,8 @@ def test_what_is_thinner_than_a_step_of_positions_makes_no_splat_fainter() -> No
     scale = np.array([[1e-9, 1e-9, 1e-9], [0.5, 1e-8, 1e-7]], np.float32)
     held = np.maximum(scale, least)
     assert (coverage.kept(opacity, scale, held, 1e-3) > 0.79).all()
-    assert (coverage.kept(opacity, scale, held, 0.0) < 0.01).all()  # of a scene of such splats they are that large
+    # In a scene of such splats a pixel is as small, up to what cannot be told from a speck.
+    np.testing.assert_allclose(coverage.kept(opacity, scale, held, 0.0), [0.8 * coverage.LEAST_GROWTH] * 2)
 
 
 @pytest.mark.filterwarnings("error")
@@ -109,11 +110,14 @@ def again(codec: ModuleType, scene: Scene, options: WriteOptions) -> Scene:
 @given(SEEDS, st.integers(0, 3))
 @settings(max_examples=15)
 def test_what_was_read_is_written_as_it_is(codec: ModuleType, lod: bool, seed: int, degree: int) -> None:
-    """SPZ however often: its choices follow the values, and these are where they were put. RAD with the same ranges."""
+    """SPZ with the same fractional bits: its other choices follow the values, which are where they were put. RAD with
+    the same choices."""
     splats = random_splats(60, sh_degree=degree, seed=seed, extent=0.02)
     splats.sh[:] *= np.random.default_rng(seed).choice([0.1, 1, 4])
     scene = Scene(*quick.build(splats)) if lod else Scene(splats)
-    options = WriteOptions() if codec is spz else rad.settled(scene, WriteOptions())
+    options = codec.settled(scene, WriteOptions())
+    if codec is spz:
+        options = WriteOptions(fractional_bits=options.fractional_bits)
     once = again(codec, scene, options)
     twice = again(codec, once, options)
     for column in sorted(set(COLUMNS) - {"quat_xyzw"}):

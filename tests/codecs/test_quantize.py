@@ -186,7 +186,7 @@ def test_sh_clamps_what_overflows_quietly() -> None:
 
 Coder = Callable[[np.ndarray], np.ndarray]
 QUATERNIONS: dict[str, tuple[Coder, Coder, list[float]]] = {
-    # With the rotations that come out worst, as a search found them.
+    # With rotations that come out badly, as a search found them.
     "first three": (
         quantize.encode_quat_first_three,
         quantize.decode_quat_first_three,

@@ -57,11 +57,12 @@ def test_an_array_holds_all_of_them() -> None:
     assert array.dtype == np.uint8 and array.ndim == 1 and len(array) < 20_000
     back = Statistics.from_array(array)
     for name, value in vars(found).items():
-        if name not in ("leaf_scale", "leaf_sh", "magnitudes"):
+        if name not in ("leaf_scale", "leaf_length", "leaf_sh", "magnitudes"):
             assert getattr(back, name) == value
     for one, other in [
         (found.leaf_scale, back.leaf_scale),
         (found.leaf_sh, back.leaf_sh),
+        (found.leaf_length, back.leaf_length),
         *((found.magnitudes[name], back.magnitudes[name]) for name in found.magnitudes),
     ]:
         for key, value in vars(one).items():
@@ -74,8 +75,8 @@ def test_an_array_holds_all_of_them() -> None:
 def test_only_what_is_needed_is_counted() -> None:
     settled = WriteOptions(fractional_bits=3, sh_bits=5)
     assert spz.needed(DEFAULTS) == {"reach", "leaf_scale", "leaf_sh"} and spz.needed(settled) == {"reach"}
-    assert rad.needed(DEFAULTS) == {"rgb", "scale", "sh", "leaf_scale"}
-    assert rad.needed(WriteOptions(rad=RadOptions(center="f32"))) == {"rgb", "scale", "sh"}
+    assert rad.needed(DEFAULTS) == {"rgb", "scale", "sh", "leaf_scale", "leaf_length"}
+    assert rad.needed(WriteOptions(rad=RadOptions(center="f32"))) == {"rgb", "scale", "sh", "leaf_length"}
     scene = Scene(random_splats(50, sh_degree=1))
     assert rad.needed(rad.settled(scene, DEFAULTS)) == frozenset()
 

@@ -190,8 +190,7 @@ def spz_precision(source: Scene, version: int) -> Precision:
     return Precision(
         center=0.5 * 2.0**-bits,
         log_scale=1.001 / 32,
-        # Near half a turn the first three are less exact than their docstring says, which test_quantize.py checks.
-        degrees=max(stated_degrees(coding), 13.4) if version == 2 else stated_degrees(coding),
+        degrees=stated_degrees(coding),
         opacity=1.001 / 255 if source.tree else 1.001 / 510,
         blur=2.0**-bits,
         merged=4.004 / 255,
