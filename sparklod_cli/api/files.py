@@ -110,6 +110,7 @@ def build_lod(
         ValueError: there is no such method, or an option is out of its range.
     """
     from ..bake import BakeSettings
+    from ..lod.band_order import banded
     from ..model.selection import Selection
 
     if scene_like(scene).tree is not None:
@@ -123,7 +124,7 @@ def build_lod(
     with on_threads(threads), telling(progress) as told, memory_errors_translated():
         kept, _ = (selection or Selection()).apply(scene.splats.with_max_sh(max_sh))
         # A builder frees its input as it goes where nobody else holds it.
-        nodes, tree = build(kept, progress=told)
+        nodes, tree = banded([build(kept, progress=told)])
     return Tree(nodes, tree, scene.antialiased)
 
 

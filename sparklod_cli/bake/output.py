@@ -38,6 +38,10 @@ class Output(Protocol):
         """Whether it is read in chunks, so that nodes are put in an order for that first."""
 
     @property
+    def in_bands(self) -> bool:
+        """Whether it is read whole, so that nodes of a tree that was built are put in the order for that."""
+
+    @property
     def needed(self) -> frozenset[str]:
         """The statistics of all nodes by which it is written, see `codecs.statistics`."""
 
@@ -132,6 +136,11 @@ class _File:
     options: WriteOptions
     sink: SceneSink
     in_chunks: bool
+
+    @property
+    def in_bands(self) -> bool:
+        """SPZ is."""
+        return not self.in_chunks
 
     @property
     def needed(self) -> frozenset[str]:
