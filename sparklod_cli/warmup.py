@@ -91,6 +91,13 @@ JOBS = {
             "render scene.ply --size 64x64 --color-by overdraw -o overdraw.png",
         ),
     ),
+    "refine": Job(
+        (
+            *("cut.find_cut", "project.gather_drawn", "project.project", "raster.draw_tiles"),
+            *("raster.sort_into_tiles", "shade.add_sh"),
+        ),
+        ("build-lod shiny.spz --refine 2 -o refined.spz",),
+    ),
     "palette": Job(
         (
             *("chunk_demand.fill_demand", "chunk_inside.sort_within_chunks", "chunk_sets.split_sets", "sort.sort_pass"),

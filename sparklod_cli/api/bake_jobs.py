@@ -10,6 +10,7 @@ from ..bake import bake_unless_there as bake_unless_there
 from ..bake.out_of_core.cluster import ClusterSettings as ClusterSettings
 from ..bake.out_of_core.cluster import cluster as cluster
 from ..bake.out_of_core.cluster_engine import ClusterEngine as ClusterEngine
+from ..bake.refining import Refined as Refined
 from ..bake.side_by_side import bake_side_by_side as bake_side_by_side
 from ..bake.written import WrittenDetail as WrittenDetail
 from ..extract_leaves import Extracted as Extracted

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..io import read_rgba
+from ..io import read_rgba, read_stored
 from ..model.lod_tree import LodTree
 from ..model.scene import Scene
 from ..model.splats import Splats
@@ -20,13 +20,14 @@ from ..support.threads import on_threads
 from .checks import transformed
 from .clock import Clock
 from .environment import divided, read_environment
-from .kept_tree import check_kept
+from .kept_tree import check_kept, has_format_of
 from .out_of_core.contracts import Engine
 from .output import Output, output_of
+from .refining import Refined, fit_settings, refined
 from .resources import Resources
 from .scaling import Scaled, bake_scaled
 from .settings import BakeSettings
-from .sources import Source, read_source
+from .sources import Merged, Source, read_source
 from .written import WrittenTree
 
 
@@ -42,7 +43,8 @@ class Baked(WrittenTree):
         method: that built the tree; None for the tree of the input.
         nodes, levels: of the tree; levels is its depth and 1, so that a tree of one node has one.
         notes: what the reader had to leave out, for display.
-        seconds: by stage (read, build, order, arrange, levels, errors, write).
+        seconds: by stage (read, build, order, refine, arrange, levels, errors, write).
+        refine: what fitting merged splats brought; None where that was not asked for.
         blocks: that were built one after the other, out of core; None in memory.
         scratch_bytes_written, scratch_bytes_read: in the scratch folder; None in memory.
     """
@@ -57,6 +59,7 @@ class Baked(WrittenTree):
     levels: int
     notes: tuple[str, ...]
     seconds: dict[str, float]
+    refine: Refined | None = None
     blocks: int | None = None
     scratch_bytes_written: int | None = None
     scratch_bytes_read: int | None = None
@@ -70,14 +73,18 @@ class _Made:
         nodes, tree: the tree.
         leaves: how many it has.
         dropped: the splats that were left out, by reason.
+        output: where it goes.
         environment: splats that are no part of the tree.
+        is_ordered: its nodes are in the order of a file of the same format already.
     """
 
     nodes: Splats
     tree: LodTree
     leaves: int
     dropped: dict[str, int]
+    output: Output
     environment: Splats | None = None
+    is_ordered: bool = False
 
 
 def bake(
@@ -105,15 +112,18 @@ def bake(
         progress: told of the stages.
         resources: that it may use; None for those of a machine that is otherwise idle.
         engine: runs the tasks of a bake that goes out of core because of it; None for this process.
-        say: told in a line that it goes out of core, and what is left after an interruption.
+        say: told in a line that it goes out of core, what is left after an interruption, and what fitting brought.
 
     Raises:
         FormatError, InvalidSplatsError, OutputError: see `read_source`, `Selection.apply` and `io.scene_sink`; or the
             input has a tree, and the settings do not keep it.
         ScratchError: the scratch folder is full, in use, or has the results of another bake.
         OutOfMemoryError: it does not fit into memory.
+        CameraPathError: the training cameras cannot be read.
+        KeyboardInterrupt: see `refined`.
     """
     with memory_errors_translated():
+        fitting = fit_settings(settings)
         output, clock = output_of(target, settings, overwrite=overwrite), Clock()
         scaled = bake_scaled(
             source,
@@ -135,18 +145,24 @@ def bake(
         antialiased, has_tree = scenes[0].antialiased, scenes[0].tree is not None
         environment = read_environment(settings, threads=threads, progress=progress)
         if has_tree:
-            made = _kept(scenes, settings, clock)
+            made = _kept(source, scenes, settings, output, clock)
         else:
             made = _built(scenes, settings, output, clock, threads, progress)
-        nodes, tree = made.nodes, made.tree
-        if output.in_chunks:
+        nodes, tree, fitted = made.nodes, made.tree, None
+        if fitting is not None:
+            whole, fitted = refined(
+                Scene(nodes, tree, antialiased), fitting, threads=threads, progress=progress, say=say
+            )
+            nodes = whole.splats
+            clock.end("refine")
+        if output.in_chunks and not made.is_ordered:
             with on_threads(threads):
                 from ..lod.chunk_order import arrange
 
                 nodes, tree = arrange(nodes, tree, progress=progress)
             clock.end("arrange")
         environment = made.environment if environment is None else environment
-        written = output.write(Scene(nodes, tree, antialiased), environment, clock, threads, progress)
+        written = made.output.write(Scene(nodes, tree, antialiased), environment, clock, threads, progress)
     return Baked(
         **vars(written),
         format=form,
@@ -159,6 +175,7 @@ def bake(
         levels=int(tree.depths().max()) + 1,
         notes=notes,
         seconds=clock.seconds,
+        refine=fitted,
     )
 
 
@@ -183,13 +200,17 @@ def _baked_of(scaled: Scaled, settings: BakeSettings) -> Baked:
     )
 
 
-def _kept(scenes: list[Scene], settings: BakeSettings, clock: Clock) -> _Made:
+def _kept(source: Source, scenes: list[Scene], settings: BakeSettings, output: Output, clock: Clock) -> _Made:
     """The tree that the input has."""
     scene = scenes.pop()
     check_kept(scene, settings)
     assert scene.tree is not None
+    leaves, is_ordered = int(np.count_nonzero(scene.tree.is_leaf)), False
+    if settings.refine is not None and has_format_of(scene, settings):
+        assert not isinstance(source, Merged)  # of which no part is a tree
+        output, is_ordered = output.keeping(read_stored(source), scene.splats), True
     clock.end("read")
-    return _Made(scene.splats, scene.tree, int(np.count_nonzero(scene.tree.is_leaf)), {})
+    return _Made(scene.splats, scene.tree, leaves, {}, output, is_ordered=is_ordered)
 
 
 def _built(
@@ -215,7 +236,7 @@ def _built(
             built = [banded(built)]
     nodes, tree = built.pop()
     clock.end("build")
-    return _Made(nodes, tree, leaves, dropped, environment)
+    return _Made(nodes, tree, leaves, dropped, output, environment)
 
 
 def _recolored(splats: Splats, rgba: Path | None) -> Splats:

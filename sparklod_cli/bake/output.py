@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
 from ..codecs import clamps
 from ..codecs.clamps import Range
-from ..codecs.encoder import CLAMPED, Encoder, Get, windows_of
+from ..codecs.encoder import CLAMPED, Encoder, Get, Kept, Stored, results, windows_of
 from ..codecs.formats import WRITABLE, Format
 from ..codecs.gpu import dump
 from ..codecs.options import WriteOptions
@@ -19,7 +20,7 @@ from ..codecs.statistics import Statistics
 from ..io import SceneSink, Sink, detail_sink, scene_sink, sink
 from ..model.nodes import CHUNK_NODES
 from ..model.scene import Scene
-from ..model.splats import Splats
+from ..model.splats import Splats, same_rows
 from ..model.streams import NodeStream
 from ..support.addresses import Place
 from ..support.progress import Progress
@@ -28,6 +29,9 @@ from .detail_output import DetailOutput
 from .settings import BakeSettings
 from .whole_output import WholeOutput
 from .written import WrittenTree
+
+#: Bytes of encoded nodes that wait in memory for their header; beyond, they wait on disk.
+SPOOLED = 1 << 26
 
 
 class Output(Protocol):
@@ -50,6 +54,16 @@ class Output(Protocol):
 
     def check_statistics(self, found: Statistics) -> None:
         """As `check`, of statistics of these splats; and where it cannot be written without all nodes in memory."""
+
+    def keeping(self, stored: Stored, before: Splats) -> Output:
+        """The same for the tree of a file of the same format: what was not chosen of how to write is that of the file.
+
+        Nodes that have the same values as there, as all leaves, are written bit for bit as they stand there.
+
+        Args:
+            stored: the codes of the file.
+            before: its nodes.
+        """
 
     def write(
         self, scene: Scene, environment: Splats | None, clock: Clock, threads: int, progress: Progress
@@ -130,12 +144,16 @@ class _File:
         options: how it is written.
         sink: writes it.
         in_chunks: see `Output`; RAD is.
+        stored: codes that nodes keep which still have the values of `before`; None where there are none.
+        before: (N,) nodes with these codes.
     """
 
     form: Format
     options: WriteOptions
     sink: SceneSink
     in_chunks: bool
+    stored: Stored | None = None
+    before: Splats | None = None
 
     @property
     def in_bands(self) -> bool:
@@ -147,6 +165,10 @@ class _File:
         """Those of the codec."""
         needed: frozenset[str] = self.form.codec().needed(self.options)
         return needed
+
+    def keeping(self, stored: Stored, before: Splats) -> Output:
+        """The same with these codes."""
+        return dataclasses.replace(self, options=stored.like(self.options), stored=stored, before=before)
 
     def check(self, scene: Scene) -> None:
         """The codec knows."""
@@ -161,7 +183,15 @@ class _File:
     ) -> WrittenTree:
         """Writes it."""
         options: WriteOptions = self.form.codec().settled(scene, self.options)
-        size = self.sink(scene, options, threads=threads, progress=progress)
+        if self.stored is None or self.before is None:
+            size = self.sink(scene, options, threads=threads, progress=progress)
+        else:
+            made = self.form.codec().encoder(scene, options, threads=threads, progress=progress)
+            encoder = self.stored.keeping(made, same_rows(scene.splats, self.before))
+            with Kept(None, SPOOLED) as kept:
+                for result in results(encoder, scene, threads, progress, "encoding"):
+                    kept.put(result)
+                size = self.sink.assemble(encoder, kept.get, threads=threads, progress=progress)
         beyond = clamps.find(scene.splats, threads, self._held(options, scene.splats.sh_degree))
         clock.end("write")
         return self._written(options, size, len(scene), scene.splats.sh_degree, beyond)

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from .. import __version__
+from ..cameras.formats.table import NAMES
 from ..io import Identity, files_of, identity_of
 from ..support.addresses import Place
 from ..support.errors import UnreadableError
@@ -19,7 +20,7 @@ from ..support.untrusted import parse_json, quoted_value
 from .settings import BakeSettings
 
 #: Settings that name a file whose content is one of the inputs.
-FILES = ("rgba", "environment")
+FILES = ("rgba", "environment", "camera_path")
 
 #: Settings that are no part of a recipe: a message, and files whose names do not matter.
 NO_PART = ("unused", *FILES)
@@ -103,8 +104,9 @@ def recipe_of(sources: Iterable[Place], settings: BakeSettings, **more: Any) -> 
 
 def files_named_in(settings: BakeSettings) -> list[Place]:
     """The files that settings name, and those that belong to these."""
-    named = filter(None, (getattr(settings, name) for name in FILES))
-    return [file for path in named for file in files_of(path)]
+    named = {name: path for name in FILES if (path := getattr(settings, name)) is not None}
+    sets = {"camera_path": NAMES}
+    return [file for name, path in named.items() for file in files_of(path, sets.get(name, ()))]
 
 
 def _identity_of_named(file: Place) -> Identity:

@@ -192,6 +192,8 @@ def _as_a_whole(settings: BakeSettings) -> str | None:
     """Why an output is made in memory only, as the end of a sentence; None where it need not be."""
     if settings.encoding is not None:
         return "--encoding writes arrays as a whole"
+    if settings.refine is not None:
+        return "--refine fits a whole tree"
     return None if settings.detail is None else "detail levels are made of a whole tree"
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from ..codecs.options import WriteOptions
+from ..fitting.settings import FitSettings
 from ..lod.builders import BUILDERS, METHODS
 from ..lod.detail_settings import DetailSettings
 from ..model.lod_tree import LodTree
@@ -40,6 +41,9 @@ class BakeSettings:
         environment: of a Streamed SOG, a file whose splats are always drawn; turned and moved as the scene.
         environment_beyond: of a Streamed SOG, splats of the input farther out than this become its environment, see
             `lod.environment.beyond`; in the input's units. None for none.
+        refine: how merged splats are fitted to pictures of full detail, its cameras left out; None for not at all.
+        camera_path: a file of training cameras, in the coordinates of the output; None for cameras that are placed
+            around and inside the scene.
         converts: an input that has a tree keeps it, if its format is another one; otherwise it is refused.
         unused: flags of options that were given and mean nothing to an input that has a tree, which is refused then.
     """
@@ -58,6 +62,8 @@ class BakeSettings:
     detail: DetailSettings | None = None
     environment: Path | None = None
     environment_beyond: float | None = None
+    refine: FitSettings | None = None
+    camera_path: Path | None = None
     converts: bool = False
     unused: tuple[str, ...] = ()
 

@@ -50,6 +50,8 @@ def bake_unless_there(
             raise OutputError(f"{target} is there, but {'; '.join(differences)}; add --overwrite to bake it anew")
     _remove(beside)  # so that it never stands beside an output that it does not tell of
     baked = bake(source, target, settings, overwrite=overwrite, **how)
+    if baked.refine is not None and not baked.refine.is_complete:
+        return baked  # another run would get farther
     inputs = [dataclasses.asdict(each) for each in seen]
     note = {"recipe": recipe.to_record(), "inputs": inputs, "output": _told(target)}
     sink(beside, overwrite=True)([json.dumps(note, indent=1).encode() + b"\n"])

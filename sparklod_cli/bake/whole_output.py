@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from typing import NoReturn
+from typing import NoReturn, TypeVar
 
-from ..codecs.encoder import Encoder, Get
+from ..codecs.encoder import Encoder, Get, Stored
 from ..codecs.statistics import Statistics
 from ..model.scene import Scene
+from ..model.splats import Splats
 from ..model.streams import NodeStream
 from ..support.errors import FormatError
 from ..support.progress import Progress
+
+#: An output.
+Whole = TypeVar("Whole", bound="WholeOutput")
 
 
 class WholeOutput:
@@ -23,6 +27,10 @@ class WholeOutput:
     in_chunks = False
     in_bands = False
     made = ""
+
+    def keeping(self: Whole, stored: Stored, before: Splats) -> Whole:
+        """It has no format that trees are read from."""
+        return self
 
     @property
     def needed(self) -> frozenset[str]:

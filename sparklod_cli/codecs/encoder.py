@@ -71,6 +71,21 @@ class Encoder(Protocol):
         """The bytes of the file, piece by piece, made of the results of all windows."""
 
 
+class Stored(Protocol):
+    """The codes of a tree's file as they stand in it, with which nodes can be written again bit for bit."""
+
+    def like(self, options: WriteOptions) -> WriteOptions:
+        """These options, and where they leave a choice open, that of the file."""
+
+    def keeping(self, encoder: Any, kept: NDArray[np.bool_]) -> Encoder:
+        """An encoder of as many nodes, in the same format and order, that gives some the codes of the file.
+
+        Args:
+            encoder: of the codec.
+            kept: (N,) the nodes that have the same values as in the file.
+        """
+
+
 def windows_of(count: int) -> list[slice]:
     """The windows of a file of so many splats."""
     return blocks_of(count, CHUNK_NODES)

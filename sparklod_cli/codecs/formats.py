@@ -28,7 +28,8 @@ class Format:
             yields the name and the bytes of each, this one last.
         trees: it can be written with a Level-of-Detail tree. Its `encode` then takes a `NodeStream`, too, and
             `scratch`, a folder; its `settled` takes `Statistics`, too, those that `needed(options)` names; and
-            `encoder(scene, options, ranges, *, threads, progress)` gives its `encoder.Encoder`.
+            `encoder(scene, options, ranges, *, threads, progress)` gives its `encoder.Encoder`, and `stored(file)`,
+            with `beside` where it has companions, the `encoder.Stored` of a file.
         suffixes: lower case, with the dot.
         beginning: a regular expression that the first bytes of its files match; None if any bytes are possible, so that
             only the suffix decides.

@@ -20,6 +20,7 @@ from .spz_options import settled as settled
 from .spz_reading import decode as decode
 from .spz_reading import examine as examine
 from .spz_reading import stream as stream
+from .spz_stored import stored as stored
 
 
 def encode(

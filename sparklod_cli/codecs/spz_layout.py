@@ -112,6 +112,11 @@ class Layout:
         return [stream for stream in table if stream.size]
 
     @property
+    def has_tree(self) -> bool:
+        """Whether the splats are the nodes of a tree."""
+        return bool(self.flags & LOD)
+
+    @property
     def total(self) -> int:
         """Bytes of all streams."""
         return self.count * sum(stream.size for stream in self.streams())

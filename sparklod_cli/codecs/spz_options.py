@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -70,17 +71,21 @@ def settled(scene: Scene | Statistics, options: WriteOptions) -> WriteOptions:
     return dataclasses.replace(options, spz_version=version, fractional_bits=bits)
 
 
-def like(scene: Scene, options: WriteOptions) -> WriteOptions:
-    """These options, and where they leave a choice open, that of the SPZ file which the scene was read from.
+def like(header: Mapping[str, int], options: WriteOptions) -> WriteOptions:
+    """These options, and where they leave a choice open, that of the SPZ file which a scene was read from.
 
     Its values then stay as they are. A version that is not written becomes the newest one that is; a scene from
     another format leaves the choice open.
+
+    Args:
+        header: of the scene, see `Scene`.
+        options: that may leave choices open.
     """
     version, bits = options.spz_version, options.fractional_bits
-    if "fractional_bits" not in scene.header:
+    if "fractional_bits" not in header:
         return options
     if version is None:
-        version = int(scene.header["version"])
+        version = int(header["version"])
         version = version if version in SPZ_VERSIONS else max(SPZ_VERSIONS)
-    bits = int(scene.header["fractional_bits"]) if bits is None else bits
+    bits = int(header["fractional_bits"]) if bits is None else bits
     return dataclasses.replace(options, spz_version=version, fractional_bits=bits)

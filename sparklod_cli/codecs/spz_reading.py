@@ -116,6 +116,19 @@ def stream(file: BinaryIO, *, scratch: Scratch, threads: int = 1, progress: Prog
     return Content(layout.count, degree, fill, _name_of(layout), antialiased, notes, facts).stream(threads)
 
 
+def read_codes(file: BinaryIO) -> tuple[Layout, dict[str, quantize.Bytes]]:
+    """The layout of a file, and (N, bytes) codes of each of its streams, by its name.
+
+    Raises:
+        FormatError: as `decode`.
+    """
+    layout, rows, _ = _opened(file)
+    codes = {each.name: np.empty((layout.count, each.size), np.uint8) for each in layout.streams()}
+    for each, part, some in rows:
+        codes[each.name][part] = some
+    return layout, codes
+
+
 def _opened(file: BinaryIO) -> tuple[Layout, Iterator[StreamRows], dict[str, int]]:
     """The layout of a file, the rows of its streams, and more numbers, the last of which come with the rows."""
     size = size_of(file)

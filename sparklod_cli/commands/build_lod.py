@@ -10,6 +10,7 @@ from typing import Any
 import click
 
 from ..codecs.streamed_sog.names import MANIFEST
+from ..support import interrupts
 from ..support.errors import SparklodError
 from ..support.printable import MOST, shortened
 from ..support.stdin import DASH, name_of
@@ -17,12 +18,14 @@ from .build_lod_inputs import Inputs, check_inputs, input_options, record_of
 from .build_lod_jobs import job_of
 from .build_lod_outputs import Outputs, check_formats
 from .command import COMMON, Command, option
+from .console import say
 from .options.baking import STREAMED_SOG, baking_options, check_method, method_of
 from .options.cluster import OF_CLUSTERS, check_cluster, cluster_of, cluster_options
 from .options.common import General, common_options, output_option, overwrite_option
+from .options.refining import check_refining
 from .options.resources import HEADING as LARGE
 from .options.resources import OF_BAKES, resources_options
-from .paths import OutputPath, claim_stdout, keep_apart, with_chunks
+from .paths import OutputPath, claim_stdout, is_same_place, keep_apart, with_chunks
 from .usage import exclude, options_of
 
 EXAMPLES = """
@@ -31,6 +34,7 @@ Examples:
   sparklod build-lod scene.ply                          # writes scene-lod.spz
   sparklod build-lod scene.ply --up -y                  # y up, as viewers want it
   sparklod build-lod scene.ply --method quality         # for publishing
+  sparklod build-lod scene.ply --method quality --refine    # the closest to full detail, in minutes
   sparklod build-lod scans/*.ply --output-dir web -f --skip-existing
   sparklod build-lod scans/*.ply --output-dir web --workers 4
   sparklod build-lod tiles/*.ply --merge -o city-lod.rad
@@ -42,6 +46,7 @@ Examples:
   sparklod build-lod scene.ply --format rad             # scene-lod.rad, which Spark streams
   sparklod build-lod scene.ply -o web/scene.rad --cluster-sh
   sparklod build-lod scene-lod.spz --format rad         # the same tree in the other format
+  sparklod build-lod scene-lod.spz --refine             # the same tree, fitted: scene-lod-refined.spz
   sparklod build-lod scene.ply -o web/lod-meta.json     # Streamed SOG, which PlayCanvas streams
   sparklod build-lod scene.ply --format streamed-sog --levels 50%,25%,10%    # scene-lod/lod-meta.json
   sparklod build-lod scene.sog --encoding ext           # writes scene-lod.npz
@@ -55,7 +60,7 @@ Examples:
 @output_option(
     "Output of a single input; - is standard output.  [default: NAME-lod.spz beside the input;"
     f" NAME-lod.rad with --format rad, NAME-lod/{MANIFEST} with --format {STREAMED_SOG}, NAME-lod.npz with --encoding,"
-    " NAME-unlod.spz with --unlod]",
+    " NAME-unlod.spz with --unlod, NAME-lod-refined.spz of a NAME-lod.spz with --refine]",
     addresses=True,
 )
 @option(
@@ -123,6 +128,10 @@ def build_lod(ctx: click.Context, /, **_: Any) -> None:
                 record = {**record_of(source), "output": str(target), **dataclasses.asdict(outcome)}
             if general.as_json:
                 click.echo(json.dumps(record))
+            if interrupts.came():  # while merged splats were fitted, which ended early then
+                console.clear()
+                say("interrupted")
+                ctx.exit(interrupts.INTERRUPTED)
     if failed:
         ctx.exit(1)
 
@@ -138,6 +147,8 @@ def _check(ctx: click.Context, given: Inputs, named: list[Path], outputs: Output
     elif DASH in inputs:
         raise click.UsageError("standard input has no name to derive one from; give --output")
     targets = [outputs.output] if outputs.output is not None else [outputs.target(source) for source in inputs]
+    if outputs.may_replace_inputs and not given.is_merged:
+        targets = [target for source, target in zip(inputs, targets, strict=True) if not is_same_place(source, target)]
     if outputs.is_chunked or outputs.is_folder or outputs.is_streamed_sog:
         targets = with_chunks(targets)
     keep_apart(ctx, {"output" if outputs.output_dir is None else "output_dir": targets, "scene": named})
@@ -148,8 +159,9 @@ def _check(ctx: click.Context, given: Inputs, named: list[Path], outputs: Output
         raise click.UsageError("--skip-existing needs an output that can be there already; name a file")
     check_formats(ctx, outputs)
     check_cluster(ctx)
+    check_refining(ctx)
     if outputs.unlod:
-        exclude(ctx, (*OF_BAKES, *OF_CLUSTERS, "skip_existing"), "--unlod")
+        exclude(ctx, (*OF_BAKES, *OF_CLUSTERS, "refine", "skip_existing"), "--unlod")
     else:
         check_method(ctx, method_of(ctx, streamed_sog=outputs.is_streamed_sog))
     if DASH in inputs:

@@ -73,11 +73,12 @@ def job_of(
 
 def _jobs_of(outputs: Outputs, settings: BakeSettings) -> list[str]:
     """The jobs of `warmup.JOBS` after that of the builder."""
+    jobs = ["refine"] if settings.refine is not None else []
     if outputs.is_streamed_sog:
-        return ["streamed-sog"]
-    if outputs.suffix != RAD:
-        return []
-    return ["rad"] if settings.options.rad.sh_codes is None else ["rad", "palette"]
+        jobs.append("streamed-sog")
+    elif outputs.suffix == RAD:
+        jobs += ["rad"] if settings.options.rad.sh_codes is None else ["rad", "palette"]
+    return jobs
 
 
 def _one_by_one(make: Callable[..., Made]) -> Make:

@@ -8,6 +8,7 @@ import click
 
 from ..codecs.formats import FORMATS, WRITABLE, ending_of
 from ..codecs.gpu.table import NPZ, RAW_SUFFIXES
+from ..codecs.rad.names import SUFFIX as RAD
 from ..codecs.streamed_sog.names import MANIFEST
 from ..support.addresses import Place
 from ..support.stdin import DASH
@@ -47,6 +48,9 @@ class Outputs:
         output_dir: the folder of all of them.
         overwrite: replace files that exist.
         unlod: write the splats of trees.
+        inputs: what they are made of.
+        refine: steps by which merged splats are fitted; None for not at all.
+        skip_existing: make nothing that is there already.
         form: of the outputs, a key of `FORMS`; None where nobody chose.
         encoding: of array files.
     """
@@ -55,6 +59,9 @@ class Outputs:
     output_dir: Place | None
     overwrite: bool
     unlod: bool
+    inputs: tuple[Place, ...]
+    refine: int | None
+    skip_existing: bool
     form: str | None
     encoding: str | None
 
@@ -73,7 +80,19 @@ class Outputs:
         """Of the format that is written, which a name need not have."""
         if self.encoding:
             return NPZ
-        return FORMS[self.form][0] if self.form is not None else self.named_suffix or SPZ
+        if self.form is not None:
+            return FORMS[self.form][0]
+        return self.named_suffix or (RAD if self.refine is not None and self._suffixes == {RAD} else SPZ)
+
+    @property
+    def _suffixes(self) -> set[str]:
+        """Of the inputs."""
+        return {source.suffix.lower() for source in self.inputs}
+
+    @property
+    def may_replace_inputs(self) -> bool:
+        """Whether an input may be its own output: of a tree that is refined, the leaves and links stay."""
+        return self.refine is not None and self.overwrite and not self.skip_existing
 
     @property
     def is_streamed_sog(self) -> bool:
@@ -100,6 +119,15 @@ class Outputs:
         """Whether somebody chose the format, by --format or by a name."""
         return self.form is not None or self.named_suffix in TREES or self.is_streamed_sog
 
+    def check_kept_format(self) -> None:
+        """Raises a `click.UsageError` where trees of several formats would have to be refined as one format."""
+        chosen = self.form is not None or self.encoding is not None or self.output is not None
+        if self.refine is not None and not chosen and RAD in self._suffixes and len(self._suffixes) > 1:
+            raise click.UsageError(
+                "--refine keeps the format of a Level-of-Detail file, and the inputs are of several; give --format, or"
+                " refine the .rad files on their own"
+            )
+
     def target(self, source: Place) -> Place:
         """Where an input goes."""
         return self.output or (self.output_dir or source.parent) / self._name(source)
@@ -110,14 +138,17 @@ class Outputs:
             return f"{stem.removesuffix('-lod')}-lod/{MANIFEST}"
         if self.unlod:
             return f"{stem.removesuffix('-lod')}-unlod{self.suffix}"
-        if self.form is not None and source.suffix.lower() in TREES:  # a tree in another format has its name
+        known = self.form is not None or self.refine is not None
+        if known and source.suffix.lower() in TREES:  # a tree in another format has its name
             stem = stem.removesuffix("-lod")
-        return f"{stem}-lod{self.suffix}"
+        name = f"{stem}-lod{self.suffix}"
+        return f"{stem}-lod-refined{self.suffix}" if self.refine is not None and name == source.name else name
 
 
 def check_formats(ctx: click.Context, outputs: Outputs) -> None:
     """Raises a `click.UsageError` where the options of formats, and the name of the output, contradict each other."""
     suffix = outputs.named_suffix
+    outputs.check_kept_format()
     if outputs.is_streamed_sog:
         _check_streamed_sog(ctx, outputs)
         return

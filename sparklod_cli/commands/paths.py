@@ -139,6 +139,13 @@ def claim_stdout(ctx: click.Context, name: str, *, as_json: bool, binary: bool =
         raise click.UsageError(f"{flag} - writes binary data; redirect it to a file or a pipe")
 
 
+def is_same_place(one: Place, other: Place) -> bool:
+    """Whether two paths are of the same file, whatever links and spellings lead there."""
+    if DASH in (one, other):
+        return False
+    return _place(one) == _place(other) or (_identity(one) is not None and _identity(one) == _identity(other))
+
+
 def _keep_apart(outputs: Iterable[Place], inputs: Iterable[Place]) -> None:
     files = set[tuple[int, int]]()
     places = dict[str, str]()

@@ -10,7 +10,7 @@ from ..support.units import format_size
 from .console import Console, count_of, size_of
 
 if TYPE_CHECKING:
-    from ..api.bake_jobs import Baked, Extracted, WrittenDetail
+    from ..api.bake_jobs import Baked, Extracted, Refined, WrittenDetail
     from ..codecs.clamps import Clamp
 
 #: What clamping does to a scene and what to do about it, by column of `Splats` and whether the upper end clamps.
@@ -52,6 +52,8 @@ def report_baked(console: Console, source: Place, target: Place, baked: Baked) -
     )
     if baked.detail is not None and len(baked.detail.levels) > 1:
         console.say(f"  {_levels(baked.detail)}")
+    if baked.refine is not None:
+        console.say(f"  {_refined(baked.refine)}")
     if baked.dropped:
         console.say(f"  left out: {describe(baked.dropped)}")
     for note in baked.notes:
@@ -59,6 +61,7 @@ def report_baked(console: Console, source: Place, target: Place, baked: Baked) -
     for clamp in baked.clamps:
         console.say(f"  {_clamped(clamp, baked)}")
     tree = f"{baked.method} tree" if baked.method is not None else "the same tree"
+    tree += ", refined" if baked.refine is not None else ""
     console.detail(f"  {baked.format} -> {tree} -> {_written(baked)}; {_stages(baked.seconds)}")
     if baked.blocks is not None:
         written, read = (format_size(size or 0) for size in (baked.scratch_bytes_written, baked.scratch_bytes_read))
@@ -75,6 +78,19 @@ def _made(baked: Baked) -> str:
     return (
         f"{count_of(len(detail.levels), 'detail level')} of {count_of(detail.regions, 'region')},"
         f" {count_of(detail.chunks, 'chunk file')}{environment}"
+    )
+
+
+def _refined(refined: Refined) -> str:
+    """How far cuts are from full detail before and after the fitting, on held-out cameras."""
+    gains = (
+        f"{100 * share:g} % {before:.2f} -> {refined.psnr_after[share]:.2f}"
+        for share, before in refined.psnr_before.items()
+    )
+    early = "" if refined.is_complete else ", interrupted"
+    return (
+        f"refined in {count_of(refined.steps, 'step')}{early}: held-out PSNR {', '.join(gains)} dB;"
+        f" {100 * refined.kept:.3g} % of the merged splats are new"
     )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from typing import BinaryIO
 
@@ -41,12 +41,17 @@ class Identity:
     sample: str
 
 
-def files_of(path: Place) -> list[Place]:
-    """The file of a path and those that it names, or the files of a folder that is an unpacked or a Streamed SOG."""
+def files_of(path: Place, sets: Collection[Collection[str]] = ()) -> list[Place]:
+    """The file of a path and those that it names, or the files of a folder that is an unpacked or a Streamed SOG.
+
+    Args:
+        path: of a file or a folder.
+        sets: names of files that belong together where some are there, as for `read_together`.
+    """
     if path == DASH or isinstance(path, Address):
         return [path]
-    found = companions(path, ())
-    return [*found] if path.is_dir() else [path, *found]
+    found = companions(path, sets)
+    return [*found] if path.is_dir() else [path, *(file for file in found if file != path)]
 
 
 def identity_of(path: Place) -> Identity:

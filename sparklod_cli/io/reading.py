@@ -9,6 +9,7 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from ..codecs.encoder import Stored
 from ..codecs.formats import FORMATS, HEAD, Format, sniff
 from ..codecs.gpu import dump
 from ..codecs.gpu.table import NPZ, RAW_SUFFIXES
@@ -40,6 +41,20 @@ def read_scene(path: Place, *, threads: int = 1, progress: Progress = silent) ->
     with opened(path) as (file, form, more):
         scene: Scene = form.codec().decode(file, threads=threads, progress=progress, **more)
     return scene
+
+
+def read_stored(path: Place) -> Stored:
+    """The codes of a Level-of-Detail file as they stand in it, so that its leaves can be written again bit for bit.
+
+    Args:
+        path: of a file whose format can be written with a tree; - is standard input.
+
+    Raises:
+        FormatError: as `read_scene`.
+    """
+    with opened(path) as (file, form, more):
+        found: Stored = form.codec().stored(file, **more)
+    return found
 
 
 def read_levels(path: Place, *, threads: int = 1, progress: Progress = silent) -> DetailScene:

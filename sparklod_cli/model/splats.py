@@ -145,6 +145,15 @@ class Splats:
 COLUMNS = tuple(field.name for field in dataclasses.fields(Splats))
 
 
+def same_rows(one: Splats, other: Splats) -> NDArray[np.bool_]:
+    """(N,) which of as many splats have the same values, bit for bit."""
+    same = np.ones(len(one), bool)
+    for name in COLUMNS:
+        a, b = (getattr(splats, name).reshape(len(one), -1).view(np.uint32) for splats in (one, other))
+        same &= (a == b).all(axis=1)
+    return same
+
+
 def describe_invalid(invalid: dict[str, NDArray[np.bool_]]) -> str:
     """ "3 of 50 splats are not finite (NaN, infinite, or a rotation of length 0; the first is splat 7)", for messages.
 

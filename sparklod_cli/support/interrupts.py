@@ -8,7 +8,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from types import FrameType
 
 #: The signals that end a run, if the system has them.
@@ -30,6 +30,22 @@ LOST, PATIENCE = 0, 0.02
 #: Set when a signal has interrupted the run.
 _came = threading.Event()
 
+
+class _Deferral:
+    """Whether a first Ctrl-C waits for the work to come to an end by itself, see `deferred`.
+
+    Attributes:
+        lasts: there is such work.
+        asked: the main thread has handled the first one.
+        seen: the watching thread has seen the first one, which may be before that.
+    """
+
+    def __init__(self) -> None:
+        self.lasts = self.asked = self.seen = False
+
+
+_deferral = _Deferral()
+
 #: The main thread and the watching thread may both end the process; only one of them writes the message.
 _leaving = threading.Lock()
 
@@ -45,6 +61,10 @@ def handle() -> None:
     ]  # an ignored signal stays ignored, as under nohup
 
     def interrupt(signum: int, frame: FrameType | None) -> None:
+        if signum == signal.SIGINT and _deferral.lasts and not _deferral.asked:
+            _deferral.asked = True
+            _came.set()
+            return
         _leave_if_compiling()
         _came.set()
         for number in handled:
@@ -68,6 +88,21 @@ def came() -> bool:
     of numpy's C modules does.
     """
     return _came.is_set()
+
+
+@contextlib.contextmanager
+def deferred() -> Iterator[Callable[[], bool]]:
+    """Lets work that can stop early do so by itself at the first Ctrl-C; yields the function that tells it to.
+
+    `came` knows of that Ctrl-C. A second one, and every other signal, interrupts as ever, and so does the first one
+    after the context has ended. Without `handle`, as in a library, nothing is deferred.
+    """
+    _deferral.asked = _deferral.seen = False
+    _deferral.lasts = True
+    try:
+        yield lambda: _deferral.asked
+    finally:
+        _deferral.lasts = False
 
 
 def ignore() -> None:
@@ -102,8 +137,15 @@ def _watch(reader: int, handled: list[signal.Signals]) -> None:
         if LOST in read:
             time.sleep(PATIENCE)  # until the callback is left that lost it
             signal.pthread_kill(main, handled[0])
-        if any(number in handled for number in read):
+        if any(number in handled and not _waits(number) for number in read):
             _leave_if_compiling()
+
+
+def _waits(number: int) -> bool:
+    """Whether the watching thread sees a first Ctrl-C that is deferred."""
+    waits = number == signal.SIGINT and _deferral.lasts and not _deferral.seen
+    _deferral.seen |= waits
+    return waits
 
 
 def _leave_if_compiling() -> None:

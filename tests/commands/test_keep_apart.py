@@ -27,6 +27,7 @@ INPUTS: dict[str, dict[str, tuple[object, ...]]] = {
         "rgba": (PLAIN, "--rgba", "X"),
         "scene": ("--scene", "X"),
         "environment": (PLAIN, "--environment", "X"),
+        "camera_path": (PLAIN, "--refine", "--camera-path", "X"),
     },
     "inspect": {"files": ("X",), "expect": (LOD, "--expect", "X"), "leaves_of": (LOD, "--leaves-of", "X")},
     "traverse": {

@@ -26,6 +26,7 @@ from .reading import examine as examine
 from .reading import name_of as name_of
 from .reading import read_chunk as read_chunk
 from .reading import stream as stream
+from .stored import stored as stored
 
 #: Bytes of chunks that wait in memory for their header; beyond, they wait on disk.
 SPOOLED = 1 << 26

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +39,21 @@ _RAW = -zlib_ng.MAX_WBITS
 
 #: The largest float32 below 1.
 _BELOW_1 = np.nextafter(np.float32(1), np.float32(0))
+
+
+class Coded(NamedTuple):
+    """A property of a chunk.
+
+    Attributes:
+        encoding: one of `layout.SIZES`.
+        codes: their bytes, of any shape, not compressed.
+        min, max: ends of the range of the codes; None where there is none.
+    """
+
+    encoding: str
+    codes: NDArray[Any]
+    min: float | None
+    max: float | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,16 +132,22 @@ class RadEncoder:
         payload, properties, at = [], [], 0
         labels = None if self.palette is None else self.palette.labels_of(splats, start)
         for row in self._rows(first=start == 0):
-            encoding = getattr(self.options.rad, row.option) if row.option else row.encodings[0]
-            low, high = code_range(row, self._codes)
-            values = self._values(row, encoding, splats, tree, labels)
-            data = self._deflated(CODINGS[encoding].encode(values, low, high), encoding)
-            ends = (low, high) if RANGES.get(encoding) else (None, None)
-            properties.append(Property(at, len(data), row.name, encoding, GZ, *ends))
+            made = self.coded(row, splats, tree, labels, start)
+            data = self._deflated(made.codes, made.encoding)
+            properties.append(Property(at, len(data), row.name, made.encoding, GZ, made.min, made.max))
             payload += [data, bytes(padding(len(data)))]
             at += len(data) + padding(len(data))
         header = RadChunkHeader(start, len(splats), at, self.sh_degree, self.tree, tuple(properties), self._codes)
         return b"".join([pack_chunk_header(header), *payload])
+
+    def coded(
+        self, row: Row, splats: Splats, tree: LodTree | None, labels: NDArray[np.uint32] | None, start: int
+    ) -> Coded:
+        """A property of the chunk that begins with node `start`."""
+        encoding = getattr(self.options.rad, row.option) if row.option else row.encodings[0]
+        low, high = code_range(row, self._codes)
+        codes = CODINGS[encoding].encode(self.values(row, encoding, splats, tree, labels), low, high)
+        return Coded(encoding, codes, *((low, high) if RANGES.get(encoding) else (None, None)))
 
     def _rows(self, *, first: bool) -> Iterator[Row]:
         """The properties of a chunk."""
@@ -141,7 +162,7 @@ class RadEncoder:
             if present:
                 yield row
 
-    def _values(
+    def values(
         self, row: Row, encoding: str, splats: Splats, tree: LodTree | None, labels: NDArray[np.uint32] | None
     ) -> NDArray[Any]:
         """(n, numbers) values of a property, as its encoding takes them."""

@@ -18,6 +18,7 @@ from ..paths import InputPath
 from ..usage import given, is_given, refuse
 from .common import Command
 from .detail import detail_of, detail_options
+from .refining import fit_settings_of, refining_options
 from .types import AutoOr, Ball, Codes, Numbers, Real
 
 if TYPE_CHECKING:
@@ -232,7 +233,7 @@ OPTIONS: tuple[Callable[[Command], Command], ...] = (
 
 def baking_options(command: Command) -> Command:
     """Adds the options of this module; `bake_settings` and `write_options` take what they are given."""
-    return with_options(command, *OPTIONS, detail_options)
+    return with_options(command, *OPTIONS, refining_options, detail_options)
 
 
 def method_of(ctx: click.Context, *, streamed_sog: bool) -> str:
@@ -291,6 +292,8 @@ def bake_settings(ctx: click.Context, *, suffix: str, raw: bool, streamed_sog: b
         detail=detail_of(ctx) if streamed_sog else None,
         environment=asked["environment"],
         environment_beyond=asked["environment_beyond"],
+        refine=fit_settings_of(ctx),
+        camera_path=asked["camera_path"],
         converts=converts,
         unused=tuple(given(ctx, (*OF_TREES, *OF_SELECTION, *OF_PLACE, "environment_beyond"))),
     )

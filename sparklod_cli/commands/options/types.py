@@ -83,12 +83,22 @@ class AutoOr(click.IntRange):
 
 
 class Codes(click.IntRange):
-    """A number that may be left out, so that an input after its option is taken for it; says what to do then."""
+    """A number that may be left out, so that an input after its option is taken for it; says what to do then.
+
+    Args:
+        least, most: of the number.
+        example: of it, for that message; the most unless given.
+    """
+
+    def __init__(self, least: int, most: int, *, example: int | None = None) -> None:
+        super().__init__(least, most)
+        self.example = most if example is None else example
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
         if isinstance(value, str) and not value.lstrip("-").isdigit() and param is not None:
             flag = param.opts[0]
-            self.fail(f"{value!r} is no number; put {flag} after the inputs, or write {flag}={self.max}", param, ctx)
+            example = f"{flag}={self.example}"
+            self.fail(f"{value!r} is no number; put {flag} after the inputs, or write {example}", param, ctx)
         number: int = super().convert(value, param, ctx)
         return number
 

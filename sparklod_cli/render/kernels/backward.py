@@ -15,7 +15,7 @@ from numba import prange
 from ...support.jit import kernel
 from .falloff import gauss, merged_parts
 from .project import BLUE, END, GREEN, OPACITY, POWER, RED, A, B, C
-from .raster import LANES, TILE, box_in_tile, tiles_of
+from .raster import LANES, TILE, box_in_tile, lines_of, tiles_of, tilt_of
 
 f32 = np.float32
 
@@ -190,10 +190,15 @@ def weigh_tiles(drawn, first, least, image, by_image, sums):
             if entry >= drawn.stop[tile]:
                 continue
             x, y, first_line, last_line, begin, end = box_in_tile(row, left, top, rows, columns)
-            for block in range(begin, end if first_line < last_line else begin):
+            lean, slope, tall, narrow, slack = tilt_of(row)
+            for block in range(begin, end):
+                away = x - f32(LANES * block)
+                top_line, bottom_line = lines_of(away, y, lean, slope, tall, narrow, slack, first_line, last_line)
+                if top_line >= bottom_line:
+                    continue
                 column = records[block]
-                column[first_line * RECORD : first_line * RECORD + SUMS * LANES] = 0
-                for line in range(first_line, last_line):
+                column[top_line * RECORD : top_line * RECORD + SUMS * LANES] = 0
+                for line in range(top_line, bottom_line):
                     record = column[line * RECORD : (line + 1) * RECORD + SUMS * LANES]
-                    weigh_lanes(record, row, x - f32(LANES * block), f32(line) - y, least)
-                add_lanes(column[last_line * RECORD : last_line * RECORD + SUMS * LANES], out)
+                    weigh_lanes(record, row, away, f32(line) - y, least)
+                add_lanes(column[bottom_line * RECORD : bottom_line * RECORD + SUMS * LANES], out)

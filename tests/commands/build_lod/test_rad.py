@@ -141,7 +141,9 @@ def test_a_tree_is_refused_where_nothing_is_to_be_converted(tmp_path: Path, caps
     capsys.readouterr()
     for source, options, hint in refused:
         assert build(source, "-o", tmp_path / "out", *options) == 1
-        said = f"it is a Level-of-Detail file already; --unlod writes its splats back out, and --format {hint}\n"
+        said = (
+            f"it is a Level-of-Detail file already; --unlod writes its splats back out, and --format {hint}; --refine"
+        )
         assert said in capsys.readouterr().err
     for options in (
         ["--base", "1.5"],

@@ -1,0 +1,100 @@
+"""Fits the merged splats of a tree that is baked: `--refine`."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..cameras.sources import read_path
+from ..fitting.settings import FitReport, FitSettings
+from ..model.scene import Scene
+from ..model.splats import Splats, describe_invalid
+from ..support import interrupts
+from ..support.errors import InvalidSplatsError
+from ..support.progress import Progress
+from .settings import BakeSettings
+
+
+@dataclass(frozen=True, kw_only=True)
+class Refined(FitReport):
+    """What fitting the merged splats brought, as `--json` has it.
+
+    Attributes:
+        seed: of the cameras and budgets that were drawn at random.
+        seconds: that it took.
+    """
+
+    seed: int
+    seconds: float
+
+
+def fit_settings(settings: BakeSettings) -> FitSettings | None:
+    """How merged splats are fitted, with the cameras of the file that the settings name; None for not at all.
+
+    Raises:
+        CameraPathError: that file cannot be read, or has no cameras; names it.
+    """
+    if settings.refine is None or settings.camera_path is None:
+        return settings.refine
+    return dataclasses.replace(settings.refine, path=read_path(settings.camera_path))
+
+
+def refined(
+    scene: Scene, settings: FitSettings, *, threads: int, progress: Progress, say: Callable[[str], None]
+) -> tuple[Scene, Refined]:
+    """A tree whose merged splats are fitted, and what that brought.
+
+    A first Ctrl-C ends the fitting early: what the finished stages gained is kept.
+
+    Args:
+        scene: a tree.
+        settings: how.
+        threads: to work on; the result does not depend on it.
+        progress: told of the steps.
+        say: told what came of each stage.
+
+    Raises:
+        InvalidSplatsError: a node has numbers that no splat has, as only a file of another program can.
+        KeyboardInterrupt: the fitting was interrupted before it gained anything.
+    """
+    from ..fitting.fit import fit
+
+    assert scene.tree is not None
+    invalid = scene.splats.invalid()
+    if invalid:
+        raise InvalidSplatsError(f"--refine takes no tree with invalid nodes: {describe_invalid(invalid)}")
+    start = time.perf_counter()
+    with interrupts.deferred() as interrupted:
+        nodes, report = fit(
+            scene.splats,
+            scene.tree,
+            settings,
+            antialiased=scene.antialiased,
+            threads=threads,
+            progress=progress,
+            say=say,
+            interrupted=interrupted,
+        )
+    if not report.is_complete:
+        if not report.kept:
+            raise KeyboardInterrupt
+        say("interrupted; what the finished stages gained is written, and a second Ctrl-C ends without an output")
+    seconds = round(time.perf_counter() - start, 4)
+    return dataclasses.replace(scene, splats=_within(nodes, scene)), Refined(
+        **vars(report), seed=settings.seed, seconds=seconds
+    )
+
+
+def _within(nodes: Splats, scene: Scene) -> Splats:
+    """Nodes whose merged splats stay in the box of all centres before.
+
+    A format that holds these with some number of bits then still does; with another one, leaves would move.
+    """
+    assert scene.tree is not None
+    center, inner, before = nodes.center.copy(), ~scene.tree.is_leaf, scene.splats.center
+    center[inner] = np.clip(center[inner], before.min(axis=0), before.max(axis=0))
+    return dataclasses.replace(nodes, center=center)
