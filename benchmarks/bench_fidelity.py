@@ -19,6 +19,7 @@ from fidelity_report import WITH_SH, add_outputs, report
 from fidelity_trees import METHODS, SHARES, Source, build, decimated
 from fidelity_views import CAMERAS, MOVING, OF_PATHS, SIZE, Figures, FullDetail, cameras_of, of_tree
 from fine_structure import fine_structure
+from glossy_knot import glossy_knot
 from scenes import write_ply
 
 import sparklod_cli as sparklod
@@ -27,7 +28,7 @@ import sparklod_cli as sparklod
 REAL_SCENES = ("biker.ply", "playbot.sog", "playbot-125k.ply", "meadow.sog")
 
 #: Scenes that we make.
-MADE = {"fine-structure": fine_structure}
+MADE = {"fine-structure": fine_structure, "glossy-knot": glossy_knot}
 
 BUDGETS = "2%,5%,10%,25%,50%"
 

@@ -19,15 +19,18 @@ if TYPE_CHECKING:
     from .api.cameras import orbit, read_cameras
     from .api.files import build_lod, extract_leaves, inspect, pack, read, unpack
     from .api.rad import arrange_chunks, read_rad_chunk, read_rad_header
+    from .api.refining import refine
     from .api.results import ComparisonTable, Frames, Picture, show
     from .api.views import compare, cut, psnr, render, ssim, traverse
     from .api.writing import Written, write
+    from .bake.refining import Refined
     from .cameras.camera import Camera
     from .cameras.path import CameraPath
     from .codecs.options import RadOptions, SogOptions
     from .codecs.rad.codec import RadChunk
     from .codecs.rad.records import RadChunkEntry, RadChunkHeader, RadHeader
     from .codecs.splat_encoding import SplatEncoding
+    from .fitting.settings import FitSettings
     from .inspection.report import Report
     from .lod.detail_rule import DetailRule
     from .lod.detail_settings import DetailSettings
@@ -62,15 +65,18 @@ _MODULES = {
     "api.cameras": ("orbit", "read_cameras"),
     "api.files": ("build_lod", "extract_leaves", "inspect", "pack", "read", "unpack"),
     "api.rad": ("arrange_chunks", "read_rad_chunk", "read_rad_header"),
+    "api.refining": ("refine",),
     "api.results": ("ComparisonTable", "Frames", "Picture", "show"),
     "api.views": ("compare", "cut", "psnr", "render", "ssim", "traverse"),
     "api.writing": ("Written", "write"),
+    "bake.refining": ("Refined",),
     "cameras.camera": ("Camera",),
     "cameras.path": ("CameraPath",),
     "codecs.options": ("RadOptions", "SogOptions"),
     "codecs.rad.codec": ("RadChunk",),
     "codecs.rad.records": ("RadChunkEntry", "RadChunkHeader", "RadHeader"),
     "codecs.splat_encoding": ("SplatEncoding",),
+    "fitting.settings": ("FitSettings",),
     "inspection.report": ("Report",),
     "lod.detail_settings": ("DetailSettings",),
     "lod.detail_rule": ("DetailRule",),
@@ -105,6 +111,7 @@ __all__ = [
     "Cut",
     "DetailRule",
     "DetailSettings",
+    "FitSettings",
     "FormatError",
     "Frames",
     "Frustum",
@@ -123,6 +130,7 @@ __all__ = [
     "RadHeader",
     "RadOptions",
     "RasterSettings",
+    "Refined",
     "RenderSettings",
     "Report",
     "Scene",
@@ -150,6 +158,7 @@ __all__ = [
     "read_instances",
     "read_rad_chunk",
     "read_rad_header",
+    "refine",
     "render",
     "show",
     "ssim",

@@ -93,8 +93,11 @@ JOBS = {
     ),
     "refine": Job(
         (
-            *("cut.find_cut", "project.gather_drawn", "project.project", "raster.draw_tiles"),
-            *("raster.sort_into_tiles", "shade.add_sh"),
+            *("adam.step", "backward.first_rows", "backward.weigh_tiles", "cut.find_cut", "difference.by_image"),
+            *("difference.squared_differences", "project.gather_drawn", "project.project"),
+            *("project_gradients.carry_back", "raster.draw_tiles", "raster.sort_into_tiles", "shade.add_sh"),
+            *("shade.sh_gradients", "tree_links.add_child_sizes", "tree_links.find_parents", "view.gather"),
+            "view.mark_seen",
         ),
         ("build-lod shiny.spz --refine 2 -o refined.spz",),
     ),

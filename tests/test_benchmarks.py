@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import sparklod_cli as sparklod
 from tests.conftest import ROOT
 
 BENCHMARKS = sorted(path.stem for path in (ROOT / "benchmarks").glob("bench_*.py"))
@@ -121,3 +122,20 @@ def test_the_scene_of_thin_things_is_the_same_for_a_seed_and_thin(benchmark_modu
     assert 0 < splats.opacity.min() <= splats.opacity.max() < 1
     ratio = splats.scale.max(axis=1) / splats.scale.min(axis=1)
     assert np.mean(ratio > 3) > 0.5, "most splats are far longer than wide"
+
+
+def test_the_glossy_knot_is_the_same_for_a_seed_and_has_highlights(benchmark_module: Any) -> None:
+    make = benchmark_module("glossy_knot").glossy_knot
+    splats, again, other = make(), make(), make(1)
+    assert (splats.sh_degree, len(splats)) == (3, 70_000)
+    assert (splats.sh == again.sh).all() and (splats.center == again.center).all()
+    assert (splats.center != other.center).any()
+    assert 0.1 < np.mean(np.log(splats.scale.min(axis=1)) < -10) < 0.9, "some are thinner than SPZ holds"
+    bright = [sparklod.render(sparklod.Scene(each), camera(splats)) for each in (splats, splats.with_max_sh(0))]
+    assert np.abs(bright[0] - bright[1]).max() > 0.2
+
+
+def camera(splats: sparklod.Splats) -> sparklod.Camera:
+    """A camera that sees the splats from where the light comes."""
+    middle = splats.center.mean(axis=0)
+    return sparklod.Camera.look_at(middle + np.array([0.14, -0.24, -0.11]), middle, size=(96, 54))

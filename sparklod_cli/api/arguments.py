@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 
 from ..cameras.camera import Camera
+from ..cameras.path import CameraPath
 from ..model.scene import Scene
 
 
@@ -30,6 +33,25 @@ def camera_like(value: Any) -> Camera:
     if not isinstance(value, Camera):
         raise TypeError(f"a camera is a Camera, not {_kind(value)}; Camera.look_at makes one, read_cameras reads paths")
     return value
+
+
+def path_like(cameras: CameraPath | Iterable[Camera]) -> CameraPath:
+    """Cameras one after the other.
+
+    Raises:
+        TypeError: one is no camera.
+        ValueError: there are none, or they are not in the order of their times.
+    """
+    if isinstance(cameras, CameraPath):
+        return cameras
+    if isinstance(cameras, str):
+        camera_like(cameras)
+    every = tuple(map(camera_like, [cameras] if isinstance(cameras, Camera) else cameras))
+    if not every:
+        raise ValueError("there are no cameras; give at least one")
+    if any(later.time < earlier.time for earlier, later in itertools.pairwise(every)):
+        raise ValueError("the cameras are not in the order of their times")
+    return CameraPath(every, "cameras", (), tuple(range(len(every))))
 
 
 def within(name: str, value: Any, least: float, most: float) -> None:

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from ..fitting.settings import FitSettings
     from ..inspection.report import Report
     from ..model.selection import Selection
 
@@ -89,6 +90,7 @@ def build_lod(
     growth: float = DEFAULT_GROWTH,
     max_sh: int = MAX_SH_DEGREE,
     selection: Selection | None = None,
+    refine: bool | int | FitSettings = False,
     threads: int | None = None,
     progress: Told = None,
 ) -> Tree:
@@ -101,6 +103,8 @@ def build_lod(
         growth: of quality, the most nodes for each leaf, 1.05 to 2.0.
         max_sh: SH degrees above this are left out.
         selection: which splats to keep; all that can be drawn, unless given.
+        refine: fit merged splats to pictures of full detail: True, or in how many steps, or how. The function `refine`
+            does the same and tells what it brought.
         threads: to work on; None for all processors.
         progress: called with how much is done.
 
@@ -112,6 +116,7 @@ def build_lod(
     from ..bake import BakeSettings
     from ..lod.band_order import banded
     from ..model.selection import Selection
+    from .refining import asked_for, refined_tree
 
     if scene_like(scene).tree is not None:
         raise FormatError("the scene has a Level-of-Detail tree already; extract_leaves gives its splats")
@@ -120,12 +125,14 @@ def build_lod(
     within("base", base, MIN_BASE, MAX_BASE)
     within("growth", growth, MIN_GROWTH, MAX_GROWTH)
     whole_within("max_sh", max_sh, 0, MAX_SH_DEGREE)
+    fitting = asked_for(refine)
     build = BakeSettings(method=method, base=base, growth=growth).builder()
     with on_threads(threads), telling(progress) as told, memory_errors_translated():
         kept, _ = (selection or Selection()).apply(scene.splats.with_max_sh(max_sh))
         # A builder frees its input as it goes where nobody else holds it.
         nodes, tree = banded([build(kept, progress=told)])
-    return Tree(nodes, tree, scene.antialiased)
+        made = Tree(nodes, tree, scene.antialiased)
+        return made if fitting is None else refined_tree(made, fitting, thread_count(threads), told, None)[0]
 
 
 def extract_leaves(tree: Scene) -> Scene:

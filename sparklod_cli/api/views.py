@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from fractions import Fraction
@@ -31,7 +30,7 @@ from ..support.defaults import BLEND, PRECISIONS
 from ..support.errors import FormatError, memory_errors_translated
 from ..support.threads import on_threads, thread_count
 from ..tables.comparison import COLUMNS as OF_COMPARISON
-from .arguments import camera_like, viewed_like
+from .arguments import camera_like, path_like, viewed_like
 from .progress import Told, telling
 from .results import ComparisonTable, Frames
 
@@ -153,7 +152,7 @@ def traverse(
     with on_threads(threads) as count, telling(progress) as told, memory_errors_translated():
         scenes = _trees(viewed, count, precision)
         simulation = Simulation(scenes, _lod(scenes, budget, settings, False), streaming, by_instance=by_instance)
-        frames = simulation.run(_path(cameras), threads=count, progress=told)
+        frames = simulation.run(path_like(cameras), threads=count, progress=told)
         return Frames([row for frame in frames for row in frame.rows], COLUMNS)
 
 
@@ -200,7 +199,7 @@ def compare(
         given = [_budget(budget) for budget in budgets]
         lod = settings or LodSettings(pixel_scale_limit=0.0)
         comparison = Comparison(scenes, lod, given, render or RenderSettings(), full=full)
-        rows = list(comparison.run(_path(cameras), threads=count, progress=told))
+        rows = list(comparison.run(path_like(cameras), threads=count, progress=told))
     return ComparisonTable(rows, OF_COMPARISON, [budget.text for budget in given])
 
 
@@ -299,16 +298,3 @@ def _budget(budget: BudgetLike) -> Budget:
     if share:
         return Budget(f"{100 * budget:g}%", Fraction(str(budget)), None)
     return Budget.of_count(int(budget))
-
-
-def _path(cameras: CameraPath | Iterable[Camera]) -> CameraPath:
-    if isinstance(cameras, CameraPath):
-        return cameras
-    if isinstance(cameras, str):
-        camera_like(cameras)
-    every = tuple(map(camera_like, [cameras] if isinstance(cameras, Camera) else cameras))
-    if not every:
-        raise ValueError("there are no cameras; give at least one")
-    if any(later.time < earlier.time for earlier, later in itertools.pairwise(every)):
-        raise ValueError("the cameras are not in the order of their times")
-    return CameraPath(every, "cameras", (), tuple(range(len(every))))

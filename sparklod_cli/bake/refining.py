@@ -66,7 +66,7 @@ def refined(
     assert scene.tree is not None
     invalid = scene.splats.invalid()
     if invalid:
-        raise InvalidSplatsError(f"--refine takes no tree with invalid nodes: {describe_invalid(invalid)}")
+        raise InvalidSplatsError(f"a tree with invalid nodes cannot be refined: {describe_invalid(invalid)}")
     start = time.perf_counter()
     with interrupts.deferred() as interrupted:
         nodes, report = fit(

@@ -3,19 +3,30 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
+from ..cameras.camera import Camera
 from ..model.lod_tree import LodTree
 from ..model.splats import Splats
 from ..render.settings import RasterSettings
 from ..support.progress import Progress, silent
 from ..support.threads import on_threads
 from .cameras import HELD_OUT, Place, placed, split_path
-from .held_out import HeldOut
+from .held_out import Scores, gain, scores_of
+from .laws import keep_gains, keep_sizes
 from .nodes import FittedNodes
-from .settings import FitReport, FitSettings
+from .optimiser import Optimiser
+from .pictures import Picture, pictures
+from .schedule import DEFAULT_STEPS, STAGES, rates_at, shares_of
+from .settings import FitReport, FitSettings, FitStage
+
+#: Near plane at most and far plane at least, in radii of the scene, for scenes of tiny or huge units.
+NEAR, FAR = 0.01, 100.0
+
+#: Times that nodes are given their first values for one law after another, until they keep all.
+TRIES = 4
 
 
 def fit(
@@ -35,22 +46,116 @@ def fit(
         nodes: N nodes in final order.
         tree: of them; it stays as it is, and so do the leaves, bit for bit.
         settings: steps, seed and cameras.
-        antialiased: of the scene.
+        antialiased: of the scene; splats are drawn the same either way, as Spark draws them.
         threads: to work on; the result does not depend on it.
         progress: called with the number of steps done.
         say: called with a line of text after each stage.
         interrupted: asked between steps; when it returns True, what the finished stages gained is returned.
 
     Returns:
-        N nodes, and what fitting brought: never less than before on the held-out cameras.
+        N nodes, and what fitting brought: at none of `settings.SHARES` less than before on the held-out cameras.
     """
     with on_threads(threads):
-        fitted = FittedNodes(nodes, tree, threads)
-        _, held_out_seed = np.random.SeedSequence(settings.seed).spawn(2)
+        fitting = _Fitting(nodes, tree, settings, threads)
+        is_complete = True
+        for number in range(STAGES if fitting.can_gain else 0):
+            if not fitting.run_stage(number, progress, interrupted):
+                is_complete = False
+                break
+            say(fitting.told())
+        return fitting.finish(is_complete)
+
+
+class _Fitting:
+    """What is fitted, and how far it has come."""
+
+    def __init__(self, nodes: Splats, tree: LodTree, settings: FitSettings, threads: int) -> None:
+        place = Place.of(nodes.center[tree.is_leaf])
+        raster = RasterSettings()
+        near, far = min(raster.near, NEAR * place.radius), max(raster.far, FAR * place.radius)
+        self.nodes = FittedNodes(nodes, tree, RasterSettings(near=near, far=far), threads)
+        seeds = np.random.SeedSequence(settings.seed).spawn(3)
+        self._random = np.random.Generator(np.random.PCG64(seeds[2]))
+        training, held_out = self._cameras(settings, place, seeds)
+        self._training = pictures(training, self.nodes)
+        self._held_out = list(itertools.islice(pictures(held_out, self.nodes), HELD_OUT))
+        self._steps = DEFAULT_STEPS if settings.steps is None else settings.steps
+        self._done = 0
+        self._optimiser = Optimiser(self.nodes)
+        self._before = self._best = scores_of(self.nodes, self._held_out)
+        self._kept = self.nodes.copy()
+        self._stages: list[FitStage] = []
+
+    def _cameras(
+        self, settings: FitSettings, place: Place, seeds: list[np.random.SeedSequence]
+    ) -> tuple[Iterator[Camera], Iterator[Camera]]:
+        """Training cameras without end, and held-out cameras."""
         if settings.path is None:
-            cameras = placed(Place.of(nodes.center[fitted.leaves]), held_out_seed)
-        else:
-            cameras = itertools.chain(split_path(settings.path)[1])
-        held_out = HeldOut(cameras, HELD_OUT, fitted, RasterSettings())
-        before = held_out.psnr(fitted)
-        return nodes, FitReport(0, (), before, before, 0.0)
+            return placed(place, seeds[0]), placed(place, seeds[1])
+        training, held_out = split_path(settings.path)
+        return self._shuffled(training), iter(held_out)
+
+    def _shuffled(self, cameras: tuple[Camera, ...]) -> Iterator[Camera]:
+        """Cameras without end, each as often as the others; on a path neighbours see nearly the same."""
+        while True:
+            for at in self._random.permutation(len(cameras)):
+                yield cameras[at]
+
+    @property
+    def can_gain(self) -> bool:
+        """Whether there is anything to do, and to see."""
+        return self._steps > 0 and bool(self._held_out) and self.nodes.merged.size > 0
+
+    def run_stage(self, number: int, progress: Progress, interrupted: Callable[[], bool]) -> bool:
+        """Takes the steps of a stage, and keeps the nodes if that brought anything; False if it was interrupted."""
+        first, last = self._done, self._steps * (number + 1) // STAGES
+        while self._done < last:
+            picture = next(self._training, None)
+            if picture is None or not self._fit_to(picture, last, progress, interrupted):
+                return picture is None
+        now = scores_of(self.nodes, self._held_out)
+        start = self._stages[-1].psnr_after if self._stages else self._before
+        self._stages.append(FitStage(f"fit {number + 1} of {STAGES}", self._done - first, start, now))
+        if gain(self._best, now) > 0:
+            self._best, self._kept = now, self.nodes.copy()
+        return True
+
+    def _fit_to(self, picture: Picture, last: int, progress: Progress, interrupted: Callable[[], bool]) -> bool:
+        """A step for each of some cuts, up to a number of steps; False if it was interrupted."""
+        shown = []
+        for share in shares_of(self._random)[: last - self._done]:
+            if interrupted():
+                return False
+            cut = self.nodes.cut(picture.camera, share)
+            shown.append(self._optimiser.step(picture, cut, rates_at(self._done / self._steps)))
+            self._done += 1
+            progress("refining", self._done, self._steps, "step")
+        self.nodes.renew(np.unique(np.concatenate(shown)))
+        return True
+
+    def told(self) -> str:
+        """What the last stage brought, for display."""
+        stage = self._stages[-1]
+        changes = (
+            f"{share:.0%} {self._before[share]:.2f} -> {after:.2f} dB" for share, after in stage.psnr_after.items()
+        )
+        return f"{stage.name}: {', '.join(changes)}"
+
+    def finish(self, is_complete: bool) -> tuple[Splats, FitReport]:
+        """The best nodes, those that lost with their first values, and the report."""
+        self.nodes.restore(self.nodes.merged, self._kept)
+        after = self._lawful() if self.can_gain else self._before
+        changed = self.nodes.changed()
+        kept = float(changed[self.nodes.merged].mean()) if self.nodes.merged.size else 0.0
+        report = FitReport(self._done, tuple(self._stages), self._before, after, kept, is_complete)
+        return self.nodes.result(), report
+
+    def _lawful(self) -> Scores:
+        """Has the nodes keep what they must, and returns their scores."""
+        for _ in range(TRIES):
+            keep_sizes(self.nodes)
+            after = keep_gains(self.nodes, self._held_out, self._before)
+            if not keep_sizes(self.nodes):
+                return after
+        self.nodes.restore(self.nodes.merged)
+        return self._before

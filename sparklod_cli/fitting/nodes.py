@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 from numpy.typing import NDArray
 
 from ..cameras.camera import Camera
 from ..lod.traversal import Forest, Traversal, TreeInstance, View
 from ..model.foveation import Cones
-from ..model.gaussian import linear_opacity, lod_opacity
+from ..model.gaussian import linear_opacity, lod_opacity, normalized_quat, size_factor
 from ..model.lod_tree import LodTree
+from ..model.sh import COEFFICIENTS
 from ..model.splats import FloatArray, Splats
-from ..render.shading import ShadedSplats, shade
+from ..render import rasterizer
+from ..render.kernels.shade import add_sh
+from ..render.settings import RasterSettings
+from ..render.shading import ShadedSplats
 from ..scenes.loaded_scene import nodes_of
+from .kernels.adam import Columns
+from .kernels.view import gather, mark_seen
 
 Index = NDArray[np.int64]
 
@@ -25,23 +29,23 @@ class FittedNodes:
     Args:
         nodes: N nodes, as they are at first.
         tree: of them.
+        raster: how they are drawn.
         threads: to prepare them on.
 
     Attributes:
-        splats: N, as they are now, but for the opacity; columns are changed in place.
-        lod_opacity: (N,) float32 D, as they are now.
+        columns: of the nodes, as they are now; changed in place.
+        old: the columns as they were at first.
         leaves: indices of full detail, ascending.
-        merged: (N,) bool, the nodes that may change.
+        merged: indices of the nodes that may change, ascending.
     """
 
-    def __init__(self, nodes: Splats, tree: LodTree, threads: int) -> None:
-        self.original, self.tree = nodes, tree
-        self.splats = dataclasses.replace(
-            nodes, **{field.name: getattr(nodes, field.name).copy() for field in dataclasses.fields(Splats)}
-        )
-        self.lod_opacity = lod_opacity(nodes.opacity)
-        self.merged = ~tree.is_leaf
+    def __init__(self, nodes: Splats, tree: LodTree, raster: RasterSettings, threads: int) -> None:
+        self.original, self.tree, self.raster = nodes, tree, raster
+        d = lod_opacity(nodes.opacity)
+        self.old = Columns(nodes.center, nodes.scale, nodes.quat_xyzw, d, nodes.rgb, nodes.sh)
+        self.columns = Columns(*(column.copy() for column in self.old))
         self.leaves: Index = np.flatnonzero(tree.is_leaf)
+        self.merged: Index = np.flatnonzero(~tree.is_leaf)
         self._forest = Forest([nodes_of(nodes, tree, "float16", threads)])
         self._traversal = Traversal(self._forest, [TreeInstance(foveation=Cones())])
 
@@ -51,12 +55,63 @@ class FittedNodes:
         view = View(camera.camera_to_world, camera.fov_x, camera.fov_y)
         return self._traversal.cut(view, budget=budget).indices()[0].astype(np.int64)
 
-    def shaded(self, index: Index, camera: Camera) -> ShadedSplats:
-        """Some nodes as a camera sees them."""
-        return shade([(self.result().take(index), np.eye(4))], camera)
+    def seen(self, index: Index, camera: Camera) -> tuple[Index, ShadedSplats]:
+        """Those of some nodes that a camera may see, and as it sees them."""
+        now = self.columns
+        whole = ShadedSplats(now.center, now.scale, now.quat_xyzw, now.lod_opacity, now.rgb)
+        _, matrix, lens, limits = rasterizer.arguments(whole, camera, self.raster)
+        marks = np.empty(len(index), np.bool_)
+        mark_seen(now.center, now.lod_opacity, index, matrix, lens, limits, marks)
+        seen = index[marks]
+        found = Columns(*(np.empty((len(seen), *column.shape[1:]), np.float32) for column in now))
+        gather(now, seen, found)
+        if terms := found.sh.shape[1]:
+            add_sh(found.center, found.sh, camera.position.astype(np.float32), COEFFICIENTS.index(terms), found.rgb)
+        np.maximum(found.rgb, 0, out=found.rgb)
+        return seen, ShadedSplats(found.center, found.scale, found.quat_xyzw, found.lod_opacity, found.rgb)
+
+    @np.errstate(over="ignore")  # what float16 cannot hold is infinite, as in Spark
+    def renew(self, index: Index) -> None:
+        """Has cuts found with some nodes as they are now."""
+        rows = self._forest.nodes
+        center = self.columns.center[index].astype(np.float16)
+        rows["x"][index], rows["y"][index], rows["z"][index] = center.T
+        rows["size"][index] = self.sizes(index).astype(np.float16)
+
+    def sizes(self, index: Index, columns: Columns | None = None) -> FloatArray:
+        """Feature sizes of some nodes as they are now, or by other columns; `gaussian.spark_size`."""
+        columns = columns or self.columns
+        x, y, z = columns.scale[index].T
+        size: FloatArray = size_factor(columns.lod_opacity[index]) * 2 * ((x + y + z) / np.float32(3))
+        return size
+
+    def restore(self, index: Index, columns: Columns | None = None) -> None:
+        """Gives some nodes the values of other columns, or those that they had at first."""
+        for now, other in zip(self.columns, columns or self.old, strict=True):
+            now[index] = other[index]
+        self.renew(index)
+
+    def halve(self, index: Index) -> None:
+        """Takes back half of what was changed of some nodes."""
+        for now, old in zip(self.columns, self.old, strict=True):
+            now[index] = (now[index] + old[index]) / 2
+        turned = index[(self.columns.quat_xyzw[index] != self.old.quat_xyzw[index]).any(axis=1)]
+        self.columns.quat_xyzw[turned] = normalized_quat(self.columns.quat_xyzw[turned])
+        self.renew(index)
+
+    def copy(self) -> Columns:
+        """The columns as they are now."""
+        return Columns(*(column.copy() for column in self.columns))
+
+    def changed(self) -> NDArray[np.bool_]:
+        """(N,) the nodes that are not as they were at first."""
+        pairs = zip(self.columns, self.old, strict=True)
+        return np.logical_or.reduce([(a != b).reshape(len(a), -1).any(axis=1) for a, b in pairs])
 
     def result(self) -> Splats:
         """All nodes as they are now; what has not changed is the same bit for bit."""
-        same = self.lod_opacity == lod_opacity(self.original.opacity)
-        opacity: FloatArray = np.where(same, self.original.opacity, linear_opacity(self.lod_opacity))
-        return dataclasses.replace(self.splats, opacity=opacity)
+        now = self.columns
+        opacity = np.where(
+            now.lod_opacity == self.old.lod_opacity, self.original.opacity, linear_opacity(now.lod_opacity)
+        )
+        return Splats(now.center, now.scale, now.quat_xyzw, opacity, now.rgb, now.sh)

@@ -50,6 +50,7 @@ SOURCES = (
     "support/jit_cache.py",
     "support/leftovers.py",
     "codecs/kernels/*.py",
+    "fitting/kernels/*.py",
     "lod/kernels/*.py",
     "render/kernels/*.py",
 )

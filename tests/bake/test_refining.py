@@ -221,6 +221,6 @@ def test_a_tree_with_numbers_that_are_none_is_refused(tmp_path: Path, stand_in: 
     scene.splats.rgb[5] = np.nan
 
     scene_sink(plain, WRITABLE[".rad"], overwrite=True)(scene, floats)
-    with pytest.raises(InvalidSplatsError, match="--refine takes no tree with invalid nodes: 1 of"):
+    with pytest.raises(InvalidSplatsError, match="a tree with invalid nodes cannot be refined: 1 of"):
         bake(plain, tmp_path / "out.rad", dataclasses.replace(REFINE, suffix=".rad"))
     assert not stand_in.calls

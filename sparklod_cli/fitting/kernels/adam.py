@@ -1,0 +1,220 @@
+"""One step of the optimiser: Adam (Kingma and Ba 2014) for the splats that a picture shows, each with its own count."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import prange
+
+from ...model import gaussian
+from ...support.jit import kernel
+
+f32 = np.float32
+
+#: Decay of the first and of the second moments.
+BETA1, BETA2 = f32(0.9), f32(0.99)
+
+#: Columns of the first moments: centre, in the splat's own axes and scales, ln(scale), rotation vector, D and colour.
+CENTER, SCALE, TURN, OPACITY, COLOR = 0, 3, 6, 9, 10
+FIRST = 13
+
+#: Columns of the second moments, one of each property, SH among them; and of the mean of 1 / squared error of the
+#: pictures that a splat was in.
+SECOND, PRECISION = 7, 6
+
+#: Range of D.
+LEAST_D, MOST_D = f32(0.004), f32(5)
+
+#: Least and largest scale, over that of the old splat; farthest centre, in its largest scales.
+MOST_CHANGE = f32(2)
+FARTHEST = f32(2)
+
+#: Colours stay in this range.
+LEAST_COLOR, MOST_COLOR = f32(-2), f32(4)
+
+#: A splat whose axis is shorter than this share of its mean scale moves along it as if it were that long.
+THIN = f32(0.1)
+
+TINY = f32(1e-30)
+
+#: Added to the root of a second moment. Derivatives of splats that matter are above 1e-6; the squares of those that are
+#: hidden behind others may be 0 in float32.
+EPSILON = f32(1e-8)
+
+rotation_matrix = kernel(inline=True)(gaussian.rotation_matrix)
+
+
+class Columns(NamedTuple):
+    """Columns of N nodes, float32.
+
+    Attributes:
+        center: (N, 3). scale: (N, 3). quat_xyzw: (N, 4). lod_opacity: (N,). rgb: (N, 3). sh: (N, K, 3).
+    """
+
+    center: Any
+    scale: Any
+    quat_xyzw: Any
+    lod_opacity: Any
+    rgb: Any
+    sh: Any
+
+
+class Gradients(NamedTuple):
+    """Derivatives by the properties of M drawn splats, float32; see `render.gradients.SplatGradients`.
+
+    Attributes:
+        center: (M, 3). log_scale: (M, 3). turn: (M, 3). lod_opacity: (M,). rgb: (M, 3). sh: (M, K, 3).
+    """
+
+    center: Any
+    log_scale: Any
+    turn: Any
+    lod_opacity: Any
+    rgb: Any
+    sh: Any
+
+
+class Moments(NamedTuple):
+    """What Adam remembers of each merged splat.
+
+    Attributes:
+        first: (S, FIRST) float32. first_sh: (S, K, 3) float32. second: (S, SECOND) float32. count: (S,) int32 steps.
+    """
+
+    first: Any
+    first_sh: Any
+    second: Any
+    count: Any
+
+
+class Rates(NamedTuple):
+    """How far a step goes, float32.
+
+    Attributes:
+        center: in scales. log_scale: ln. turn: radians. lod_opacity: D. rgb: 0..1. sh: of rgb.
+    """
+
+    center: Any
+    log_scale: Any
+    turn: Any
+    lod_opacity: Any
+    rgb: Any
+    sh: Any
+
+
+@kernel(inline=True)
+def moved(first, second, slot, column, of_property, gradient, rate, correction):
+    """Step along three components of a property, whose second moment they share."""
+    a, b, c = gradient
+    v = second[slot, of_property]
+    v += (f32(1) - BETA2) * ((a * a + b * b + c * c) / f32(3) - v)
+    second[slot, of_property] = v
+    first[slot, column] += (f32(1) - BETA1) * (a - first[slot, column])
+    first[slot, column + 1] += (f32(1) - BETA1) * (b - first[slot, column + 1])
+    first[slot, column + 2] += (f32(1) - BETA1) * (c - first[slot, column + 2])
+    factor = -rate * correction / (np.sqrt(v) + EPSILON)
+    return factor * first[slot, column], factor * first[slot, column + 1], factor * first[slot, column + 2]
+
+
+@kernel(parallel=True)
+def step(nodes, old, index, slots, gradients, rates, moments, precision):
+    """Moves the merged splats that were drawn against their gradients.
+
+    Args:
+        nodes: `Columns`, changed.
+        old: `Columns` as they were at first, from which scale and centre do not go too far.
+        index: (M,) int64 node of each drawn splat.
+        slots: (N,) int32 row of each node in `moments`; -1 for leaves.
+        gradients: `Gradients` of the drawn splats.
+        rates: `Rates`.
+        moments: `Moments`, changed.
+        precision: float32, 1 / squared error of the picture, in errors for which the rates are.
+    """
+    center, scale, quat, lod_opacity, rgb, sh = nodes
+    first, first_sh, second, count = moments
+    one, two = f32(1), f32(2)
+    for i in prange(len(index)):
+        node = index[i]
+        slot = slots[node]
+        if slot < 0:
+            continue
+        g = gradients.center
+        gx, gy, gz = g[i, 0], g[i, 1], g[i, 2]
+        seen = abs(gx) + abs(gy) + abs(gz) + abs(gradients.lod_opacity[i])
+        for c in range(3):
+            seen += abs(gradients.rgb[i, c])
+        if not (seen > 0 and seen < f32(1e30)):
+            continue
+        count[slot] += 1
+        t = f32(count[slot])
+        known = one - BETA2**t
+        second[slot, PRECISION] += (one - BETA2) * (precision - second[slot, PRECISION])
+        # Steps are as long as the errors that they are to mend.
+        correction = np.sqrt(known) * np.sqrt(known / second[slot, PRECISION])
+        qx, qy, qz, qw = quat[node, 0], quat[node, 1], quat[node, 2], quat[node, 3]
+        r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation_matrix(qx, qy, qz, qw, one)
+        # The centre, in the splat's own axes and scales.
+        sx, sy, sz = scale[node, 0], scale[node, 1], scale[node, 2]
+        least = THIN * (sx + sy + sz) / f32(3)
+        ex, ey, ez = max(sx, least), max(sy, least), max(sz, least)
+        local = (
+            (r00 * gx + r10 * gy + r20 * gz) * ex,
+            (r01 * gx + r11 * gy + r21 * gz) * ey,
+            (r02 * gx + r12 * gy + r22 * gz) * ez,
+        )
+        mx, my, mz = moved(first, second, slot, CENTER, 0, local, rates.center, correction)
+        mx, my, mz = mx * ex, my * ey, mz * ez
+        x = center[node, 0] + (r00 * mx + r01 * my + r02 * mz) - old.center[node, 0]
+        y = center[node, 1] + (r10 * mx + r11 * my + r12 * mz) - old.center[node, 1]
+        z = center[node, 2] + (r20 * mx + r21 * my + r22 * mz) - old.center[node, 2]
+        away = np.sqrt(x * x + y * y + z * z)
+        most = FARTHEST * max(old.scale[node, 0], old.scale[node, 1], old.scale[node, 2])
+        back = min(one, most / max(away, TINY))
+        center[node, 0] = old.center[node, 0] + back * x
+        center[node, 1] = old.center[node, 1] + back * y
+        center[node, 2] = old.center[node, 2] + back * z
+        g = gradients.log_scale
+        grown = moved(first, second, slot, SCALE, 1, (g[i, 0], g[i, 1], g[i, 2]), rates.log_scale, correction)
+        for c in range(3):
+            was = old.scale[node, c]
+            scale[node, c] = min(max(scale[node, c] * np.exp(grown[c]), was / MOST_CHANGE), was * MOST_CHANGE)
+        g = gradients.turn
+        ax, ay, az = moved(first, second, slot, TURN, 2, (g[i, 0], g[i, 1], g[i, 2]), rates.turn, correction)
+        ax, ay, az = ax / two, ay / two, az / two
+        # q * (a, 1), normalized, is q * exp(a) to second order.
+        px = qw * ax + qx + qy * az - qz * ay
+        py = qw * ay - qx * az + qy + qz * ax
+        pz = qw * az + qx * ay - qy * ax + qz
+        pw = qw - qx * ax - qy * ay - qz * az
+        length = np.sqrt(px * px + py * py + pz * pz + pw * pw)
+        quat[node, 0], quat[node, 1], quat[node, 2], quat[node, 3] = px / length, py / length, pz / length, pw / length
+        d, gd = lod_opacity[node], gradients.lod_opacity[i]
+        v = second[slot, 3]
+        v += (one - BETA2) * (gd * gd - v)
+        second[slot, 3] = v
+        first[slot, OPACITY] += (one - BETA1) * (gd - first[slot, OPACITY])
+        change = rates.lod_opacity * correction / (np.sqrt(v) + EPSILON) * first[slot, OPACITY]
+        lod_opacity[node] = min(max(d - change * min(d, one), LEAST_D), MOST_D)
+        g = gradients.rgb
+        turned = moved(first, second, slot, COLOR, 4, (g[i, 0], g[i, 1], g[i, 2]), rates.rgb, correction)
+        for c in range(3):
+            was = old.rgb[node, c]
+            rgb[node, c] = min(max(rgb[node, c] + turned[c], min(LEAST_COLOR, was)), max(MOST_COLOR, was))
+        terms = sh.shape[1]
+        if terms:
+            total = f32(0)
+            for k in range(terms):
+                for c in range(3):
+                    g_sh = gradients.sh[i, k, c]
+                    total += g_sh * g_sh
+                    first_sh[slot, k, c] += (one - BETA1) * (g_sh - first_sh[slot, k, c])
+            v = second[slot, 5]
+            v += (one - BETA2) * (total / f32(3 * terms) - v)
+            second[slot, 5] = v
+            factor = rates.sh * correction / (np.sqrt(v) + EPSILON)
+            for k in range(terms):
+                for c in range(3):
+                    value = sh[node, k, c] - factor * first_sh[slot, k, c]
+                    was = old.sh[node, k, c]
+                    sh[node, k, c] = min(max(value, min(LEAST_COLOR, was)), max(MOST_COLOR, was))
