@@ -114,6 +114,7 @@ def build_lod(
         ValueError: there is no such method, or an option is out of its range.
     """
     from ..bake import BakeSettings
+    from ..lod.band_order import banded
     from ..model.selection import Selection
     from .refining import asked_for, refined_tree
 
@@ -129,7 +130,7 @@ def build_lod(
     with on_threads(threads), telling(progress) as told, memory_errors_translated():
         kept, _ = (selection or Selection()).apply(scene.splats.with_max_sh(max_sh))
         # A builder frees its input as it goes where nobody else holds it.
-        nodes, tree = build(kept, progress=told)
+        nodes, tree = banded([build(kept, progress=told)])
         made = Tree(nodes, tree, scene.antialiased)
         return made if fitting is None else refined_tree(made, fitting, thread_count(threads), told, None)[0]
 

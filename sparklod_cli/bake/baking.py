@@ -229,7 +229,12 @@ def _built(
     handed_over = [kept]
     del scene, kept, far
     with on_threads(threads):
-        nodes, tree = settings.builder()(handed_over.pop(), progress=progress)
+        built = [settings.builder()(handed_over.pop(), progress=progress)]
+        if output.in_bands:
+            from ..lod.band_order import banded
+
+            built = [banded(built)]
+    nodes, tree = built.pop()
     clock.end("build")
     return _Made(nodes, tree, leaves, dropped, output, environment)
 

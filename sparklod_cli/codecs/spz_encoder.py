@@ -19,7 +19,7 @@ from . import clamps, compression
 from .clamps import Range
 from .encoder import CLAMPED, Encoded, Get, rows_of, windows_of
 from .options import WriteOptions
-from .spz_layout import ANTIALIASED, HEADER, LOD, MAGIC, Layout, column_of
+from .spz_layout import ANTIALIASED, HEADER, LINKS, LOD, MAGIC, Layout, column_of
 from .spz_values import to_code
 
 
@@ -72,9 +72,11 @@ class SpzEncoder:
                 for number in range(len(windows_of(layout.count))):
                     yield get(number, stream.name)
 
-        yield from compression.gzip_member(
-            data(), HEADER.size + layout.total, self.options.compression_level, threads, progress
-        )
+        sizes = {stream.name: stream.size * layout.count for stream in layout.streams()}
+        links = sum(sizes.get(name, 0) for name in LINKS)
+        total = HEADER.size + layout.total
+        level = self.options.compression_level
+        yield from compression.gzip_member(data(), total, level, threads, progress, links_from=total - links)
 
 
 def encoder(

@@ -26,6 +26,10 @@ ANTIALIASED, EXTENSIONS, LOD = 0x01, 0x02, 0x80
 KNOWN_FLAGS = ANTIALIASED | EXTENSIONS | LOD
 
 
+#: The last streams of a file with a tree: column and type, by name.
+LINKS = {"child_counts": ("child_count", "<u2"), "child_starts": ("child_start", "<u4")}
+
+
 class Stream(NamedTuple):
     """One stream of a file: one column of all splats in order.
 
@@ -105,7 +109,7 @@ class Layout:
             ),
         ]
         if self.flags & LOD:
-            table += [_integers("child_counts", "child_count", "<u2"), _integers("child_starts", "child_start", "<u4")]
+            table += [_integers(name, *of_link) for name, of_link in LINKS.items()]
         return [stream for stream in table if stream.size]
 
     @property

@@ -22,6 +22,7 @@ from ..model.splats import FloatArray, Splats
 from ..support.jit import threads_for
 from ..support.progress import Progress, silent
 from .chunk_parts import Index, parts_of
+from .families import families_of, placed
 from .foveation import set_foveation
 from .kernels.chunk_demand import fill_demand
 from .kernels.chunk_inside import sort_within_chunks
@@ -29,7 +30,6 @@ from .kernels.chunk_sets import Families, split_sets
 from .kernels.family_links import find_limits
 from .kernels.pixel_scale import NODE, VIEW
 from .kernels.sort import sort_by_key
-from .kernels.tree_links import find_parents
 
 #: Viewpoints: half outside of the scene looking at it, a quarter anywhere inside, a quarter near a node. Chosen: 16
 #: are as good for large trees, not for those of four chunks (docs/decisions/2026-11-22-chunk-order.md).
@@ -77,25 +77,12 @@ def chunk_order(
     splats: Splats, tree: LodTree, *, progress: Progress = silent
 ) -> tuple[NDArray[np.uint32], NDArray[np.uint32]]:
     """The order of `arrange`: (M,) uint32 the node at each place, and (M,) uint32 the `child_start` of each place."""
-    total = len(tree)
-    order, child_start = np.zeros(total, np.uint32), np.zeros(total, np.uint32)
-    nodes = np.flatnonzero(tree.child_count).astype(np.uint32)
+    nodes, parent = families_of(tree)
     if not len(nodes):
-        return order, child_start
-    number = np.full(total, -1, np.int32)
-    number[nodes] = np.arange(len(nodes), dtype=np.int32)
-    above, _ = find_parents(tree.child_count, tree.child_start)
-    parent = np.where(above[nodes] < 0, np.int32(-1), number[above[nodes]])
-    del number, above
+        return placed(tree, nodes)
     size = spark_size(splats)[nodes]
-    parents = nodes[family_order(parent, tree.child_count[nodes], splats.center[nodes], size, progress=progress)]
-    count = tree.child_count[parents].astype(np.int64)
-    first = np.cumsum(count) - count
-    order[1:] = np.repeat(tree.child_start[parents] - first, count) + np.arange(total - 1)
-    place = np.empty(total, np.uint32)
-    place[order] = np.arange(total, dtype=np.uint32)
-    child_start[place[parents]] = first + 1
-    return order, child_start
+    families = family_order(parent, tree.child_count[nodes], splats.center[nodes], size, progress=progress)
+    return placed(tree, nodes[families])
 
 
 def family_order(

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ...lod.band_order import band_order
 from ...lod.chunk_order import MOST_FAMILIES, family_order
 from ...lod.kernels.family_links import find_limits
 from ...lod.stages.records import NO_FAMILY, STAGE_BITS
@@ -72,13 +73,10 @@ def put_order(job: Job, *, threads: int, progress: Progress) -> None:
     sequence = _by_key(job, links, progress)
     if len(sequence):
         by_place = _by_place(links, sequence)
-        if job.in_chunks:
-            del sequence  # memory for what follows
+        del sequence  # memory for what follows
         with on_threads(threads):
-            levels, arranged = _arranged(job, links, by_place, progress)
+            levels, sequence = _arranged(job, links, by_place, progress)
         del by_place
-        if arranged is not None:
-            sequence = arranged
     start = links.starts(sequence)
     at = links.families_at(start)
     for window, part in enumerate(blocks_of(links.nodes, WINDOW_NODES)):
@@ -126,8 +124,8 @@ def _links(job: Job) -> _Links:
 
 def _arranged(
     job: Job, links: _Links, by_place: NDArray[np.int32], progress: Progress
-) -> tuple[int, NDArray[np.uint32] | None]:
-    """The levels of the tree, and the order of its families for streaming, if the output has that one.
+) -> tuple[int, NDArray[np.uint32]]:
+    """The levels of the tree, and the order of its families in the output.
 
     Args:
         job: the job.
@@ -140,15 +138,15 @@ def _arranged(
     above = links.parent[by_place]
     parent = np.where(above < 0, np.int32(-1), place[above])
     del place, above
-    if not job.in_chunks:
-        depth, _ = find_limits(parent, np.zeros(len(parent), np.float32))
-        return int(depth.max()) + 2, None
-    size = _of_all(job, "size")[by_place]
+    size, count = _of_all(job, "size")[by_place], links.count[by_place]
     depth, _ = find_limits(parent, size)
     levels = int(depth.max()) + 2
     del depth
-    center = _of_all(job, "center")[by_place]
-    order = family_order(parent, links.count[by_place], center, size, most=MOST_FAMILIES, progress=progress)
+    if job.in_chunks:
+        center = _of_all(job, "center")[by_place]
+        order = family_order(parent, count, center, size, most=MOST_FAMILIES, progress=progress)
+    else:
+        order = band_order(parent, count, size)
     return levels, by_place[order].astype(np.uint32)
 
 

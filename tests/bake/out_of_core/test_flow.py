@@ -18,7 +18,8 @@ from sparklod_cli.bake.out_of_core.flow import Built
 from sparklod_cli.bake.out_of_core.job import Job
 from sparklod_cli.bake.out_of_core.parts import parts_of
 from sparklod_cli.codecs.statistics import ALL
-from sparklod_cli.lod import quick
+from sparklod_cli.lod import band_order, quick
+from sparklod_cli.lod.band_order import banded
 from sparklod_cli.lod.chunk_order import arrange
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
@@ -40,6 +41,7 @@ def _small_windows() -> Iterator[None]:
         patch.setattr(order, "WINDOW_NODES", 64)
         patch.setattr(nodes, "WINDOW_NODES", 64)
         patch.setattr(nodes, "GAP", 5)
+        patch.setattr(band_order, "FIRST_BAND", 16)
         patch.setattr(merging, "MERGED", 20)
         patch.setattr(merging, "PROBES", 5)
         yield
@@ -75,8 +77,7 @@ def test_quick_makes_the_tree_of_a_bake_in_memory(
     splats = random_splats(count, seed=seed, sh_degree=degree)
     rng = np.random.default_rng(seed)
     expected = quick.build(splats, base)
-    if in_chunks:
-        expected = arrange(*expected)
+    expected = arrange(*expected) if in_chunks else banded([expected])
     with tempfile.TemporaryDirectory() as folder:
         found = built(folder, splats, BakeSettings(base=base), block, Loop(rng), in_chunks=in_chunks)
         total = found.nodes.count
