@@ -13,7 +13,7 @@ from .eigen import ROWS, decompose
 from .geometry import LARGEST, ellipsoid_area
 from .merge import SCALE_FLOOR, covariance
 from .pair_cost import CENTER, COLOR, COVARIANCE, COVERED, DENSITY, LOG_DET, WEIGHT, log_det
-from .profile import profile_of
+from .profile import is_needle, profile_of
 from .sort import interleave
 
 #: Bits per axis of a node's Morton code: 39 bits are sorted in four passes. Chosen.
@@ -128,7 +128,8 @@ def fill_merged_splats(order, leaves, row, rows, space, center, scale, quat, opa
         for k in range(count):
             i = found[k]
             merged = rows[source[k]]
-            linear, spread = profile_of(np.float64(merged[DENSITY]))
+            needle = is_needle(moments[0, k], moments[1, k], moments[2, k])
+            linear, spread = profile_of(np.float64(merged[DENSITY]), needle)
             opacity[i] = linear
             for axis in range(3):
                 place = np.float64(merged[CENTER + axis]) * unit + middle[axis]

@@ -16,7 +16,7 @@ from numba import prange
 from ...support.jit import kernel
 from .geometry import ellipsoid_area
 from .pair_cost import CENTER, COLOR, COVARIANCE, COVERED, DENSITY, LOG_DET, WEIGHT, WIDTH, log_det
-from .profile import profile_of, size_factor
+from .profile import is_needle, profile_of, size_factor
 
 #: Weight of opacity relative to each colour channel in the error of a picture, which may have any background. Chosen.
 ALPHA_WEIGHT = 1.0
@@ -294,7 +294,8 @@ def merge_pairs(pairs, made, leaves, rows, row, spare, children, size, error):
             np.float64(xx), np.float64(yy), np.float64(zz), np.float64(xy), np.float64(xz), np.float64(yz)
         )
         merged[DENSITY] = np.float64(merged[COVERED]) / ellipsoid_area(large, middle, small)
-        opacity, spread = profile_of(np.float64(merged[DENSITY]))
+        needle = is_needle(large * large, middle * middle, small * small)
+        opacity, spread = profile_of(np.float64(merged[DENSITY]), needle)
         mean = (large + middle + small) / (3 * math.sqrt(spread))
         size[made + pair] = 2 * mean * size_factor(opacity)
         error[node] = picture_error(a, b, merged)

@@ -24,6 +24,12 @@ from ...support.jit import kernel
 #: whose density is higher than that of this profile is drawn larger instead.
 MAX_D = 2.5
 
+#: The same for needles, whose second axis is shorter than this share of the longest. They may be thinner than a pixel,
+#: where the blur of the rasterizer takes more from a sharp profile than from the splats that it replaces: wires would
+#: fade. Measured; between 0.25 and 0.4, and between 1.5 and 1.75, little changes
+#: (docs/decisions/2026-11-22-quality-at-2-percent.md).
+NEEDLE, NEEDLE_D = 0.25, 1.5
+
 #: Entries of the table of profiles by density, between which it is interpolated linearly. Chosen.
 ENTRIES = 256
 
@@ -40,29 +46,44 @@ def harmonic(a: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.fl
     return first, second
 
 
-def _table() -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-    """Linear opacity, and spread (variance / sigma^2), at ENTRIES densities from 1 to that of MAX_D, which is third."""
-    a = linear_opacity(np.linspace(1, MAX_D, 4096, dtype=np.float32)).astype(np.float64)
+def _profiles(lod_opacity: NDArray[np.float32]) -> tuple[NDArray[np.float64], ...]:
+    """Linear opacity, spread (variance / sigma^2) and density of profiles of D at least 1."""
+    a = linear_opacity(lod_opacity).astype(np.float64)
     first, second = harmonic(a)
     spread = (first + second / first) / 2
-    density = first / spread
+    return a, spread, first / spread
+
+
+def _table() -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    """Linear opacity and spread at ENTRIES densities from 1 to that of MAX_D, which is third."""
+    a, spread, density = _profiles(np.linspace(1, MAX_D, 4096, dtype=np.float32))
     even = np.linspace(1, density[-1], ENTRIES)
     return np.interp(even, density, a), np.interp(even, density, spread), float(density[-1])
 
 
 OPACITIES, SPREADS, MAX_DENSITY = _table()
+NEEDLE_OPACITY, NEEDLE_SPREAD, NEEDLE_DENSITY = (float(x[0]) for x in _profiles(np.array([NEEDLE_D], np.float32)))
 
 lod_opacity_above_1 = kernel(inline=True)(gaussian.lod_opacity_above_1)
 
 
 @kernel(inline=True)
-def profile_of(density):
-    """Linear opacity and spread of a splat of a density; its variance is spread * sigma^2.
+def is_needle(a, b, c):
+    """Whether the second of three variances along the axes, in any order, is below NEEDLE squared of the largest."""
+    return max(min(a, b), min(max(a, b), c)) < NEEDLE * NEEDLE * max(a, b, c)
 
-    Above MAX_DENSITY the spread is smaller than the profile's, which makes sigma larger, so that the coverage is kept.
+
+@kernel(inline=True)
+def profile_of(density, needle):
+    """Linear opacity and spread of a splat, or a needle, of a density; its variance is spread * sigma^2.
+
+    Above the density of the largest D the spread is smaller than the profile's, which makes sigma larger, so that the
+    coverage is kept.
     """
     if density <= 1:
         return max(density, MIN_OPACITY), 1.0
+    if needle and density >= NEEDLE_DENSITY:
+        return NEEDLE_OPACITY, NEEDLE_SPREAD * NEEDLE_DENSITY / density
     if density >= MAX_DENSITY:
         return OPACITIES[-1], SPREADS[-1] * MAX_DENSITY / density
     at = (density - 1) * ((ENTRIES - 1) / (MAX_DENSITY - 1))

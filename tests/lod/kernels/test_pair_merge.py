@@ -182,7 +182,7 @@ def test_pairs_become_rows_that_cover_as_much_and_are_as_large_as_they_are_drawn
         axes = np.sqrt(np.linalg.eigvalsh(twin.matrix(row)))
         assert row[DENSITY] == pytest.approx(row[COVERED] / gaussians.ellipsoid_area(axes), rel=1e-5)
         assert row[LOG_DET] == pytest.approx(np.linalg.slogdet(twin.matrix(row))[1], abs=1e-4)
-        opacity, spread = profile.profile_of(float(row[DENSITY]))
+        opacity, spread = profile.profile_of(float(row[DENSITY]), profile.is_needle(*axes**2))
         larger = 1 + 0.7 * max(0.0, float(lod_opacity(np.float32([opacity]))[0]) - 1)
         assert seen == pytest.approx(2 * axes.mean() / math.sqrt(spread) * larger, rel=1e-5)
         assert off == pytest.approx(pair_merge.picture_error(a, b, row), rel=1e-6)

@@ -22,30 +22,55 @@ def test_harmonic_numbers_of_integers_are_sums(a: int) -> None:
     assert second[0] == pytest.approx(math.fsum(1 / k**2 for k in range(1, a + 1)), rel=1e-5)
 
 
-@pytest.mark.parametrize("density", [0.01, 0.3, 1.0, 1.0001, 1.1, 1.3, 1.5, float(profile.MAX_DENSITY) * 0.9999])
-def test_a_profile_has_the_density_and_the_variance_that_are_asked_for(density: float) -> None:
-    opacity, spread = profile.profile_of(density)
+#: Whether it is of needles; D and density of the sharpest profile.
+SHARPEST = [
+    pytest.param(False, profile.MAX_D, float(profile.MAX_DENSITY), id="splat"),
+    pytest.param(True, profile.NEEDLE_D, profile.NEEDLE_DENSITY, id="needle"),
+]
+
+
+@pytest.mark.parametrize(("needle", "d", "densest"), SHARPEST)
+@pytest.mark.parametrize("share", [0.01, 0.3, 0.8, 0.9, 0.9999])
+def test_a_profile_has_the_density_and_the_variance_that_are_asked_for(
+    share: float, needle: bool, d: float, densest: float
+) -> None:
+    density = share * densest
+    opacity, spread = profile.profile_of(density, needle)
     coverage, variance = twin.moments_of_profile(opacity)
     assert coverage / spread == pytest.approx(density, rel=1e-4)
     assert variance == pytest.approx(spread, rel=1e-4)
 
 
+@pytest.mark.parametrize(("needle", "d", "densest"), SHARPEST)
 @pytest.mark.parametrize("density", [1.0, 1.2, 1.9, 2.5, 40.0])
-def test_what_is_denser_than_a_profile_can_be_is_larger_and_covers_as_much(density: float) -> None:
-    density = max(density, float(profile.MAX_DENSITY))
-    opacity, spread = profile.profile_of(density)
-    assert lod_opacity(np.float32([opacity]))[0] == pytest.approx(profile.MAX_D, rel=1e-5)
+def test_what_is_denser_than_a_profile_can_be_is_larger_and_covers_as_much(
+    density: float, needle: bool, d: float, densest: float
+) -> None:
+    density = max(density, densest)
+    opacity, spread = profile.profile_of(density, needle)
+    assert lod_opacity(np.float32([opacity]))[0] == pytest.approx(d, rel=1e-5)
     assert twin.moments_of_profile(opacity)[0] / spread == pytest.approx(density, rel=1e-4)
 
 
-@given(st.floats(0, 1))
-def test_up_to_one_the_density_is_the_opacity(density: float) -> None:
-    assert profile.profile_of(density) == (max(density, MIN_OPACITY), 1)
+@given(st.floats(0, 1), st.booleans())
+def test_up_to_one_the_density_is_the_opacity(density: float, needle: bool) -> None:
+    assert profile.profile_of(density, needle) == (max(density, MIN_OPACITY), 1)
 
 
-@given(st.floats(0, 10), st.floats(0, 10))
-def test_what_is_denser_is_no_less_opaque(one: float, other: float) -> None:
-    assert profile.profile_of(min(one, other))[0] <= profile.profile_of(max(one, other))[0] * (1 + 1e-12)
+@given(st.floats(0, 10), st.floats(0, 10), st.booleans())
+def test_what_is_denser_is_no_less_opaque(one: float, other: float, needle: bool) -> None:
+    less, more = (profile.profile_of(density, needle)[0] for density in sorted([one, other]))
+    assert less <= more * (1 + 1e-5)
+
+
+@given(st.permutations([1.0, 0.999, 0.2]), st.permutations([1.0, 1.001, 0.2]), st.floats(1e-20, 1e20))
+def test_needles_have_a_second_axis_below_a_share_of_the_longest(
+    below: list[float], above: list[float], size: float
+) -> None:
+    """Lengths along the axes; the middle one as a multiple of the limit, the shortest as a share of it."""
+    for axes, expected in ((below, True), (above, False)):
+        lengths = [size * (1 if axis == 1 else axis * profile.NEEDLE) for axis in axes]
+        assert profile.is_needle(*(length * length for length in lengths)) == expected
 
 
 def test_the_size_factor_is_that_of_sparks_size() -> None:
