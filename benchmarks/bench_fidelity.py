@@ -54,21 +54,20 @@ def sources(path: Path, arguments: argparse.Namespace) -> Iterator[Source]:
     read = sparklod.read(path)
     kept, _ = sparklod.Selection().apply(read.splats)
     scene = sparklod.Scene(kept, antialiased=read.antialiased)
-    source = Source(path, scene, False, arguments.runs, arguments.growth, arguments.steps)
+    source = Source(path, scene, False, arguments.runs, arguments.growth, arguments.steps, arguments.trees)
     yield source
     if arguments.sh and kept.sh_degree:
-        yield dataclasses.replace(source, sh=True, runs=1)
+        yield dataclasses.replace(source, sh=True, runs=0)
 
 
 def measure(source: Source, arguments: argparse.Namespace) -> Iterator[tuple[str, Measured]]:
     """Measures one scene with every method, and with each way of splat-transform that there is."""
     drawn, suffix = source.drawn, WITH_SH * source.sh
-    sets = {
-        name: cameras_of(name, drawn, arguments.size)[:: 1 if name in MOVING else arguments.every]
-        for name in arguments.cameras
-    }
-    if source.sh:
-        sets = dict(list(sets.items())[:1])
+    first, half = arguments.cameras[0], (arguments.size[0] // 2, arguments.size[1] // 2)
+    sets = {}
+    for name in [first] if source.sh else arguments.cameras:
+        cameras = cameras_of(name, drawn, arguments.size if name == first else half)
+        sets[name] = cameras[:: 1 if name in MOVING else arguments.every]
     for method in arguments.methods:
         built = build(source, method)
         views = {}
@@ -79,9 +78,8 @@ def measure(source: Source, arguments: argparse.Namespace) -> Iterator[tuple[str
             print(f"{source.path.name}: {METHODS[method]}, {name}{suffix}: {psnr} dB", file=sys.stderr, flush=True)
         leaves = int(np.count_nonzero(built.tree.tree.is_leaf))
         yield method, Measured(len(built.tree), leaves, built.seconds, views)
-    still = [name for name in sets if name not in MOVING]
-    if arguments.decimated and still:
-        full = FullDetail(drawn, sets[still[0]])
+    if arguments.decimated and first not in MOVING:
+        full = FullDetail(drawn, sets[first])
         for way, scenes in decimated(arguments.decimated, source.path.stem, sh=source.sh):
             of_budgets = {}
             for share, scene in zip(SHARES, scenes, strict=True):
@@ -89,7 +87,7 @@ def measure(source: Source, arguments: argparse.Namespace) -> Iterator[tuple[str
                     raise SystemExit(f"{source.path.name}: {way} has {len(scene):,} splats, which are not {share} %")
                 if f"{share}%" in arguments.budgets:
                     of_budgets[f"{share}%"] = full.of_scene(scene)
-            yield way, Measured(0, 0, [], {still[0] + suffix: of_budgets})
+            yield way, Measured(0, 0, [], {first + suffix: of_budgets})
 
 
 def run(arguments: argparse.Namespace, made: Path) -> dict[str, Any]:
@@ -154,8 +152,11 @@ def parsed() -> argparse.Namespace:
     parser.add_argument(
         "--every", type=int, default=1, help="take every so many cameras of a set that does not move, for a quick run"
     )
-    parser.add_argument("--size", type=size_of, default=SIZE, help="of the pictures, such as 480x270 (default 960x540)")
+    sizes = "of the pictures of the first set of cameras, halved for others (default 960x540)"
+    parser.add_argument("--size", type=size_of, default=SIZE, help=sizes)
     parser.add_argument("--sh", action="store_true", help="measure with spherical harmonics as well")
+    kept = "folder that keeps our trees as NAME-METHOD.spz; those in it are not built again, and not timed"
+    parser.add_argument("--trees", type=Path, help=kept)
     text = "folder of NAME-decimate-50.ply and so on, which splat-transform made, for rows of them"
     parser.add_argument("--decimated", type=Path, help=text)
     parser.add_argument("--json", type=Path, help="file for all numbers, with those of each camera")

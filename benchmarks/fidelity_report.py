@@ -14,7 +14,6 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from fidelity_trees import METHODS, WAYS
 
 #: What scenes that were decimated by splat-transform are called in tables.
@@ -129,8 +128,9 @@ def differences(found: Found, budgets: Sequence[str], cameras: str) -> str:
     rows = []
     for scene, methods in found.items():
         for mine, theirs, gains in _gains(methods, budgets, cameras):
-            ratio = np.divide(*(statistics.median(methods[method]["seconds"]) for method in (theirs, mine)))
-            rows.append([scene, f"{NAMES[mine]} - {NAMES[theirs]}", *gains, f"{ratio:.2f}x"])
+            took = [statistics.median(methods[method]["seconds"] or [0]) for method in (theirs, mine)]
+            ratio = f"{took[0] / took[1]:.2f}x" if all(took) else ""
+            rows.append([scene, f"{NAMES[mine]} - {NAMES[theirs]}", *gains, ratio])
     return markdown(["scene", "dB", *_spelt(budgets), "their build time / ours"], rows)
 
 

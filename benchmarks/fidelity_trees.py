@@ -7,7 +7,7 @@ import json
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -44,9 +44,10 @@ class Source:
         path: its file, for Spark.
         scene: with all of its spherical harmonics.
         sh: pictures are drawn with them.
-        runs: of each builder that is timed.
+        runs: of each builder that is timed; 0 if how long it takes does not matter.
         growth: of our quality builder.
         steps: of refining; None for as many as suit the tree.
+        trees: folder that keeps our trees, and has those that need not be built; None for none.
     """
 
     path: Path
@@ -55,6 +56,7 @@ class Source:
     runs: int
     growth: float
     steps: int | None
+    trees: Path | None = None
 
     @property
     def drawn(self) -> sparklod.Scene:
@@ -68,7 +70,7 @@ class Built:
 
     Attributes:
         tree: with spherical harmonics only if they are drawn.
-        seconds: of each run.
+        seconds: of each run; none for a tree that was kept.
     """
 
     tree: sparklod.Tree
@@ -91,7 +93,7 @@ def _sparks(source: Source, builder: str) -> Built:
     """A tree of one of Spark's builders, as its memory holds it."""
     with tempfile.TemporaryDirectory() as folder:
         program = Path(__file__).with_name("spark_build.mjs")
-        command = ["node", str(program), str(source.path), str(source.runs), builder, folder]
+        command = ["node", str(program), str(source.path), str(max(source.runs, 1)), builder, folder]
         result = subprocess.run(command, capture_output=True, text=True, check=False)
         if result.returncode:
             raise SystemExit(f"Spark failed on {source.path}: {result.stderr.strip()}")
@@ -106,25 +108,29 @@ def _sparks(source: Source, builder: str) -> Built:
 
 def _ours(source: Source, method: str) -> Built:
     """A tree of one of our builders, as its file holds it; spherical harmonics as Spark holds those of the file."""
-    refined = method == "refined"
-    make: Callable[[sparklod.Scene], sparklod.Tree] = (
-        (lambda scene: _refined(scene, source))
-        if refined
-        else lambda scene: sparklod.build_lod(scene, method=method, growth=source.growth)
-    )
-    seconds = []
-    for run in range(0 if refined else source.runs + 1):
+    with tempfile.TemporaryDirectory() as made:
+        file = (source.trees or Path(made)) / f"{source.path.stem}-{method}{'-sh' * source.sh}.spz"
+        seconds = [] if file.is_file() else _bake(source, method, file)
+        tree = sparklod.read(file)
+    assert isinstance(tree, sparklod.Tree)
+    return Built(_held(tree) if source.sh else tree, seconds)
+
+
+def _bake(source: Source, method: str, file: Path) -> list[float]:
+    """Writes a tree of one of our builders, and returns the seconds of each run of it."""
+
+    def timed(scene: sparklod.Scene) -> tuple[sparklod.Tree, float]:
         start = time.perf_counter()
-        make(source.scene)
-        if run:  # the first may have to compile
-            seconds.append(time.perf_counter() - start)
-    start = time.perf_counter()
-    tree = make(source.drawn)
-    seconds = seconds or [time.perf_counter() - start]
-    with tempfile.TemporaryDirectory() as folder:
-        written = sparklod.read(sparklod.write(Path(folder, "tree.spz"), tree).path)
-    assert isinstance(written, sparklod.Tree)
-    return Built(_held(written) if source.sh else written, seconds)
+        if method == "refined":
+            return _refined(scene, source), time.perf_counter() - start
+        tree = sparklod.build_lod(scene, method=method, growth=source.growth)
+        return tree, time.perf_counter() - start
+
+    runs = 0 if method == "refined" or not source.runs else source.runs + 1
+    seconds = [timed(source.scene)[1] for _ in range(runs)][1:]  # the first may have to compile
+    tree, took = timed(source.drawn)
+    sparklod.write(file, tree)
+    return seconds or [took]
 
 
 def _refined(scene: sparklod.Scene, source: Source) -> sparklod.Tree:

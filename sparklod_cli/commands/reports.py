@@ -83,13 +83,14 @@ def _made(baked: Baked) -> str:
 
 def _refined(refined: Refined) -> str:
     """How far cuts are from full detail before and after the fitting, on held-out cameras."""
-    gains = (
+    gains = [
         f"{100 * share:g} % {before:.2f} -> {refined.psnr_after[share]:.2f}"
         for share, before in refined.psnr_before.items()
-    )
+    ]
+    seen = f"held-out PSNR {', '.join(gains)} dB" if refined.psnr_before else "no held-out camera sees anything of it"
     early = "" if refined.is_complete else ", interrupted"
     return (
-        f"refined in {count_of(refined.steps, 'step')}{early}: held-out PSNR {', '.join(gains)} dB;"
+        f"refined in {count_of(refined.steps, 'step')}{early}: {seen};"
         f" {100 * refined.kept:.3g} % of the merged splats are new"
     )
 

@@ -129,11 +129,14 @@ def split_path(path: CameraPath) -> tuple[tuple[Camera, ...], tuple[Camera, ...]
     return training or cameras, held_out
 
 
-def smaller(camera: Camera) -> Camera:
-    """The same camera with a picture of at most `LONGEST` pixels a side."""
-    share = LONGEST / max(camera.width, camera.height)
-    if share >= 1:
-        return camera
+def smaller(camera: Camera, most: float = LONGEST) -> Camera:
+    """The same camera with a picture of at most `most` pixels a side."""
+    share = most / max(camera.width, camera.height)
+    return camera if share >= 1 else scaled(camera, share)
+
+
+def scaled(camera: Camera, share: float) -> Camera:
+    """The same camera with a picture of this share of the pixels along each side."""
     width, height = max(1, round(camera.width * share)), max(1, round(camera.height * share))
     across, down = width / camera.width, height / camera.height
     (fx, fy), (cx, cy) = camera.focal, camera.principal

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
@@ -13,13 +14,13 @@ from ..model.splats import Splats
 from ..render.settings import RasterSettings
 from ..support.progress import Progress, silent
 from ..support.threads import on_threads
-from .cameras import HELD_OUT, Place, placed, split_path
+from .cameras import HELD_OUT, Place, placed, scaled, split_path
 from .held_out import Scores, gain, scores_of
 from .laws import keep_gains, keep_sizes
 from .nodes import FittedNodes
 from .optimiser import Optimiser
 from .pictures import Picture, pictures
-from .schedule import DEFAULT_STEPS, STAGES, rates_at, shares_of
+from .schedule import DEFAULT_STEPS, ROUNDS, STAGES, rates_at
 from .settings import FitReport, FitSettings, FitStage
 
 #: Near plane at most and far plane at least, in radii of the scene, for scenes of tiny or huge units.
@@ -77,7 +78,10 @@ class _Fitting:
         seeds = np.random.SeedSequence(settings.seed).spawn(3)
         self._random = np.random.Generator(np.random.PCG64(seeds[2]))
         training, held_out = self._cameras(settings, place, seeds)
-        self._training = pictures(training, self.nodes)
+        # Rounds take their cameras in turns.
+        self._rounds = itertools.cycle(
+            [(of, pictures(map(functools.partial(scaled, share=of.size), training), self.nodes)) for of in ROUNDS]
+        )
         self._held_out = list(itertools.islice(pictures(held_out, self.nodes), HELD_OUT))
         self._steps = DEFAULT_STEPS if settings.steps is None else settings.steps
         self._done = 0
@@ -110,9 +114,12 @@ class _Fitting:
         """Takes the steps of a stage, and keeps the nodes if that brought anything; False if it was interrupted."""
         first, last = self._done, self._steps * (number + 1) // STAGES
         while self._done < last:
-            picture = next(self._training, None)
-            if picture is None or not self._fit_to(picture, last, progress, interrupted):
-                return picture is None
+            of, training = next(self._rounds)
+            picture = next(training, None)
+            if picture is None:
+                break
+            if not self._fit_to(picture, of.shares(self._random)[: last - self._done], progress, interrupted):
+                return False
         now = scores_of(self.nodes, self._held_out)
         start = self._stages[-1].psnr_after if self._stages else self._before
         self._stages.append(FitStage(f"fit {number + 1} of {STAGES}", self._done - first, start, now))
@@ -120,10 +127,12 @@ class _Fitting:
             self._best, self._kept = now, self.nodes.copy()
         return True
 
-    def _fit_to(self, picture: Picture, last: int, progress: Progress, interrupted: Callable[[], bool]) -> bool:
-        """A step for each of some cuts, up to a number of steps; False if it was interrupted."""
+    def _fit_to(
+        self, picture: Picture, shares: Sequence[float], progress: Progress, interrupted: Callable[[], bool]
+    ) -> bool:
+        """A step for each of some cuts, by their shares of the leaves; False if it was interrupted."""
         shown = []
-        for share in shares_of(self._random)[: last - self._done]:
+        for share in shares:
             if interrupted():
                 return False
             cut = self.nodes.cut(picture.camera, share)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..model.splats import FloatArray
 from ..render import gradients
 from .kernels import adam
 from .nodes import FittedNodes, Index
@@ -12,6 +13,11 @@ from .pictures import Picture
 #: Root of the mean squared error of pictures, that of 30 dB, for which the rates are. The steps of a splat are
 #: proportional to the errors of the pictures that it is in: what is wrong with the splats of a fine cut is small.
 USUAL_ERROR = 0.03
+
+#: How far the feature size of a node may go from its first value: by a factor of `MOST_REACH` of those that cuts of up
+#: to `FREE_SHARE` of the leaves refine, and the logarithm of that falls with the root of the share. Which nodes a fine
+#: cut refines matters more than how large they are; measured (docs/decisions/2026-11-22-refine.md).
+MOST_REACH, FREE_SHARE = 1.5, 0.03
 
 
 class Optimiser:
@@ -31,6 +37,7 @@ class Optimiser:
             np.zeros((count, terms, 3), np.float32),
             np.zeros((count, adam.SECOND), np.float32),
             np.zeros(count, np.int32),
+            reach_of(nodes),
         )
 
     def step(self, picture: Picture, index: Index, rates: adam.Rates) -> Index:
@@ -47,3 +54,11 @@ class Optimiser:
         precision = np.float32((USUAL_ERROR / error) ** 2)
         adam.step(nodes.columns, nodes.old, seen, self._slots, columns, rates, self._moments, precision)
         return seen
+
+
+def reach_of(nodes: FittedNodes) -> FloatArray:
+    """(S,) float32 of each merged node: most that its feature size may become of the first one, or that of it."""
+    order = np.argsort(-nodes.sizes(nodes.merged), kind="stable")
+    share = np.empty(len(order))
+    share[order] = np.arange(1, len(order) + 1) / len(nodes.leaves)
+    return (MOST_REACH ** np.minimum(1, np.sqrt(FREE_SHARE / share))).astype(np.float32)

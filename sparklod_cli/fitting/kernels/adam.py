@@ -38,6 +38,8 @@ THIN = f32(0.1)
 
 TINY = f32(1e-30)
 
+SIZE_PER_D = f32(gaussian.SIZE_PER_D)
+
 #: Added to the root of a second moment. Derivatives of splats that matter are above 1e-6; the squares of those that are
 #: hidden behind others may be 0 in float32.
 EPSILON = f32(1e-8)
@@ -80,12 +82,14 @@ class Moments(NamedTuple):
 
     Attributes:
         first: (S, FIRST) float32. first_sh: (S, K, 3) float32. second: (S, SECOND) float32. count: (S,) int32 steps.
+        reach: (S,) float32, most that the feature size may become of the first one, or the first one of it.
     """
 
     first: Any
     first_sh: Any
     second: Any
     count: Any
+    reach: Any
 
 
 class Rates(NamedTuple):
@@ -101,6 +105,13 @@ class Rates(NamedTuple):
     lod_opacity: Any
     rgb: Any
     sh: Any
+
+
+@kernel(inline=True)
+def size_of(scale, lod_opacity, node):
+    """Three halves of a node's feature size; see `gaussian.spark_size`."""
+    mean = scale[node, 0] + scale[node, 1] + scale[node, 2]
+    return mean * (f32(1) + SIZE_PER_D * max(lod_opacity[node] - f32(1), f32(0)))
 
 
 @kernel(inline=True)
@@ -132,7 +143,7 @@ def step(nodes, old, index, slots, gradients, rates, moments, precision):
         precision: float32, 1 / squared error of the picture, in errors for which the rates are.
     """
     center, scale, quat, lod_opacity, rgb, sh = nodes
-    first, first_sh, second, count = moments
+    first, first_sh, second, count, reach = moments
     one, two = f32(1), f32(2)
     for i in prange(len(index)):
         node = index[i]
@@ -175,10 +186,10 @@ def step(nodes, old, index, slots, gradients, rates, moments, precision):
         center[node, 1] = old.center[node, 1] + back * y
         center[node, 2] = old.center[node, 2] + back * z
         g = gradients.log_scale
-        grown = moved(first, second, slot, SCALE, 1, (g[i, 0], g[i, 1], g[i, 2]), rates.log_scale, correction)
+        longer = moved(first, second, slot, SCALE, 1, (g[i, 0], g[i, 1], g[i, 2]), rates.log_scale, correction)
         for c in range(3):
             was = old.scale[node, c]
-            scale[node, c] = min(max(scale[node, c] * np.exp(grown[c]), was / MOST_CHANGE), was * MOST_CHANGE)
+            scale[node, c] = min(max(scale[node, c] * np.exp(longer[c]), was / MOST_CHANGE), was * MOST_CHANGE)
         g = gradients.turn
         ax, ay, az = moved(first, second, slot, TURN, 2, (g[i, 0], g[i, 1], g[i, 2]), rates.turn, correction)
         ax, ay, az = ax / two, ay / two, az / two
@@ -196,6 +207,10 @@ def step(nodes, old, index, slots, gradients, rates, moments, precision):
         first[slot, OPACITY] += (one - BETA1) * (gd - first[slot, OPACITY])
         change = rates.lod_opacity * correction / (np.sqrt(v) + EPSILON) * first[slot, OPACITY]
         lod_opacity[node] = min(max(d - change * min(d, one), LEAST_D), MOST_D)
+        grown = size_of(scale, lod_opacity, node) / max(size_of(old.scale, old.lod_opacity, node), TINY)
+        back = min(max(grown, one / reach[slot]), reach[slot]) / max(grown, TINY)
+        for c in range(3):
+            scale[node, c] *= back
         g = gradients.rgb
         turned = moved(first, second, slot, COLOR, 4, (g[i, 0], g[i, 1], g[i, 2]), rates.rgb, correction)
         for c in range(3):

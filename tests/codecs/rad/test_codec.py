@@ -365,6 +365,18 @@ def test_colours_and_scales_of_a_wide_range_are_float16() -> None:
     assert chosen(splats, scales="ln_0r8", rgb="r8") == dataclasses.replace(chosen(splats), scales="ln_0r8", rgb="r8")
 
 
+@pytest.mark.parametrize(("long", "encoding"), [(400, "oct88r8"), (600, "f16")])
+def test_rotations_of_long_splats_are_float16(long: int, encoding: str) -> None:
+    """Where at least half of the leaves are: the merged splats of a tree do not matter, nor how thin splats are."""
+    splats = random_splats(1_000)
+    splats.scale[:] = [0.01, 0.002, 1e-5]
+    splats.scale[:long] = [0.0001, 0.02, 0.002]
+    assert chosen(splats).orientation == encoding
+    assert chosen(splats, orientation="oct88r8").orientation == "oct88r8"
+    splats.scale[long:, :2] = 0  # a line, which has no width, is none
+    assert chosen(splats).orientation == encoding
+
+
 def test_scales_of_0_are_held_and_thin_ones_clamped_and_counted() -> None:
     splats = random_splats(1000)
     splats.scale[:4, 0] = np.exp(-20)

@@ -78,6 +78,12 @@ def test_the_report_has_a_line_for_each_stage_and_one_for_all(
     assert "quick tree, refined -> SPZ" in err
 
 
+def test_a_scene_of_which_nothing_is_seen_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert build(ONE, "--refine", "-o", tmp_path / "out.spz") == 0
+    said = "refined in 0 steps: no held-out camera sees anything of it; 0 % of the merged splats are new\n"
+    assert said in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("given", "name"),
     [

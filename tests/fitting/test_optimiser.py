@@ -1,0 +1,109 @@
+"""Steps of merged splats, their bounds, and what is drawn when."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+
+from sparklod_cli.fitting import cameras
+from sparklod_cli.fitting.cameras import Place, placed
+from sparklod_cli.fitting.kernels.adam import MOST_D, Rates
+from sparklod_cli.fitting.nodes import FittedNodes
+from sparklod_cli.fitting.optimiser import MOST_REACH, Optimiser, reach_of
+from sparklod_cli.fitting.pictures import Picture, pictures
+from sparklod_cli.fitting.schedule import LAST, RATES, ROUNDS, rates_at
+from sparklod_cli.lod import quality
+from sparklod_cli.render.rasterizer import draw
+from sparklod_cli.render.settings import RasterSettings
+from tests.scenes import random_splats
+
+COUNT = 2000
+SHARE = 0.05
+
+
+@pytest.fixture
+def nodes(monkeypatch: pytest.MonkeyPatch) -> FittedNodes:
+    monkeypatch.setattr(cameras, "SIZE", (160, 90))
+    return FittedNodes(*quality.build(random_splats(COUNT, sh_degree=1)), RasterSettings(), 1)
+
+
+def picture_of(nodes: FittedNodes) -> Picture:
+    seen = placed(Place.of(nodes.old.center[nodes.leaves]), np.random.SeedSequence(1))
+    return next(pictures(seen, nodes))
+
+
+def error(nodes: FittedNodes, picture: Picture) -> float:
+    _, shaded = nodes.seen(nodes.cut(picture.camera, SHARE), picture.camera)
+    return sum(picture.errors(draw(shaded, picture.camera, nodes.raster)))
+
+
+@pytest.mark.parametrize("number", range(len(RATES)))
+def test_steps_in_each_property_alone_bring_a_picture_closer(nodes: FittedNodes, number: int) -> None:
+    picture, optimiser = picture_of(nodes), Optimiser(nodes)
+    before = error(nodes, picture)
+    rates = Rates(*(0.005 * (at == number) for at in range(len(RATES))))
+    for _ in range(10):
+        optimiser.step(picture, nodes.cut(picture.camera, SHARE), rates)
+    assert error(nodes, picture) < 0.998 * before
+    names = nodes.columns._fields
+    # Quaternions are normalised anew, and D may bring a feature size to its bound.
+    moved = {
+        name
+        for name, now, old in zip(names, nodes.columns, nodes.old, strict=True)
+        if not np.allclose(now, old, rtol=1e-6, atol=1e-6)
+    }
+    assert names[number] in moved
+    assert moved <= {names[number], "scale"}
+
+
+def test_only_merged_splats_that_a_picture_shows_move(nodes: FittedNodes) -> None:
+    picture = picture_of(nodes)
+    cut = nodes.cut(picture.camera, 0.3)
+    shown = Optimiser(nodes).step(picture, cut, RATES)
+    moved = np.flatnonzero(nodes.changed())
+    assert moved.size > 50
+    assert np.isin(moved, np.intersect1d(shown, nodes.merged)).all()
+    assert nodes.tree.is_leaf[shown].any()
+
+
+def test_long_steps_stay_within_bounds(nodes: FittedNodes) -> None:
+    picture, optimiser = picture_of(nodes), Optimiser(nodes)
+    for share in (0.02, 0.1, 0.3) * 4:
+        optimiser.step(picture, nodes.cut(picture.camera, share), Rates(*(3.0,) * len(RATES)))
+    now, old, merged = nodes.columns, nodes.old, nodes.merged
+    assert not nodes.result().invalid()
+    ratio = nodes.sizes(merged) / nodes.sizes(merged, old)
+    assert ratio.max() > 1.1
+    first = reach_of(FittedNodes(nodes.original, nodes.tree, nodes.raster, 1))
+    assert (np.abs(np.log(ratio)) <= np.log(first) + 1e-5).all()
+    assert now.lod_opacity.max() <= MOST_D
+    away = np.linalg.norm(now.center - old.center, axis=1)
+    assert (away <= 2.001 * old.scale.max(axis=1)).all()
+
+
+def test_the_sizes_of_fine_nodes_may_change_less_than_those_of_coarse_ones(nodes: FittedNodes) -> None:
+    reach, size = reach_of(nodes), nodes.sizes(nodes.merged)
+    order = np.argsort(-size, kind="stable")
+    assert (np.diff(reach[order]) <= 0).all()
+    assert reach[order[0]] == np.float32(MOST_REACH)
+    assert 1 < reach[order[-1]] < 1.2
+
+
+def test_rates_fall_from_the_first_to_the_last() -> None:
+    rates = np.array([rates_at(share) for share in np.linspace(0, 1, 9)])
+    assert np.allclose(rates[0], RATES)
+    assert np.allclose(rates[-1], LAST * np.array(RATES))
+    assert (np.diff(rates, axis=0) < 0).all()
+
+
+def test_the_shares_of_rounds_spread_over_their_range_and_meet() -> None:
+    random = np.random.default_rng(1)
+    for of in ROUNDS:
+        shares = np.array([of.shares(random) for _ in range(200)])
+        assert of.least <= shares.min() and shares.max() <= of.most
+        middle = np.sqrt(of.least * of.most)
+        assert (np.count_nonzero(shares < middle, axis=1) == of.cuts // 2).all()
+    for one, other in itertools.pairwise(ROUNDS):
+        assert one.most == other.least
