@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+
 from sparklod_cli.lod.kernels.group import split_box
 from sparklod_cli.lod.kernels.pair_cost import CENTER, WIDTH
 
