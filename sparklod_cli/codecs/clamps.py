@@ -38,6 +38,13 @@ class Range:
 SPZ = tuple(Range(column, low, high) for column, (low, high) in quantize.CLAMPS.items())
 
 
+#: Shares of the smallest value of a range: what lies below these, too, is counted.
+DEEPER = (1e-1, 1e-2, 1e-3, 1e-4)
+
+#: Share of splats with a scale below their range from which on a scene is too small for a format, rather than a few of
+#: its splats too thin.
+MANY = 0.01
+
 #: Counts of what lies beyond ranges, see `tally`.
 Tally = NDArray[np.float64]
 
@@ -54,6 +61,7 @@ class Clamp:
         farthest: the value farthest beyond the end.
         degree: as in `Range`.
         both: the range is -end to end; the values lie beyond either, and `farthest` is a magnitude.
+        deeper: number of splats with such a value below each of `DEEPER` of a lower end above 0.
     """
 
     column: str
@@ -63,6 +71,17 @@ class Clamp:
     farthest: float
     degree: int = 0
     both: bool = False
+    deeper: tuple[int, ...] = ()
+
+    def multiple(self, splats: int) -> int | None:
+        """The least power of ten by which a scene has to grow to have few values below a lower end; None if more than
+        `DEEPER` has is needed.
+
+        Args:
+            splats: of the scene.
+        """
+        fitting = (round(1 / share) for share, left in zip(DEEPER, self.deeper, strict=True) if left <= MANY * splats)
+        return next(fitting, None)
 
 
 @dataclass(frozen=True)
@@ -86,11 +105,11 @@ def tally(splats: Splats, ranges: Sequence[Range]) -> Tally:
         ranges: those of one column are side by side.
 
     Returns:
-        (ranges, 6) float64: splats below the range, above, and either; splats beyond any range of its column; the
-        least and the largest value, infinite where there is none.
+        (ranges, 6 + deeper) float64: splats below the range, above, and either; splats beyond any range of its column;
+        the least and the largest value, infinite where there is none; splats below each of `DEEPER` of the range.
     """
-    found = np.zeros((len(ranges), 6))
-    found[:, 4:] = np.inf, -np.inf
+    found = np.zeros((len(ranges), 6 + len(DEEPER)))
+    found[:, 4:6] = np.inf, -np.inf
     for name in dict.fromkeys(each.column for each in ranges):
         column, either = getattr(splats, name).reshape(len(splats), -1), np.zeros(len(splats), np.bool_)
         numbers = [number for number, each in enumerate(ranges) if each.column == name]
@@ -104,7 +123,10 @@ def tally(splats: Splats, ranges: Sequence[Range]) -> Tally:
             below, above = _rows_with(values < each.low), _rows_with(values > each.high)
             either |= below | above
             counts = (np.count_nonzero(mask) for mask in (below, above, below | above))
-            found[number] = (*counts, 0, values.min(), values.max())
+            found[number, :6] = (*counts, 0, values.min(), values.max())
+            if each.low > 0 and below.any():
+                least = values[below].min(axis=1)
+                found[number, 6:] = [np.count_nonzero(least < share * each.low) for share in DEEPER]
         found[numbers, 3] = np.count_nonzero(either)
     return found
 
@@ -112,14 +134,16 @@ def tally(splats: Splats, ranges: Sequence[Range]) -> Tally:
 def merged(tallies: Sequence[Tally]) -> Tally:
     """The tally of all splats of one part or more."""
     parts = np.stack(tallies)
-    return np.column_stack([parts[:, :, :4].sum(axis=0), parts[:, :, 4].min(axis=0), parts[:, :, 5].max(axis=0)])
+    ends = [parts[:, :, 4].min(axis=0), parts[:, :, 5].max(axis=0)]
+    return np.column_stack([parts[:, :, :4].sum(axis=0), *ends, parts[:, :, 6:].sum(axis=0)])
 
 
 def clamps_of(found: Tally, ranges: Sequence[Range]) -> Clamps:
     """What a tally of these ranges says, in their order."""
     counts: dict[str, int] = {}
     ends = []
-    for each, (below, above, beyond, either, least, most) in zip(ranges, found.tolist(), strict=True):
+    for each, row in zip(ranges, found.tolist(), strict=True):
+        below, above, beyond, either, least, most, *deeper = row
         if either:
             counts[each.column] = int(either)
         if each.low == -each.high:
@@ -128,7 +152,8 @@ def clamps_of(found: Tally, ranges: Sequence[Range]) -> Clamps:
                 ends.append(Clamp(each.column, True, int(beyond), each.high, farthest, each.degree, both=True))
             continue
         if below:
-            ends.append(Clamp(each.column, False, int(below), each.low, least, each.degree))
+            found_deeper = tuple(map(int, deeper)) if each.low > 0 else ()
+            ends.append(Clamp(each.column, False, int(below), each.low, least, each.degree, deeper=found_deeper))
         if above:
             ends.append(Clamp(each.column, True, int(above), each.high, most, each.degree))
     return Clamps(counts, tuple(ends))

@@ -59,6 +59,8 @@ class WriteOptions:
         compression_level: of SPZ and RAD, 1 (fast) to 9 (small).
         rad: of RAD.
         sog: of SOG.
+        sh_bits: upper bits kept of each SH byte of SPZ, 4 to 8; None for as many as suit the scene, see `sh_bits`.
+            Merged splats keep 4, and 5 of degree 1, as other writers do with all splats.
     """
 
     spz_version: int | None = None
@@ -66,6 +68,7 @@ class WriteOptions:
     compression_level: int = DEFAULT_COMPRESSION
     rad: RadOptions = RadOptions()
     sog: SogOptions = SogOptions()
+    sh_bits: int | None = None
 
 
 #: What is written where nobody chooses.

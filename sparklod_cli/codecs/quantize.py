@@ -5,13 +5,14 @@ Encoders take finite numbers and clamp them to the range of the code.
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..model.gaussian import normalized_quat
-from ..model.sh import SH_C0
+from ..model.sh import COEFFICIENTS, SH_C0
 from ..model.splats import FloatArray
 
 Bytes = NDArray[np.uint8]
@@ -22,8 +23,8 @@ SCALE_STEPS, SCALE_OFFSET = 16, 10
 #: Bytes of colours, as SPZ defines them: an SH DC coefficient is multiplied by this, around one half.
 COLOR_GAIN = 0.15
 
-#: Upper bits kept of the SH bytes of each degree, as Niantic's library writes them.
-SH_BITS = (5, 4, 4)
+#: Fewest bits kept of the SH bytes of all degrees but the first, and of the first, as Niantic's library writes them.
+LEAST_SH_BITS, LEAST_SH_BITS_1 = 4, 5
 
 #: Largest code of signed 24-bit fixed point.
 FIXED24_MAX = 2**23 - 1
@@ -41,6 +42,11 @@ CLAMPS = {
 _SQRT_HALF = np.float32(np.sqrt(0.5))
 #: Indices of the three components that remain, by the index of the one that is left out.
 OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
+
+#: w of a unit quaternion below which codes beside those of x y z may mean a nearer rotation.
+_SMALL_W = 0.25
+#: The codes beside those of x y z, and themselves first.
+_STEPS = sorted(itertools.product((0, -1, 1), repeat=3), key=lambda step: sum(map(abs, step)))
 
 #: Written in place of an infinite logarithm or logit: in float32 its exponential and sigmoid are exactly those of
 #: infinity, and readers that refuse infinite numbers accept it.
@@ -153,28 +159,48 @@ def decode_color(codes: Bytes) -> FloatArray:
     return (codes.astype(np.float32) / 255 - np.float32(0.5)) * np.float32(SH_C0 / COLOR_GAIN) + np.float32(0.5)
 
 
-def encode_sh(sh: FloatArray) -> Bytes:
-    """(N, K, 3) coefficients to bytes, rounded to the middle of buckets of 8 or 16 codes; the range is -1..0.99."""
-    degree = np.repeat([0, 1, 2], [3, 5, 7])[: sh.shape[1]]
-    bucket = (2.0 ** (8 - np.array(SH_BITS)))[degree].astype(np.float32)[:, None]
+def encode_sh(sh: FloatArray, bits: int = LEAST_SH_BITS) -> Bytes:
+    """(N, K, 3) coefficients to bytes, rounded to multiples of 2 ** (8 - bits) codes; the range is -1..0.99.
+
+    Args:
+        sh: coefficients.
+        bits: upper bits kept of each byte, `LEAST_SH_BITS` to 8; degree 1 keeps `LEAST_SH_BITS_1` at least. The codes
+            of fewer bits are among those of more.
+    """
+    first = np.arange(sh.shape[1]) < COEFFICIENTS[1]
+    bucket = np.exp2(8 - np.where(first, max(bits, LEAST_SH_BITS_1), bits)).astype(np.float32)[:, None]
     with np.errstate(over="ignore"):
-        codes = np.rint(sh * 128) + 128
-        return _to_byte(np.floor((codes + bucket / 2) / bucket) * bucket)
+        return _to_byte(np.rint(sh * (128 / bucket)) * bucket + 128)
 
 
 def decode_sh(codes: Bytes) -> FloatArray:
-    """Largest error inside the range: 1 / 32 + 1 / 256 for degree 1, 1 / 16 + 1 / 256 above."""
+    """Largest error inside the range, of `LEAST_SH_BITS`: 1 / 32 for degree 1, 1 / 16 above; half for each bit more."""
     return (codes.astype(np.float32) - 128) / 128
 
 
 def encode_quat_first_three(quat_xyzw: FloatArray) -> Bytes:
-    """(N, 4) unit quaternions to (N, 3) bytes of x y z, of the one of q and -q whose w is not negative."""
-    sign = np.where(quat_xyzw[:, 3:] < 0, np.float32(-127.5), np.float32(127.5))
-    return _to_byte(quat_xyzw[:, :3] * sign + np.float32(127.5))
+    """(N, 4) unit quaternions to (N, 3) bytes of x y z, of the one of q and -q whose w is not negative.
+
+    w follows from x y z as the root of a small difference where it is near 0. There, the codes beside the nearest are
+    tried as well, and those of the nearest rotation taken.
+    """
+    sign = np.where(quat_xyzw[:, 3:] < 0, np.float32(-1), np.float32(1))
+    codes = _to_byte(quat_xyzw[:, :3] * (sign * np.float32(127.5)) + np.float32(127.5))
+    rows = np.flatnonzero(np.abs(quat_xyzw[:, 3]) < _SMALL_W)
+    if rows.size:
+        exact, first = quat_xyzw[rows] * sign[rows], codes[rows].astype(np.int16)
+        nearest = np.full(len(rows), -np.inf, np.float32)
+        for step in _STEPS:
+            tried = np.clip(first + step, 0, 255).astype(np.uint8)
+            cosine = np.einsum("ij,ij->i", decode_quat_first_three(tried), exact)
+            better = cosine > nearest
+            nearest[better] = cosine[better]
+            codes[rows[better]] = tried[better]
+    return codes
 
 
 def decode_quat_first_three(codes: Bytes) -> FloatArray:
-    """(N, 3) bytes to (N, 4) unit quaternions. Largest error: 13.4 degrees of rotation, where w is near 0."""
+    """(N, 3) bytes to (N, 4) unit quaternions. Largest error: 8 degrees of rotation, where w is near 0."""
     return quat_of_xyz(codes.astype(np.float32) / np.float32(127.5) - 1)
 
 

@@ -17,9 +17,10 @@ from ..support.parallel import blocks_of
 from ..support.progress import Progress, silent
 from . import clamps, compression
 from .clamps import Range
-from .encoder import CLAMPED, Encoded, Get, windows_of
+from .encoder import CLAMPED, Encoded, Get, rows_of, windows_of
 from .options import WriteOptions
 from .spz_layout import ANTIALIASED, HEADER, LOD, MAGIC, Layout, column_of
+from .spz_values import to_code
 
 
 @dataclass(frozen=True)
@@ -50,9 +51,13 @@ class SpzEncoder:
         """The result of a window, wherever it begins."""
         streams = self.layout.streams()
         codes = {stream.name: np.empty((len(splats), stream.size), np.uint8) for stream in streams}
+        bits, sh_bits = self.layout.fractional_bits, self.options.sh_bits
+        assert sh_bits is not None
         for part in blocks_of(len(splats)):
+            some, links = rows_of(splats, tree, part)
+            some = to_code(some, None if links is None else links.is_leaf, bits, sh_bits)
             for stream in streams:
-                values = np.ascontiguousarray(stream.encode(column_of(splats, tree, stream)[part]))
+                values = np.ascontiguousarray(stream.encode(column_of(some, links, stream)))
                 codes[stream.name][part] = values.view(np.uint8).reshape(-1, stream.size)
         return codes | ({CLAMPED: clamps.tally(splats, self.ranges)} if self.ranges else {})
 
@@ -91,7 +96,7 @@ def encoder(
     Raises:
         ValueError: the options are not settled.
     """
-    if options.spz_version is None or options.fractional_bits is None:
+    if options.spz_version is None or options.fractional_bits is None or options.sh_bits is None:
         raise ValueError("the options leave choices open; `settled` makes them")
     if isinstance(scene, NodeStream):
         count, sh_degree, tree = scene.count, scene.sh_degree, True

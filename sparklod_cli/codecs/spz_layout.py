@@ -16,6 +16,7 @@ from ..model.sh import COEFFICIENTS
 from ..model.splats import Splats
 from ..support.defaults import MAX_SH_DEGREE
 from . import quantize
+from .sh_bits import ALL_BITS
 
 MAGIC = 0x5053474E  # "NGSP"
 HEADER = struct.Struct("<IIIBBBB")  # magic, version, splats, SH degree, fractional bits, flags, reserved
@@ -100,7 +101,7 @@ class Layout:
                 3 * coefficients,  # coefficient-major, r g b innermost
                 "sh",
                 lambda codes: q.decode_sh(codes.reshape(-1, coefficients, 3)[:, : COEFFICIENTS[MAX_SH_DEGREE]]),
-                q.encode_sh,
+                lambda sh: q.encode_sh(sh, ALL_BITS),  # what is dropped of them is by now, see `spz_values`
             ),
         ]
         if self.flags & LOD:

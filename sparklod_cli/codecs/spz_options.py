@@ -12,6 +12,7 @@ from ..support.defaults import DEFAULT_SPZ_VERSION, MAX_FRACTIONAL_BITS, SPZ_VER
 from ..support.errors import FormatError
 from . import quantize
 from .options import WriteOptions
+from .sh_bits import ALL_BITS, enough
 from .statistics import Statistics
 from .steps import fine_bits
 
@@ -40,14 +41,19 @@ def largest_fractional_bits(largest: float) -> int:
 
 def needed(options: WriteOptions) -> frozenset[str]:
     """The statistics by which `settled` settles these options."""
-    return frozenset(("reach",) if options.fractional_bits is not None else ("reach", "leaf_scale"))
+    needed = {"reach"}
+    if options.fractional_bits is None:
+        needed.add("leaf_scale")
+    if options.sh_bits is None:
+        needed.add("leaf_sh")
+    return frozenset(needed)
 
 
 def settled(scene: Scene | Statistics, options: WriteOptions) -> WriteOptions:
     """These options with nothing left open: `encode` writes the scene with them.
 
     Positions get as many fractional bits as all nodes allow, up to where a step is far below the smallest splats of
-    full detail (`steps.STEPS_A_SPLAT`): merged splats are larger.
+    full detail (`steps.STEPS_A_SPLAT`): merged splats are larger. SH get as many bits as colours need, see `sh_bits`.
 
     Args:
         scene: or the statistics of one that are `needed`.
@@ -55,7 +61,7 @@ def settled(scene: Scene | Statistics, options: WriteOptions) -> WriteOptions:
 
     Raises:
         FormatError: a coordinate does not fit the fractional bits; the text names the most that would.
-        ValueError: the version is not one that is written.
+        ValueError: the version is not one that is written, or there are no such bits.
     """
     version = DEFAULT_SPZ_VERSION if options.spz_version is None else options.spz_version
     if version not in SPZ_VERSIONS:
@@ -68,7 +74,12 @@ def settled(scene: Scene | Statistics, options: WriteOptions) -> WriteOptions:
         bits = max(0, min(most, fine_bits(found.leaf_scale)))
     if bits > most:
         raise FormatError(f"a coordinate does not fit {bits} fractional bits; use at most {most}")
-    return dataclasses.replace(options, spz_version=version, fractional_bits=bits)
+    sh_bits = options.sh_bits
+    if sh_bits is None:
+        sh_bits = quantize.LEAST_SH_BITS if found.leaf_sh is None else enough(found.leaf_sh)
+    if not quantize.LEAST_SH_BITS <= sh_bits <= ALL_BITS:
+        raise ValueError(f"sh_bits is {sh_bits}, not {quantize.LEAST_SH_BITS} to {ALL_BITS}")
+    return dataclasses.replace(options, spz_version=version, fractional_bits=bits, sh_bits=sh_bits)
 
 
 def like(header: Mapping[str, int], options: WriteOptions) -> WriteOptions:

@@ -16,12 +16,14 @@ from numpy.typing import NDArray
 
 from ..model.scene import Scene
 from ..model.sh import COEFFICIENTS
-from ..model.splats import Splats
+from ..model.splats import FloatArray, Splats
 from .binades import Binades
 from .magnitudes import Magnitudes
+from .sh_bits import ShBytes
 
-#: What can be counted: the largest coordinate, the largest scale of each leaf, and the magnitudes of columns.
-ALL = frozenset(("reach", "leaf_scale", "rgb", "scale", "sh"))
+#: What can be counted: the largest coordinate, the largest scale of each leaf, how many times as long as wide it is,
+#: the SH bytes of leaves, and the magnitudes of columns.
+ALL = frozenset(("reach", "leaf_scale", "leaf_length", "leaf_sh", "rgb", "scale", "sh"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +37,9 @@ class Statistics:
         reach: the largest magnitude of a coordinate; None where it was not asked for.
         leaf_scale: the largest scale of each leaf, or splat where there is no tree; None where not asked for.
         magnitudes: of the values of "rgb", "scale", "sh1", "sh2" and "sh3", as far as they were asked for.
+        leaf_sh: SH of leaves, or of splats where there is no tree; None where not asked for, or without SH.
+        leaf_length: of each leaf, or splat where there is no tree, the largest scale as a multiple of the middle one;
+            None where not asked for.
     """
 
     count: int
@@ -43,6 +48,8 @@ class Statistics:
     reach: float | None = None
     leaf_scale: Binades | None = None
     magnitudes: Mapping[str, Magnitudes] = field(default_factory=dict)
+    leaf_sh: ShBytes | None = None
+    leaf_length: Binades | None = None
 
     @classmethod
     def of(cls, splats: Splats, leaf: NDArray[np.bool_] | None = None, needed: Collection[str] = ALL) -> Statistics:
@@ -53,19 +60,24 @@ class Statistics:
             leaf: (N,) which nodes are leaves; None for splats that are no nodes.
             needed: what to count, of `ALL`.
         """
-        reach, leaf_scale = None, None
+        reach, leaf_scale, leaf_length = None, None, None
         if "reach" in needed:
             center = splats.center
             reach = float(np.maximum(center.max(initial=0), -center.min(initial=0)))  # NaN stays
         if "leaf_scale" in needed:
             scale = splats.scale if leaf is None else splats.scale[leaf]
             leaf_scale = Binades.of(np.maximum.reduce(scale.T))
+        if "leaf_length" in needed:
+            leaf_length = Binades.of(lengths(splats.scale if leaf is None else splats.scale[leaf]))
+        leaf_sh = None
+        if "leaf_sh" in needed and splats.sh_degree:
+            leaf_sh = ShBytes.of(splats.sh if leaf is None else splats.sh[leaf])
         columns = {name: getattr(splats, name) for name in ("rgb", "scale") if name in needed}
         if "sh" in needed:
             for degree in range(1, splats.sh_degree + 1):
                 columns[f"sh{degree}"] = splats.sh[:, COEFFICIENTS[degree - 1] : COEFFICIENTS[degree]]
         magnitudes = {name: Magnitudes.of(values) for name, values in columns.items()}
-        return cls(len(splats), splats.sh_degree, leaf is not None, reach, leaf_scale, magnitudes)
+        return cls(len(splats), splats.sh_degree, leaf is not None, reach, leaf_scale, magnitudes, leaf_sh, leaf_length)
 
     @classmethod
     def of_scene(cls, scene: Scene, needed: Collection[str] = ALL) -> Statistics:
@@ -89,6 +101,8 @@ class Statistics:
             None if first.reach is None else float(np.max([part.reach for part in parts])),
             None if first.leaf_scale is None else Binades.merged([_known(part.leaf_scale) for part in parts]),
             {name: Magnitudes.merged([part.magnitudes[name] for part in parts]) for name in first.magnitudes},
+            None if first.leaf_sh is None else ShBytes.merged([part.leaf_sh for part in parts if part.leaf_sh]),
+            None if first.leaf_length is None else Binades.merged([_known(part.leaf_length) for part in parts]),
         )
 
     def array(self) -> NDArray[np.uint8]:
@@ -96,8 +110,11 @@ class Statistics:
         columns: dict[str, Any] = {"facts": [self.count, self.sh_degree, self.tree]}
         if self.reach is not None:
             columns["reach"] = self.reach
-        parts = {"leaf_scale": self.leaf_scale} if self.leaf_scale is not None else {}
-        for name, part in {**parts, **self.magnitudes}.items():
+        of_leaves = {"leaf_scale": self.leaf_scale, "leaf_length": self.leaf_length, "leaf_sh": self.leaf_sh}
+        parts = {**of_leaves, **self.magnitudes}
+        for name, part in parts.items():
+            if part is None:
+                continue
             columns |= {f"{name}.{key}": value for key, value in vars(part).items()}
         file = io.BytesIO()
         np.savez_compressed(file, **columns)
@@ -114,9 +131,23 @@ class Statistics:
         for name, value in columns.items():
             column, key = name.split(".")
             parts.setdefault(column, {})[key] = value
-        scale = parts.pop("leaf_scale", None)
-        leaf_scale = None if scale is None else Binades(**scale)
-        return cls(count, sh_degree, bool(tree), reach, leaf_scale, {k: Magnitudes(**v) for k, v in parts.items()})
+        leaf_scale, leaf_length = (
+            None if found is None else Binades(**found)
+            for found in (parts.pop("leaf_scale", None), parts.pop("leaf_length", None))
+        )
+        sh = parts.pop("leaf_sh", None)
+        leaf_sh = None if sh is None else ShBytes(**sh)
+        magnitudes = {name: Magnitudes(**found) for name, found in parts.items()}
+        return cls(count, sh_degree, bool(tree), reach, leaf_scale, magnitudes, leaf_sh, leaf_length)
+
+
+def lengths(scale: FloatArray) -> FloatArray:
+    """(N,) how many times as long as wide splats are: the largest scale by the middle one; 1 for those of no width."""
+    x, y, z = scale.T
+    largest = np.maximum(np.maximum(x, y), z)
+    middle = np.maximum(np.minimum(x, y), np.minimum(np.maximum(x, y), z))
+    with np.errstate(divide="ignore", over="ignore"):
+        return np.divide(largest, middle, out=np.ones_like(largest), where=middle > 0)
 
 
 def _known(found: Binades | None) -> Binades:

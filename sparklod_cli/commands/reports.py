@@ -119,6 +119,7 @@ def _written(baked: Baked) -> str:
 
 def _clamped(clamp: Clamp, baked: Baked) -> str:
     """How many nodes have values that were clamped, how far these were off, and what that means."""
+    from ..codecs.clamps import MANY
     from ..codecs.rad.encodings import LARGEST_F16
 
     form, table = ("SPZ", CLAMPED_BY_SPZ) if baked.chunks is None else ("RAD", CLAMPED_BY_RAD)
@@ -129,10 +130,23 @@ def _clamped(clamp: Clamp, baked: Baked) -> str:
     where = "beyond ±" if clamp.both else f"{where} "
     farthest = clamp.farthest or 0.0  # no -0
     advice = advice.format(wide="f16" if abs(farthest) <= LARGEST_F16 else "f32")
+    if form == "SPZ" and clamp.deeper and clamp.splats > MANY * baked.nodes:
+        advice = _remedy(clamp, baked)
     return (
         f"{name} of {share} are {where}{clamp.end:.3g}, {way} to {farthest:.3g}, and are clamped to what {form} holds:"
         f" {advice}"
     )
+
+
+def _remedy(clamp: Clamp, baked: Baked) -> str:
+    """What keeps scales of which many are too small for SPZ.
+
+    A scene that is enlarged has fewer fractional bits, for as many as it grows by; there must be some to give away.
+    """
+    multiple = clamp.multiple(baked.nodes)
+    if multiple is None or multiple > 2 ** (baked.fractional_bits or 0):
+        return "--format rad keeps them"
+    return f"--scale {multiple} or --format rad keeps them"
 
 
 def report_extracted(console: Console, source: Place, target: Place, extracted: Extracted) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -9,10 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..codecs import coverage
 from ..codecs.octahedral import STEPS_8_8_8, encode_axis_angle, encode_lod_alpha
 from ..codecs.rad.encodings import CODINGS
 from ..codecs.rad.layout import PROPERTIES, Row
+from ..codecs.sh_bits import ALL_BITS, ShBytes, enough
 from ..codecs.spz_layout import LOD, Layout
+from ..codecs.spz_values import to_code
 from ..model.scene import Scene
 from ..model.sh import COEFFICIENTS
 from ..model.splats import FloatArray, Splats
@@ -67,15 +71,25 @@ class Coding:
     degrees: float
 
 
-def of_spz(scene: Scene) -> Coding:
-    """The coding of an SPZ file that a scene was read from."""
+def of_spz(scene: Scene, leaves: Splats, *, covering: bool) -> Coding:
+    """The coding of an SPZ file that a scene was read from.
+
+    Args:
+        scene: with a tree.
+        leaves: of the tree.
+        covering: opacities make up for the rounding of scales, see `coverage`; only sparklod writes so.
+    """
     version, bits = max(2, int(scene.header["version"])), int(scene.header["fractional_bits"])
     degree = scene.splats.sh_degree
     steps = np.full(3 + 1 + 3 + 3 + 3 * COEFFICIENTS[degree], STEPS)
     steps[10:] = SH_STEPS
+    sh_bits = enough(ShBytes.of(leaves.sh)) if degree else ALL_BITS
 
     def encode(splats: Splats) -> Coded:
         parts, numbers = [], {}
+        opacity = splats.opacity
+        splats = to_code(splats, None, bits, sh_bits)
+        splats = splats if covering else dataclasses.replace(splats, opacity=opacity)
         for stream in Layout(version, len(splats), degree, bits, LOD).streams():
             if not hasattr(splats, stream.column):
                 continue  # the columns of the tree
@@ -91,12 +105,13 @@ def of_spz(scene: Scene) -> Coding:
     return Coding(encode, steps, DEGREES[3 if version == 2 else 4])
 
 
-def of_rad(facts: RadFacts, leaves: Splats) -> Coding | str:
+def of_rad(facts: RadFacts, leaves: Splats, *, covering: bool) -> Coding | str:
     """The coding of a RAD file; or why there is none. A palette of SH, whose entries stand for many, is left out.
 
     Args:
         facts: of the file.
         leaves: its leaves, whose centres may have been rounded to multiples of a power of two.
+        covering: as for SPZ.
     """
     mixed = [name for name, found in facts.properties.items() if "," in found.encoding]
     if mixed:
@@ -121,6 +136,7 @@ def of_rad(facts: RadFacts, leaves: Splats) -> Coding | str:
                 yield _rad_codes(splats, row, found, name)
 
     def encode(splats: Splats) -> Coded:
+        splats = _covering(splats, facts, bits) if covering else splats
         numbers = np.concatenate(list(numbers_of(splats)), axis=1)
         axis = np.stack(encode_axis_angle(splats.quat_xyzw, STEPS_8_8_8), axis=1)
         parts = [np.ascontiguousarray(each).view(np.uint8).reshape(len(splats), -1) for each in (numbers, axis)]
@@ -139,6 +155,16 @@ def _fractional_bits(center: FloatArray) -> int | None:
         if (scaled == np.round(scaled)).all():
             return bits
     return None
+
+
+def _covering(splats: Splats, facts: RadFacts, bits: int | None) -> Splats:
+    """Splats whose opacities make up for how a RAD file rounds their scales."""
+    found = facts.properties.get("scales")
+    if found is None:
+        return splats
+    rounded = CODINGS[found.encoding].rounded(splats.scale, found.min or 0.0, found.max or 0.0)
+    blur = 0.0 if bits is None else 2.0**-bits
+    return dataclasses.replace(splats, opacity=coverage.kept(splats.opacity, splats.scale, rounded, blur))
 
 
 def _rad_codes(splats: Splats, row: Row, found: PropertyFacts, encoding: str) -> NDArray[np.int32]:

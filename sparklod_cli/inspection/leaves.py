@@ -21,8 +21,8 @@ MAX_SEARCHED = 20_000
 def check(scene: Scene, original: Scene, facts: RadFacts | None = None) -> list[Finding]:
     """A finding if the leaves of `scene`, a tree, are not exactly the splats of `original` that can be drawn.
 
-    Both are compared as codes of the tree's file: most are equal, and each of the others must pair with one whose codes
-    all lie within a step.
+    Both are compared as codes of the tree's file, as sparklod makes them or as others do: most are equal, and each of
+    the others must pair with one whose codes all lie within a step.
 
     Args:
         scene: of an SPZ or RAD file.
@@ -42,12 +42,16 @@ def check(scene: Scene, original: Scene, facts: RadFacts | None = None) -> list[
         return [Finding("expect.leaves", f"{found}, but {expected} of the original can be drawn")]
     if leaves.sh_degree != splats.sh_degree:
         return [Finding("expect.leaves", f"SH degree {leaves.sh_degree}, but the original has {splats.sh_degree}")]
-    coding = of_spz(scene) if facts is None else of_rad(facts, leaves)
-    if isinstance(coding, str):
-        return [Finding("expect.leaves", coding)]
-    missing = _unpaired(coding.encode(leaves), coding.encode(splats), coding)
-    if not len(missing):
-        return []
+    missing = None
+    for covering in (True, False):
+        coding = of_spz(scene, leaves, covering=covering) if facts is None else of_rad(facts, leaves, covering=covering)
+        if isinstance(coding, str):
+            return [Finding("expect.leaves", coding)]
+        unpaired = _unpaired(coding.encode(leaves), coding.encode(splats), coding)
+        if not len(unpaired):
+            return []
+        missing = unpaired if missing is None or len(unpaired) < len(missing) else missing
+    assert missing is not None
     index = int(np.flatnonzero(scene.tree.is_leaf)[missing[0]])
     what = f"{len(missing):,} leaves are not splats of the original; the first is node {index:,}"
     return [Finding("expect.leaves", what, index, len(missing))]

@@ -76,6 +76,7 @@ class ValueChecks:
         count: splats so far.
         checked: of them, those of which few may be invisible or clamped: the leaves of a tree, or all.
         invisible: of these, valid or not.
+        small: of them, those whose scale is at the lower end.
         tallies: by what is wrong.
     """
 
@@ -84,6 +85,7 @@ class ValueChecks:
     count: int = 0
     checked: int = 0
     invisible: int = 0
+    small: int = 0
     tallies: dict[str, Tally] = field(default_factory=dict)
 
     def _add(self, what: str, mask: NDArray[np.bool_], block: Block) -> None:
@@ -108,7 +110,9 @@ class ValueChecks:
         self._add("center", valid & (furthest >= self.ends.center), block)
         low, high = self.ends.scale
         if high < math.inf:  # a smallest scale that was clamped is not visible
-            self._add("scale", some & (most > 0) & ((most <= low) | (most >= high)), block)
+            small = some & (most > 0) & (most <= low)
+            self.small += int(np.count_nonzero(small & valid))
+            self._add("scale", small | (some & (most >= high)), block)
         self._add("far", valid & (furthest >= FLOAT16_END), block)
 
     def findings(self) -> list[Finding]:
@@ -132,7 +136,11 @@ class ValueChecks:
             report("values.center-clamped", "center", text)
         if "scale" in self.tallies and self.tallies["scale"].count > MANY_CLAMPED * self.checked:
             low, high = self.ends.scale
-            text = f"a scale is {low:.2g} or {high:.0f}, the ends of the range of its code"
+            small = 2 * self.small > self.tallies["scale"].count
+            text = (
+                f"a scale is {low:.2g} or {high:.0f}, the ends of the range of its code; baking with"
+                f" --scale {100 if small else 0.01} or --format rad keeps such scales"
+            )
             report("values.scale-clamped", "scale", text)
         report("values.center-far", "far", f"a coordinate is {FLOAT16_END:,} or more, which float16 cannot hold")
         return found

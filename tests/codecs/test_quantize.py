@@ -147,19 +147,23 @@ def in_all_coefficients(values: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(np.broadcast_to(values[:, None, None], (len(values), 15, 3)))
 
 
-@pytest.mark.parametrize(("coefficients", "bound"), [(slice(0, 3), 1 / 32 + 1 / 256), (slice(3, 15), 1 / 16 + 1 / 256)])
-def test_sh_keeps_and_reaches_its_error(coefficients: slice, bound: float) -> None:
-    values = in_all_coefficients(np.linspace(-1, 0.99, 50_001, dtype=np.float32))
-    error = np.abs(quantize.decode_sh(quantize.encode_sh(values)) - values)[:, coefficients].max(axis=(0, 2))
-    assert (error <= ROUNDING * bound).all()
-    assert (error >= 0.98 * bound).all()
+@pytest.mark.parametrize("bits", range(4, 9))
+def test_sh_keeps_and_reaches_its_error(bits: int) -> None:
+    values = in_all_coefficients(np.linspace(-0.9375, 0.9375, 50_001, dtype=np.float32))
+    error = quantize.decode_sh(quantize.encode_sh(values, bits)) - values
+    bound = np.repeat([0.5 ** max(bits, 5), 0.5**bits], [3, 12])[:, None]
+    assert (np.abs(error).max(axis=0) <= ROUNDING * bound).all()
+    assert (np.abs(error).max(axis=0) >= 0.98 * bound).all()
+    assert (np.abs(error.mean(axis=0)) <= 0.01 * bound).all()  # as often up as down
 
 
-def test_sh_stores_the_middles_of_buckets() -> None:
-    codes = quantize.encode_sh(in_all_coefficients(quantize.decode_sh(CODES)))
-    step = np.repeat([8, 16], [3, 12])[None, :, None]
+@pytest.mark.parametrize("bits", range(4, 9))
+def test_sh_codes_of_fewer_bits_are_among_those_of_more(bits: int) -> None:
+    codes = quantize.encode_sh(in_all_coefficients(quantize.decode_sh(CODES)), bits)
+    step = np.repeat([2 ** (8 - max(bits, 5)), 2 ** (8 - bits)], [3, 12])[None, :, None]
     assert ((codes % step == 0) | (codes == 255)).all()
-    np.testing.assert_array_equal(quantize.encode_sh(quantize.decode_sh(codes)), codes)
+    for more in range(bits, 9):
+        np.testing.assert_array_equal(quantize.encode_sh(quantize.decode_sh(codes), more), codes)
 
 
 @pytest.mark.parametrize("coefficients", [3, 8, 15])
@@ -182,7 +186,7 @@ def test_sh_clamps_what_overflows_quietly() -> None:
 
 Coder = Callable[[np.ndarray], np.ndarray]
 QUATERNIONS: dict[str, tuple[Coder, Coder, list[float]]] = {
-    # With the rotations that come out worst, as a search found them.
+    # With rotations that come out badly, as a search found them.
     "first three": (
         quantize.encode_quat_first_three,
         quantize.decode_quat_first_three,

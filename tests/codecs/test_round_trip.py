@@ -10,7 +10,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from sparklod_cli.codecs import spz
+from sparklod_cli.codecs import coverage, spz
 from sparklod_cli.codecs.formats import FORMATS
 from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.codecs.rad import codec as rad
@@ -74,8 +74,11 @@ def assert_close(back: Splats, source: Splats, allowed: Precision) -> None:
     expected = np.clip(source.scale, *allowed.scale_range)
     assert (np.abs(np.log(back.scale / expected)) <= allowed.log_scale).all()
     assert rotation_degrees(back.quat_xyzw, source.quat_xyzw).max() <= allowed.degrees
-    off = np.abs(lod_opacity(back.opacity) - lod_opacity(source.opacity))
-    assert (off <= np.where(source.opacity > 1, allowed.merged, allowed.opacity)).all()
+    opacity = source.opacity
+    if allowed.blur is not None:
+        opacity = coverage.kept(opacity, source.scale, back.scale, allowed.blur)
+    off = np.abs(lod_opacity(back.opacity) - lod_opacity(opacity))
+    assert (off <= np.where(opacity > 1, allowed.merged, allowed.opacity)).all()
     assert (np.abs(back.rgb - np.clip(source.rgb, *allowed.rgb_range)) <= allowed.rgb).all()
     sh = np.abs(back.sh - np.clip(source.sh, *allowed.sh_range))
     assert sh[:, :3].max(initial=0) <= allowed.sh[0] * (1 + slack)

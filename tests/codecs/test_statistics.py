@@ -57,24 +57,26 @@ def test_an_array_holds_all_of_them() -> None:
     assert array.dtype == np.uint8 and array.ndim == 1 and len(array) < 20_000
     back = Statistics.from_array(array)
     for name, value in vars(found).items():
-        if name not in ("leaf_scale", "magnitudes"):
+        if name not in ("leaf_scale", "leaf_length", "leaf_sh", "magnitudes"):
             assert getattr(back, name) == value
     for one, other in [
         (found.leaf_scale, back.leaf_scale),
+        (found.leaf_sh, back.leaf_sh),
+        (found.leaf_length, back.leaf_length),
         *((found.magnitudes[name], back.magnitudes[name]) for name in found.magnitudes),
     ]:
         for key, value in vars(one).items():
             np.testing.assert_array_equal(getattr(other, key), value)
     few = Statistics.from_array(Statistics.of_scene(scene, {"reach"}).array())
-    assert few.leaf_scale is None
+    assert few.leaf_scale is None and few.leaf_sh is None
     assert few.reach == float(np.abs(scene.splats.center).max()) and not few.magnitudes
 
 
 def test_only_what_is_needed_is_counted() -> None:
-    settled = WriteOptions(fractional_bits=3)
-    assert spz.needed(DEFAULTS) == {"reach", "leaf_scale"} and spz.needed(settled) == {"reach"}
-    assert rad.needed(DEFAULTS) == {"rgb", "scale", "sh", "leaf_scale"}
-    assert rad.needed(WriteOptions(rad=RadOptions(center="f32"))) == {"rgb", "scale", "sh"}
+    settled = WriteOptions(fractional_bits=3, sh_bits=5)
+    assert spz.needed(DEFAULTS) == {"reach", "leaf_scale", "leaf_sh"} and spz.needed(settled) == {"reach"}
+    assert rad.needed(DEFAULTS) == {"rgb", "scale", "sh", "leaf_scale", "leaf_length"}
+    assert rad.needed(WriteOptions(rad=RadOptions(center="f32"))) == {"rgb", "scale", "sh", "leaf_length"}
     scene = Scene(random_splats(50, sh_degree=1))
     assert rad.needed(rad.settled(scene, DEFAULTS)) == frozenset()
 

@@ -49,6 +49,7 @@ class Precision:
     log_scale: float | Array = 2e-6
     degrees: float = 1e-3
     opacity: float = 1e-6
+    blur: float | None = None  # of `coverage.kept`, where the opacity makes up for the rounding of scales
     merged: float = 1e-6  # of an LoD opacity D above 1
     rgb: float | Array = 1e-6
     sh: tuple[float, float] = (0.0, 0.0)  # degree 1, degrees above
@@ -189,12 +190,12 @@ def spz_precision(source: Scene, version: int) -> Precision:
     return Precision(
         center=0.5 * 2.0**-bits,
         log_scale=1.001 / 32,
-        # Near half a turn the first three are less exact than their docstring says, which test_quantize.py checks.
-        degrees=max(stated_degrees(coding), 13.4) if version == 2 else stated_degrees(coding),
+        degrees=stated_degrees(coding),
         opacity=1.001 / 255 if source.tree else 1.001 / 510,
+        blur=2.0**-bits,
         merged=4.004 / 255,
         rgb=0.00369,
-        sh=(1 / 32 + 1 / 256, 1 / 16 + 1 / 256),
+        sh=(1 / 32, 1 / 16),
         scale_range=(np.exp(-10), np.exp(95 / 16)),
         rgb_range=(-0.4403, 1.4403),
         sh_range=(-1, 0.992),
@@ -504,7 +505,8 @@ def written_rad_precision(source: Scene, options: RadOptions) -> Precision:
     ranges = chosen.ranges  # those of SH are for viewers; codes in a file reach at least from -1 to 1
     tops = {f"sh{degree}_max": max(1.0, float(ranges.sh_max(degree))) for degree in (1, 2, 3)}
     encodings = {name: getattr(chosen, name) for name in SMALL_RAD}
-    return rad_precision(source, encodings, dataclasses.replace(ranges, **tops), chosen.center_bits)
+    found = rad_precision(source, encodings, dataclasses.replace(ranges, **tops), chosen.center_bits)
+    return dataclasses.replace(found, blur=0.0 if chosen.center_bits is None else 2.0**-chosen.center_bits)
 
 
 def rad_encodings(number: int) -> RadOptions:

@@ -13,7 +13,9 @@ from sparklod_cli.cli import run
 from sparklod_cli.codecs import ply
 from sparklod_cli.commands.reports import CLAMPED_BY_SPZ
 from sparklod_cli.io import read_scene
+from sparklod_cli.model.scene import Scene
 from tests.conftest import FIXTURES
+from tests.scenes import random_splats
 
 TREE, PLAIN = FIXTURES / "golden" / "tree-v3.spz", FIXTURES / "one.ply"
 Said = pytest.CaptureFixture[str]
@@ -101,8 +103,34 @@ def test_what_is_clamped_is_said_with_its_end_and_what_to_do(
     assert run(["build-lod", str(clamped_scene(tmp_path, **{name: value}))]) == 0
     err = capsys.readouterr().err
     advice = CLAMPED_BY_SPZ[name, "above" in said][1]
+    if value == 1e-7:  # one of few nodes is many
+        advice = "--scale 1000 or --format rad keeps them"
     assert re.search(rf"\n  {said}, and are clamped to what SPZ holds: {re.escape(advice)}\n", err), err
     assert err.count("clamped to") == 1
+
+
+@pytest.mark.parametrize(
+    ("small", "scale", "advice"),
+    [
+        (300, 1e-6, "--scale 100 or --format rad keeps them"),
+        (300, 1e-9, "--format rad keeps them"),  # such a scene would be too large for positions
+        (2, 1e-6, CLAMPED_BY_SPZ["scale", False][1]),
+    ],
+)
+def test_a_scene_too_small_for_spz_is_told_how_much_larger_it_fits(
+    small: int, scale: float, advice: str, tmp_path: Path, capsys: Said
+) -> None:
+    splats = random_splats(1_000)
+    splats.scale[:small, 0] = scale
+    source = tmp_path / "small.ply"
+    source.write_bytes(b"".join(ply.encode(Scene(splats))))
+    assert run(["build-lod", str(source)]) == 0
+    err = capsys.readouterr().err
+    said = r"are below 4.4e-05, down to 1e-\d+, and are clamped to what SPZ holds: "
+    assert re.search(said + re.escape(advice) + "\n", err), err
+    if "--scale" in advice and small > 2:
+        assert run(["build-lod", str(source), "--scale", "100", "-o", str(tmp_path / "large-lod.spz")]) == 0
+        assert "clamped" not in capsys.readouterr().err
 
 
 def test_counts_of_one_have_a_singular_noun(tmp_path: Path, capsys: Said) -> None:

@@ -8,7 +8,7 @@ import io
 import numpy as np
 from numpy.typing import NDArray
 
-from sparklod_cli.codecs import spz
+from sparklod_cli.codecs import coverage, spz
 from sparklod_cli.codecs.options import DEFAULTS, WriteOptions
 from sparklod_cli.model.gaussian import lod_opacity
 from sparklod_cli.model.lod_tree import LodTree
@@ -110,10 +110,13 @@ def check_close(got: ExtSplats, splats: Splats, version: int, fractional_bits: i
     log_scale = np.log(splats.scale.astype(np.float64)).clip(-10, 255 / 16 - 10)
     within(got.log_scale, log_scale, 1 / 32 + 1e-6)
     assert degrees_between(got.quat_xyzw, splats.quat_xyzw).max() <= SPZ_DEGREES[version] + EXT_DEGREES
+    # The opacity makes up for the rounding of scales.
+    codes = np.rint(16 * (log_scale + 10)).clip(0, 255)
+    opacity = coverage.kept(splats.opacity, splats.scale, np.exp(codes / 16 - 10), 2.0**-fractional_bits)
     if got.nodes is None:
-        within(got.alpha, splats.opacity, 1 / 510 + HALF)
+        within(got.alpha, opacity, 1 / 510 + HALF + TINY)
     else:
-        d = lod_opacity(splats.opacity).astype(np.float64)
+        d = lod_opacity(opacity).astype(np.float64)
         # A byte: half of its codes are for 0..1, half for 1..5; 1 lies between two codes.
         within(got.lod_opacity, d, np.where(d > 1, 4 / 255 + 8 * HALF, 1 / 255 + HALF))
 

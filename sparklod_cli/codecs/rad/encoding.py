@@ -18,7 +18,7 @@ from ...model.sh import COEFFICIENTS
 from ...model.splats import COLUMNS, FloatArray, Splats
 from ...model.streams import NodeStream
 from ...support.progress import Progress, silent
-from .. import clamps, octahedral
+from .. import clamps, coverage, octahedral
 from ..clamps import Range
 from ..encoder import CLAMPED, Encoded, Get, windows_of
 from ..options import WriteOptions
@@ -26,7 +26,7 @@ from ..splat_encoding import SplatEncoding
 from .comment import comment_of
 from .encodings import CODINGS
 from .header import pack_chunk_header, pack_header, padding
-from .layout import PROPERTIES, RANGES, SIZES, Row
+from .layout import BY_NAME, PROPERTIES, RANGES, SIZES, Row
 from .names import SUFFIX, chunk_name
 from .options import code_range
 from .palette import Palette
@@ -174,12 +174,19 @@ class RadEncoder:
             return labels[:, None]
         column: NDArray[Any] = getattr(splats if row.column in COLUMNS else tree, row.column)
         if row.column == "opacity":
-            return _alpha(column, encoding, self._codes)[:, None]
+            return _alpha(self._opacity(splats), encoding, self._codes)[:, None]
         if row.column == "quat_xyzw" and encoding != "oct88r8":
             return column[:, :3] * np.where(column[:, 3:] < 0, np.float32(-1), np.float32(1))
         if row.column == "center" and self.options.rad.center_bits is not None:
             return rounded(column, self.options.rad.center_bits)
         return column if column.ndim == 2 else column[:, None]
+
+    def _opacity(self, splats: Splats) -> FloatArray:
+        """(n,) opacities that make up for the rounding of scales."""
+        ends = code_range(BY_NAME["scales"], self._codes)
+        rounded = CODINGS[self.options.rad.scales].rounded(splats.scale, *ends)
+        bits = self.options.rad.center_bits
+        return coverage.kept(splats.opacity, splats.scale, rounded, 0.0 if bits is None else 2.0**-bits)
 
     def _deflated(self, codes: NDArray[Any], encoding: str) -> bytes:
         """A raw deflate stream.

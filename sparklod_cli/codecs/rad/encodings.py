@@ -35,6 +35,11 @@ class Coding(NamedTuple):
     encode: Callable[[NDArray[Any], float, float], NDArray[Any]]
     decode: Callable[[Bytes, int, int, float, float], NDArray[Any]]
 
+    def rounded(self, values: NDArray[Any], low: float, high: float) -> NDArray[Any]:
+        """(N, numbers) values as they are decoded."""
+        codes = np.ascontiguousarray(self.encode(values, low, high)).reshape(-1).view(np.uint8)
+        return np.ascontiguousarray(self.decode(codes, len(values), values.shape[1], low, high))
+
 
 def _plain(code: str, most: np.float32 | None = None) -> Coding:
     """Numbers as they are, in a type."""

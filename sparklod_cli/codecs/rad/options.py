@@ -21,8 +21,12 @@ from .layout import AUTO, OPTIONS, PROPERTIES, RANGES, Row, choices
 #: What "auto" stands for, where the scene does not decide.
 AUTOMATIC = RadOptions("f32_lebytes", "r8", "r8", "ln_0r8", "oct88r8", "s8")
 
-#: Range from which float16 is used: as Spark does, which is also where its error of 2 ** -11 becomes the smaller one.
-WIDE_LOG_RANGE = 25.0
+#: Range of logarithms of scales from which float16 is used: steps of a byte would be as coarse as SPZ's, 6 %.
+WIDE_LOG_RANGE = 16.0
+
+#: Splats are long if they are as many times as long as wide. Where half of them are, rotations are float16: those of
+#: oct88r8, off by up to 1.9 degrees, would move the ends of each by a quarter of its width.
+LONG = 8.0
 
 #: Range of colours from which float16 is used: a code would be 4 steps of 8-bit colour and more.
 WIDE_RGB_RANGE = 4.0
@@ -37,7 +41,9 @@ def needed(options: WriteOptions) -> frozenset[str]:
     """The statistics by which `settled` settles these options."""
     rad = options.rad
     ranges = NEEDED if rad.ranges is None else frozenset[str]()
-    return ranges | {"leaf_scale"} if _rounds(rad) else ranges
+    rounds = {"leaf_scale"} if _rounds(rad) else set()
+    turns = {"leaf_length"} if rad.orientation == AUTO else set()
+    return ranges | rounds | turns
 
 
 def _rounds(rad: RadOptions) -> bool:
@@ -72,6 +78,8 @@ def settled(scene: Scene | Statistics, options: WriteOptions) -> WriteOptions:
         chosen["scales"] = "ln_f16"
     if rad.rgb == AUTO and ranges.rgb_max - ranges.rgb_min > WIDE_RGB_RANGE:
         chosen["rgb"] = "f16"
+    if rad.orientation == AUTO and found.leaf_length is not None and found.leaf_length.quantile(0.5) >= LONG:
+        chosen["orientation"] = "f16"
     bits = rad.center_bits
     if _rounds(rad):
         # The lowest bytes of rounded float32 are mostly zeros, which take no room.

@@ -233,10 +233,11 @@ def test_an_opaque_leaf_does_not_become_a_merged_splat() -> None:
     splats.opacity[:] = np.linspace(0, 1, 200)
     splats.opacity[0] = 1000
     tree = Scene(splats, broad_tree(200))
-    back = read(written(tree, alpha="r8")).splats.opacity
+    back = read(written(tree, alpha="r8", scales="f32")).splats.opacity  # which need not make up for scales
     assert back[1:].max() <= 1 < back[0]
     assert np.abs(back[1:] - splats.opacity[1:]).max() <= 1 / 255 + 1e-6
-    assert read(written(Scene(splats.take(slice(1, None))), alpha="r8")).splats.opacity.max() == 1
+    assert read(written(Scene(splats.take(slice(1, None))), alpha="r8", scales="f32")).splats.opacity.max() == 1
+    assert read(written(tree, alpha="r8")).splats.opacity[1:].max() <= 1
 
 
 def test_a_scene_without_splats_is_a_file_without_chunks() -> None:
@@ -362,6 +363,18 @@ def test_colours_and_scales_of_a_wide_range_are_float16() -> None:
     splats.scale[:, 2] = np.exp(np.linspace(-29, 3, 300))
     assert chosen(splats).scales == "ln_f16"
     assert chosen(splats, scales="ln_0r8", rgb="r8") == dataclasses.replace(chosen(splats), scales="ln_0r8", rgb="r8")
+
+
+@pytest.mark.parametrize(("long", "encoding"), [(400, "oct88r8"), (600, "f16")])
+def test_rotations_of_long_splats_are_float16(long: int, encoding: str) -> None:
+    """Where at least half of the leaves are: the merged splats of a tree do not matter, nor how thin splats are."""
+    splats = random_splats(1_000)
+    splats.scale[:] = [0.01, 0.002, 1e-5]
+    splats.scale[:long] = [0.0001, 0.02, 0.002]
+    assert chosen(splats).orientation == encoding
+    assert chosen(splats, orientation="oct88r8").orientation == "oct88r8"
+    splats.scale[long:, :2] = 0  # a line, which has no width, is none
+    assert chosen(splats).orientation == encoding
 
 
 def test_scales_of_0_are_held_and_thin_ones_clamped_and_counted() -> None:

@@ -1,0 +1,58 @@
+"""Keeps what a splat covers when its scales are rounded: its opacity makes up for them.
+
+A code of a scale is off by 3 % and more, so that a splat gets up to 7 % larger or smaller, and with it what it adds to
+a picture. See docs/decisions/2026-11-22-rounding.md.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..model.splats import FloatArray
+
+#: Largest factor by which an opacity grows for an area that was lost, somewhat more than rounding can take. What loses
+#: more is larger than any code, such as a sky, and shrinks: a denser middle would not be more like it.
+MOST_GROWTH = 1.125
+
+#: Smallest factor, of what is smaller than any code: a pixel shows it all the same.
+LEAST_GROWTH = 1 / 16
+
+#: Euler's constant, of the harmonic numbers.
+_EULER = 0.5772156649015329
+
+
+def faces(scale: FloatArray, blur: float) -> NDArray[np.float64]:
+    """(N,) sums of the products of two scales each, which the area is proportional to that a splat shows on average.
+
+    Args:
+        scale: (N, 3) standard deviations, world units.
+        blur: added to each, as a pixel does: what is far thinner than that covers no less for it.
+    """
+    x, y, z = np.sqrt(np.square(scale.T.astype(np.float64)) + blur * blur)
+    return x * y + x * z + y * z
+
+
+def kept(opacity: FloatArray, scale: FloatArray, rounded: FloatArray, blur: float) -> FloatArray:
+    """(N,) linear opacities with which splats of rounded scales cover as much as before.
+
+    A splat of opacity A up to 1 covers A times its area, and keeps an opacity up to 1. A merged one of A above 1 covers
+    H(A) times its area, the integral of its falloff 1 - (1 - exp(-z ** 2 / 2)) ** A, where H are the harmonic numbers.
+    Where nothing is rounded, the opacity stays as it is, bit for bit.
+
+    Args:
+        opacity: (N,) linear opacities.
+        scale: (N, 3) standard deviations, world units.
+        rounded: (N, 3) the same as a file holds them.
+        blur: see `faces`; a step of the positions is a good one, for it is far below a small splat of the scene.
+    """
+    area = faces(rounded, blur)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.where(area > 0, np.clip(faces(scale, blur) / area, LEAST_GROWTH, MOST_GROWTH), 1)
+    faint = opacity <= 1
+    wide = opacity.astype(np.float64)
+    most = np.maximum(wide, 1)
+    covered = np.log(most) + _EULER + (1 - _EULER) / most  # H(A), within 1.5 %
+    slope = most / (most + 0.5)  # of H(A) by ln(A), within 4 %
+    grown = np.where(faint, np.minimum(wide * ratio, 1), most * np.exp(covered * (ratio - 1) / slope))
+    return np.where(ratio == 1, opacity, grown).astype(np.float32)
