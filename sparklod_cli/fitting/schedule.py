@@ -33,7 +33,7 @@ class Round:
         return [float(self.least * ratio ** ((part + random.random()) / self.cuts)) for part in parts]
 
 
-#: Rounds, one after the other, each with a camera of its own: what is fitted to few cameras looks right from those only.
+#: Rounds, one after the other, each with a camera of its own: what is fitted to few cameras looks right from those.
 ROUNDS = (Round(2, 0.01, 0.1), Round(2, 0.1, 0.5))
 
 #: Rates of the first steps, and those of the last ones over these. Measured (docs/decisions/2026-11-22-refine.md).
