@@ -130,8 +130,8 @@ def build_lod(
     with on_threads(threads), telling(progress) as told, memory_errors_translated():
         kept, _ = (selection or Selection()).apply(scene.splats.with_max_sh(max_sh))
         # A builder frees its input as it goes where nobody else holds it.
-        nodes, tree = banded([build(kept, progress=told)])
-        made = Tree(nodes, tree, scene.antialiased)
+        built = build(kept, progress=told)
+        made = Tree(*(banded([built]) if BUILDERS[method].in_bands else built), scene.antialiased)
         return made if fitting is None else refined_tree(made, fitting, thread_count(threads), told, None)[0]
 
 

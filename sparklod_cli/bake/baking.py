@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from ..io import read_rgba, read_stored
+from ..lod.builders import BUILDERS
 from ..model.lod_tree import LodTree
 from ..model.scene import Scene
 from ..model.splats import Splats
@@ -230,7 +231,7 @@ def _built(
     del scene, kept, far
     with on_threads(threads):
         built = [settings.builder()(handed_over.pop(), progress=progress)]
-        if output.in_bands:
+        if BUILDERS[settings.method].in_bands and not output.in_chunks:
             from ..lod.band_order import banded
 
             built = [banded(built)]

@@ -42,10 +42,6 @@ class Output(Protocol):
         """Whether it is read in chunks, so that nodes are put in an order for that first."""
 
     @property
-    def in_bands(self) -> bool:
-        """Whether it is read whole, so that nodes of a tree that was built are put in the order for that."""
-
-    @property
     def needed(self) -> frozenset[str]:
         """The statistics of all nodes by which it is written, see `codecs.statistics`."""
 
@@ -154,11 +150,6 @@ class _File:
     in_chunks: bool
     stored: Stored | None = None
     before: Splats | None = None
-
-    @property
-    def in_bands(self) -> bool:
-        """SPZ is."""
-        return not self.in_chunks
 
     @property
     def needed(self) -> frozenset[str]:

@@ -20,12 +20,11 @@ class WholeOutput:
     """The part of an `Output` that refuses to be written window by window.
 
     Attributes:
-        in_chunks, in_bands: see `Output`.
+        in_chunks: see `Output`.
         made: what is made of the nodes, and how, for the refusal.
     """
 
     in_chunks = False
-    in_bands = False
     made = ""
 
     def keeping(self: Whole, stored: Stored, before: Splats) -> Whole:

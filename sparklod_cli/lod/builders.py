@@ -19,12 +19,15 @@ class Builder:
         stages: module of this package that is a `stages.records.StagedBuilder` of such trees.
         setting: name of its only parameter, a number.
         summary: a phrase for help texts.
+        in_bands: its trees are put in the order of `band_order` for files that are read whole. That saves 3 to 4 % of
+            a file of quality, and 1 to 2 % of one of quick, which is not worth the time.
     """
 
     module: str
     stages: str
     setting: str
     summary: str
+    in_bands: bool
 
     def load(self) -> Any:
         """The module, imported when it is needed."""
@@ -38,7 +41,7 @@ class Builder:
 
 #: Builders by the name of the method; the first is the default.
 BUILDERS = {
-    "quick": Builder("quick", "stages.quick", "base", "a voxel grid a level, in seconds"),
-    "quality": Builder("quality", "stages.quality", "growth", "merges the pairs that cost least, for closer cuts"),
+    "quick": Builder("quick", "stages.quick", "base", "pairs in cells of a voxel grid, in seconds", in_bands=False),
+    "quality": Builder("quality", "stages.quality", "growth", "the pairs that cost least, in all", in_bands=True),
 }
 METHODS = tuple(BUILDERS)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from pathlib import Path
 from typing import Any
@@ -52,7 +53,7 @@ def test_trees_and_merged_splats_are_refused(tmp_path: Path) -> None:
     tree = sparklod.build_lod(SCENE)
     with pytest.raises(sparklod.FormatError, match="a tree is written as"):
         sparklod.write(tmp_path / "x.sog", tree)
-    merged = sparklod.Scene(tree.splats)
+    merged = sparklod.Scene(dataclasses.replace(tree.splats, opacity=tree.splats.opacity * np.float32(2)))
     with pytest.raises(sparklod.FormatError, match=r"opacities reach [0-9.]+, and SOG holds 0 to 1"):
         sparklod.write(tmp_path / "x.sog", merged)
     assert not list(tmp_path.iterdir())

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...lod.band_order import band_order
+from ...lod.builders import BUILDERS
 from ...lod.chunk_order import MOST_FAMILIES, family_order
 from ...lod.kernels.family_links import find_limits
 from ...lod.stages.records import NO_FAMILY, STAGE_BITS
@@ -73,10 +74,13 @@ def put_order(job: Job, *, threads: int, progress: Progress) -> None:
     sequence = _by_key(job, links, progress)
     if len(sequence):
         by_place = _by_place(links, sequence)
-        del sequence  # memory for what follows
+        if job.in_chunks:
+            del sequence  # memory for what follows
         with on_threads(threads):
-            levels, sequence = _arranged(job, links, by_place, progress)
+            levels, arranged = _arranged(job, links, by_place, progress)
         del by_place
+        if arranged is not None:
+            sequence = arranged
     start = links.starts(sequence)
     at = links.families_at(start)
     for window, part in enumerate(blocks_of(links.nodes, WINDOW_NODES)):
@@ -124,8 +128,8 @@ def _links(job: Job) -> _Links:
 
 def _arranged(
     job: Job, links: _Links, by_place: NDArray[np.int32], progress: Progress
-) -> tuple[int, NDArray[np.uint32]]:
-    """The levels of the tree, and the order of its families in the output.
+) -> tuple[int, NDArray[np.uint32] | None]:
+    """The levels of the tree, and the order of its families in the output, if that is not the builder's.
 
     Args:
         job: the job.
@@ -145,9 +149,10 @@ def _arranged(
     if job.in_chunks:
         center = _of_all(job, "center")[by_place]
         order = family_order(parent, count, center, size, most=MOST_FAMILIES, progress=progress)
-    else:
-        order = band_order(parent, count, size)
-    return levels, by_place[order].astype(np.uint32)
+        return levels, by_place[order].astype(np.uint32)
+    if BUILDERS[job.settings.method].in_bands:
+        return levels, by_place[band_order(parent, count, size)].astype(np.uint32)
+    return levels, None
 
 
 def _of_all(job: Job, key: str) -> FloatArray:

@@ -19,7 +19,6 @@ from sparklod_cli.bake.out_of_core.job import Job
 from sparklod_cli.bake.out_of_core.parts import parts_of
 from sparklod_cli.codecs.statistics import ALL
 from sparklod_cli.lod import band_order, quick
-from sparklod_cli.lod.band_order import banded
 from sparklod_cli.lod.chunk_order import arrange
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
@@ -77,7 +76,7 @@ def test_quick_makes_the_tree_of_a_bake_in_memory(
     splats = random_splats(count, seed=seed, sh_degree=degree)
     rng = np.random.default_rng(seed)
     expected = quick.build(splats, base)
-    expected = arrange(*expected) if in_chunks else banded([expected])
+    expected = arrange(*expected) if in_chunks else expected
     with tempfile.TemporaryDirectory() as folder:
         found = built(folder, splats, BakeSettings(base=base), block, Loop(rng), in_chunks=in_chunks)
         total = found.nodes.count
