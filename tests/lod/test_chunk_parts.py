@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sparklod_cli.lod import chunk_order, quick
+from sparklod_cli.lod import chunk_order, quality
 from sparklod_cli.lod.chunk_order import chunk_order as order_of
 from sparklod_cli.lod.chunk_order import family_order
 from sparklod_cli.lod.chunk_parts import parts_of
@@ -87,10 +87,10 @@ def test_parts_are_the_same_whatever_is_looked_at_together(monkeypatch: pytest.M
 
 @pytest.fixture(scope="module")
 def built() -> tuple[Splats, LodTree]:
-    return quick.build(random_splats(60_000, seed=3), 1.5)
+    return quality.build(random_splats(60_000, seed=3), 1.3)
 
 
-@pytest.mark.parametrize("most", [300, 1_500])
+@pytest.mark.parametrize("most", [700, 4_000])
 def test_chunks_are_full_across_parts(
     most: int, built: tuple[Splats, LodTree], monkeypatch: pytest.MonkeyPatch
 ) -> None:
