@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import itertools
 from collections.abc import Callable, Iterator, Sequence
 
@@ -14,13 +13,13 @@ from ..model.splats import Splats
 from ..render.settings import RasterSettings
 from ..support.progress import Progress, silent
 from ..support.threads import on_threads
-from .cameras import HELD_OUT, Place, placed, scaled, split_path
+from .cameras import HELD_OUT, Place, placed, split_path
 from .held_out import Scores, gain, scores_of
 from .laws import keep_gains, keep_sizes
 from .nodes import FittedNodes
 from .optimiser import Optimiser
 from .pictures import Picture, pictures
-from .schedule import DEFAULT_STEPS, ROUNDS, STAGES, rates_at
+from .schedule import ROUNDS, STAGES, default_steps, rates_at
 from .settings import FitReport, FitSettings, FitStage
 
 #: Near plane at most and far plane at least, in radii of the scene, for scenes of tiny or huge units.
@@ -78,12 +77,9 @@ class _Fitting:
         seeds = np.random.SeedSequence(settings.seed).spawn(3)
         self._random = np.random.Generator(np.random.PCG64(seeds[2]))
         training, held_out = self._cameras(settings, place, seeds)
-        # Rounds take their cameras in turns.
-        self._rounds = itertools.cycle(
-            [(of, pictures(map(functools.partial(scaled, share=of.size), training), self.nodes)) for of in ROUNDS]
-        )
+        self._training, self._rounds = pictures(training, self.nodes), itertools.cycle(ROUNDS)
         self._held_out = list(itertools.islice(pictures(held_out, self.nodes), HELD_OUT))
-        self._steps = DEFAULT_STEPS if settings.steps is None else settings.steps
+        self._steps = default_steps(len(self.nodes.leaves)) if settings.steps is None else settings.steps
         self._done = 0
         self._optimiser = Optimiser(self.nodes)
         self._before = self._best = scores_of(self.nodes, self._held_out)
@@ -114,11 +110,11 @@ class _Fitting:
         """Takes the steps of a stage, and keeps the nodes if that brought anything; False if it was interrupted."""
         first, last = self._done, self._steps * (number + 1) // STAGES
         while self._done < last:
-            of, training = next(self._rounds)
-            picture = next(training, None)
+            picture = next(self._training, None)
             if picture is None:
                 break
-            if not self._fit_to(picture, of.shares(self._random)[: last - self._done], progress, interrupted):
+            shares = next(self._rounds).shares(self._random)[: last - self._done]
+            if not self._fit_to(picture, shares, progress, interrupted):
                 return False
         now = scores_of(self.nodes, self._held_out)
         start = self._stages[-1].psnr_after if self._stages else self._before

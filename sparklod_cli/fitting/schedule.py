@@ -15,15 +15,13 @@ STAGES = 6
 
 @dataclass(frozen=True)
 class Round:
-    """What is drawn of what one camera sees.
+    """Which cuts are drawn of what one camera sees.
 
     Attributes:
-        size: of its pictures, over that of held-out ones.
         cuts: how many.
         least, most: range of their shares of the leaves.
     """
 
-    size: float
     cuts: int
     least: float
     most: float
@@ -31,20 +29,23 @@ class Round:
     def shares(self, random: np.random.Generator) -> list[float]:
         """Shares of the leaves, one of each part of the range, in any order."""
         ratio = self.most / self.least
-        return [
-            float(self.least * ratio ** ((at + random.random()) / self.cuts)) for at in random.permutation(self.cuts)
-        ]
+        parts = random.permutation(self.cuts)
+        return [float(self.least * ratio ** ((part + random.random()) / self.cuts)) for part in parts]
 
 
-#: Rounds, one after the other: the splats of coarse cuts are large, so that small pictures show what is wrong with them
-#: as well, in a third of the time.
-ROUNDS = (Round(0.5, 2, 0.01, 0.1), Round(1.0, 2, 0.1, 0.5))
+#: Rounds, one after the other, each with a camera of its own: what is fitted to few cameras looks right from those.
+ROUNDS = (Round(2, 0.01, 0.1), Round(2, 0.1, 0.5))
 
 #: Rates of the first steps, and those of the last ones over these. Measured (docs/decisions/2026-11-22-refine.md).
 RATES, LAST = Rates(0.015, 0.03, 0.008, 0.015, 0.015, 0.003), 0.02
 
-#: Steps unless given, for trees of any size. Chosen.
-DEFAULT_STEPS = 6000
+#: Steps unless given: the most, the least, and their number times that of the leaves: 3,500 for 500,000. Chosen.
+MOST_STEPS, LEAST_STEPS, WORK = 6000, 1000, 1_750_000_000
+
+
+def default_steps(leaves: int) -> int:
+    """The number of steps unless given, by the leaves of a tree."""
+    return max(LEAST_STEPS, min(MOST_STEPS, WORK // leaves))
 
 
 def rates_at(progress: float) -> Rates:

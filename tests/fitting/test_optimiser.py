@@ -13,7 +13,7 @@ from sparklod_cli.fitting.kernels.adam import MOST_D, Rates
 from sparklod_cli.fitting.nodes import FittedNodes
 from sparklod_cli.fitting.optimiser import MOST_REACH, Optimiser, reach_of
 from sparklod_cli.fitting.pictures import Picture, pictures
-from sparklod_cli.fitting.schedule import LAST, RATES, ROUNDS, rates_at
+from sparklod_cli.fitting.schedule import LAST, RATES, ROUNDS, default_steps, rates_at
 from sparklod_cli.lod import quality
 from sparklod_cli.render.rasterizer import draw
 from sparklod_cli.render.settings import RasterSettings
@@ -107,3 +107,8 @@ def test_the_shares_of_rounds_spread_over_their_range_and_meet() -> None:
         assert (np.count_nonzero(shares < middle, axis=1) == of.cuts // 2).all()
     for one, other in itertools.pairwise(ROUNDS):
         assert one.most == other.least
+
+
+def test_larger_trees_have_fewer_steps_within_bounds() -> None:
+    steps = [default_steps(leaves) for leaves in (1, 100_000, 500_000, 1_000_000, 50_000_000)]
+    assert steps == [6000, 6000, 3500, 1750, 1000]
