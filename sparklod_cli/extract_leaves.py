@@ -83,7 +83,9 @@ def extract_leaves(
         scene = read_scene(source, threads=threads, progress=progress)
         leaves = leaves_of(scene)
         read_done = time.perf_counter()
-        size = write(leaves, like(scene.header, options), threads=threads, progress=progress)
+        # As they are: their opacities make up for nothing.
+        chosen = dataclasses.replace(like(scene.header, options), covering=False)
+        size = write(leaves, chosen, threads=threads, progress=progress)
         seconds = {"read": read_done - start, "write": time.perf_counter() - read_done}
     return Extracted(
         format=scene.format,

@@ -210,6 +210,8 @@ def _kept(source: Source, scenes: list[Scene], settings: BakeSettings, output: O
     if settings.refine is not None and has_format_of(scene, settings):
         assert not isinstance(source, Merged)  # of which no part is a tree
         output, is_ordered = output.keeping(read_stored(source), scene.splats), True
+    else:
+        output = output.converting()
     clock.end("read")
     return _Made(scene.splats, scene.tree, leaves, {}, output, is_ordered=is_ordered)
 

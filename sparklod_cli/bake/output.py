@@ -51,6 +51,9 @@ class Output(Protocol):
     def check_statistics(self, found: Statistics) -> None:
         """As `check`, of statistics of these splats; and where it cannot be written without all nodes in memory."""
 
+    def converting(self) -> Output:
+        """The same for the tree of a file, in another format or in several files, whose nodes keep their opacities."""
+
     def keeping(self, stored: Stored, before: Splats) -> Output:
         """The same for the tree of a file of the same format: what was not chosen of how to write is that of the file.
 
@@ -156,6 +159,10 @@ class _File:
         """Those of the codec."""
         needed: frozenset[str] = self.form.codec().needed(self.options)
         return needed
+
+    def converting(self) -> Output:
+        """The same without changes to opacities."""
+        return dataclasses.replace(self, options=dataclasses.replace(self.options, covering=False))
 
     def keeping(self, stored: Stored, before: Splats) -> Output:
         """The same with these codes."""

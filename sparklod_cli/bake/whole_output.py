@@ -27,6 +27,10 @@ class WholeOutput:
     in_chunks = False
     made = ""
 
+    def converting(self: Whole) -> Whole:
+        """Nothing of it makes up for rounding."""
+        return self
+
     def keeping(self: Whole, stored: Stored, before: Splats) -> Whole:
         """It has no format that trees are read from."""
         return self

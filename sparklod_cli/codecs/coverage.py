@@ -18,6 +18,9 @@ MOST_GROWTH = 1.125
 #: Smallest factor, of what is smaller than any code: a pixel shows it all the same.
 LEAST_GROWTH = 1 / 16
 
+#: The smallest float32 above 1.
+_ABOVE_1 = np.nextafter(np.float32(1), np.float32(2))
+
 #: Euler's constant, of the harmonic numbers.
 _EULER = 0.5772156649015329
 
@@ -38,7 +41,7 @@ def kept(opacity: FloatArray, scale: FloatArray, rounded: FloatArray, blur: floa
 
     A splat of opacity A up to 1 covers A times its area, and keeps an opacity up to 1. A merged one of A above 1 covers
     H(A) times its area, the integral of its falloff 1 - (1 - exp(-z ** 2 / 2)) ** A, where H are the harmonic numbers.
-    Where nothing is rounded, the opacity stays as it is, bit for bit.
+    It stays above 1, for that is another falloff. Where nothing is rounded, the opacity stays as it is, bit for bit.
 
     Args:
         opacity: (N,) linear opacities.
@@ -54,5 +57,6 @@ def kept(opacity: FloatArray, scale: FloatArray, rounded: FloatArray, blur: floa
     most = np.maximum(wide, 1)
     covered = np.log(most) + _EULER + (1 - _EULER) / most  # H(A), within 1.5 %
     slope = most / (most + 0.5)  # of H(A) by ln(A), within 4 %
-    grown = np.where(faint, np.minimum(wide * ratio, 1), most * np.exp(covered * (ratio - 1) / slope))
+    merged = np.maximum(most * np.exp(covered * (ratio - 1) / slope), _ABOVE_1)
+    grown = np.where(faint, np.minimum(wide * ratio, 1), merged)
     return np.where(ratio == 1, opacity, grown).astype(np.float32)

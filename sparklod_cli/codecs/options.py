@@ -61,6 +61,8 @@ class WriteOptions:
         sog: of SOG.
         sh_bits: upper bits kept of each SH byte of SPZ, 4 to 8; None for as many as suit the scene, see `sh_bits`.
             Merged splats keep 4, and 5 of degree 1, as other writers do with all splats.
+        covering: opacities make up for the rounding of scales, see `coverage`; False where splats of a tree are written
+            in another format, so that they keep their opacities.
     """
 
     spz_version: int | None = None
@@ -69,6 +71,7 @@ class WriteOptions:
     rad: RadOptions = RadOptions()
     sog: SogOptions = SogOptions()
     sh_bits: int | None = None
+    covering: bool = True
 
 
 #: What is written where nobody chooses.

@@ -55,7 +55,8 @@ class SpzEncoder:
         assert sh_bits is not None
         for part in blocks_of(len(splats)):
             some, links = rows_of(splats, tree, part)
-            some = to_code(some, None if links is None else links.is_leaf, bits, sh_bits)
+            is_leaf = None if links is None else links.is_leaf
+            some = to_code(some, is_leaf, bits, sh_bits, covering=self.options.covering)
             for stream in streams:
                 values = np.ascontiguousarray(stream.encode(column_of(some, links, stream)))
                 codes[stream.name][part] = values.view(np.uint8).reshape(-1, stream.size)

@@ -11,7 +11,9 @@ from ..model.splats import Splats
 from . import coverage, quantize
 
 
-def to_code(splats: Splats, is_leaf: NDArray[np.bool_] | None, fractional_bits: int, sh_bits: int) -> Splats:
+def to_code(
+    splats: Splats, is_leaf: NDArray[np.bool_] | None, fractional_bits: int, sh_bits: int, *, covering: bool
+) -> Splats:
     """The values that the streams of a file are coded from, of each splat by itself; those of a file stay as they are.
 
     Args:
@@ -19,9 +21,12 @@ def to_code(splats: Splats, is_leaf: NDArray[np.bool_] | None, fractional_bits: 
         is_leaf: (N,) which of them are leaves; None for splats without a tree.
         fractional_bits: of the positions, a step of which is too thin to matter.
         sh_bits: bits kept of the SH bytes of leaves; merged splats keep `quantize.LEAST_SH_BITS`.
+        covering: opacities make up for the rounding of scales.
     """
-    rounded = quantize.decode_log_scale(quantize.encode_log_scale(splats.scale))
-    opacity = coverage.kept(splats.opacity, splats.scale, rounded, 2.0**-fractional_bits)
+    opacity = splats.opacity
+    if covering:
+        rounded = quantize.decode_log_scale(quantize.encode_log_scale(splats.scale))
+        opacity = coverage.kept(opacity, splats.scale, rounded, 2.0**-fractional_bits)
     sh = splats.sh
     if sh.shape[1] and len(sh):
         least = quantize.LEAST_SH_BITS

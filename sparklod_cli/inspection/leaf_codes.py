@@ -87,9 +87,7 @@ def of_spz(scene: Scene, leaves: Splats, *, covering: bool) -> Coding:
 
     def encode(splats: Splats) -> Coded:
         parts, numbers = [], {}
-        opacity = splats.opacity
-        splats = to_code(splats, None, bits, sh_bits)
-        splats = splats if covering else dataclasses.replace(splats, opacity=opacity)
+        splats = to_code(splats, None, bits, sh_bits, covering=covering)
         for stream in Layout(version, len(splats), degree, bits, LOD).streams():
             if not hasattr(splats, stream.column):
                 continue  # the columns of the tree

@@ -70,6 +70,8 @@ def test_merged_splats_cover_what_they_did() -> None:
     off = np.abs(integral(kept) * area / expected - 1)
     assert off.max() < 0.012  # of 0.06
     assert (np.abs(kept - opacity) > 0).all()
+    barely = np.full(400, 1.001, np.float32)
+    assert (coverage.kept(barely, splats.scale, held, 0.0) > 1).all()  # they keep their falloff
 
 
 @pytest.mark.parametrize("opacity", [0.0, 0.5, 1.0, 1.5, 1000.0])

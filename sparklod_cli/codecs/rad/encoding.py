@@ -183,6 +183,8 @@ class RadEncoder:
 
     def _opacity(self, splats: Splats) -> FloatArray:
         """(n,) opacities that make up for the rounding of scales."""
+        if not self.options.covering:
+            return splats.opacity
         ends = code_range(BY_NAME["scales"], self._codes)
         rounded = CODINGS[self.options.rad.scales].rounded(splats.scale, *ends)
         bits = self.options.rad.center_bits

@@ -109,6 +109,20 @@ def test_a_tree_is_the_same_in_the_other_format(
     np.testing.assert_array_equal(rows(read_scene(tmp_path / "many.rad")), rows(there))
 
 
+def test_a_converted_tree_keeps_its_opacities(large: Path, tmp_path: Path) -> None:
+    """Scales are rounded to other codes; those of opacities are the same in both formats."""
+    assert build(large, "-o", tmp_path / "there.rad") == 0
+    assert build(tmp_path / "there.rad", "-o", tmp_path / "back.spz") == 0
+    assert build(tmp_path / "there.rad", "--unlod", "-o", tmp_path / "leaves.spz") == 0
+    before, there, back = (read_scene(path) for path in (large, tmp_path / "there.rad", tmp_path / "back.spz"))
+    assert not np.array_equal(np.sort(before.splats.scale[:, 0]), np.sort(there.splats.scale[:, 0]))
+    np.testing.assert_allclose(np.sort(there.splats.opacity), np.sort(before.splats.opacity), rtol=1e-5)
+    np.testing.assert_allclose(back.splats.opacity, there.splats.opacity, rtol=1e-5)
+    assert there.tree is not None
+    leaves = there.splats.opacity[there.tree.is_leaf]
+    np.testing.assert_allclose(read_scene(tmp_path / "leaves.spz").splats.opacity, leaves, atol=1 / 510 + 1e-6)
+
+
 def test_a_converted_tree_has_the_name_of_the_other_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     source = tmp_path / "scene-lod.spz"
     shutil.copy(TREE, source)
