@@ -39,8 +39,8 @@ ROUNDS = (Round(2, 0.01, 0.1), Round(2, 0.1, 0.5))
 #: Rates of the first steps, and those of the last ones over these. Measured (docs/decisions/2026-11-22-refine.md).
 RATES, LAST = Rates(0.015, 0.03, 0.008, 0.015, 0.015, 0.003), 0.02
 
-#: Steps unless given: the most, the least, and their number times that of the leaves: 3,500 for 500,000. Chosen.
-MOST_STEPS, LEAST_STEPS, WORK = 6000, 1000, 1_750_000_000
+#: Steps unless given: the most, the least, and their number times that of the leaves: 2,400 for 500,000. Chosen.
+MOST_STEPS, LEAST_STEPS, WORK = 6000, 1000, 1_200_000_000
 
 
 def default_steps(leaves: int) -> int:

@@ -111,4 +111,4 @@ def test_the_shares_of_rounds_spread_over_their_range_and_meet() -> None:
 
 def test_larger_trees_have_fewer_steps_within_bounds() -> None:
     steps = [default_steps(leaves) for leaves in (1, 100_000, 500_000, 1_000_000, 50_000_000)]
-    assert steps == [6000, 6000, 3500, 1750, 1000]
+    assert steps == [6000, 6000, 2400, 1200, 1000]
