@@ -69,6 +69,7 @@ JOBS = {
             *("node_rows.fill_leaf_rows", "node_rows.fill_merged_splats", "node_rows.morton_keys"),
             *("pair_cost.find_partners", "pair_cost.match_pairs", "pair_merge.merge_pairs", "prune.drop_nodes"),
             *("prune.fill_usefulness_terms", "prune.lay_out_children", "prune.size_ranks"),
+            *("family_links.find_limits", "tree_links.find_parents"),
         ),
         ("build-lod scene.ply --method quality -o quality.spz",),
     ),
