@@ -93,7 +93,7 @@ def test_every_stream_of_a_tree_has_its_bytes(version: int) -> None:
     assert list(color) == [round((value - 0.5) / 0.28209479177387814 * 0.15 * 255 + 127.5) for value in rgb]
     logs = [max(0, round((-0.5 * i + axis + 10) * 16)) for i in range(count) for axis in (1, 0, -1)]
     assert list(scale) == logs
-    assert list(sh) == [math.floor((round(v * 128) + 132) / 8) * 8 for v in np.linspace(-0.9, 0.9, 9 * count)]
+    assert list(sh) == [8 * round(v * 16) + 128 for v in np.linspace(-0.9, 0.9, 9 * count)]
     assert struct.unpack("<8H", counts) == (3, 2, 0, 2, 0, 0, 0, 0)
     assert struct.unpack("<8I", starts) == (1, 4, 0, 6, 0, 0, 0, 0)
     x, w = np.sin(np.arange(count) * 0.7), np.cos(np.arange(count) * 0.7)

@@ -62,7 +62,8 @@ def test_colours_replace_those_of_the_splats(tmp_path: Path, capsys: pytest.Capt
     assert sorted(nearest) == list(range(7, COUNT))
     expected = codes[nearest] / 255
     np.testing.assert_allclose(leaves.rgb, expected[:, :3], atol=0.0038)
-    np.testing.assert_allclose(leaves.opacity, expected[:, 3], atol=1.001 / 255)
+    # Opacities make up for the rounding of scales, by up to 1 / 32 an axis.
+    np.testing.assert_allclose(leaves.opacity, expected[:, 3], rtol=0.07, atol=1.001 / 255)
     np.testing.assert_allclose(leaves.sh, source.sh[nearest], atol=0.07)
 
 

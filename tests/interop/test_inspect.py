@@ -215,7 +215,9 @@ def test_leaves_of_sparks_trees_are_the_splats_but_for_small_rotations(
     turned = degrees_between(leaves.quat_xyzw, quats)
     assert code == 3
     (found,) = (found for found in report["findings"] if found["code"] == "expect.leaves")
-    assert 0 < np.count_nonzero(turned > 1) <= found["count"] <= np.count_nonzero(turned > 0.5) < 1e-3 * len(leaves)
+    assert 0 < np.count_nonzero(turned > 1) <= np.count_nonzero(turned > 0.5) < 1e-3 * len(leaves)
+    # They hold scales as float16, too, so that a few are rounded to other codes, and opacities make up for that.
+    assert np.count_nonzero(turned > 1) <= found["count"] < 1e-2 * len(leaves)
     assert turned.max() < 2.6
     # Without such small rotations, the leaves are the splats.
     needle = tmp_path / "needle.spz"

@@ -26,12 +26,15 @@ SIZE = 320, 180
 #: pictures from Spark's coding of the splats without that rounding, which differ by float32 and float16 alone.
 LEAST, LEAST_COVERED, LEAST_HELD = 45, 40, 58
 
+#: The first two where splats have SH, of which ExtSplats lose up to half of a coefficient, and files no longer do.
+LEAST_SH = {"least": 42, "covered": 35}
 
-def check(found: Iterable[Difference]) -> None:
+
+def check(found: Iterable[Difference], *, least: float = LEAST, covered: float = LEAST_COVERED) -> None:
     for view, difference in enumerate(found):
         assert difference.share > 0.05, f"view {view} is nearly empty"
         assert difference.same_cut is not False, f"view {view} has another cut"
-        assert difference.psnr >= LEAST and difference.covered >= LEAST_COVERED, f"view {view}: {difference}"
+        assert difference.psnr >= least and difference.covered >= covered, f"view {view}: {difference}"
         assert difference.held >= LEAST_HELD, f"view {view}: {difference}"
 
 
@@ -62,7 +65,8 @@ def test_spark_draws_the_cut_of_a_tree_as_we_do(page: Page, tmp_path: Path, budg
 @pytest.mark.parametrize("sh_degree", range(1, 4))
 def test_spark_draws_spherical_harmonics_as_we_do(page: Page, tmp_path: Path, sh_degree: int) -> None:
     splats = random_splats(3_000, sh_degree=sh_degree)
-    check(compare(page, written(tmp_path, Scene(splats)), cameras_around(splats.center, *SIZE)[:2], RasterSettings()))
+    found = compare(page, written(tmp_path, Scene(splats)), cameras_around(splats.center, *SIZE)[:2], RasterSettings())
+    check(found, **LEAST_SH)
 
 
 @pytest.mark.parametrize("sort", SORTS)

@@ -37,8 +37,8 @@ def leaves(path: Path) -> Splats:
 
 
 def in_order(splats: Splats) -> Splats:
-    """The same splats in an order of their opacities and colours, which no transform changes."""
-    return splats.take(np.lexsort((*splats.rgb.T, splats.opacity)))
+    """The same splats in an order of their colours, which no transform changes."""
+    return splats.take(np.lexsort(splats.rgb.T))
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -48,8 +48,8 @@ def test_the_leaves_are_the_splats_transformed(case: str, tmp_path: Path) -> Non
     assert build(SCENE, "-o", tmp_path / "after.spz", "--fractional-bits", 12, *options) == 0
     found = in_order(leaves(tmp_path / "after.spz"))
     expected = in_order(Transform.from_parts(**parts).apply(leaves(tmp_path / "before.spz")))  # type: ignore[arg-type]
-    # Both were rounded to SPZ's codes, before the transform or after it.
-    for column, most in (("center", 0.001), ("opacity", 0), ("rgb", 0), ("sh", 0.2)):
+    # Both were rounded to SPZ's codes, before the transform or after it; opacities make up for the rounding of scales.
+    for column, most in (("center", 0.001), ("opacity", 0.1), ("rgb", 0), ("sh", 0.2)):
         np.testing.assert_allclose(getattr(found, column), getattr(expected, column), atol=most, err_msg=column)
     np.testing.assert_allclose(found.scale, expected.scale, rtol=0.07)
     assert np.abs(np.einsum("ij,ij->i", found.quat_xyzw, expected.quat_xyzw)).min() > 0.999

@@ -32,7 +32,7 @@ def test_a_difference_is_drawn_and_its_psnr_said(built: Path, tmp_path: Path, ca
 
 
 def test_a_difference_says_what_it_shows(built: Path, tmp_path: Path, capsys: Said) -> None:
-    how = (built, "--budget", 300, "--size", "400x240", *AT, "--diff", DEMO, "--json")
+    how = (built, "--budget", 9_000, "--size", "400x240", *AT, "--diff", DEMO, "--json")
     assert render(*how, "-o", tmp_path / "bar.png") == 0
     out, err = capsys.readouterr()
     report = json.loads(out)

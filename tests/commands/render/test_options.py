@@ -153,7 +153,12 @@ MODES: dict[str, tuple[str, ...]] = {
 
 #: Options that ask for what is so already: nothing is outside of a view of all, floats keep alpha, and as many splats
 #: cover a pixel in either profile, unless they are more opaque than these.
-THE_SAME = {"a view of the scene": {"outside_foveate"}, "floats": {"alpha"}, "overdraw": {"profile"}}
+THE_SAME = {
+    "a view of the scene": {"outside_foveate", "cone_foveate"},
+    "floats": {"alpha"},
+    "overdraw": {"profile"},
+    "sorted billboards": {"sort"},
+}
 
 Came = tuple[int, dict[str, bytes], Any, str]
 
