@@ -7,16 +7,13 @@ from collections.abc import Callable, Iterable
 from ..bake.refining import Refined, refined
 from ..cameras.camera import Camera
 from ..cameras.path import CameraPath
-from ..fitting.settings import FitSettings
+from ..fitting.settings import MOST_SEED, MOST_STEPS, FitSettings
 from ..model.scene import Scene, Tree
 from ..support.errors import FormatError, memory_errors_translated
 from ..support.progress import Progress
 from ..support.threads import thread_count
 from .arguments import path_like, scene_like, whole_within
 from .progress import Told, telling
-
-#: The most steps, and the largest seed.
-MOST_STEPS, MOST_SEED = 1_000_000, (1 << 32) - 1
 
 
 def refine(

@@ -40,12 +40,12 @@ ROUNDS = (Round(2, 0.01, 0.1), Round(2, 0.1, 0.5))
 RATES, LAST = Rates(0.015, 0.03, 0.008, 0.015, 0.015, 0.003), 0.02
 
 #: Steps unless given: the most, the least, and their number times that of the leaves: 2,400 for 500,000. Chosen.
-MOST_STEPS, LEAST_STEPS, WORK = 6000, 1000, 1_200_000_000
+MOST_BY_DEFAULT, LEAST_BY_DEFAULT, WORK = 6000, 1000, 1_200_000_000
 
 
 def default_steps(leaves: int) -> int:
     """The number of steps unless given, by the leaves of a tree."""
-    return max(LEAST_STEPS, min(MOST_STEPS, WORK // leaves))
+    return max(LEAST_BY_DEFAULT, min(MOST_BY_DEFAULT, WORK // leaves))
 
 
 def rates_at(progress: float) -> Rates:

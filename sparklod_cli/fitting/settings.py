@@ -9,6 +9,9 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from ..cameras.path import CameraPath
 
+#: The most steps that can be asked for, far more than pay, and hours of work; and the largest seed.
+MOST_STEPS, MOST_SEED = 1_000_000, (1 << 32) - 1
+
 #: Shares of the leaves at which trees are judged.
 SHARES = (0.02, 0.05, 0.1, 0.25, 0.5)
 

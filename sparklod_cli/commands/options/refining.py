@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from ...fitting.settings import MOST_SEED, MOST_STEPS
 from ..command import option, with_options
 from ..paths import InputPath
 from ..usage import exclude, is_given, require
@@ -21,11 +22,8 @@ HEADING = "Refining"
 #: Parameters that mean nothing without --refine, and those that mean nothing with it: it works in memory.
 OF_REFINING, OF_SCRATCH = ("camera_path", "seed"), ("scratch_dir", "resume")
 
-#: The most steps: far more than pay, and hours of work. An example of a number that pays.
-MOST_STEPS, EXAMPLE_STEPS = 1_000_000, 2000
-
-#: The largest seed.
-MOST_SEED = (1 << 32) - 1
+#: An example of a number of steps that pays.
+EXAMPLE_STEPS = 2000
 
 #: What --refine is without a number.
 DEFAULT = "default"
