@@ -28,6 +28,9 @@ LASTING = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, e
 #: What the scheduler tells of workers, and nannies of memory.
 TOPICS = ("all", "worker-restart-memory")
 
+#: States of a future that has ended. Others are "pending", and "lost" with the worker that held its result.
+ENDED = {"finished", "error", "cancelled"}
+
 #: Names of tasks that a message lists.
 LISTED = 3
 
@@ -189,8 +192,12 @@ class Pool:
             except queue.Empty:
                 self._connection.look()
                 continue
+            status = self._futures[name].status
+            if status not in ENDED:  # its worker was lost since: the scheduler has it done again
+                self._ask_again(name)
+                continue
             future = self._futures.pop(name)
-            if future.status == "finished":
+            if status == "finished":
                 with self._connection.guarded():
                     result = future.result()
                 del self._calls[name]
@@ -199,6 +206,12 @@ class Pool:
             if not self._is_worth_another(name, error):
                 del self._calls[name]
                 return name, None, error
+
+    def _ask_again(self, name: str) -> None:
+        """Looks at a call once more, after a while."""
+        self._connection.look()
+        loop = self._connection.client.loop
+        loop.add_callback(loop.call_later, TICK, self._ended.put, name)
 
     def _is_worth_another(self, name: str, error: Exception) -> bool:
         """Whether a call is tried again, after a pause."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pickle
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -105,6 +106,19 @@ def test_calls_side_by_side_give_results_and_failures_in_order(engine: ClusterEn
     assert [each if isinstance(each, int) else str(each) for each in found] == [0, 2, 4, "no 3", 8, 10]
     assert isinstance(found[3], ScratchError)
     assert told[0] == ("baking", 0, 6, "scene") and [each[1] for each in told] == sorted(each[1] for each in told)
+
+
+def test_a_result_that_is_lost_with_its_worker_is_waited_for(engine: ClusterEngine) -> None:
+    with cluster_pool.Pool(engine._connection, "baking") as pool:
+        pool.submit("twice", 0, cluster_worker.run_call, made_up.twice, (21,), 1)
+        future = pool._futures["twice"]
+        future.result(timeout=60)
+        loop = engine._connection.client.loop
+        loop.add_callback(future._state.lose)  # as when the scheduler hears that the worker is gone
+        loop.add_callback(loop.call_later, 0.5, future._state.finish)
+        while future.status != "lost":
+            time.sleep(0.01)
+        assert pool.next() == ("twice", 42, None)
 
 
 def test_calls_that_nobody_waits_for_are_cancelled(engine: ClusterEngine) -> None:
