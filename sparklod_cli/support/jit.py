@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import os
 import time
 from collections.abc import Callable, Iterator
@@ -26,6 +25,7 @@ import numba  # noqa: E402
 from numba.core import event  # noqa: E402
 
 from .jit_cache import KernelCache, Trouble, is_whole, pattern_of, stem_of  # noqa: E402
+from .kernel_sources import PACKAGE, digest_of, sources_of  # noqa: E402
 
 #: Called with the name of a kernel when its compilation begins, and with its duration in seconds when it ends.
 Begun = Callable[[str], None]
@@ -35,38 +35,15 @@ Done = Callable[[float], None]
 #: Chosen; no difference was measured up to 65,536 (docs/decisions/2026-11-21-kernels.md).
 PARALLEL_ROWS = 4096
 
-#: Sources of compiled code: kernels, and the modules whose constants and functions they use. The name of the cache
-#: folder is a digest of them.
-SOURCES = (
-    "model/gaussian.py",
-    "model/lod_tree.py",
-    "model/sh.py",
-    "model/splats.py",
-    "support/atomic.py",
-    "support/defaults.py",
-    "support/errors.py",
-    "support/fast_math.py",
-    "support/jit.py",
-    "support/jit_cache.py",
-    "support/leftovers.py",
-    "codecs/kernels/*.py",
-    "fitting/kernels/*.py",
-    "lod/kernels/*.py",
-    "render/kernels/*.py",
-)
-
 
 def _cache_folder() -> Path | None:
     """The folder for compiled code, or None if none is writable.
 
-    numba's own cache is invalidated by changes to the file of a kernel only. A kernel also depends on the kernels that
-    it calls and the constants that it uses, so the folder is named by a digest of all SOURCES.
+    Its name is a digest of the code that compiles; the names of files depend on the sources of their kernels.
     """
-    package = Path(__file__).parents[1]
-    sources = [path for pattern in SOURCES for path in sorted(package.glob(pattern))]
-    digest = hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()[:16]
+    digest = digest_of(sources_of(Path(__file__)))
     given = os.environ.get("NUMBA_CACHE_DIR")
-    places = [Path(given)] if given else [package / "__pycache__"]
+    places = [Path(given)] if given else [PACKAGE / "__pycache__"]
     if not given:
         with contextlib.suppress(RuntimeError):  # no home directory
             places.append(Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sparklod")
@@ -117,8 +94,10 @@ def is_cached(name: str) -> bool:
     """Whether this process can load the compiled code of a kernel, which is named "module.function"."""
     if CACHE_FOLDER is None:
         return False
+    sources = PACKAGE.glob(f"*/kernels/{name.partition('.')[0]}.py")
     with contextlib.suppress(OSError):
-        return any(path.is_file() and is_whole(path.read_bytes()) for path in CACHE_FOLDER.glob(pattern_of(name)))
+        files = (file for source in sources for file in CACHE_FOLDER.glob(pattern_of(name, source)))
+        return any(file.is_file() and is_whole(file.read_bytes()) for file in files)
     return False
 
 

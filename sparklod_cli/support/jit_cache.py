@@ -6,7 +6,7 @@ import contextlib
 import hashlib
 import pickle
 import platform
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from numba.core.serialize import dumps
 
 from . import atomic
 from .errors import out_of_memory
+from .kernel_sources import digest_of, sources_of
 
 #: Suffix of the files of compiled kernels.
 SUFFIX = ".kernel"
@@ -33,10 +34,10 @@ class KernelCache(caching._Cache):
 
     numba's cache trusts its files: an empty one ends in an `EOFError`, a flipped bit in an error of LLVM or a crash, a
     full disk in an `OSError`; and two processes that compile two signatures of one function at the same time can each
-    take the other's file for its own. Here each signature has its own file, named by all that its code depends on,
-    except the source, which names the folder (`jit.CACHE_FOLDER`). A file is written atomically and begins with a
-    checksum. If a file is damaged, the kernel is compiled again; if the folder cannot be used, the kernel is compiled
-    but not stored.
+    take the other's file for its own. Besides, it looks at the file of a kernel only, not at the kernels and constants
+    that it uses. Here each signature has its own file, named by all that its code depends on. A file is written
+    atomically and begins with a checksum. If a file is damaged, the kernel is compiled again; if the folder cannot be
+    used, the kernel is compiled but not stored.
 
     Args:
         function: the Python function.
@@ -46,7 +47,7 @@ class KernelCache(caching._Cache):
 
     def __init__(self, function: Callable[..., Any], folder: Path, trouble: Trouble) -> None:
         self._folder, self._trouble = folder, trouble
-        self._stem = stem_of(function)
+        self._stem, self._sources = stem_of(function), sources_of(Path(function.__code__.co_filename))
         self._enabled = True
 
     @property
@@ -98,12 +99,22 @@ class KernelCache(caching._Cache):
             self._trouble(f"cannot cache compiled code in {self._folder} ({reason}); it is compiled in every run")
 
     def _path(self, signature: Any, codegen: Any) -> Path:
-        return self._folder / f"{self._stem}-{_digest(*_machine(codegen))}-{_digest(str(signature))}{SUFFIX}"
+        start = _start(self._stem, self._sources, codegen)
+        return self._folder / f"{start}-{_digest(str(signature))}{SUFFIX}"
 
 
-def pattern_of(stem: str) -> str:
-    """Glob pattern of the files of a kernel that this process can load: those for its processor, numba and Python."""
-    return f"{stem}-{_digest(*_machine(cpu_target.target_context.codegen()))}-*{SUFFIX}"
+def pattern_of(stem: str, source: Path) -> str:
+    """Glob pattern of the files of a kernel that this process can load: those for its processor, numba and Python.
+
+    Args:
+        stem: "module.function".
+        source: the module.
+    """
+    return f"{_start(stem, sources_of(source), cpu_target.target_context.codegen())}-*{SUFFIX}"
+
+
+def _start(stem: str, sources: Collection[Path], codegen: Any) -> str:
+    return f"{stem}-{digest_of(sources)}-{_digest(*_machine(codegen))}"
 
 
 def _machine(codegen: Any) -> tuple[Any, ...]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import itertools
 import os
 import shutil
 import subprocess
@@ -13,6 +14,7 @@ import numba
 import pytest
 
 from sparklod_cli.support import jit
+from sparklod_cli.support.kernel_sources import sources_of
 from tests.conftest import ROOT
 
 PACKAGE = ROOT / "sparklod_cli"
@@ -47,25 +49,32 @@ def imported(path: Path) -> set[Path]:
     return {path for path in found if path.is_file()}
 
 
-def test_the_name_of_the_cache_depends_on_every_source_of_kernels() -> None:
-    made_of, new = set(), {*PACKAGE.glob("*/kernels/*.py"), PACKAGE / "support/jit.py"}
+@pytest.mark.parametrize("kernels", sorted(PACKAGE.glob("*/kernels/*.py")), ids=lambda path: path.stem)
+def test_a_kernel_depends_on_all_that_its_module_imports(kernels: Path) -> None:
+    made_of, new = set(), {kernels}
     while new:
         made_of |= new
         new = set().union(*map(imported, new)) - made_of
-    assert {PACKAGE / "model/lod_tree.py", PACKAGE / "model/gaussian.py"} < made_of
-    assert made_of == {path for pattern in jit.SOURCES for path in PACKAGE.glob(pattern)}
+    assert sources_of(kernels) == made_of
+    assert kernels.stem == "__init__" or PACKAGE / "support/jit.py" in made_of
 
 
-def test_a_change_of_a_kernel_or_constant_makes_a_new_cache(tmp_path: Path) -> None:
+def test_a_change_of_a_kernel_or_constant_changes_the_names_of_those_that_depend_on_it(tmp_path: Path) -> None:
     copy = tmp_path / "sparklod_cli"
     shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
-    code = "from sparklod_cli.support import jit; print(jit.CACHE_FOLDER)"
-    folders = []
-    for name in ("model/lod_tree.py", "model/lod_tree.py", "lod/kernels/merge.py"):
+    names = ("merge", "sort", "node_rows", "prune")
+    code = "from sparklod_cli.support.kernel_sources import *; " + "".join(
+        f"print(digest_of(sources_of(PACKAGE / 'lod/kernels/{name}.py'))); " for name in names
+    )
+    digests = []
+    for changed in ("model/lod_tree.py", "lod/kernels/merge.py", "support/jit.py", "README.md"):
         command = [sys.executable, "-c", code]
-        folders.append(subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True).stdout)
-        (copy / name).write_text((copy / name).read_text() + "# changed\n")
-    assert len(set(folders)) == 3
+        found = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True).stdout.split()
+        digests.append(dict(zip(names, found, strict=True)))
+        with (copy / changed).open("a") as file:
+            file.write("# changed\n")
+    changes = [{name for name in names if now[name] != before[name]} for before, now in itertools.pairwise(digests)]
+    assert changes == [{"prune"}, {"merge", "node_rows"}, set(names)]
 
 
 def test_kernels_run_without_compilation() -> None:

@@ -43,8 +43,9 @@ def was_cached(kernel: Any) -> bool:
 
 def test_code_compiled_for_another_processor_is_not_used(tmp_path: Path) -> None:
     compiled(tmp_path, [])(2.0)
-    assert list(tmp_path.glob(pattern_of("test_jit_cache.twice")))
-    code = "from sparklod_cli.support.jit_cache import pattern_of; print(pattern_of('test_jit_cache.twice'))"
+    assert list(tmp_path.glob(pattern_of("test_jit_cache.twice", Path(__file__))))
+    call = f"pattern_of('test_jit_cache.twice', Path({__file__!r}))"
+    code = f"from pathlib import Path; from sparklod_cli.support.jit_cache import pattern_of; print({call})"
     environment = {**os.environ, "NUMBA_CPU_NAME": "generic"}
     other = subprocess.run([sys.executable, "-c", code], cwd=ROOT, env=environment, capture_output=True, text=True)
     assert other.stdout.startswith("test_jit_cache.twice-")
