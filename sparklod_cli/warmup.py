@@ -83,7 +83,7 @@ JOBS = {
     "render": Job(
         (
             *("bands.count_fragments", "bands.draw_discs", "cut.find_cut", "pixel_scale.pixel_scales"),
-            *("project.gather_drawn", "project.project", "raster.draw_tiles", "raster.sort_into_tiles"),
+            *("project.project", "raster.draw_tiles", "raster.sort_into_tiles"),
         ),
         (
             "render tree.spz --size 64x64 -o cut.png",
@@ -95,7 +95,7 @@ JOBS = {
     "refine": Job(
         (
             *("adam.step", "backward.first_rows", "backward.weigh_tiles", "cut.find_cut", "difference.by_image"),
-            *("difference.squared_differences", "project.gather_drawn", "project.project"),
+            *("difference.squared_differences", "project.project"),
             *("project_gradients.carry_back", "raster.draw_tiles", "raster.sort_into_tiles", "shade.add_sh"),
             *("shade.sh_gradients", "tree_links.add_child_sizes", "tree_links.find_parents", "view.gather"),
             "view.mark_seen",
