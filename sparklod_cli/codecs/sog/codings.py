@@ -59,6 +59,11 @@ def encode_quat(quat_xyzw: FloatArray) -> Bytes:
     return codes
 
 
+def quat_components() -> FloatArray:
+    """(256,) components of a rotation by their bytes."""
+    return (np.arange(256, dtype=np.float32) / np.float32(127.5) - 1) * np.float32(np.sqrt(0.5))
+
+
 def decode_quat(codes: Bytes) -> FloatArray:
     """(N, 4) bytes to (N, 4) unit quaternions x y z w; one without a tag gives NaN, an invalid splat.
 
