@@ -6,6 +6,8 @@ their length. Bits come first to last from 64-bit words, least significant first
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import numpy as np
 
 from ...support.jit import kernel
@@ -34,6 +36,22 @@ ORDER = np.array([17, 18, 0, 1, 2, 3, 4, 5, 16, 6, 7, 8, 9, 10, 11, 12, 13, 14, 
 
 #: Bits of the table of the codes of lengths.
 SHORT_BITS = 7
+
+
+class Tables(NamedTuple):
+    """Where the codes of an image go.
+
+    Attributes:
+        groups: (G, COLUMNS) uint32.
+        table, longs: (T,) uint16 and (L,) int32, the tables and the long codes of all groups.
+        used: (2,) int64, how many numbers of these two are in use.
+    """
+
+    groups: Any
+    table: Any
+    longs: Any
+    used: Any
+
 
 _ONE, _IN_WORD, _WORD = np.uint64(1), np.uint64(63), np.uint64(6)
 
@@ -176,23 +194,22 @@ def _read_lengths(words, at, lengths, alphabet):
 
 
 @kernel(nogil=True)
-def read_codes(words, at, limit, groups, done, cache, most, table, longs, used):
+def read_codes(words, at, limit, tables, done, cache, most):
     """Reads the codes of groups until there are no more, or input or room runs out.
 
     Args:
         words: (W,) uint64 input, with room behind for the codes of a group.
-        at: (1,) uint64 position in it in bits, which is moved.
+        at: uint64, of which the first is the position in it, in bits, which is moved.
         limit: position beyond which no group is begun.
-        groups: (G, COLUMNS) uint32, filled.
+        tables: filled behind what is in use.
         done: number of groups that were read before.
         cache: number of colours of the cache.
-        most: most bits of a table, at most 11.
-        table, longs: uint16 and int32, filled behind what is used.
-        used: (2,) int64, of the two.
+        most: most bits of a table.
 
     Returns:
         what came of it, and the number of groups that have been read.
     """
+    groups, table, longs, used = tables
     lengths = np.zeros(LARGEST, np.uint8)
     for group in range(done, len(groups)):
         if at[0] > np.uint64(limit):

@@ -38,6 +38,7 @@ class Codes(NamedTuple):
         shift: binary logarithm of the side of a tile, in pixels; 0 for a single one of all pixels.
         cache: (2 ** n,) uint32 colours by their hash; one colour if there is no cache.
         cache_shift: 32 - n; 32 if there is none.
+        width, total: pixels of a row and of the image.
     """
 
     groups: Any
@@ -48,6 +49,8 @@ class Codes(NamedTuple):
     shift: int
     cache: Any
     cache_shift: int
+    width: int
+    total: int
 
 
 @kernel(nogil=True)
@@ -75,7 +78,7 @@ def _extended(symbol, v):
 
 
 @kernel(nogil=True)
-def read_pixels(words, at, limit, codes, pixels, width, begin, stop, total):
+def read_pixels(words, at, limit, codes, pixels, begin, stop):
     """Decodes pixels until `stop` is reached, or input runs out.
 
     Args:
@@ -85,15 +88,13 @@ def read_pixels(words, at, limit, codes, pixels, width, begin, stop, total):
         limit: position beyond which no pixel is begun.
         codes: of the image.
         pixels: (P,) uint32 of A R G B from the most significant byte, filled; with room for 4096 beyond `stop`.
-        width: of the image.
         begin: number of the first of `pixels`.
         stop: number of a pixel.
-        total: pixels of the image.
 
     Returns:
         what came of it; `stop` may be passed.
     """
-    groups, table, longs, tiles, across, shift, cache, cache_shift = codes
+    groups, table, longs, tiles, across, shift, cache, cache_shift, width, total = codes
     first, last, end = np.uint64(begin), np.uint64(stop), np.uint64(limit)
     bit, pixel, cached = at[0], at[1] - first, at[2] - first
     last -= first

@@ -2,12 +2,37 @@
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import numpy as np
 
 from ...support.jit import kernel
 
 #: The transforms as they are numbered in files.
 PREDICTOR, COLOR, GREEN, INDEXING = 0, 1, 2, 3
+
+#: No transform of a file: an image without alpha has all of it.
+OPAQUE = 4
+
+
+class Transform(NamedTuple):
+    """A transform that is undone.
+
+    Attributes:
+        kind: PREDICTOR, COLOR, GREEN, INDEXING or OPAQUE.
+        width: of a row of the result.
+        tiles, across, shift: the image of what it needs, (T,) uint32, its width, and the binary logarithm of the side
+            of a tile; of indexing, (256,) colours, 0 behind the last, and the logarithm of the indices in a pixel.
+        above: (width,) uint32, the finished row above, of the predictor.
+    """
+
+    kind: int
+    width: int
+    tiles: Any
+    across: int
+    shift: int
+    above: Any
+
 
 _ODD, _EVEN = np.uint64(0xFF00FF00), np.uint64(0x00FF00FF)
 _HALVES = np.uint64(0xFEFEFEFE)
@@ -167,45 +192,48 @@ def _add_shares(pixels, width, row, tiles, across, shift):
 
 
 @kernel(nogil=True)
-def undo(kind, pixels, width, row, tiles, across, shift):
-    """Undoes a transform of some rows in place.
-
-    Args:
-        kind: PREDICTOR, COLOR or GREEN.
-        pixels: (P,) uint32 of whole rows; for the predictor, the finished row above comes before them.
-        width: of a row.
-        row: number of the first row.
-        tiles: (T,) uint32 image of what the transform needs.
-        across: its width.
-        shift: binary logarithm of the side of a tile.
-    """
-    if kind == PREDICTOR:
-        _predict(pixels, width, row, tiles, across, shift)
-    elif kind == COLOR:
-        _add_shares(pixels, width, row, tiles, across, shift)
-    else:
-        for i in range(len(pixels)):
-            p = pixels[i]
-            green = np.uint32(p >> np.uint32(8)) & np.uint32(255)
-            pixels[i] = (p & np.uint32(0xFF00FF00)) | (
-                (p & np.uint32(0x00FF00FF)) + (green << np.uint32(16) | green)
-            ) & np.uint32(0x00FF00FF)
+def _add_green(pixels):
+    """Adds green to red and blue."""
+    others = np.uint32(0x00FF00FF)
+    for i in range(len(pixels)):
+        p = pixels[i]
+        green = p >> np.uint32(8) & np.uint32(255)
+        pixels[i] = (p & np.uint32(0xFF00FF00)) | ((p & others) + (green << np.uint32(16) | green)) & others
 
 
 @kernel(nogil=True)
-def look_up_colors(pixels, width, bits, colors, out, across):
-    """Fills rows of colours by the indices that stand in the green of pixels, several in each.
+def _look_up(pixels, out, width, colors, shift):
+    """Fills rows of colours by the indices that stand in the green of pixels, 2 ** shift in each."""
+    bits, last = 8 >> shift, (1 << (8 >> shift)) - 1
+    across = (width + (1 << shift) - 1) >> shift
+    for row in range(len(out) // width):
+        for x in range(width):
+            packed = np.int64(pixels[row * across + (x >> shift)]) >> 8 & 255
+            place = bits * (x & (1 << shift) - 1)
+            out[row * width + x] = colors[packed >> place & last]
+
+
+@kernel(nogil=True)
+def undo(transform, pixels, row, out):
+    """Undoes a transform of some rows.
 
     Args:
-        pixels: (P,) uint32 of whole rows.
-        width: of a row of them.
-        bits: of an index: 1, 2, 4 or 8.
-        colors: (256,) uint32; 0 behind the last.
-        out: (Q,) uint32, filled.
-        across: width of a row of it.
+        transform: which.
+        pixels: (P,) uint32 of whole rows, changed in place; for the predictor, with room for the row above before them.
+        row: number of the first row.
+        out: (Q,) uint32 of whole rows, filled by INDEXING.
     """
-    many, last = 8 // bits, (1 << bits) - 1
-    for row in range(len(pixels) // width):
-        for x in range(across):
-            packed = np.int64(pixels[row * width + x // many]) >> 8 & 255
-            out[row * across + x] = colors[packed >> bits * (x % many) & last]
+    kind, width, tiles, across, shift, above = transform
+    if kind == PREDICTOR:
+        pixels[:width] = above
+        _predict(pixels, width, row, tiles, across, shift)
+        above[:] = pixels[len(pixels) - width :]
+    elif kind == COLOR:
+        _add_shares(pixels, width, row, tiles, across, shift)
+    elif kind == INDEXING:
+        _look_up(pixels, out, width, tiles, shift)
+    elif kind == GREEN:
+        _add_green(pixels)
+    else:
+        for i in range(len(pixels)):
+            pixels[i] |= np.uint32(0xFF000000)

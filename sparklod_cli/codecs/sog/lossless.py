@@ -6,12 +6,12 @@ libwebp, which Pillow has, keeps all pixels of an image, several times.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..kernels import webp_codes, webp_pixels, webp_transforms
+from ..kernels.webp_transforms import Transform
 from ..stream import Read
 
 Pixels = NDArray[np.uint32]
@@ -32,9 +32,6 @@ REACH, LONGEST = 1 << 20, 1 << 12
 #: Most bits of a table of codes, if there are at most so many groups of codes: larger tables are faster, but take the
 #: more memory.
 MOST_BITS = ((1 << 10, 11), (1 << 12, 9), (1 << 16, 7))
-
-#: Alpha of images that have none.
-ALPHA = np.uint32(0xFF000000)
 
 
 class ImageError(ValueError):
@@ -113,7 +110,7 @@ class Coded:
     """
 
     def __init__(self, bits: Bits, width: int, height: int, *, tiled: bool = False) -> None:
-        self._bits, self._width, self._total = bits, width, width * height
+        self._bits = bits
         cached = bits.number(4) if bits.number(1) else 0
         if cached > 11:
             raise ImageError(f"its cache has 2 ** {cached} colours, more than 2 ** 11")
@@ -123,12 +120,11 @@ class Coded:
             across = parts(width, shift)
             image = Coded(bits, across, parts(height, shift)).all()
             tiles = (image >> np.uint32(8)).astype(np.uint16)
-        groups, table, longs = _codes(bits, int(tiles.max()) + 1, 1 << cached if cached else 0)
+        tables = _read_codes(bits, int(tiles.max()) + 1, 1 << cached if cached else 0)
         cache = np.zeros(1 << cached, np.uint32)
-        self._codes = webp_pixels.Codes(groups, table, longs, tiles, across, shift, cache, 32 - cached)
-        self._room = min(self._total, 2 * REACH) + LONGEST
-        self._pixels = np.empty(self._room, np.uint32)
-        self._first, self._next = 0, 0
+        self._codes = webp_pixels.Codes(*tables[:3], tiles, across, shift, cache, 32 - cached, width, width * height)
+        self._pixels = np.empty(min(self._codes.total, 2 * REACH) + LONGEST, np.uint32)
+        self._first = 0
         self._at = np.zeros(3, np.uint64)
 
     def pixels(self, begin: int, stop: int) -> Pixels:
@@ -137,7 +133,7 @@ class Coded:
         Raises:
             ImageError: they are corrupt.
         """
-        if stop + LONGEST - self._first > self._room:
+        if stop + LONGEST - self._first > len(self._pixels):
             gone = begin - REACH - self._first
             ahead = int(self._at[1]) - self._first
             self._pixels[: ahead - gone] = self._pixels[gone:ahead].copy()
@@ -145,9 +141,7 @@ class Coded:
         while int(self._at[1]) < stop:
             self._at[0] = self._bits.at[0]
             words, limit = self._bits.words, self._bits.limit
-            answer = webp_pixels.read_pixels(
-                words, self._at, limit, self._codes, self._pixels, self._width, self._first, stop, self._total
-            )
+            answer = webp_pixels.read_pixels(words, self._at, limit, self._codes, self._pixels, self._first, stop)
             if answer == webp_codes.CORRUPT:
                 raise ImageError("a copy leads beyond its pixels")
             self._bits.at[0] = self._at[0]
@@ -158,60 +152,40 @@ class Coded:
 
     def all(self) -> Pixels:
         """All pixels."""
-        return self.pixels(0, self._total)
+        return self.pixels(0, self._codes.total)
 
 
-def _codes(bits: Bits, groups: int, cache: int) -> tuple[NDArray[np.uint32], NDArray[np.uint16], NDArray[np.int32]]:
-    """The groups of codes, their tables and their long codes."""
+def _read_codes(bits: Bits, groups: int, cache: int) -> webp_codes.Tables:
+    """So many groups of codes, where the cache has so many colours."""
     most = next(most for many, most in MOST_BITS if groups <= many)
     found = np.zeros((groups, webp_codes.COLUMNS), np.uint32)
-    table, longs = np.zeros(1 << 14, np.uint16), np.zeros(1 << 13, np.int32)
-    used = np.zeros(2, np.int64)
+    tables = webp_codes.Tables(found, np.zeros(1 << 14, np.uint16), np.zeros(1 << 13, np.int32), np.zeros(2, np.int64))
     answer, done = webp_codes.INPUT, 0
     while answer != webp_codes.DONE:
-        answer, done = webp_codes.read_codes(
-            bits.words, bits.at, bits.limit, found, done, cache, most, table, longs, used
-        )
+        answer, done = webp_codes.read_codes(bits.words, bits.at, bits.limit, tables, done, cache, most)
         if answer == webp_codes.CORRUPT:
             raise ImageError("a code of its colours is incomplete")
         if answer == webp_codes.INPUT:
             bits.more()
         elif answer == webp_codes.ROOM:
-            table, longs = (np.concatenate([each, np.zeros_like(each)]) for each in (table, longs))
+            table, longs = (np.concatenate([each, np.zeros_like(each)]) for each in (tables.table, tables.longs))
+            tables = tables._replace(table=table, longs=longs)
         bits.check()
-    return found, table, longs
-
-
-@dataclass(frozen=True, eq=False)
-class Transform:
-    """A transform that is undone.
-
-    Attributes:
-        kind: see `webp_transforms`.
-        width: of a row of the result.
-        tiles, across, shift: the image of what it needs, its width, and the binary logarithm of the side of a tile; of
-            indexing, (256,) colours, and that of the number of indices in a pixel.
-        above: (width,) the finished row above, of the predictor.
-    """
-
-    kind: int
-    width: int
-    tiles: Pixels
-    across: int
-    shift: int
-    above: Pixels
+    return tables
 
 
 def _transform(bits: Bits, kind: int, width: int, height: int) -> Transform:
-    if kind == webp_transforms.GREEN:
-        return Transform(kind, width, np.zeros(1, np.uint32), 1, 0, np.zeros(0, np.uint32))
+    """A transform of an image of these sides, whose data come next."""
+    none = np.zeros(0, np.uint32)
+    if kind in (webp_transforms.GREEN, webp_transforms.OPAQUE):
+        return Transform(kind, width, none, 0, 0, none)
     if kind == webp_transforms.INDEXING:
         many = bits.number(8) + 1
         shift = 0 if many > 16 else 1 if many > 4 else 2 if many > 2 else 3
         steps = Coded(bits, many, 1).all().view(np.uint8).reshape(-1, 4)
         colors = np.zeros((256, 4), np.uint8)
         colors[:many] = np.cumsum(steps, axis=0, dtype=np.uint8)  # each is the difference to the one before
-        return Transform(kind, width, colors.view(np.uint32).ravel(), 1, shift, np.zeros(0, np.uint32))
+        return Transform(kind, width, colors.view(np.uint32).ravel(), 0, shift, none)
     shift = 2 + bits.number(3)
     across = parts(width, shift)
     tiles = Coded(bits, across, parts(height, shift)).all()
@@ -246,7 +220,9 @@ class LosslessImage:
         Raises:
             ImageError: the data are corrupt.
         """
-        bits, width, transforms = self._bits, self.width, list[Transform]()
+        bits, width = self._bits, self.width
+        first = [] if self._has_alpha else [webp_transforms.OPAQUE]
+        transforms = [_transform(bits, kind, width, self.height) for kind in first]
         while bits.number(1):
             kind = bits.number(2)
             if any(kind == each.kind for each in transforms):
@@ -267,22 +243,9 @@ class LosslessImage:
         band = np.empty((1 + rows) * width, np.uint32)  # a row for the one above
         band[width:] = pixels
         for each in transforms:
+            part = band if each.kind == webp_transforms.PREDICTOR else band[width:]
             if each.kind == webp_transforms.INDEXING:
-                packed, before = band, width
                 width = each.width
                 band = np.empty((1 + rows) * width, np.uint32)
-                webp_transforms.look_up_colors(
-                    packed[before:], before, 8 >> each.shift, each.tiles, band[width:], width
-                )
-                continue
-            predicts = each.kind == webp_transforms.PREDICTOR
-            if predicts:
-                band[:width] = each.above
-            part = band if predicts else band[width:]
-            webp_transforms.undo(each.kind, part, width, row, each.tiles, each.across, each.shift)
-            if predicts:
-                each.above[:] = band[-width:]
-        out = band[width:]
-        if not self._has_alpha:
-            out |= ALPHA
-        return out
+            webp_transforms.undo(each, part, row, band[width:])
+        return band[width:]
