@@ -59,11 +59,12 @@ def log_det(xx, yy, zz, xy, xz, yz):
 
 @kernel()
 def pair_costs(lanes, first, step, count, largest, cost):
-    """Cost of merging node first + i with first + i + step: Runnalls' bound on the Kullback-Leibler divergence, weighted by coverage.
+    """Cost of merging node first + i with that `step` places on: Runnalls' bound on the Kullback-Leibler divergence.
 
-    With coverages w and covariances P it is ((w_i + w_j) ln|P_ij| - w_i ln|P_i| - w_j ln|P_j|) / 2 (Runnalls 2007),
-    plus COLOR_COST times Ward's variance of the colours. Branch-free, and columns are contiguous, so that LLVM
-    vectorizes over pairs: a slice of `lanes` instead of `first` takes five times as long.
+    With coverages w as weights, and covariances P, it is ((w_i + w_j) ln|P_ij| - w_i ln|P_i| - w_j ln|P_j|) / 2
+    (Runnalls 2007), plus COLOR_COST times Ward's variance of the colours. Branch-free, and columns are contiguous, so
+    that LLVM vectorizes over pairs; with a slice of `lanes` instead of `first` it does not, and takes four times as
+    long.
 
     Args:
         lanes: (LANES, at least first + count + step) float32 columns of node rows, C-contiguous.
