@@ -15,8 +15,8 @@ from ...support.errors import ChecksumError, FormatError, NotSplatsError
 from ...support.units import count_of
 from ...support.untrusted import ZIP_ERRORS, parse_json, quoted, quoted_value
 from ..compression import check_promise
-from ..stream import Read, size_of
-from .lossless import PIECE, Pixels
+from ..stream import size_of
+from .lossless import PIECE, Pixels, Read
 from .names import META
 from .webp import WebPHeader, bands, read_header
 

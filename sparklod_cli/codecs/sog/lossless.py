@@ -5,16 +5,18 @@ libwebp, which Pillow has, keeps all pixels of an image, several times.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..kernels import webp_codes, webp_pixels, webp_transforms
 from ..kernels.webp_transforms import Transform
-from ..stream import Read
 
 Pixels = NDArray[np.uint32]
+
+#: Reads the next `size` bytes, or fewer, of which none are left at the end.
+Read = Callable[[int], bytes]
 
 #: First byte of an image.
 SIGNATURE = 0x2F

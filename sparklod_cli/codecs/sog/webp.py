@@ -12,8 +12,7 @@ from PIL.WebPImagePlugin import WebPImageFile
 
 from ...support.errors import FormatError
 from ...support.untrusted import quoted_value
-from ..stream import Read
-from .lossless import PIECE, ImageError, LosslessImage, Pixels
+from .lossless import PIECE, ImageError, LosslessImage, Pixels, Read
 
 #: Bytes of the header of a file and of its first chunk, and those that are read of any file at first.
 HEADER, START = 20, 30
