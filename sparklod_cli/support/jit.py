@@ -93,13 +93,14 @@ class Kernel:
         py_func: the Python function.
         options: how to compile it.
         compiler: see `jit_numba.compiler_of`; None as long as nothing had to be compiled.
+        called: what runs with arguments of the types of a key, see `jit_types.key_of`.
     """
 
     def __init__(self, function: Callable[..., Any], options: Options) -> None:
         functools.update_wrapper(self, function)
         self.py_func, self.options = function, options
         self.compiler: Any = None
-        self._called: dict[Hashable, Callable[..., Any]] = {}
+        self.called: dict[Hashable, Callable[..., Any]] = {}
 
     def __call__(self, *arguments: Any, **named: Any) -> Any:
         if named or self.py_func.__defaults__:
@@ -107,7 +108,7 @@ class Kernel:
             bound.apply_defaults()
             arguments = bound.args
         key = key_of(arguments)
-        called = self._called.get(key)
+        called = self.called.get(key)
         if called is None:
             called = self._find(key, arguments)
         return called(*arguments)
@@ -126,7 +127,7 @@ class Kernel:
         called = None if path is None else self._load(path)
         if called is None:
             called = self._compile(path, arguments)
-        self._called[key] = called
+        self.called[key] = called
         return called
 
     def _dispatcher(self) -> Callable[..., Any]:
@@ -162,7 +163,6 @@ class Kernel:
             return called
         jit_cache.write(path, code.pieces(), report_trouble)
         return linked
-
 
 
 def kernel(
@@ -257,19 +257,19 @@ _listeners: list[tuple[Begun, Done, Trouble]] = []
 
 def report_begun(name: str) -> None:
     """Tells listeners which kernel is being compiled."""
-    for begun, _, _ in list(_listeners):
+    for begun, _, _ in _listeners:
         begun(name)
 
 
 def report_done(seconds: float) -> None:
     """Tells listeners how long that took."""
-    for _, done, _ in list(_listeners):
+    for _, done, _ in _listeners:
         done(seconds)
 
 
 def report_trouble(text: str) -> None:
     """Tells listeners what is wrong with the cache."""
-    for _, _, trouble in list(_listeners):
+    for _, _, trouble in _listeners:
         trouble(text)
 
 

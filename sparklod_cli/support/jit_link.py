@@ -12,11 +12,13 @@ import ctypes
 import functools
 import itertools
 import json
+import pickle
 import platform
 import sys
 import threading
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -29,6 +31,9 @@ TESTED = {("linux", "x86_64")}
 
 #: Bytes of the length of what precedes the object code in a file.
 LENGTH = 4
+
+#: Bytes of the digests of objects in machine code.
+_DIGEST = 20
 
 #: What parallel code takes of the threading layer besides `numba_parallel_for`.
 SCHEDULING = (
@@ -75,7 +80,7 @@ class MachineCode:
 
 
 def is_tested() -> bool:
-    """Whether machine code can be linked here, and numba would use it unchanged."""
+    """Whether machine code is linked here: not where it was never tried, nor where a file of settings is for numba."""
     return (sys.platform, platform.machine()) in TESTED and numba_folder() is not None and not SETTINGS.exists()
 
 
@@ -93,6 +98,40 @@ def link(code: MachineCode, function: Callable[..., Any]) -> Callable[..., Any]:
     """
     with _lock:
         return _linker().link(code, function)
+
+
+#: Objects in machine code, such as the class of the arrays that kernels return, by their address and digest.
+_unpickled: dict[tuple[int, bytes], Any] = {}
+
+
+def _unpickle(address: int, pickled: bytes, digest: bytes) -> Any:
+    """An object in machine code, which is made once."""
+    key = address, digest
+    if key not in _unpickled:
+        _unpickled[key] = pickle.loads(pickled)
+    return _unpickled[key]
+
+
+def _provide_unpickle(helpers: Any) -> None:
+    """Has numba's extension module unpickle with `_unpickle` instead of the same function in a module of numba.
+
+    The first time that it unpickles, which is here, it imports that module, by the `__import__` of the code that is
+    running, and keeps the function. It unpickles the class of every array that a kernel returns.
+    """
+    if "numba" in sys.modules:
+        return
+    name = "numba.core.serialize"
+    module: Any = ModuleType(name)
+    module._numba_unpickle = _unpickle
+    call = ctypes.PYFUNCTYPE(ctypes.py_object, ctypes.c_char_p, ctypes.c_int, ctypes.c_char_p)
+    nothing = pickle.dumps(None)
+    arguments = nothing, len(nothing), bytes(_DIGEST)
+    scope = {"unpickle": call(helpers.c_helpers["unpickle"]), "arguments": arguments}
+    sys.modules[name] = module
+    try:
+        eval("unpickle(*arguments)", {**scope, "__builtins__": {"__import__": lambda *_: None}})
+    finally:
+        del sys.modules[name]
 
 
 _lock = threading.RLock()
@@ -113,7 +152,7 @@ class _Linker:
         binding.initialize_native_target()
         binding.initialize_native_asmprinter()
         self._orc = orcjit
-        self._engine = orcjit.create_lljit_compiler()
+        self._engine = orcjit.create_lljit_compiler(suppress_errors=True)
         ctypes.pythonapi.Py_IncRef(ctypes.py_object(self._engine))
         self._number = itertools.count()
         self._dynfunc: Any = extension("_dynfunc")
@@ -125,6 +164,7 @@ class _Linker:
         helpers: Any = extension("_helperlib")
         memory: Any = extension("core.runtime._nrt_python")
         memory.memsys_use_cpython_allocator()
+        _provide_unpickle(helpers)
         symbols = {"_Py_NoneStruct": id(None)}
         for name, address in {**helpers.c_helpers, **self._dynfunc.c_helpers}.items():
             symbols[name] = symbols[f"numba_{name}"] = address  # functions of the C library have no prefix

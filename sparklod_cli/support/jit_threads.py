@@ -1,7 +1,8 @@
-"""The threads of parallel kernels: those of numba's threading layer, started without numba unless it has been loaded."""
+"""The threads of parallel kernels: numba's threading layer, which is started without loading numba."""
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import functools
 import importlib.machinery
@@ -71,10 +72,8 @@ def layer() -> Layer:
 def _layer() -> Layer:
     if "numba" not in sys.modules and not SETTINGS.exists() and not any(map(os.environ.get, CHOICES)):
         for name in LAYERS:
-            try:
+            with contextlib.suppress(ImportError, OSError, ValueError):
                 return _started(name)
-            except (ImportError, OSError, ValueError):
-                continue
     from . import jit_numba
 
     return jit_numba.threading_layer()

@@ -37,12 +37,10 @@ def key_of(values: Iterable[Any]) -> Hashable | None:
     """
     keys: list[Hashable] = []
     for value in values:
-        kind = type(value)
+        kind: Any = type(value)
         if kind is np.ndarray or kind is np.memmap:
             keys.append((value.dtype, value.ndim, _LAYOUTS[value.flags.num & _FLAGS]))
-        elif kind in _SCALARS or kind in _PYTHON:
-            keys.append(kind)
-        elif kind is int and -_INT64_END <= value < _INT64_END:
+        elif kind in _SCALARS or kind in _PYTHON or (kind is int and -_INT64_END <= value < _INT64_END):
             keys.append(kind)
         elif kind is tuple or (isinstance(value, tuple) and hasattr(kind, "_fields")):
             inner = key_of(value)

@@ -85,8 +85,12 @@ def test_kernels_run_without_compilation() -> None:
     assert float(done.stdout) == pytest.approx(12.566, abs=1e-3)
 
 
-def test_compilations_are_reported_but_not_nested_ones() -> None:
-    inner = numba.njit(lambda x: x + 1)
+def test_compilations_are_reported_but_not_nested_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(jit, "CACHE_FOLDER", None)
+
+    @jit.kernel()
+    def inner(x: int) -> int:
+        return x + 1
 
     def outer(x: int) -> int:
         result: int = inner(x)
@@ -96,11 +100,11 @@ def test_compilations_are_reported_but_not_nested_ones() -> None:
     seconds: list[float] = []
     stop = jit.listen(begun.append, seconds.append, lambda text: None)
     try:
-        assert numba.njit(outer)(1) == 2
-        numba.njit(add)(1, 2)
+        assert jit.kernel()(outer)(1) == 2
+        jit.kernel()(add)(1, 2)
     finally:
         stop()
-    numba.njit(add)(1, 2)
+    jit.kernel()(add)(1, 2)
     assert begun == ["test_jit.outer", "test_jit.add"]
     assert len(seconds) == 2
     assert all(value > 0 for value in seconds)
