@@ -70,6 +70,14 @@ class prange:  # noqa: N801 - it is numba's, and Python's `range` where kernels 
         return range(*bounds)
 
 
+def prefetch(array: Any, index: int) -> None:
+    """In a compiled kernel: asks the processor to fetch an element of a C-contiguous row of records; changes nothing.
+
+    For loops that read elements in an order that the processor cannot foresee: with some iterations' notice, their
+    cache misses overlap. An index beyond the end is harmless.
+    """
+
+
 @dataclass(frozen=True)
 class Options:
     """How a kernel is compiled; see `kernel`."""

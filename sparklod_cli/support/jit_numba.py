@@ -13,8 +13,11 @@ from typing import Any
 
 import numba
 import numpy as np
-from numba.core import caching, compiler, event
+from llvmlite import ir
+from numba import types
+from numba.core import caching, cgutils, compiler, event
 from numba.core.serialize import dumps
+from numba.extending import intrinsic
 from numba.np.ufunc import parallel
 
 from . import jit, jit_cache, jit_threads
@@ -53,9 +56,9 @@ class Compiler:
 
     def compile(self, arguments: Sequence[Any]) -> tuple[Callable[..., Any], MachineCode | None]:
         """What to call with arguments of these types, and the machine code if other processes can link it."""
-        types = tuple(map(numba.typeof, arguments))
-        called: Callable[..., Any] = self.dispatcher.compile(types)
-        return called, None if self._cache is None else self._cache.machine_code(types)
+        signature = tuple(map(numba.typeof, arguments))
+        called: Callable[..., Any] = self.dispatcher.compile(signature)
+        return called, None if self._cache is None else self._cache.machine_code(signature)
 
 
 def compiler_of(kernel: jit.Kernel) -> Compiler:
@@ -92,10 +95,32 @@ def _fill_namespace(original: dict[str, Any]) -> None:
         namespace[name] = _known(value)
 
 
+def _lower_prefetch(typing_context: Any, array: Any, index: Any) -> Any:
+    """`jit.prefetch` in machine code."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        row = context.make_array(signature.args[0])(context, builder, arguments[0])
+        shape, strides = cgutils.unpack_tuple(builder, row.shape), cgutils.unpack_tuple(builder, row.strides)
+        place = cgutils.get_item_pointer2(context, builder, row.data, shape, strides, "C", [arguments[1]])
+        byte, word = ir.IntType(8).as_pointer(), ir.IntType(32)
+        kind = ir.FunctionType(ir.VoidType(), [byte, word, word, word])
+        fetch = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0i8")
+        read, all_levels, data = word(0), word(3), word(1)
+        builder.call(fetch, [builder.bitcast(place, byte), read, all_levels, data])
+        return context.get_dummy_value()
+
+    return types.void(array, types.int64), generate
+
+
+_prefetch: Any = intrinsic(_lower_prefetch)
+
+
 def _known(value: Any) -> Any:
     """What numba knows a global as: its own `prange`, and dispatchers instead of kernels."""
     if value is jit.prange:
         return numba.prange
+    if value is jit.prefetch:
+        return _prefetch
     return compiler_of(value).dispatcher if isinstance(value, jit.Kernel) else value
 
 

@@ -9,11 +9,14 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numba
+import numpy as np
 import pytest
 
 from sparklod_cli.support import jit
+from sparklod_cli.support.jit import prefetch as jit_prefetch
 from sparklod_cli.support.kernel_sources import sources_of
 from tests.conftest import ROOT
 
@@ -108,6 +111,23 @@ def test_compilations_are_reported_but_not_nested_ones(monkeypatch: pytest.Monke
     assert begun == ["test_jit.outer", "test_jit.add"]
     assert len(seconds) == 2
     assert all(value > 0 for value in seconds)
+
+
+def test_prefetch_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(jit, "CACHE_FOLDER", None)
+
+    @jit.kernel()
+    def total(values: Any) -> int:
+        found = 0
+        for index in range(len(values)):
+            jit_prefetch(values, index + 16)  # beyond the end, at last
+            found += values[index]["count"]
+        return found
+
+    rows = np.zeros(100, [("count", np.int64), ("share", np.float32)])
+    rows["count"] = np.arange(100)
+    assert total(rows) == total.py_func(rows) == 4950
+    assert np.array_equal(rows["count"], np.arange(100))
 
 
 @pytest.mark.parametrize("given", [{}, {"OMP_WAIT_POLICY": "ACTIVE"}, {"GOMP_SPINCOUNT": "7"}])
