@@ -63,8 +63,7 @@ def _start(stem: str, source: Path) -> str:
 @functools.cache
 def _machine() -> str:
     """A digest of all that machine code depends on besides the sources, found without loading numba."""
-    from llvmlite import binding
-
+    binding = llvm()
     try:
         features = binding.get_host_cpu_features().flatten()
     except RuntimeError:  # LLVM does not know them, and numba does not use them
@@ -73,6 +72,23 @@ def _machine() -> str:
     settings = SETTINGS.read_bytes() if SETTINGS.is_file() else b""
     host = binding.get_process_triple(), binding.get_host_cpu_name(), features
     return digest(host, sorted(variables.items()), settings, numba_version(), sys.version)
+
+
+def llvm() -> Any:
+    """llvmlite's module of LLVM.
+
+    Raises:
+        MemoryError: LLVM does not fit into memory.
+        ImportError, OSError: it cannot be loaded.
+    """
+    try:
+        from llvmlite import binding
+    except OSError as error:
+        reasons = f"{error} {error.__cause__} {error.__context__}"
+        if "failed to map segment" in reasons or "annot allocate memory" in reasons:
+            raise MemoryError from error
+        raise
+    return binding
 
 
 @functools.cache

@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from .jit_cache import SETTINGS, numba_folder
+from .jit_cache import SETTINGS, llvm, numba_folder
 from .jit_threads import extension, layer
 
 #: Systems and processors on which this is tested; on others numba loads what it has compiled.
@@ -146,7 +146,7 @@ class _Linker:
     """LLVM's linker, and what it takes of numba. It lives as long as the process: arrays may outlive all else."""
 
     def __init__(self) -> None:
-        from llvmlite import binding
+        binding = llvm()
         from llvmlite.binding import orcjit
 
         binding.initialize_native_target()
