@@ -22,6 +22,7 @@ if "OMP_WAIT_POLICY" not in os.environ:
         os.environ.setdefault(_name, _value)
 
 import numba  # noqa: E402
+from numba import prange as prange  # noqa: E402
 from numba.core import event  # noqa: E402
 
 from .jit_cache import KernelCache, Trouble, is_whole, pattern_of, stem_of  # noqa: E402

@@ -6,9 +6,8 @@ A cell is a range of `members`, the indices of its rows.
 from __future__ import annotations
 
 import numpy as np
-from numba import prange
 
-from ...support.jit import kernel
+from ...support.jit import kernel, prange
 
 #: Rows that a cell's direction is found from, spaced evenly over its members. Measured: 8,192 gain nothing.
 SAMPLE = 2048

@@ -8,9 +8,8 @@ same coefficient is beside itself in memory.
 from __future__ import annotations
 
 import numpy as np
-from numba import prange
 
-from ...support.jit import kernel
+from ...support.jit import kernel, prange
 
 #: Codes of a group.
 GROUP = 256

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import prange
 
-from ...support.jit import kernel
+from ...support.jit import kernel, prange
 
 #: Odd multipliers with irregular bits: 2 ** 64 / golden ratio, and the second of MurmurHash3's finalizer.
 SPREAD, MIX = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xC4CEB9FE1A85EC53)

@@ -14,10 +14,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import prange
 
 from ...support.fast_math import exp2
-from ...support.jit import kernel
+from ...support.jit import kernel, prange
 from .geometry import ellipsoid_area
 from .pair_cost import COVARIANCE, COVERED, DENSITY, LOG_DET, NEVER, WEIGHT, WIDTH, log_det, pair_costs
 from .pair_merge import semi_axes

@@ -5,9 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import prange
 
-from ...support.jit import kernel
+from ...support.jit import kernel, prange
 from .pixel_scale import INFINITE, ZERO, pixel_scale
 
 #: Viewpoints that one pass over the families serves. Measured: 8 take half as long as one by one.

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import prange
 
-from ...support.jit import kernel
+from ...support.jit import kernel, prange
 from .sort import AXIS_BITS, interleave
 
 #: Bits of a key below its depth, and the depth from which on families keep the order that they have.

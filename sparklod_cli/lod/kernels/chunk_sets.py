@@ -9,9 +9,8 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import prange
 
-from ...support.jit import kernel
+from ...support.jit import kernel, prange
 
 #: Ways to split a set: along x, y, z (whole subtrees of roots, by the parent's centre), or by size.
 AXES = 4

@@ -6,10 +6,9 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import prange
 
 from ...model.gaussian import THOMSEN_P
-from ...support.jit import kernel
+from ...support.jit import kernel, prange
 
 #: The largest float32, world units: centres and scales of merged splats are clamped to it.
 LARGEST = float(np.finfo(np.float32).max)

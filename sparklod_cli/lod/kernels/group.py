@@ -5,9 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import prange
 
-from ...support.jit import kernel
+from ...support.jit import kernel, prange
 from .pair_cost import CENTER
 from .sort import morton_code
 

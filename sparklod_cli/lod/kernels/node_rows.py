@@ -6,9 +6,8 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import prange
 
-from ...support.jit import kernel
+from ...support.jit import kernel, prange
 from .eigen import ROWS, decompose
 from .geometry import LARGEST, ellipsoid_area
 from .merge import SCALE_FLOOR, covariance

@@ -9,10 +9,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import prange
 
 from ...support.fast_math import log2
-from ...support.jit import kernel
+from ...support.jit import kernel, prange
 
 f32 = np.float32
 

@@ -6,11 +6,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
 from ...model.splats import FloatArray
-from ...support.jit import kernel
+from ...support.jit import kernel, prange
 from .pair_cost import CENTER
 
 Keys = NDArray[np.uint64]

@@ -10,9 +10,8 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import prange
 
-from ...support.jit import kernel
+from ...support.jit import kernel, prange
 from .falloff import gauss, merged_parts
 from .project import BLUE, END, GREEN, OPACITY, POWER, RED, A, B, C
 from .raster import LANES, TILE, box_in_tile, lines_of, tiles_of, tilt_of

@@ -5,9 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import prange
 
-from ...support.jit import kernel
+from ...support.jit import kernel, prange
 from .falloff import alpha_at
 from .project import END, HALF_HEIGHT, HALF_WIDTH, OPACITY, POWER, A, B, C, X, Y
 

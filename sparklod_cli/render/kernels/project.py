@@ -5,10 +5,9 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import prange
 
 from ...model import gaussian
-from ...support.jit import kernel
+from ...support.jit import kernel, prange
 
 f32 = np.float32
 

@@ -9,9 +9,8 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import prange
 
-from ...support.jit import kernel
+from ...support.jit import kernel, prange
 from .backward import BY_RED, BY_SHAPE, BY_X, BY_XX, BY_XY, BY_Y, BY_YY, SUMS
 from .project import (
     END,

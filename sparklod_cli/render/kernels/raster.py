@@ -5,9 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import prange
 
-from ...support.jit import kernel
+from ...support.jit import kernel, prange
 from .falloff import merged, plain, shifted
 from .project import BLUE, END, GREEN, HALF_HEIGHT, HALF_WIDTH, OPACITY, POWER, RED, A, B, C, X, Y
 

@@ -8,9 +8,8 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import prange
 
-from ...support.jit import kernel
+from ...support.jit import kernel, prange
 from .project import COLUMNS, Lens, ShadedColumns, project_splat
 from .raster import LANES, TILE, draw_tile, tiles_of
 

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import prange
 
 from ...model.sh import SH_C1, SH_C2, SH_C3
-from ...support.jit import kernel
+from ...support.jit import kernel, prange
 
 f32 = np.float32
 
