@@ -114,9 +114,7 @@ def encode_log_scale(
 
 
 @np.errstate(over="ignore")  # a stranger's range may be any
-def log_scale_table(
-    low: float, high: float, *, exp: Callable[[FloatArray], FloatArray] = nearest_exp
-) -> FloatArray:
+def log_scale_table(low: float, high: float, *, exp: Callable[[FloatArray], FloatArray] = nearest_exp) -> FloatArray:
     """(256,) linear scales of the codes. Largest error: a factor of e ** ((high - low) / 508); exact for 0."""
     first = np.float32(low)
     logs = first + np.arange(-1, 255, dtype=np.float32) * ((np.float32(high) - first) / np.float32(254))

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
@@ -27,12 +27,13 @@ class FileCoding:
     Attributes:
         scales: of each run of splats, in order.
         run: splats of each run but the last.
-        ranges: RAD's "splatEncoding", by the fields of `codecs.splat_encoding.SplatEncoding`; empty where there is none.
+        packed_range: ends of the range of logarithms in which Spark packs the scales of the file as PackedSplats, where
+            the file sets one (RAD's "splatEncoding"); None for Spark's own.
     """
 
     scales: tuple[ScaleCoding, ...]
     run: int
-    ranges: Mapping[str, float] = field(default_factory=dict)
+    packed_range: tuple[float, float] | None = None
 
     def parts(self, count: int) -> Iterator[tuple[slice, ScaleCoding]]:
         """The rows of `count` splats, as few slices as their codings allow."""

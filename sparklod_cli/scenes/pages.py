@@ -20,6 +20,9 @@ from ..support.errors import SparklodError, TreeError
 from ..support.machine import available_memory
 from ..support.parallel import ordered_map
 
+#: Makes nodes of the splats, the tree and the coding of a chunk.
+NodesOf = Callable[[Splats, LodTree, FileCoding], Nodes]
+
 #: Columns that nodes are made of.
 TRAVERSED = ("center", "scale", "opacity")
 
@@ -37,7 +40,7 @@ class Pages:
     Args:
         file: of a tree in chunks of `CHUNK_NODES`.
         name: of the file, for errors.
-        nodes_of: makes nodes of the splats, the tree and the coding of a chunk.
+        nodes_of: makes the nodes of a chunk.
         threads: to decode splats with.
 
     Attributes:
@@ -45,7 +48,9 @@ class Pages:
         depth: (N,) int32 edges from the root, of the nodes that the present chunks lead to; 0 of others.
     """
 
-    def __init__(self, file: RadFile, name: str, nodes_of: Callable[[Splats, LodTree, FileCoding], Nodes], threads: int) -> None:
+    def __init__(
+        self, file: RadFile, name: str, nodes_of: Callable[[Splats, LodTree, FileCoding], Nodes], threads: int
+    ) -> None:
         self.file, self._name, self._nodes_of, self._threads = file, name, nodes_of, threads
         self.count = file.header.count
         self.present = np.zeros(len(file.header.chunks), np.bool_)

@@ -11,8 +11,8 @@ from ...support import defaults
 #: words of a scene by their names; docs/formats.md has their layout.
 ENCODINGS = {"packed": "packed_splats", "ext": "ext_splats", "lodtree": "lod_tree", "texture": "data_texture"}
 
-#: Layouts after which `loaded_nodes` measures nodes, as Spark does when it has loaded a file: ExtSplats, PackedSplats of
-#: a file that it loads whole, and those of a RAD file that it streams.
+#: Layouts after which `loaded_nodes` measures nodes, as Spark does when it has loaded a file: ExtSplats, PackedSplats
+#: of a file that it loads whole, and those of a RAD file that it streams.
 LOADED = ("ext", "packed", "packed-pages")
 
 #: Precisions of the nodes that cuts are found with: the file's, its half floats, and what Spark has in each layout.

@@ -149,7 +149,9 @@ def facts_of(header: RadHeader, palette: FloatArray | None) -> dict[str, int]:
 
 def coding_of(header: RadHeader, scales: Sequence[ScaleCoding]) -> FileCoding:
     """How a file holds its scales, of those of its chunks, or of a single chunk."""
-    return FileCoding(tuple(scales), header.chunk_size, {} if header.encoding is None else vars(header.encoding))
+    found = header.encoding
+    ranges = None if found is None else (found.ln_scale_min, found.ln_scale_max)
+    return FileCoding(tuple(scales), header.chunk_size, ranges)
 
 
 def fill_known(
