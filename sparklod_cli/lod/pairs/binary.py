@@ -130,6 +130,7 @@ def merge_levels(
     by_level = np.argsort(levels, kind="stable").astype(np.uint32)
     lowest = int(levels.min())
     ends = np.cumsum(np.bincount(levels - lowest))
+    del levels
     active = np.empty(0, np.uint32)
     waiting: list[tuple[Nodes, Levels]] = []
     joined = level = 0
