@@ -25,12 +25,18 @@ TABLE = Table(
 ALL = "all of these"
 
 
-def rows(scene: Path, runs: int) -> list[Row]:
-    """A row for each command; each finds in the cache what those before it compiled, but `warmup` finds none."""
+def rows(scene: Path, runs: int, *, brief: bool = False) -> list[Row]:
+    """A row for each command; each finds in the cache what those before it compiled, but `warmup` finds none.
+
+    Args:
+        scene: a splat file.
+        runs: of all commands.
+        brief: only of the first command.
+    """
     found: dict[str, dict[str, list[float]]] = {}
     for _ in range(runs):
         with tempfile.TemporaryDirectory() as folder:
-            _turn(scene, Path(folder), found)
+            _turn(scene, Path(folder), found, brief)
     return [Row({"command": name, "cache": _before(name)}, figures) for name, figures in found.items()]
 
 
@@ -38,7 +44,7 @@ def _before(name: str) -> str:
     return "empty" if name in ("build-lod", "warmup", ALL) else "of those above"
 
 
-def _turn(scene: Path, folder: Path, found: dict[str, dict[str, list[float]]]) -> None:
+def _turn(scene: Path, folder: Path, found: dict[str, dict[str, list[float]]], brief: bool) -> None:
     """One run of every command."""
     tree = folder / "tree.spz"
     bake = [*SPARKLOD, "build-lod", scene, "-o", tree, "--overwrite", "-q"]
@@ -49,12 +55,16 @@ def _turn(scene: Path, folder: Path, found: dict[str, dict[str, list[float]]]) -
         "traverse": [*SPARKLOD, "traverse", tree, "--orbit", "4", "--json"],
         "render": [*SPARKLOD, "render", tree, "-o", folder / "view.png", "-q"],
     }
+    if brief:
+        commands = {"build-lod": bake}
     total = {"wall_s": 0.0, "cpu_s": 0.0}
     for name, command in commands.items():
         took = run(command, variables={"NUMBA_CACHE_DIR": str(folder / "one")}, codes=(0, 3))
         _add(found, name, wall_s=took.wall_s, cpu_s=took.cpu_s, peak_bytes=took.peak_bytes)
         total["wall_s"] += took.wall_s
         total["cpu_s"] += took.cpu_s
+    if brief:
+        return
     _add(found, ALL, **total)
     took = run([*SPARKLOD, "warmup"], variables={"NUMBA_CACHE_DIR": str(folder / "other")})
     _add(found, "warmup", wall_s=took.wall_s, cpu_s=took.cpu_s, peak_bytes=took.peak_bytes)

@@ -56,7 +56,7 @@ def _bakes(bench: Any, context: Context) -> Iterable[Row]:
 
 
 def _compiling(bench: Any, context: Context) -> Iterable[Row]:
-    return bench.rows(context.scene("biker.ply"), context.count(1))
+    return bench.rows(context.scene("biker.ply"), context.count(1), brief=context.quick)
 
 
 def _quick(bench: Any, context: Context) -> Iterable[Row]:
