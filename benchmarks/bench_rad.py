@@ -73,9 +73,11 @@ TIMES = Table(
         figure("native_peak_bytes", "native peak MB", 0, per=1e6),
         ratio("wall_s", "native_wall_s", "s / native s", 2),
         ratio("cpu_s", "native_cpu_s", "processors' s / native's", 2),
+        figure("output_bytes", "MB", 2, per=1e6),
+        ratio("output_bytes", "native_output_bytes", "MB / native MB", 2),
     ),
     key=("scene", "method", "output"),
-    judged=("wall_s", "cpu_s", "peak_bytes"),
+    judged=("wall_s", "cpu_s", "peak_bytes", "output_bytes"),
 )
 READING = Table(
     columns=(
@@ -152,11 +154,17 @@ def time_rows(bakeries: Sequence[Bakery], ways: Sequence[Way], runs: int) -> Ite
         ours = [way for way in ways if not way.peer]
         peers = {PEERS[way] for way in ours} & set(ways) if bakery.peer else set()
         every = [*ours, *(way for way in ways if way in peers)]
-        baked = in_turn(runs, [lambda way=way, bakery=bakery: bakery.bake(way).took for way in every])
-        took = dict(zip(every, baked, strict=True))
+        found = in_turn(runs, [lambda way=way, bakery=bakery: bakery.bake(way) for way in every])
+        baked = dict(zip(every, found, strict=True))
         for way in ours:
             labels = {"scene": bakery.scene.name, "method": bakery.method, "output": way.name}
-            yield Row(labels, {**runs_of(took[way]), **runs_of(took.get(PEERS[way], []), "native_")})
+            yield Row(labels, {**_figures(baked[way]), **_figures(baked.get(PEERS[way], []), "native_")})
+
+
+def _figures(baked: Sequence[Baked], prefix: str = "") -> dict[str, list[float]]:
+    """The runs of a row."""
+    runs = runs_of([each.took for each in baked], prefix)
+    return {**runs, f"{prefix}output_bytes": [each.bytes for each in baked]}
 
 
 def read_rows(bakeries: Sequence[Bakery], ways: Sequence[Way], runs: int) -> Iterator[Row]:

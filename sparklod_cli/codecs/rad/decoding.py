@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from zlib_ng import zlib_ng
 
 from ...model.lod_tree import LodTree
 from ...model.sh import COEFFICIENTS
 from ...model.splats import FloatArray, Splats
 from ...support.errors import FormatError, TooLongError, TruncatedError
 from .. import octahedral
+from ..inflate import ERRORS, raw_unpacker
 from ..promises import check, error_of
 from ..quantize import Bytes, quat_of_xyz
 from . import promises
@@ -23,9 +23,6 @@ from .encodings import CODINGS
 from .header import read_chunk_header
 from .layout import BY_NAME, SIZES, Row
 from .records import Property, RadChunkHeader, RadHeader
-
-_ZlibError: Any = zlib_ng.error  # the stubs take the class for an instance
-_RAW = -zlib_ng.MAX_WBITS
 
 
 @dataclass(frozen=True)
@@ -90,11 +87,11 @@ class Packed:
         data = self.payload[each.offset : each.offset + each.bytes]
         what = f"{each.name} of chunk {self.number:,}"
         if each.compression is not None:
-            unpacker = zlib_ng.decompressobj(_RAW)
+            unpacker = raw_unpacker()
             try:
                 data = unpacker.decompress(data, expected + 1)  # a byte more, which tells what is too long
-            except _ZlibError as error:
-                raise FormatError(f"corrupt data in {what}: {error}") from None
+            except ERRORS:
+                raise FormatError(f"corrupt data in {what}") from None
             if len(data) == expected and not unpacker.eof:
                 raise TruncatedError(f"{what} is cut short: its compressed data do not end")
         if len(data) > expected:

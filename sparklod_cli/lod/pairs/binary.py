@@ -62,7 +62,7 @@ class BinaryTree:
         spare: (N,) uint32 row that is to spare in the tree of each merged node without a parent.
         children: (N, 2) uint32, of merged nodes.
         size: (2N,) float32 feature sizes of leaves and merged nodes, units.
-        error: (N,) float32, `kernels.pair_merge.picture_error` of merged nodes.
+        error: (N,) float32, `kernels.pair_overlap.picture_error` of merged nodes.
         used: number of nodes so far.
         rounds: number of rounds of merging so far.
     """
