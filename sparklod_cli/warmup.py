@@ -67,6 +67,7 @@ JOBS = {
         (
             *("geometry.find_bounds", "final_order.fill_leaves", "final_order.merge_colors", "sort.sort_pass"),
             *("node_rows.fill_leaf_rows", "node_rows.fill_merged_splats", "node_rows.morton_keys"),
+            "curve_sort.sort_along_curve",
             *("pair_cost.find_partners", "pair_cost.match_pairs", "pair_merge.merge_pairs", "prune.drop_nodes"),
             *("prune.fill_usefulness_terms", "prune.lay_out_children", "prune.size_ranks"),
             *("family_links.find_limits", "tree_links.find_parents"),
@@ -111,8 +112,18 @@ JOBS = {
         ("build-lod shiny.spz --format rad --cluster-sh 4 -o palette.rad",),
     ),
     "streamed-sog": Job(
-        ("region_errors.compare_levels", "row_hash.hash_rows", "shade.add_sh", "tree_links.find_parents"),
-        ("build-lod shiny.spz -o web/lod-meta.json",),
+        (
+            *("region_errors.compare_levels", "row_hash.hash_rows", "shade.add_sh", "tree_links.find_parents"),
+            *(
+                "texels.fill_quats",
+                "texels.gather_rows",
+                "texels.look_up",
+                "texels.look_up_words",
+                "texels.place_bytes",
+            ),
+            *("webp_codes.read_codes", "webp_pixels.read_pixels", "webp_transforms.undo"),
+        ),
+        ("build-lod shiny.spz -o web/lod-meta.json", "inspect web/lod-meta.json --check"),
     ),
 }
 
