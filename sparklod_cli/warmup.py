@@ -53,7 +53,9 @@ JOBS = {
         ("build-lod scene.ply -o quick.spz",),
     ),
     "traverse": Job(
-        ("cut.find_cut", "cut_statistics.measure_cut", "cut_statistics.replace_drawn"),
+        (
+            *("cut.find_cut", "cut_statistics.measure_cut", "cut_statistics.replace_drawn", "cut_statistics.select"),
+        ),
         ("traverse tree.spz --orbit 2 -o frames.csv",),
     ),
     "inspect": Job(
