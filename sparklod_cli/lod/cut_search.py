@@ -74,10 +74,11 @@ class CutSearch:
             threads: that find the cut, if it is large.
         """
         stop = Stop(np.float32(smallest).view(np.int32), budget)
-        length = min(budget, self._most) + 1
+        most = min(budget, self._most)
+        length = most + threads  # each thread writes one more before it knows whether that is drawn
         nodes = CutNodes(np.empty(length, np.uint32), np.empty(length, np.int32), np.empty(length, np.uint16))
         found = None
-        if threads > 1 and length > PARALLEL_BUDGET and trees.resident.all():
+        if threads > 1 and most >= PARALLEL_BUDGET and trees.resident.all():
             found = self._find_together(trees, stop, nodes, threads)
         found = found or self._find_alone(trees, stop, nodes)
         # The next cut is likely to be similar.

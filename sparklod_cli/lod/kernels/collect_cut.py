@@ -8,6 +8,7 @@ from ...support.jit import kernel
 from .cut_arrays import (
     ABSENT,
     BASE,
+    BEGIN,
     BUCKET_BITS,
     BUDGET,
     COUNT,
@@ -205,15 +206,14 @@ def close_gaps(tally, cut):
     """Moves what the parts have collected together, to the beginning of the cut; returns the number of nodes.
 
     Args:
-        tally: `Slots.tally` of all parts; each part has room for the nodes that it left to the queue behind its own.
-        cut: `CutNodes`.
+        tally: `Slots.tally` of all parts.
+        cut: `CutNodes`; between the nodes of the parts is room for those that they left to the queue.
     """
-    selected, begin = np.int64(0), np.int64(0)
+    selected = np.int64(0)
     for part in range(len(tally)):
-        own = tally[part, SELECTED]
+        begin, own = tally[part, BEGIN], tally[part, SELECTED]
         for entry in range(min(begin - selected, own)):
             last = begin + own - 1 - entry
             put(cut, selected + entry, cut.node[last], cut.limit[last], cut.instance[last])
         selected += own
-        begin += own + tally[part, QUEUED]
     return selected

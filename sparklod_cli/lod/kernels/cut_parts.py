@@ -170,6 +170,6 @@ def plan(stop, guess, slots):
     begin = np.int64(0)
     for part in range(parts):
         tally[part, BEGIN] = begin
-        begin += tally[part, BASE]
+        begin += tally[part, BASE] + 1  # `collect` writes one more before it knows whether that is drawn
         for bucket in range(low + 1, BUCKETS):
             begin += sums[part, bucket]
