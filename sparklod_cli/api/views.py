@@ -67,7 +67,7 @@ def cut(
             those of PlayCanvas.
         continuous: a cut that fades nodes into their children; the width of that, or True for 1.25.
         precision: "float32", or "float16" for the centres and sizes that Spark holds of a tree.
-        threads: to prepare the trees on; None for all processors.
+        threads: to prepare the trees on, and to find a large cut; None for all processors.
 
     Raises:
         ValueError: the budget is out of its range, or less than one splat for each instance; `continuous` is not
@@ -76,7 +76,7 @@ def cut(
     camera_like(camera)
     with on_threads(threads) as count, memory_errors_translated():
         scenes = scenes_of(viewed, count, precision)
-        return CutFinder(scenes, _lod(scenes, budget, settings, continuous)).cut(camera)
+        return CutFinder(scenes, _lod(scenes, budget, settings, continuous), threads=count).cut(camera)
 
 
 def render(

@@ -107,7 +107,9 @@ def shares(limit: NDArray[np.float32], threshold: float, width: float) -> Shares
     """
     share = np.zeros(len(limit))
     above = np.flatnonzero(limit > threshold)
-    share[above] = _smoothstep(np.log(limit[above].astype(np.float64) / threshold) / math.log(width)) if threshold else 1
+    share[above] = (
+        _smoothstep(np.log(limit[above].astype(np.float64) / threshold) / math.log(width)) if threshold else 1
+    )
     return share
 
 

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from ..model.nodes import CHUNK_NODES
 from .kernels import cut_arrays, cut_parts
-from .kernels.cut import find_cut
 from .kernels.cut_arrays import CutNodes, Slots, Stop, Trees
 
 #: Initial size of the buffers, in visited nodes per node of a cut: enough if every refined node has two or more
@@ -93,7 +92,9 @@ class CutSearch:
             if self._alone is None or self._alone.node.shape[1] <= size:
                 self._alone = _slots(1, size)
             slots = self._alone
-            selected, reason, *rest = find_cut(trees, stop, np.float32(self.guess), slots, wanted, nodes)
+            selected, reason, *rest = cut_parts.take_step(
+                cut_parts.WHOLE, 0, trees, stop, np.float32(self.guess), slots, wanted, nodes
+            )
             if reason != cut_arrays.FULL:
                 return _found(nodes, slots, wanted, selected, reason, *rest)
             size = 2 * slots.node.shape[1]

@@ -1,4 +1,4 @@
-"""Finds continuous cuts by plain numpy: the inner nodes of a tree depth by depth, all of them sorted by their limits."""
+"""Finds continuous cuts by plain numpy: inner nodes depth by depth, all of them sorted by their limits."""
 
 from __future__ import annotations
 

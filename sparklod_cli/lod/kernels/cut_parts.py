@@ -1,4 +1,4 @@
-"""Finds a cut on several threads: the steps of `find_cut`, each of which all parts take before the next begins.
+"""Finds a cut on one thread, or on several: the steps of `find_cut`, which all parts take before the next begins.
 
 The first part refines the top of the trees, until there are subtrees enough to deal out. From there on each part has
 subtrees, and slots, of its own, and nothing is written by two. Between steps the sums of all parts tell, as those of
@@ -11,7 +11,7 @@ import numpy as np
 
 from ...support.jit import kernel
 from .collect_cut import collect, finish
-from .cut import FIRST_STEP
+from .cut import FIRST_STEP, find_cut
 from .cut_arrays import (
     BASE,
     BEGIN,
@@ -34,9 +34,9 @@ from .cut_arrays import (
 from .pixel_scale import ZERO
 from .refine import lowered, refine, visit_roots
 
-#: Steps. SOW and PLAN are taken by one thread, REFINE and COLLECT by each part, and FINISH by one thread. SERIAL: the
-#: parts cannot find this cut, and `find_cut` is to do so.
-SOW, PLAN, REFINE, COLLECT, FINISH, SERIAL = range(6)
+#: Steps. WHOLE is all that there is for one thread, also where parts cannot find a cut. Of several threads, SOW, PLAN and
+#: FINISH are taken by one, REFINE and COLLECT by each part.
+WHOLE, SOW, PLAN, REFINE, COLLECT, FINISH = range(6)
 
 #: In place of the limit of a node that was dealt to another part: larger than any but the largest bucket's, so that
 #: `collect` takes it for refined.
@@ -47,16 +47,20 @@ DEALT = np.int32((1 << 31) - 1)
 def take_step(step, part, trees, stop, guess, slots, wanted, cut):
     """Takes a step of a part, or of all; `slots.tally` of the first part says which step is NEXT.
 
+    One kernel for all steps, so that programs that find cuts load one.
+
     Args:
-        step: SOW, PLAN, REFINE, COLLECT or FINISH.
+        step: WHOLE, SOW, PLAN, REFINE, COLLECT or FINISH.
         part: number of the part, for REFINE and COLLECT.
-        trees, stop, guess, cut: as for `find_cut`; all chunks are resident.
+        trees, stop, guess, cut: as for `find_cut`; all chunks are resident, unless step is WHOLE.
         slots: `Slots` of all parts.
         wanted: (parts, chunks) float32, filled by COLLECT and FINISH: as of `find_cut`, of each part.
 
     Returns:
-        as `find_cut` after FINISH; before that, nothing that has a meaning.
+        as `find_cut` after WHOLE and FINISH; after the others, nothing that has a meaning.
     """
+    if step == WHOLE:
+        return find_cut(trees, stop, guess, slots, wanted, cut)
     row = row_of(slots, part)
     if step == SOW:
         sow(trees, stop, guess, slots)
@@ -145,7 +149,7 @@ def plan(stop, guess, slots):
     waiting, drawn, total = np.int64(0), np.int64(0), np.int64(0)
     for part in range(parts):
         if tally[part, OVERFLOW]:
-            tally[0, NEXT] = SERIAL
+            tally[0, NEXT] = WHOLE
             return
         waiting += tally[part, WAITING]
         drawn += tally[part, DRAWN]
@@ -166,7 +170,7 @@ def plan(stop, guess, slots):
             tally[part, ROOM] = stop.budget - (drawn - tally[part, DRAWN])
         return
     # The largest bucket is not told from nodes that were dealt.
-    tally[0, NEXT], tally[0, LOW] = COLLECT if low < BUCKETS - 1 else SERIAL, low
+    tally[0, NEXT], tally[0, LOW] = COLLECT if low < BUCKETS - 1 else WHOLE, low
     begin = np.int64(0)
     for part in range(parts):
         tally[part, BEGIN] = begin
