@@ -22,10 +22,6 @@ if "OMP_WAIT_POLICY" not in os.environ:
         os.environ.setdefault(_name, _value)
 
 import numba  # noqa: E402
-from llvmlite import ir  # noqa: E402
-from numba import types  # noqa: E402
-from numba.core import cgutils  # noqa: E402
-from numba.extending import intrinsic  # noqa: E402
 from numba import prange as prange  # noqa: E402
 from numba.core import event  # noqa: E402
 
@@ -193,25 +189,3 @@ def threading_layer() -> str:
     _launch_threads()
     layer: str = numba.threading_layer()
     return layer
-
-
-@intrinsic
-def prefetch(typing_context: Any, array: Any, index: Any) -> Any:
-    """In a kernel: asks the processor to fetch an element of a one-dimensional C-contiguous array; changes nothing.
-
-    For loops that read elements in an order that the processor cannot foresee: with some iterations' notice, their
-    cache misses overlap. The index must be that of an element.
-    """
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        row = context.make_array(signature.args[0])(context, builder, arguments[0])
-        shape, strides = cgutils.unpack_tuple(builder, row.shape), cgutils.unpack_tuple(builder, row.strides)
-        place = cgutils.get_item_pointer2(context, builder, row.data, shape, strides, "C", [arguments[1]])
-        byte, word = ir.IntType(8).as_pointer(), ir.IntType(32)
-        kind = ir.FunctionType(ir.VoidType(), [byte, word, word, word])
-        fetch = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0i8")
-        read, all_levels, data = word(0), word(3), word(1)
-        builder.call(fetch, [builder.bitcast(place, byte), read, all_levels, data])
-        return context.get_dummy_value()
-
-    return types.void(array, types.int64), generate
