@@ -21,7 +21,7 @@ from sparklod_cli import Scene, Splats
 INFLATE = """
 import re, sys
 from pathlib import Path
-from sparklod_cli.codecs.compression import Inflate
+from sparklod_cli.codecs.inflate import Inflate
 with open(sys.argv[1], "rb") as file:
     data = Inflate(file)
     while data.read(1 << 20):

@@ -13,8 +13,10 @@ from scenes import load
 
 import sparklod_cli as sparklod
 from sparklod_cli.codecs import compression, spz
+from sparklod_cli.codecs.compression import MIXED, Run
 from sparklod_cli.codecs.options import DEFAULTS, WriteOptions
 from sparklod_cli.codecs.rad import codec as rad
+from sparklod_cli.codecs.spz_encoder import WAYS
 from sparklod_cli.lod.builders import METHODS
 from sparklod_cli.lod.chunk_order import arrange
 from sparklod_cli.model.scene import Scene
@@ -34,7 +36,9 @@ def of_streams(scene: Scene, options: WriteOptions) -> dict[str, int]:
     codes = spz.encoder(scene, options).encode(scene.splats, scene.tree, 0)
     level = options.compression_level
     return {
-        name: sum(map(len, compression.gzip_member([column], column.nbytes, level, 1, silent)))
+        name: sum(
+            map(len, compression.gzip_member([column], [Run(column.nbytes, WAYS.get(name, MIXED))], level, 1, silent))
+        )
         for name, column in codes.items()
     }
 

@@ -1,72 +1,94 @@
-"""Compression: writes one gzip member on several threads, and inflates without buffering more than requested.
+"""Compression: writes one gzip member on several threads, and reads zstd without buffering more than requested.
 
-docs/decisions explains why the library's own threaded gzip is not used.
+docs/decisions explains why the library's own threaded gzip is not used. `inflate` reads gzip.
 """
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable, Iterator
-from typing import Any, BinaryIO
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any, BinaryIO, NamedTuple
 
 import zstandard
 from zlib_ng import zlib_ng
 
 from ..support.defaults import DEFAULT_COMPRESSION
-from ..support.errors import ChecksumError, FormatError, PromiseError, TooLongError, TruncatedError
+from ..support.errors import ChecksumError, FormatError, PromiseError, TooLongError
 from ..support.parallel import ordered_map
 from ..support.progress import Progress
 
-#: Bytes of a block that one thread deflates, bytes before a block that it may refer to (deflate's window), and bytes of
-#: a file that are read at a time.
-BLOCK, WINDOW, PIECE = 1 << 18, 1 << 15, 1 << 17
+#: Bytes of a block that one thread deflates, or inflates, by itself, and bytes that are read at a time. That blocks of
+#: this size refer to none before them costs 0.05 to 0.2 % of a file (docs/decisions/2026-11-22-inspect-speed.md).
+BLOCK, PIECE = 1 << 19, 1 << 17
 
-#: The level of links, the only data in which a longer search finds something: 10 % of them, 0.5 to 1 % of a file.
-LINKS_LEVEL = 9
+#: Bytes at the beginning of a block on which the ways to deflate it are compared.
+TRIED = 1 << 16
+
+
+class Way(NamedTuple):
+    """How a block is deflated.
+
+    Attributes:
+        level: of compression; None for the one that was asked for.
+        strategy: of zlib.
+    """
+
+    level: int | None = None
+    strategy: int = zlib_ng.Z_DEFAULT_STRATEGY
+
+
+#: Ways by kind of data; the one that makes the beginning of a block smallest is taken, the first of those that are
+#: equal. Most bytes of splats are noise, of which codes of Huffman make as little as a search does, in a third of the
+#: time; colours repeat in three bytes, which only level 9 looks for.
+MIXED = (Way(),)
+NOISE = (Way(strategy=zlib_ng.Z_HUFFMAN_ONLY), Way())
+TRIPLES = (Way(9), Way())
+RUNS = (Way(strategy=zlib_ng.Z_RLE), Way())
+LINKS = (Way(6),)
 
 #: Bytes up to which the size announced by a header is accepted; beyond, a file may expand by at most `MAX_RATIO`. Real
 #: scenes reach a ratio of 3; deflate's limit is 1000, which a scene of equal splats reaches.
 TRUSTED_SIZE, MAX_RATIO = 1 << 26, 200
 
-_ZlibError: Any = zlib_ng.error  # the stubs take the class for an instance
-GZIP_MAGIC = b"\x1f\x8b"
-_RAW, _GZIP = -zlib_ng.MAX_WBITS, zlib_ng.MAX_WBITS + 16
+_RAW = -zlib_ng.MAX_WBITS
+
+
+class Run(NamedTuple):
+    """Data of one kind.
+
+    Attributes:
+        size: bytes.
+        ways: to deflate them.
+    """
+
+    size: int
+    ways: tuple[Way, ...] = MIXED
 
 
 def gzip_member(
-    pieces: Iterable[Any],
-    total: int,
-    level: int,
-    threads: int,
-    progress: Progress,
-    *,
-    links_from: int | None = None,
+    pieces: Iterable[Any], runs: Sequence[Run], level: int, threads: int, progress: Progress
 ) -> Iterator[bytes]:
     """One gzip member, piece by piece; the same bytes for any number of threads, and however the data are cut.
 
-    As in pigz, blocks are deflated separately, each with the end of the previous one as its dictionary, and end on a
-    byte boundary with an empty stored block, so that together they are one deflate stream.
+    Blocks are deflated separately, without a reference to one before, and end on a byte boundary with an empty stored
+    block, so that together they are one deflate stream, which `inflate.Inflate` reads on several threads.
 
     Args:
         pieces: bytes, or contiguous arrays, asked for a few blocks ahead.
-        total: their bytes.
-        level: of compression.
+        runs: what they hold, in order. A block holds data of one, unless all fit into a block.
+        level: of compression. Below the default, which means haste, no other is used, and above it no lower one.
         threads: to deflate on.
         progress: told of the bytes.
-        links_from: where links of a tree begin, which are the last data: a block that begins there or behind is
-            deflated at `LINKS_LEVEL`, unless the level is below the default, which means haste. None without links.
     """
     check = 0
-    links_from = total if links_from is None or level < DEFAULT_COMPRESSION else links_from
+    total = sum(run.size for run in runs)
 
-    def blocks() -> Iterator[tuple[memoryview, memoryview, bool, int]]:
+    def blocks() -> Iterator[tuple[memoryview, bool, tuple[Way, ...]]]:
         nonlocal check
-        before, at = memoryview(b""), 0
-        for block in blocks_of_pieces(pieces, BLOCK):
-            of_block = LINKS_LEVEL if at >= links_from else level
+        at, parts = 0, list(_parts_of(runs, level))
+        for (_, ways), block in zip(parts, blocks_of_pieces(pieces, [size for size, _ in parts]), strict=True):
             check, at = zlib_ng.crc32(block, check), at + len(block)
-            yield before, block, at >= total, of_block
-            before = block[-WINDOW:]
+            yield block, at >= total, ways
 
     yield b"\x1f\x8b\x08\0\0\0\0\0\0\xff"  # no name, no time, no system: the same scene gives the same bytes
     done = 0
@@ -77,99 +99,66 @@ def gzip_member(
     yield struct.pack("<II", check, total & 0xFFFFFFFF)
 
 
-def _deflated(before: memoryview, block: memoryview, last: bool, level: int) -> tuple[int, bytes]:
-    """The bytes of a block, and its part of a deflate stream, in which it comes after the bytes `before`."""
-    memory, strategy = zlib_ng.DEF_MEM_LEVEL, zlib_ng.Z_DEFAULT_STRATEGY
-    packer = zlib_ng.compressobj(level, zlib_ng.DEFLATED, _RAW, memory, strategy, zdict=before)
-    return len(block), packer.compress(block) + packer.flush(zlib_ng.Z_FINISH if last else zlib_ng.Z_SYNC_FLUSH)
+def _parts_of(runs: Sequence[Run], level: int) -> Iterator[Run]:
+    """The blocks of a member, one at least, and the ways to deflate each at a level."""
+    total = sum(run.size for run in runs)
+    if total <= BLOCK:
+        yield Run(total, (Way(level),))
+        return
+    for run in runs:
+        ways = tuple(dict.fromkeys(_at_level(way, level) for way in run.ways))
+        for start in range(0, run.size, BLOCK):
+            yield Run(min(BLOCK, run.size - start), ways)
 
 
-def blocks_of_pieces(pieces: Iterable[Any], size: int) -> Iterator[memoryview]:
-    """The data of pieces in blocks of `size` bytes; the last may be shorter, and is empty where there are no data.
+def _at_level(way: Way, level: int) -> Way:
+    """A way, with the level that it has where one was asked for."""
+    if way.strategy != zlib_ng.Z_DEFAULT_STRATEGY:
+        return way._replace(level=level)
+    return Way(level if way.level is None or level < DEFAULT_COMPRESSION else max(level, way.level))
+
+
+def _deflated(block: memoryview, last: bool, ways: tuple[Way, ...]) -> tuple[int, bytes]:
+    """The bytes of a block, and its part of a deflate stream."""
+    way = min(ways, key=lambda way: len(_packed(block[:TRIED], way, last=True))) if len(ways) > 1 else ways[0]
+    return len(block), _packed(block, way, last=last)
+
+
+def _packed(block: memoryview, way: Way, *, last: bool) -> bytes:
+    memory = zlib_ng.DEF_MEM_LEVEL
+    packer = zlib_ng.compressobj(way.level, zlib_ng.DEFLATED, _RAW, memory, way.strategy)
+    packed: bytes = packer.compress(block) + packer.flush(zlib_ng.Z_FINISH if last else zlib_ng.Z_SYNC_FLUSH)
+    return packed
+
+
+def blocks_of_pieces(pieces: Iterable[Any], sizes: Iterable[int]) -> Iterator[memoryview]:
+    """The data of pieces in blocks of these sizes, which may be 0.
 
     A block that lies within one piece is a view of it.
+
+    Raises:
+        ValueError: the pieces hold more data, or fewer.
     """
-    rest: list[memoryview] = []
-    missing = size
-    block = None
-    for piece in pieces:
-        view = memoryview(piece)
-        view = view.cast("B") if view.nbytes else memoryview(b"")
-        while len(view) >= missing:
-            block = view[:missing] if missing == size else memoryview(b"".join([*rest, view[:missing]]))
-            view, rest, missing = view[missing:], [], size
-            yield block
-        if len(view):
-            rest.append(view)
-            missing -= len(view)
-    if rest or block is None:
-        yield memoryview(b"".join(rest))
+    views = (memoryview(piece).cast("B") for piece in pieces if memoryview(piece).nbytes)
+    view = memoryview(b"")
+    for size in sizes:
+        parts = []
+        while size > 0:
+            view = view or next(views, view)
+            if not view:
+                raise ValueError(f"{size} bytes of a block are missing")
+            parts.append(view[:size])
+            view = view[len(parts[-1]) :]
+            size -= len(parts[-1])
+        yield parts[0] if len(parts) == 1 else memoryview(b"".join(parts))
+    if view or next(views, None) is not None:
+        raise ValueError("there are more data than blocks")
 
 
 def check_promise(total: int, file_size: int) -> None:
     """Raises `PromiseError` if a header announces more bytes than a file of this size can expand to."""
     if total > TRUSTED_SIZE and total > MAX_RATIO * file_size:
         raise PromiseError(f"its header announces {total:,} bytes, more than a file of {file_size:,} bytes can hold")
-
-
-class Inflate:
-    """Reads a gzip member of a file, buffering little more than requested."""
-
-    def __init__(self, file: BinaryIO) -> None:
-        self._file = file
-        self._rest = b""
-        self._unpacker = zlib_ng.decompressobj(_GZIP)
-
-    def read(self, size: int) -> bytes:
-        """The next `size` bytes, or fewer where the data ends.
-
-        Raises:
-            FormatError: the data is corrupt.
-        """
-        pieces = []
-        while size > 0 and not self._unpacker.eof:
-            packed = self._rest or self._file.read(PIECE)
-            try:
-                piece: bytes = self._unpacker.decompress(packed, size)
-            except _ZlibError as error:
-                kind = ChecksumError if "check" in str(error) else FormatError  # "incorrect data check"
-                raise kind(f"corrupt gzip data: {error}") from None
-            self._rest = self._unpacker.unconsumed_tail
-            if not (packed or piece):
-                break
-            pieces.append(piece)
-            size -= len(piece)
-        return b"".join(pieces)
-
-    def finish(self, *, allow_more: bool) -> None:
-        """Checks that the member ends here with a correct checksum.
-
-        Args:
-            allow_more: the member may go on with data that are not read; nothing is checked.
-
-        Raises:
-            FormatError: the member does not end here, or the checksum is wrong.
-        """
-        if allow_more:
-            return
-        if self.read(1):
-            raise TooLongError("it holds more data than its header announces")
-        if not self._unpacker.eof:
-            raise TruncatedError("cut short: the gzip checksum is missing")
-
-    def behind(self) -> bytes:
-        """The first two bytes after the member, or fewer at the end of the file; empty before the member has ended."""
-        if not self._unpacker.eof:
-            return b""
-        rest: bytes = self._unpacker.unused_data
-        at = self._file.tell()
-        more = self._file.read(2)
-        self._file.seek(at)
-        return (rest + more)[:2]
-
-    def end(self) -> int:
-        """The position of the end of the member in the file, once it has been read."""
-        return self._file.tell() - len(self._unpacker.unused_data)
 
 
 class _Window:

@@ -17,10 +17,19 @@ from ..support.parallel import blocks_of
 from ..support.progress import Progress, silent
 from . import clamps, compression
 from .clamps import Range
+from .compression import Run
 from .encoder import CLAMPED, Encoded, Get, rows_of, windows_of
 from .options import WriteOptions
-from .spz_layout import ANTIALIASED, HEADER, LINKS, LOD, MAGIC, Layout, column_of
+from .spz_layout import ANTIALIASED, HEADER, LOD, MAGIC, Layout, column_of
 from .spz_values import to_code
+
+#: How streams are deflated; the others have repetitions of all kinds.
+WAYS = {
+    **dict.fromkeys(("alphas", "scales", "rotations"), compression.NOISE),
+    "colors": compression.TRIPLES,
+    "child_counts": compression.RUNS,
+    "child_starts": compression.LINKS,
+}
 
 
 @dataclass(frozen=True)
@@ -73,11 +82,11 @@ class SpzEncoder:
                 for number in range(len(windows_of(layout.count))):
                     yield get(number, stream.name)
 
-        sizes = {stream.name: stream.size * layout.count for stream in layout.streams()}
-        links = sum(sizes.get(name, 0) for name in LINKS)
-        total = HEADER.size + layout.total
-        level = self.options.compression_level
-        yield from compression.gzip_member(data(), total, level, threads, progress, links_from=total - links)
+        runs = [
+            Run(stream.size * layout.count, WAYS.get(stream.name, compression.MIXED)) for stream in layout.streams()
+        ]
+        runs[0] = runs[0]._replace(size=runs[0].size + HEADER.size)
+        yield from compression.gzip_member(data(), runs, self.options.compression_level, threads, progress)
 
 
 def encoder(

@@ -10,6 +10,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from ..model.coding import FileCoding, ScaleCoding
 from ..model.lod_tree import LodTree
 from ..model.scene import Scene
 from ..model.sh import notes_on_degree
@@ -21,6 +22,7 @@ from ..support.parallel import ordered_map
 from ..support.progress import Progress, silent
 from . import compression, quantize
 from .content import HAS_TREE, Content, Scratch
+from .inflate import GZIP_MAGIC, Inflate
 from .sound import with_sound_tree
 from .spz_layout import ANTIALIASED, EXTENSIONS, HEADER, LOD, MAGIC, Layout, Stream, StreamRows, column_of
 from .stream import Positioned, Read, rows_between, rows_of, size_of
@@ -30,6 +32,9 @@ STREAM_SIZES = struct.Struct("<QQ")  # of a version 4 stream: compressed, uncomp
 
 #: Versions that are read.
 READABLE = (1, 2, 3, 4)
+
+#: How all versions hold scales.
+CODING = FileCoding((ScaleCoding("spz"),), 1)
 
 
 def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> Scene:
@@ -52,7 +57,7 @@ def examine(
     Raises:
         FormatError: as `decode`, but not for a broken tree.
     """
-    layout, rows, header = _opened(file)
+    layout, rows, header = _opened(file, threads)
     make = Splats.empty if set(COLUMNS) <= set(columns) else Splats.zeros
     splats = make(layout.count, min(layout.sh_degree, MAX_SH_DEGREE))
     tree = None
@@ -71,7 +76,7 @@ def examine(
         done += count
         progress("reading", done, layout.total, "B")
     antialiased, notes = bool(layout.flags & ANTIALIASED), _notes(layout, header)
-    return Scene(splats, tree, antialiased, _name_of(layout), notes, _facts(layout) | header)
+    return Scene(splats, tree, antialiased, _name_of(layout), notes, _facts(layout) | header, coding=CODING)
 
 
 def stream(file: BinaryIO, *, scratch: Scratch, threads: int = 1, progress: Progress = silent) -> SceneStream:
@@ -81,7 +86,7 @@ def stream(file: BinaryIO, *, scratch: Scratch, threads: int = 1, progress: Prog
         HasTreeError: it has a tree.
         FormatError: as `decode`; what is wrong with the data, at the first block.
     """
-    layout, rows, header = _opened(file)
+    layout, rows, header = _opened(file, threads)
     if layout.flags & LOD:
         raise HasTreeError(HAS_TREE)
     if not layout.count:  # there is nothing to read, but what follows may be wrong
@@ -122,20 +127,20 @@ def read_codes(file: BinaryIO) -> tuple[Layout, dict[str, quantize.Bytes]]:
     Raises:
         FormatError: as `decode`.
     """
-    layout, rows, _ = _opened(file)
+    layout, rows, _ = _opened(file, 1)
     codes = {each.name: np.empty((layout.count, each.size), np.uint8) for each in layout.streams()}
     for each, part, some in rows:
         codes[each.name][part] = some
     return layout, codes
 
 
-def _opened(file: BinaryIO) -> tuple[Layout, Iterator[StreamRows], dict[str, int]]:
+def _opened(file: BinaryIO, threads: int) -> tuple[Layout, Iterator[StreamRows], dict[str, int]]:
     """The layout of a file, the rows of its streams, and more numbers, the last of which come with the rows."""
     size = size_of(file)
     plain = file.read(4) == struct.pack("<I", MAGIC)
     file.seek(0)
     header: dict[str, int] = {}
-    layout, rows = _read_v4(file, size, header) if plain else _read_gzip(file, size, header)
+    layout, rows = _read_v4(file, size, header) if plain else _read_gzip(file, size, header, threads)
     return layout, rows, header
 
 
@@ -175,8 +180,8 @@ def _rows(layout: Layout, read: Read, stream: Stream) -> Iterator[StreamRows]:
         yield stream, part, codes
 
 
-def _read_gzip(file: BinaryIO, size: int, header: dict[str, int]) -> tuple[Layout, Iterator[StreamRows]]:
-    inflate = compression.Inflate(file)
+def _read_gzip(file: BinaryIO, size: int, header: dict[str, int], threads: int) -> tuple[Layout, Iterator[StreamRows]]:
+    inflate = Inflate(file, threads)
     head = inflate.read(HEADER.size)
     if len(head) < HEADER.size:
         raise TruncatedError("cut short inside the SPZ header")
@@ -190,7 +195,7 @@ def _read_gzip(file: BinaryIO, size: int, header: dict[str, int]) -> tuple[Layou
             for stream in layout.streams():
                 yield from _rows(layout, inflate.read, stream)
         except TruncatedError as error:
-            if inflate.behind() == compression.GZIP_MAGIC:
+            if inflate.behind() == GZIP_MAGIC:
                 raise MembersError(
                     f"{error}; its data continue in a second gzip member, which Spark does not read"
                 ) from None
@@ -199,7 +204,7 @@ def _read_gzip(file: BinaryIO, size: int, header: dict[str, int]) -> tuple[Layou
         if layout.flags & EXTENSIONS:  # the end of the member is not searched for
             return
         header["trailing_bytes"] = size - inflate.end()
-        header["trailing_members"] = int(inflate.behind() == compression.GZIP_MAGIC)
+        header["trailing_members"] = int(inflate.behind() == GZIP_MAGIC)
 
     return layout, rows()
 

@@ -23,7 +23,7 @@ BLOCK_BYTES = 1 << 18
 Rows = tuple[slice, NDArray[Any]]
 
 #: Reads the next `size` bytes, or fewer at the end of the data.
-Read = Callable[[int], bytes]
+Read = Callable[[int], bytes | memoryview]
 
 
 def size_of(file: BinaryIO) -> int:

@@ -1,4 +1,4 @@
-"""gzip: one member, the same for any number of threads, that anyone can read. Inflating: never more than asked for."""
+"""gzip: one member, the same for any number of threads, that anyone can read. zstd: never more than asked for."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ import pytest
 import zstandard
 
 from sparklod_cli.codecs import compression
+from sparklod_cli.codecs.compression import Run, Way
 from sparklod_cli.support.errors import FormatError
 from sparklod_cli.support.progress import silent
 
@@ -34,7 +35,7 @@ def sample(size: int, kind: str = "mixed") -> np.ndarray:
 
 
 def packed(data: np.ndarray, *, level: int = 5, threads: int = 1) -> bytes:
-    return b"".join(compression.gzip_member([data], data.size, level, threads, silent))
+    return b"".join(compression.gzip_member([data], [Run(data.size)], level, threads, silent))
 
 
 @pytest.mark.parametrize("size", SIZES)
@@ -65,59 +66,95 @@ def test_every_level_is_read_back(level: int) -> None:
     assert gzip.decompress(packed(data, level=level, threads=2)) == data.tobytes()
 
 
-def test_blocks_refer_to_the_block_before() -> None:
-    """Noise that repeats across a block boundary costs next to nothing the second time."""
-    noise = sample(BLOCK, "noise")
-    tail = noise[-compression.WINDOW // 2 :]
-    alone, after = (len(packed(data)) for data in (noise, np.concatenate([noise, tail])))
-    assert after - alone < 0.1 * len(tail)
+def blocks_of(made: bytes) -> list[bytes]:
+    """The blocks of a member, each inflated by itself."""
+    parts = [part + b"\0\0\xff\xff" for part in made[10:-8].split(b"\0\0\xff\xff")]
+    return [zlib.decompressobj(-15).decompress(part) for part in parts]
+
+
+def test_blocks_are_inflated_by_themselves_in_any_order() -> None:
+    data = np.tile(sample(BLOCK // 4, "noise"), 9)  # which repeats further back than blocks may look
+    data = np.concatenate([data, data[-compression.TRIED :]])
+    found = blocks_of(packed(data))
+    assert [len(block) for block in found] == [BLOCK, BLOCK, BLOCK // 4 + compression.TRIED]
+    assert b"".join(found) == data.tobytes()
+
+
+def test_blocks_end_where_a_run_does_unless_all_fit_into_one() -> None:
+    data = sample(BLOCK + 30)
+    sizes = {BLOCK + 30: [BLOCK, 30], 20: [20, BLOCK, 10], 0: [BLOCK, 30]}
+    for first, expected in sizes.items():
+        runs = [Run(first, compression.NOISE), Run(len(data) - first)]
+        made = b"".join(compression.gzip_member([data[:7], data[7:]], runs, 5, 2, silent))
+        assert [len(block) for block in blocks_of(made)] == expected
+        assert gzip.decompress(made) == data.tobytes()
+    small = [Run(20, compression.NOISE), Run(30)]
+    assert len(blocks_of(b"".join(compression.gzip_member([data[:50]], small, 5, 1, silent)))) == 1
+
+
+@pytest.mark.parametrize("missing", [-1, 1])
+def test_pieces_hold_what_the_runs_say(missing: int) -> None:
+    data = sample(BLOCK + 30)
+    with pytest.raises(ValueError, match="of a block are missing" if missing > 0 else "more data than blocks"):
+        list(compression.gzip_member([data], [Run(data.size + missing)], 5, 1, silent))
+
+
+def patterns() -> dict[str, np.ndarray]:
+    """Data on which ways differ: bytes that repeat by chance, triples that repeat, runs, and distant repetitions."""
+    rng, size = np.random.default_rng(3), BLOCK + 10_000
+    triples = rng.integers(0, 256, (300, 3))[rng.integers(0, 300, size // 3)]
+    runs = np.repeat(rng.integers(0, 3, size // 40), rng.integers(30, 50, size // 40))
+    found = {
+        "chance": rng.normal(128, 20, size).astype(np.uint8),
+        "triples": triples.ravel(),
+        "runs": runs,
+        "words": np.tile(rng.integers(0, 256, 1 << 12), size >> 12),
+    }
+    return {name: np.resize(values, size).astype(np.uint8) for name, values in found.items()}
+
+
+@pytest.mark.parametrize("ways", [compression.NOISE, compression.TRIPLES, compression.RUNS])
+@pytest.mark.parametrize("kind", ["chance", "triples", "runs", "words"])
+def test_of_several_ways_the_smallest_is_taken(kind: str, ways: tuple[Way, ...]) -> None:
+    data = patterns()[kind]
+
+    def size_of(*some: Way) -> int:
+        made = b"".join(compression.gzip_member([data], [Run(data.size, some)], 5, 1, silent))
+        assert gzip.decompress(made) == data.tobytes()
+        return len(made)
+
+    assert size_of(*ways) <= 1.001 * min(map(size_of, ways))
+
+
+def test_each_way_is_the_smallest_for_some_data() -> None:
+    kinds = patterns()
+    for ways, kind, first in [
+        (compression.NOISE, "chance", True),
+        (compression.NOISE, "words", False),
+        (compression.TRIPLES, "triples", True),
+        (compression.RUNS, "words", False),
+    ]:
+        sizes = [len(packed_by(way, kinds[kind])) for way in ways]
+        assert (sizes[0] < sizes[1]) == first, kind
+
+
+def packed_by(way: Way, data: np.ndarray) -> bytes:
+    return b"".join(compression.gzip_member([data], [Run(data.size, (way,))], 5, 1, silent))
+
+
+@pytest.mark.parametrize("level", [1, 4])
+def test_a_low_level_means_haste_whatever_the_data_are(level: int) -> None:
+    data = patterns()["triples"]
+    for ways in (compression.TRIPLES, compression.LINKS):
+        run = Run(data.size, ways)
+        assert b"".join(compression.gzip_member([data], [run], level, 1, silent)) == packed(data, level=level)
 
 
 def test_progress_ends_at_the_end() -> None:
     said: list[tuple[str, int, int, str]] = []
     data = sample(3 * BLOCK + 7)
-    list(compression.gzip_member([data], data.size, 1, 2, lambda *args: said.append(args)))
+    list(compression.gzip_member([data], [Run(data.size)], 1, 2, lambda *args: said.append(args)))
     assert said == [("writing", min(BLOCK * (i + 1), len(data)), len(data), "B") for i in range(4)]
-
-
-@pytest.mark.parametrize("sizes", [[10], [1, 2, 3], [0, 10_000, 0, 1], [20_000]])
-def test_inflating_gives_what_is_asked_for(sizes: list[int]) -> None:
-    data = bytes(range(256)) * 100
-    inflate = compression.Inflate(io.BytesIO(gzip.compress(data)))
-    at = 0
-    for size in sizes:
-        assert inflate.read(size) == data[at : at + size]
-        at += size
-    with pytest.raises(FormatError, match="more data"):
-        inflate.finish(allow_more=False)
-    inflate.finish(allow_more=True)
-
-
-def test_inflating_beyond_the_end_gives_less() -> None:
-    inflate = compression.Inflate(io.BytesIO(gzip.compress(b"some")))
-    assert inflate.read(10) == b"some"
-    inflate.finish(allow_more=False)
-
-
-@pytest.mark.parametrize("cut", range(1, 9))
-def test_a_truncated_checksum_is_refused(cut: int) -> None:
-    inflate = compression.Inflate(io.BytesIO(gzip.compress(b"some")[:-cut]))
-    inflate.read(4)
-    with pytest.raises(FormatError, match="checksum is missing"):
-        inflate.finish(allow_more=False)
-
-
-def test_a_bomb_is_never_inflated_whole() -> None:
-    bomb = gzip.compress(bytes(50_000_000), 9)
-    tracemalloc.start()
-    try:
-        inflate = compression.Inflate(io.BytesIO(bomb))
-        assert inflate.read(1000) == bytes(1000)
-        with pytest.raises(FormatError, match="more data"):
-            inflate.finish(allow_more=False)
-        assert tracemalloc.get_traced_memory()[1] < 1_000_000
-    finally:
-        tracemalloc.stop()
 
 
 PROMISED = 10 * compression.MAX_RATIO * compression.TRUSTED_SIZE

@@ -9,13 +9,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from zlib_ng import zlib_ng
 
+from ...model.coding import ScaleCoding
 from ...model.lod_tree import LodTree
 from ...model.sh import COEFFICIENTS
 from ...model.splats import FloatArray, Splats
 from ...support.errors import FormatError, TooLongError, TruncatedError
 from .. import octahedral
+from ..inflate import ERRORS, raw_unpacker
 from ..promises import check, error_of
 from ..quantize import Bytes, quat_of_xyz
 from . import promises
@@ -23,9 +24,6 @@ from .encodings import CODINGS
 from .header import read_chunk_header
 from .layout import BY_NAME, SIZES, Row
 from .records import Property, RadChunkHeader, RadHeader
-
-_ZlibError: Any = zlib_ng.error  # the stubs take the class for an instance
-_RAW = -zlib_ng.MAX_WBITS
 
 
 @dataclass(frozen=True)
@@ -56,6 +54,13 @@ class Packed:
     def property(self, name: str) -> Property | None:
         """A property by its name; None where the chunk has none."""
         return next((each for each in self.header.properties if each.name == name), None)
+
+    def scale_coding(self) -> ScaleCoding:
+        """How the chunk holds its scales."""
+        found = self.property("scales")
+        if found is None or not found.encoding.startswith("ln_"):
+            return ScaleCoding()
+        return ScaleCoding(found.encoding, found.min or 0.0, found.max or 0.0)
 
     def palette(self, header: RadHeader) -> FloatArray | None:
         """(codes, K, 3) SH coefficients that labels point to; None where the chunk has no palette.
@@ -90,11 +95,11 @@ class Packed:
         data = self.payload[each.offset : each.offset + each.bytes]
         what = f"{each.name} of chunk {self.number:,}"
         if each.compression is not None:
-            unpacker = zlib_ng.decompressobj(_RAW)
+            unpacker = raw_unpacker()
             try:
                 data = unpacker.decompress(data, expected + 1)  # a byte more, which tells what is too long
-            except _ZlibError as error:
-                raise FormatError(f"corrupt data in {what}: {error}") from None
+            except ERRORS:
+                raise FormatError(f"corrupt data in {what}") from None
             if len(data) == expected and not unpacker.eof:
                 raise TruncatedError(f"{what} is cut short: its compressed data do not end")
         if len(data) > expected:

@@ -181,7 +181,7 @@ def find_partners_in_cells(lanes, count, cell, place, largest, cost, best, at):
         best[i], at[i] = NEVER, -1
     for step in range(1, min(WINDOW, count - 1) + 1):
         pairs = count - step
-        pair_costs(lanes, step, pairs, largest, cost)
+        pair_costs(lanes, 0, step, pairs, largest, cost)
         for i in range(pairs):
             price = cost[i] if cost[i] < most else most  # also where it is not a number
             cost[i] = price if cell[i] == cell[i + step] else NEVER

@@ -34,8 +34,8 @@ from .cut_arrays import (
 from .pixel_scale import ZERO
 from .refine import lowered, refine, visit_roots
 
-#: Steps. WHOLE is all that there is for one thread, also where parts cannot find a cut. Of several threads, SOW, PLAN and
-#: FINISH are taken by one, REFINE and COLLECT by each part.
+#: Steps. WHOLE is all that there is for one thread, also where parts cannot find a cut. Of several threads, SOW, PLAN
+#: and FINISH are taken by one, REFINE and COLLECT by each part.
 WHOLE, SOW, PLAN, REFINE, COLLECT, FINISH = range(6)
 
 #: In place of the limit of a node that was dealt to another part: larger than any but the largest bucket's, so that

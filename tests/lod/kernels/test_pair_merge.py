@@ -9,14 +9,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sparklod_cli.lod.kernels import pair_merge, profile
+from sparklod_cli.lod.kernels import pair_merge, pair_overlap, profile
 from sparklod_cli.lod.kernels.pair_cost import CENTER, COLOR, COVARIANCE, COVERED, DENSITY, LOG_DET, WEIGHT
 from sparklod_cli.lod.pairs.binary import BinaryTree
 from sparklod_cli.model.gaussian import lod_opacity
 from tests.references import gaussians
 from tests.references import quality as twin
 
-PLANES = {(0, 1): pair_merge.PLANES[0], (0, 2): pair_merge.PLANES[1], (1, 2): pair_merge.PLANES[2]}
+#: Axes of the planes of `overlaps`, in its order.
+PLANES = ((0, 1), (0, 2), (1, 2))
 
 
 def test_semi_axes_are_roots_of_eigenvalues() -> None:
@@ -38,12 +39,20 @@ def test_semi_axes_of_what_is_round_or_flat(variances: tuple[float, float, float
     assert min(got) >= pair_merge.SHORTEST
 
 
+def overlap_share(a: np.ndarray, b: np.ndarray) -> float:
+    return float(pair_overlap.overlap_share(pair_overlap.overlaps(a, b), a[DENSITY], b[DENSITY]))
+
+
+def picture_error(a: np.ndarray, b: np.ndarray, merged: np.ndarray) -> float:
+    return float(pair_overlap.picture_error(a, b, merged, pair_overlap.overlaps(a, b)))
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_products_on_planes_are_integrals(seed: int) -> None:
     a, b = twin.random_rows(2, seed, spread=0.7)
-    for axes, plane in PLANES.items():
+    for axes, found in zip(PLANES, pair_overlap.overlaps(a, b), strict=True):
         expected = np.array(twin.integrals(a, b, axes)) / (2 * math.pi)
-        np.testing.assert_allclose(pair_merge.overlap_on_plane(a, b, plane), expected, rtol=1e-5)
+        np.testing.assert_allclose(found, expected, rtol=1e-5)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -55,7 +64,7 @@ def test_the_overlap_is_that_of_integrals(seed: int) -> None:
         area_a, area_b = a[DENSITY] * area_a, b[DENSITY] * area_b
         shared += min(a[DENSITY] * b[DENSITY] * both, area_a, area_b)
         alone += area_a + area_b
-    assert pair_merge.overlap_share(a, b) == pytest.approx(shared / alone, rel=1e-5)
+    assert overlap_share(a, b) == pytest.approx(shared / alone, rel=1e-5)
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -72,18 +81,18 @@ def test_the_error_of_a_picture_is_an_integral(seed: int) -> None:
             total += high[0] ** 2 * over(a, a) + high[1] ** 2 * over(b, b) + high[2] ** 2 * over(merged, merged)
             total += 2 * high[0] * high[1] * over(a, b)
             total -= 2 * high[2] * (high[0] * over(a, merged) + high[1] * over(b, merged))
-    assert pair_merge.picture_error(a, b, merged) == pytest.approx(total / (2 * math.pi), rel=1e-4)
+    assert picture_error(a, b, merged) == pytest.approx(total / (2 * math.pi), rel=1e-4)
 
 
 def test_a_merged_node_that_looks_as_its_two_is_without_error() -> None:
     a, nothing = twin.random_rows(2, seed=5)
     nothing[DENSITY] = 0
-    assert pair_merge.picture_error(a, nothing, a) == pytest.approx(0, abs=1e-5)
+    assert picture_error(a, nothing, a) == pytest.approx(0, abs=1e-5)
 
 
 def united(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     merged = np.zeros_like(a)
-    pair_merge.merge_pair(a, b, merged)
+    pair_merge.merge_pair(a, b, pair_overlap.overlaps(a, b), merged)
     return merged
 
 
@@ -93,7 +102,7 @@ def test_two_equal_splats_overlap_by_a_quarter() -> None:
     a[COVERED] /= a[DENSITY]
     a[DENSITY] = 1
     merged = united(a, a)
-    assert pair_merge.overlap_share(a, a) == pytest.approx(1 / 4)
+    assert overlap_share(a, a) == pytest.approx(1 / 4)
     assert merged[COVERED] == pytest.approx(1.5 * a[COVERED], rel=1e-6)
     np.testing.assert_allclose(merged[CENTER : CENTER + 3], a[CENTER : CENTER + 3], atol=1e-6)
     expected = 7 / 6 * twin.matrix(a)
@@ -185,7 +194,7 @@ def test_pairs_become_rows_that_cover_as_much_and_are_as_large_as_they_are_drawn
         opacity, spread = profile.profile_of(float(row[DENSITY]), profile.is_needle(*axes**2))
         larger = 1 + 0.7 * max(0.0, float(lod_opacity(np.float32([opacity]))[0]) - 1)
         assert seen == pytest.approx(2 * axes.mean() / math.sqrt(spread) * larger, rel=1e-5)
-        assert off == pytest.approx(pair_merge.picture_error(a, b, row), rel=1e-6)
+        assert off == pytest.approx(picture_error(a, b, row), rel=1e-6)
 
 
 def merge(tree: BinaryTree, pairs: np.ndarray) -> None:
