@@ -67,7 +67,7 @@ def cut(
         settings: foveation, pixel-scale limit and so on; Spark 2's on a desktop unless given, and for detail levels
             those of PlayCanvas.
         continuous: a cut that fades nodes into their children; the width of that, or True for 1.25.
-            precision: of the centres and sizes of a tree: "float32", or their half floats, "float16"; or what Spark has of
+        precision: of the centres and sizes of a tree: "float32", or their half floats, "float16"; or what Spark has of
             it, for the same cut to the last node: "ext" with `extSplats`, else "packed", or "packed-pages" where Spark
             streams a RAD file. Of a tree that was not read from a file, Spark's are taken to be its own numbers.
         threads: to prepare the trees on, and to find a large cut; None for all processors.
