@@ -71,7 +71,7 @@ class _Made:
     """What is written.
 
     Attributes:
-        nodes, tree: the tree.
+        built: the tree, in a list so that whoever takes it out can free it.
         leaves: how many it has.
         dropped: the splats that were left out, by reason.
         output: where it goes.
@@ -79,8 +79,7 @@ class _Made:
         is_ordered: its nodes are in the order of a file of the same format already.
     """
 
-    nodes: Splats
-    tree: LodTree
+    built: list[tuple[Splats, LodTree]]
     leaves: int
     dropped: dict[str, int]
     output: Output
@@ -149,7 +148,7 @@ def bake(
             made = _kept(source, scenes, settings, output, clock)
         else:
             made = _built(scenes, settings, output, clock, threads, progress)
-        nodes, tree, fitted = made.nodes, made.tree, None
+        (nodes, tree), fitted = made.built.pop(), None
         if fitting is not None:
             whole, fitted = refined(
                 Scene(nodes, tree, antialiased), fitting, threads=threads, progress=progress, say=say
@@ -158,9 +157,13 @@ def bake(
             clock.end("refine")
         if output.in_chunks and not made.is_ordered:
             with on_threads(threads):
-                from ..lod.chunk_order import arrange
+                from ..lod.chunk_order import chunk_order
+                from ..lod.families import taken
 
-                nodes, tree = arrange(nodes, tree, progress=progress)
+                order, child_start = chunk_order(nodes, tree, progress=progress)
+                built = [(nodes, tree)]
+                del nodes, tree
+                nodes, tree = taken(built, order, child_start)
             clock.end("arrange")
         environment = made.environment if environment is None else environment
         written = made.output.write(Scene(nodes, tree, antialiased), environment, clock, threads, progress)
@@ -213,7 +216,7 @@ def _kept(source: Source, scenes: list[Scene], settings: BakeSettings, output: O
     else:
         output = output.converting()
     clock.end("read")
-    return _Made(scene.splats, scene.tree, leaves, {}, output, is_ordered=is_ordered)
+    return _Made([(scene.splats, scene.tree)], leaves, {}, output, is_ordered=is_ordered)
 
 
 def _built(
@@ -237,9 +240,8 @@ def _built(
             from ..lod.band_order import banded
 
             built = [banded(built)]
-    nodes, tree = built.pop()
     clock.end("build")
-    return _Made(nodes, tree, leaves, dropped, output, environment)
+    return _Made(built, leaves, dropped, output, environment)
 
 
 def _recolored(splats: Splats, rgba: Path | None) -> Splats:

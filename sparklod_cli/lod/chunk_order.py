@@ -22,7 +22,7 @@ from ..model.splats import FloatArray, Splats
 from ..support.jit import threads_for
 from ..support.progress import Progress, silent
 from .chunk_parts import Index, parts_of
-from .families import families_of, placed
+from .families import families_of, placed, taken
 from .foveation import set_foveation
 from .kernels.chunk_demand import fill_demand
 from .kernels.chunk_inside import sort_within_chunks
@@ -70,7 +70,7 @@ def arrange(splats: Splats, tree: LodTree, *, progress: Progress = silent) -> tu
         progress: called with the number of nodes that have a chunk.
     """
     order, child_start = chunk_order(splats, tree, progress=progress)
-    return splats.take(order), LodTree(tree.child_count[order], child_start)
+    return taken([(splats, tree)], order, child_start)
 
 
 def chunk_order(

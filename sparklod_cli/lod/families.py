@@ -6,7 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..model.lod_tree import LodTree
-from ..model.splats import Splats
+from ..model.splats import FloatArray, Splats
+from ..support.jit import threads_in_use
+from ..support.parallel import for_blocks
 from .kernels.tree_links import find_parents
 
 
@@ -59,5 +61,17 @@ def taken(
     columns = dict(vars(nodes))
     del nodes
     for name in columns:
-        columns[name] = columns[name][order]
+        columns[name] = _rows(columns[name], order)
     return Splats(**columns), LodTree(tree.child_count[order], child_start)
+
+
+def _rows(column: FloatArray, order: NDArray[np.uint32]) -> FloatArray:
+    """`column[order]`, copied on the threads of kernels."""
+    found = np.empty((len(order), *column.shape[1:]), column.dtype)
+
+    def copy(part: slice) -> None:
+        # "clip" lets numpy write to `found` at once; with its default it has a copy of its own.
+        np.take(column, order[part], axis=0, out=found[part], mode="clip")
+
+    for_blocks(copy, len(order), threads_in_use(), lambda done: None)
+    return found
