@@ -62,7 +62,7 @@ JOBS = {
             *("tree_links.add_weighted", "tree_links.fill_weights", "tree_links.sum_by_depth"),
             *("digits.count_digits", "digits.sh_lengths"),
         ),
-        ("inspect shiny.spz --check --stats",),
+        ("inspect shiny.spz --check --stats --json",),
     ),
     "quality": Job(
         (
