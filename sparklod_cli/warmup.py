@@ -68,6 +68,7 @@ JOBS = {
         (
             *("geometry.find_bounds", "final_order.fill_leaves", "final_order.merge_colors", "sort.sort_pass"),
             *("node_rows.fill_leaf_rows", "node_rows.fill_merged_splats", "node_rows.morton_keys"),
+            "curve_sort.sort_along_curve",
             *("pair_cost.find_partners", "pair_cost.match_pairs", "pair_merge.merge_pairs", "prune.drop_nodes"),
             *("prune.fill_usefulness_terms", "prune.lay_out_children", "prune.size_ranks"),
             *("family_links.find_limits", "tree_links.find_parents"),

@@ -15,12 +15,12 @@ from __future__ import annotations
 import numpy as np
 
 from ..model.lod_tree import LodTree
-from ..model.splats import Splats
+from ..model.splats import FloatArray, Splats
 from ..support.defaults import DEFAULT_GROWTH, MAX_GROWTH, MIN_GROWTH
 from ..support.jit import threads_for
 from ..support.progress import Progress, silent
 from .check import check, check_setting
-from .pairs.binary import BinaryTree, levels_of, lowest_level, merge_levels
+from .pairs.binary import BinaryTree, Levels, levels_of, lowest_level, merge_levels
 from .pairs.curve import Curve
 from .pairs.final_tree import Wanted, in_final_order
 
@@ -53,9 +53,15 @@ def build(splats: Splats, growth: float = DEFAULT_GROWTH, *, progress: Progress 
     with threads_for(n) as threads:
         index = curve.order(splats.center, threads)
         binary = BinaryTree.of_leaves(*curve.leaf_rows(splats, index))
-        levels = levels_of(binary.size[:n])
-        merge_levels(binary, np.maximum(levels, lowest_level(levels)), curve, None, progress)
-        del levels
+        merge_levels(binary, _levels(binary.size[:n]), curve, None, progress)
         wanted = Wanted(max(int(growth * n) - n, 1), n)
-        final = in_final_order(binary, index, splats, wanted, curve, progress)
+        columns = dict(vars(splats))
+        del splats
+        final = in_final_order(binary, index, columns, wanted, curve, progress)
         return final.splats, final.tree
+
+
+def _levels(size: FloatArray) -> Levels:
+    """(n,) levels that leaves of a size, in units, join at."""
+    levels = levels_of(size)
+    return np.maximum(levels, lowest_level(levels), out=levels)

@@ -32,7 +32,7 @@ def merge_colors(parents, child_start, child_count, order, weight, color, blocks
         parents: (G,) final indices of the nodes.
         child_start, child_count: of the whole tree.
         order: (M,) uint32, the node of each final index.
-        weight: (nodes,) float64, of each node.
+        weight: (nodes,) of each node.
         color: (M, J) float32 in final order; rows `parents` are filled.
         blocks: ranges of nodes to process in parallel; the result does not depend on it.
     """
@@ -46,7 +46,7 @@ def merge_colors(parents, child_start, child_count, order, weight, color, blocks
                 total[k] = 0.0
             begin = np.int64(child_start[node])
             for child in range(begin, begin + child_count[node]):
-                w = weight[order[child]]
+                w = np.float64(weight[order[child]])
                 total_weight += w
                 for k in range(width):
                     total[k] += w * color[child, k]

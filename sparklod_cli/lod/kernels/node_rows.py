@@ -74,6 +74,16 @@ def fill_leaf_rows(index, splats, rgb, space, rows, size):
         size[i] = max(2 * (a + b + c) / 3, LEAST)
 
 
+@kernel(inline=True)
+def place_on_curve(rows, at, low, step):
+    """The Morton code of the centre of row `at`; see `morton_keys`."""
+    most = float((1 << CURVE_BITS) - 1)
+    x = np.uint64(min(max((rows[at, CENTER] - low[0]) / step, 0.0), most))
+    y = np.uint64(min(max((rows[at, CENTER + 1] - low[1]) / step, 0.0), most))
+    z = np.uint64(min(max((rows[at, CENTER + 2] - low[2]) / step, 0.0), most))
+    return interleave(x, y, z)
+
+
 @kernel(parallel=True)
 def morton_keys(rows, nodes, low, step):
     """Morton codes of nodes, of CURVE_BITS per axis; centres outside the curve's box are clamped to it.
@@ -88,13 +98,8 @@ def morton_keys(rows, nodes, low, step):
         (n,) uint64.
     """
     keys = np.empty(len(nodes), np.uint64)
-    most = float((1 << CURVE_BITS) - 1)
     for i in prange(len(nodes)):
-        row = rows[nodes[i]]
-        x = np.uint64(min(max((row[CENTER] - low[0]) / step, 0.0), most))
-        y = np.uint64(min(max((row[CENTER + 1] - low[1]) / step, 0.0), most))
-        z = np.uint64(min(max((row[CENTER + 2] - low[2]) / step, 0.0), most))
-        keys[i] = interleave(x, y, z)
+        keys[i] = place_on_curve(rows, nodes[i], low, step)
     return keys
 
 

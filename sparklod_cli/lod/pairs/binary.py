@@ -130,6 +130,7 @@ def merge_levels(
     by_level = np.argsort(levels, kind="stable").astype(np.uint32)
     lowest = int(levels.min())
     ends = np.cumsum(np.bincount(levels - lowest))
+    del levels
     active = np.empty(0, np.uint32)
     waiting: list[tuple[Nodes, Levels]] = []
     joined = level = 0
@@ -167,8 +168,9 @@ def _merge(
     done, leaves = 0, binary.leaves
     while len(active) > 1 and (rounds is None or done < rounds):
         with threads_for(len(active)) as threads:
-            active = curve.sort(binary.rows, binary.rows_of(active), active, binary.rounds, threads)
-            partner, cost = pair_cost.find_partners(binary.rows, binary.rows_of(active), WINDOW, np.float32(largest))
+            active, at = curve.sort(binary.rows, binary.row, active, binary.rounds, threads)
+            partner, cost = pair_cost.find_partners(binary.rows, at, WINDOW, np.float32(largest))
+            del at
             before = len(active)
             pairs, rest = pair_cost.match_pairs(active, partner, cost, _largest_cost(cost), binary.used)
             if rounds is None and not len(pairs):  # no finite cost: too far apart for float32

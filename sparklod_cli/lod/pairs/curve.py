@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from ...model.splats import FloatArray, Splats
 from ..check import Bounds
 from ..kernels import node_rows, pair_cost
+from ..kernels.curve_sort import sort_along_curve
 from ..kernels.geometry import SplatColumns
-from ..kernels.sort import Keys, Nodes, sort_by_key
+from ..kernels.sort import Keys, Nodes
 
 #: Sample size for the scene's middle, unit and box. Chosen.
 SAMPLE = 1 << 14
@@ -71,7 +72,7 @@ class Curve:
         units = np.subtract(center, self.middle, dtype=np.float64)
         units /= self.unit
         everything = np.arange(len(center), dtype=np.uint32)
-        return self.sort(units.astype(np.float32), everything, everything, 0, threads)
+        return self.sort(units.astype(np.float32), everything[:0], everything, 0, threads)[0]
 
     def leaf_rows(self, splats: Splats, index: Nodes) -> tuple[FloatArray, FloatArray]:
         """(n, WIDTH) node rows and (n,) feature sizes, in units, of some splats."""
@@ -80,21 +81,26 @@ class Curve:
         node_rows.fill_leaf_rows(index, columns, splats.rgb, self.space, rows, size)
         return rows, size
 
-    def sort(self, rows: FloatArray, at: Nodes, values: Nodes, turn: int, threads: int) -> Nodes:
-        """Sorts values along the curve of a round.
+    def sort(self, rows: FloatArray, row: Nodes, nodes: Nodes, turn: int, threads: int) -> tuple[Nodes, Nodes]:
+        """Sorts nodes along the curve of a round.
 
         Args:
-            rows: node rows.
-            at: (n,) uint32 rows of the values.
-            values: (n,) uint32.
+            rows: (N, ...) node rows, as many as there are leaves.
+            row: (N,) uint32 row of each merged node; that of a leaf is its own.
+            nodes: (n,) uint32.
             turn: number of the round.
             threads: number of threads.
+
+        Returns:
+            (n,) uint32 nodes, and (n,) uint32 their rows.
         """
-        _, values = sort_by_key(self.keys(rows, at, turn), values.copy(), 3 * node_rows.CURVE_BITS, threads)
-        return values
+        return sort_along_curve(rows, row, len(rows), nodes, *self._grid(turn), threads)
 
     def keys(self, rows: FloatArray, at: Nodes, turn: int) -> Keys:
         """(n,) Morton codes of rows on the curve of a round."""
+        return node_rows.morton_keys(rows, at, *self._grid(turn))
+
+    def _grid(self, turn: int) -> tuple[NDArray[np.float64], float]:
+        """The lowest corner of the curve's box in a round, and the edge of a cell, units."""
         shift = np.modf(np.array([1, 2, 3]) * GOLDEN * turn)[0] * SLACK * self.extent
-        step = (1 + SLACK) * self.extent / (1 << node_rows.CURVE_BITS)
-        return node_rows.morton_keys(rows, at, self.low - shift, step)
+        return self.low - shift, (1 + SLACK) * self.extent / (1 << node_rows.CURVE_BITS)

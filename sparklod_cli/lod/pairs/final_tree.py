@@ -18,6 +18,10 @@ from ..kernels.sort import Keys, Nodes, sort_by_key
 from .binary import BinaryTree
 from .curve import Curve
 
+#: Columns of splats that merged ones have of their node rows, and those that they have of their children.
+GEOMETRY = ("center", "scale", "quat_xyzw", "opacity")
+COLORS = tuple(name for name in COLUMNS if name not in GEOMETRY)
+
 
 @dataclass(frozen=True)
 class Wanted:
@@ -70,14 +74,15 @@ class FinalTree:
 
 
 def in_final_order(
-    binary: BinaryTree, index: Nodes, splats: Splats, wanted: Wanted, curve: Curve, progress: Progress
+    binary: BinaryTree, index: Nodes, columns: dict[str, FloatArray], wanted: Wanted, curve: Curve, progress: Progress
 ) -> FinalTree:
     """Prunes a tree, and writes its nodes and their colours in final order. The binary tree is of no use afterwards.
 
     Args:
         binary: the tree.
         index: (N,) splat of each of its leaves.
-        splats: as the leaves are drawn.
+        columns: of the splats as the leaves are drawn; emptied, so that they are freed one by one where nobody else
+            holds them.
         wanted: of the nodes.
         curve: for the order of nodes of one rank.
         progress: told of the nodes.
@@ -87,28 +92,32 @@ def in_final_order(
     inner, ranks, keys = _by_rank(binary, rank[: len(rank) - hidden], curve)
     del rank
     slots = inner - np.uint32(n)
-    rows = binary.rows[binary.row[slots]]
-    binary.rows, binary.spare = rows, np.empty(0, np.uint32)  # frees the rows of what was dropped
+    binary.spare = np.empty(0, np.uint32)
+    binary.rows = rows = binary.rows[binary.row[slots]]  # frees those of what was dropped
     binary.row[slots] = np.arange(len(inner), dtype=np.uint32)
     total = n + len(inner) + hidden
     progress("ordering", 0, total, "node")
     order = np.empty(total, np.uint32)
     tree = LodTree(np.zeros(total, np.uint16), np.zeros(total, np.uint32))
     root = np.full(hidden, len(parent) - 1, np.uint32)
-    columns = order, tree.child_start, tree.child_count
-    parents = prune.lay_out_children(np.concatenate([root, inner]), n, parent, saved, *columns)[hidden:]
+    links = order, tree.child_start, tree.child_count
+    parents = prune.lay_out_children(np.concatenate([root, inner]), n, parent, saved, *links)[hidden:]
     del parent, saved
-    out = Splats.empty(total, degree_of(splats.sh.shape[1]))
-    geometry = out.center, out.scale, out.quat_xyzw, out.opacity
-    places = (column[hidden:] for column in geometry)
+    out = Splats.empty(total, degree_of(columns["sh"].shape[1]))
+
+    def fill(name: str) -> None:
+        fill_leaves(order, index, columns.pop(name).reshape(n, -1), getattr(out, name).reshape(total, -1))
+
+    for name in GEOMETRY:
+        fill(name)
+    places = (getattr(out, name)[hidden:] for name in GEOMETRY)
     node_rows.fill_merged_splats(order[hidden:], n, binary.row, rows, curve.space, *places)
-    of_merged = rows[:, pair_cost.WEIGHT].copy()
+    weights = np.empty(binary.used, np.float32)
+    weights[:n], weights[inner] = binary.weight, rows[:, pair_cost.WEIGHT]
     if wanted.is_whole:  # frees the rows before memory for colours is touched
         binary.rows = rows = rows[:0].copy()
-    for name in COLUMNS:
-        fill_leaves(order, index, getattr(splats, name).reshape(n, -1), getattr(out, name).reshape(total, -1))
-    weights = np.empty(binary.used, np.float64)
-    weights[:n], weights[inner] = binary.weight, of_merged
+    for name in COLORS:
+        fill(name)
     ends = np.concatenate([np.flatnonzero(np.diff(ranks, prepend=ranks[:1] - 1)), [len(inner)]])
     for begin, end in zip(ends[-2::-1], ends[:0:-1], strict=True):
         with threads_for(int(end - begin)) as threads:

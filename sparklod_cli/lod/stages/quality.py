@@ -153,7 +153,7 @@ def advance(
         border = None if region is None else _Border.of(region, curve)
         left = merge_levels(binary, nodes.level, curve, border, progress)
         wanted = _wanted(nodes, len(left[0]), region, plan)
-        final = in_final_order(binary, index, splats, wanted, plan.curve, progress)
+        final = in_final_order(binary, index, _columns(splats), wanted, plan.curve, progress)
     numbers = np.full(len(final.order), NO_FAMILY, np.int64)
     is_leaf = final.order < count
     numbers[is_leaf] = nodes.family[final.order[is_leaf]]
