@@ -10,6 +10,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from ..model.coding import FileCoding, ScaleCoding
 from ..model.lod_tree import LodTree
 from ..model.scene import Scene
 from ..model.sh import notes_on_degree
@@ -32,6 +33,9 @@ STREAM_SIZES = struct.Struct("<QQ")  # of a version 4 stream: compressed, uncomp
 
 #: Versions that are read.
 READABLE = (1, 2, 3, 4)
+
+#: How all versions hold scales.
+CODING = FileCoding((ScaleCoding("spz"),), 1)
 
 
 def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> Scene:
@@ -73,7 +77,7 @@ def examine(
         done += count
         progress("reading", done, layout.total, "B")
     antialiased, notes = bool(layout.flags & ANTIALIASED), _notes(layout, header)
-    return Scene(splats, tree, antialiased, _name_of(layout), notes, _facts(layout) | header)
+    return Scene(splats, tree, antialiased, _name_of(layout), notes, _facts(layout) | header, coding=CODING)
 
 
 def stream(file: BinaryIO, *, scratch: Scratch, threads: int = 1, progress: Progress = silent) -> SceneStream:

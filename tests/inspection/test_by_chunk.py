@@ -91,7 +91,7 @@ def test_a_chunk_is_what_all_of_them_have_in_its_place(tmp_path: Path) -> None:
     file = RadFile.open(tree(240, chunk=24, max_sh=1, palette=True).write(tmp_path / "a.rad"))
     assert file is not None
     for number, (start, splats, nodes) in enumerate(file.chunks({"center", "sh"}, thorough=True, threads=2)):
-        some, tree_of_some = file.chunk(number, {"center"})
+        some, tree_of_some, _ = file.chunk(number, {"center"})
         assert start == 24 * number
         assert np.array_equal(splats.center, some.center)
         assert splats.sh.any()
