@@ -113,8 +113,18 @@ JOBS = {
         ("build-lod shiny.spz --format rad --cluster-sh 4 -o palette.rad",),
     ),
     "streamed-sog": Job(
-        ("region_errors.compare_levels", "row_hash.hash_rows", "shade.add_sh", "tree_links.find_parents"),
-        ("build-lod shiny.spz -o web/lod-meta.json",),
+        (
+            *("region_errors.compare_levels", "row_hash.hash_rows", "shade.add_sh", "tree_links.find_parents"),
+            *(
+                "texels.fill_quats",
+                "texels.gather_rows",
+                "texels.look_up",
+                "texels.look_up_words",
+                "texels.place_bytes",
+            ),
+            *("webp_codes.read_codes", "webp_pixels.read_pixels", "webp_transforms.undo"),
+        ),
+        ("build-lod shiny.spz -o web/lod-meta.json", "inspect web/lod-meta.json --check"),
     ),
 }
 
