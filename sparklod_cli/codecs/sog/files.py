@@ -10,7 +10,6 @@ from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL.WebPImagePlugin import WebPImageFile
 
 from ...support.errors import ChecksumError, FormatError, NotSplatsError
 from ...support.units import count_of
@@ -233,6 +232,8 @@ def _webp_size(data: bytes, name: str) -> tuple[int, int]:
 
 
 def _decode_webp(data: bytes, name: str) -> Texels:
+    from PIL.WebPImagePlugin import WebPImageFile  # every command loads this module, and few decode images
+
     try:
         # Not by Image.open, which warns of large images and refuses larger ones: the size has been checked above.
         with WebPImageFile(io.BytesIO(data)) as image:
