@@ -15,6 +15,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from bench_sog import splat_transform
 from performance.machine import machine
 from performance.rows import Row, Table, figure, label, ratio
 from scenes import load, tiled
@@ -40,16 +41,12 @@ TABLE = Table(
     judged=("read_s", "peak_bytes"),
 )
 
-#: Ends of the names of files that sparklod writes, with their SH degree: SOG is without SH,
-#: since clustering those of millions of splats takes long.
-OURS = {".ply": 3, ".splat": 0, ".rad": 3, "-sh0.sog": 0}
+#: Ends of the names of files that sparklod writes, with their SH degree: SOG is without SH, since clustering those of
+#: millions of splats takes long.
+OURS = {".ply": 3, ".splat": 0, ".rad": 3, "-v3.spz": 3, "-sh0.sog": 0}
 
-#: The same of files that splat-transform writes from the first of them, with its options.
-THEIRS: dict[str, dict[str, Any]] = {
-    ".compressed.ply": {},
-    "-v3.spz": {"spzVersion": 3},
-    "-v4.spz": {"spzVersion": 4},
-}
+#: The same of files that splat-transform writes from the first of them.
+THEIRS = (".compressed.ply", "-v4.spz")
 
 #: Those that have goals at sizes where the others take long to make.
 LARGE = (".ply", ".splat", "-sh0.sog")
@@ -118,17 +115,16 @@ def peak(path: Path) -> int:
     return int(result.stdout) * 1024
 
 
-def made(splats: Splats, stem: str, folder: Path, transform: SplatTransform, names: Sequence[str]) -> Iterator[Path]:
+def made(splats: Splats, stem: str, folder: Path, names: Sequence[str]) -> Iterator[Path]:
     """Yields a file of some splats in each of `OURS` and `THEIRS` that is asked for, and can be had."""
     for name in names:
         path = folder / f"{stem}{name}"
         if name in OURS:
             sparklod.write(path, sparklod.Scene(splats.with_max_sh(OURS[name])), overwrite=True)
             yield path
-        else:
-            plain = folder / f"{stem}.ply"
-            if transform.ask(write=str(path), source=str(plain), options=THEIRS[name]) is not None:
-                yield path
+        elif "FOREIGN_DIR" in os.environ:
+            splat_transform(folder / f"{stem}.ply", path)
+            yield path
 
 
 def rows(paths: Iterable[Path], transform: SplatTransform, runs: int) -> Iterator[Row]:
@@ -156,7 +152,7 @@ def tiled_rows(
     """Rows of files of a scene tiled to a size, in all formats or in some."""
     splats = tiled(load(source), round(million * 1e6))
     with tempfile.TemporaryDirectory() as folder:
-        files = made(splats, f"tiled-{million:g}M", Path(folder), transform, names)
+        files = made(splats, f"tiled-{million:g}M", Path(folder), names)
         yield from rows(files, transform, runs)
 
 
