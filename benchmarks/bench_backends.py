@@ -12,7 +12,7 @@ from importlib import import_module
 from pathlib import Path
 
 import numpy as np
-from bench_build import machine
+from performance.machine import machine
 from scenes import load
 
 from sparklod_cli.cameras.camera import Camera

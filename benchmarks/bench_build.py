@@ -5,80 +5,98 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import platform
-import statistics
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
-import numpy as np
+from performance.machine import machine
+from performance.process import SPARKLOD, Took, in_turn, run, runs_of
+from performance.rows import Row, Table, figure, label, ratio
 from scenes import load, tiled, write_ply
 
 import sparklod_cli as sparklod
 from sparklod_cli.lod.builders import METHODS
-from sparklod_cli.support.parallel import processors
 
 HERE = Path(__file__).resolve().parent
 
-HEADINGS = (
-    *("scene", "splats", "nodes", "read s", "build s", "write s", "process s", "peak MB", "peak / input", "LoD MB"),
-    *("LoD / plain", "warm build s", "million splats/s (min to max)", "Spark's build s", "ratio"),
+TABLE = Table(
+    columns=(
+        *(label("scene"), label("splats"), label("nodes")),
+        *(figure(f"{stage}_s", f"{stage} s", 2) for stage in ("read", "build", "write")),
+        figure("wall_s", "process s", 2, spread=True),
+        figure("cpu_s", "processors' s", 2),
+        figure("peak_bytes", "peak MB", 0, per=1e6),
+        ratio("peak_bytes", "input_bytes", "peak / input"),
+        figure("output_bytes", "LoD MB", 1, per=1e6),
+        ratio("output_bytes", "plain_bytes", "LoD / plain", 2),
+        figure("warm_s", "warm build s", 3, spread=True),
+        ratio("splats", "warm_s", "million splats/s", 2, per=1e6),
+        figure("spark_s", "Spark's build s", 2),
+        ratio("spark_s", "warm_s", "Spark's build / ours", unit="x"),
+    ),
+    key=("scene",),
+    judged=("wall_s", "cpu_s", "peak_bytes", "output_bytes", "warm_s"),
 )
 
-#: Runs a command and prints the peak of its resident memory in kB. It asks the kernel itself, since the figure that a
-#: parent process gets includes the parent's own memory before exec.
-MEASURED = """
-import re, sys
-from pathlib import Path
-from sparklod_cli.cli import run
-code = run(sys.argv[1:])
-print(re.search(r"VmHWM:\\s+(\\d+)", Path("/proc/self/status").read_text())[1])
-sys.exit(code)
-"""
+
+def rows(paths: Iterable[Path], method: str, runs: int, *, spark_up_to: float = 0, warm: bool = True) -> Iterator[Row]:
+    """A row for each scene.
+
+    Args:
+        paths: splat files.
+        method: our builder; Spark's is always its tiny one.
+        runs: of everything, but of Spark at most 3.
+        spark_up_to: splats that Spark's builder gets at most.
+        warm: also time the builder alone.
+    """
+    for path in paths:
+        with tempfile.TemporaryDirectory() as folder:
+            yield _row(path, Path(folder, "out.spz"), method, runs, spark_up_to, warm)
 
 
-def machine() -> str:
-    """Describes this machine, for tables."""
-    info = Path("/proc/cpuinfo")
-    models = [line.split(":")[1].strip() for line in info.read_text().splitlines() if line.startswith("model name")]
-    return (
-        f"{models[0] if models else platform.processor()}, {processors()} threads, Python {platform.python_version()}"
-    )
+def _row(path: Path, output: Path, method: str, runs: int, spark_up_to: float, warm: bool) -> Row:
+    (commands,) = in_turn(runs, [lambda: whole_command(path, output, method)])
+    reports: list[dict[str, Any]] = [json.loads(took.output) for took in commands]
+    splats = len(load(path))
+    figures = {
+        **runs_of(commands),
+        **{f"{stage}_s": [report["seconds"][stage] for report in reports] for stage in ("read", "build", "write")},
+        "warm_s": warm_build(path, method, runs) if warm else [],
+        "spark_s": spark(path, min(runs, 3)) if splats <= spark_up_to else [],
+    }
+    labels = {
+        "scene": path.name,
+        "splats": splats,
+        "nodes": int(reports[-1]["nodes"]),
+        "input_bytes": path.stat().st_size,
+        "plain_bytes": plain_bytes(path, int(reports[-1]["fractional_bits"])),
+    }
+    return Row(labels, {**figures, "output_bytes": [report["bytes"] for report in reports]})
+
+
+def whole_command(path: Path, output: Path, method: str) -> Took:
+    """Runs the command once, with its report in JSON."""
+    return run([*SPARKLOD, "build-lod", path, "--method", method, "-o", output, "--overwrite", "--json"])
 
 
 def warm_build(path: Path, method: str, runs: int) -> list[float]:
-    """Times the builder alone, from decoded splats to final order; returns the seconds of each run after the first."""
+    """Times the builder alone, from decoded splats to final order; returns the seconds of each run after the first.
+
+    The first run also touches the memory: on a virtual machine the first touch of a page is slow, since the host may
+    take free pages back. In a long-running process that is not a cost of the builder.
+    """
     scene = sparklod.Scene(load(path))
-    # Touch memory first: on a virtual machine the first touch of a page is slow, since the host may take free pages
-    # back. That would be measured as a cost of the builder, which in a long-running process it is not.
-    np.zeros(1 << 30, np.float64)[::512] = 1
     seconds = []
-    for run in range(runs + 1):
+    for turn in range(runs + 1):
         start = time.perf_counter()
         sparklod.build_lod(scene, method=method)
-        if run:
+        if turn:
             seconds.append(time.perf_counter() - start)
     return seconds
-
-
-def whole_command(path: Path, output: Path, method: str) -> dict[str, float]:
-    """Runs the command once; returns the seconds of its stages, its wall time, and the peak memory of the process."""
-    options = ["--method", method, "-o", str(output), "--overwrite", "--json"]
-    command = [sys.executable, "-c", MEASURED, "build-lod", str(path), *options]
-    start = time.perf_counter()
-    result = subprocess.run(command, capture_output=True, text=True, check=True)
-    wall = time.perf_counter() - start
-    record, peak = map(json.loads, result.stdout.splitlines())
-    return {
-        **record["seconds"],
-        "wall": wall,
-        "peak": peak * 1024,
-        "nodes": record["nodes"],
-        "bytes": record["bytes"],
-        "bits": record["fractional_bits"],
-    }
 
 
 def plain_bytes(path: Path, bits: int) -> int:
@@ -100,7 +118,7 @@ def spark(path: Path, runs: int) -> list[float]:
 
 
 def main() -> None:
-    """Prints Markdown tables."""
+    """Prints a Markdown table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("scenes", nargs="+", type=Path, help="splat files; the last is also tiled to larger sizes")
     parser.add_argument(
@@ -111,46 +129,14 @@ def main() -> None:
     parser.add_argument("--spark-up-to", type=float, default=2, help="splats that Spark builds at most, in millions")
     arguments = parser.parse_args()
     print(f"Machine: {machine()}. Medians of {arguments.runs} runs.\n")
-    print("| " + " | ".join(HEADINGS) + " |")
-    print("|---" * len(HEADINGS) + "|")
     with tempfile.TemporaryDirectory() as folder:
         paths = list(arguments.scenes)
         source = load(paths[-1])
         for millions in arguments.millions:
-            path = Path(folder) / f"tiled-{millions:g}M.ply"
-            if not path.exists():
-                write_ply(path, tiled(source, int(millions * 1e6)))
-            paths.append(path)
+            paths.append(Path(folder) / f"tiled-{millions:g}M.ply")
+            write_ply(paths[-1], tiled(source, int(millions * 1e6)))
         del source
-        for path in paths:
-            row(path, Path(folder) / "out.spz", arguments)
-
-
-def row(path: Path, output: Path, arguments: argparse.Namespace) -> None:
-    """Measures one scene and prints its row."""
-    whole_command(path, output, arguments.method)  # fills the caches of the operating system and of numba
-    commands = [whole_command(path, output, arguments.method) for _ in range(arguments.runs)]
-    median = {key: statistics.median(run[key] for run in commands) for key in commands[0]}
-    warm = warm_build(path, arguments.method, arguments.runs)
-    splats = len(load(path))
-    theirs = spark(path, 3) if splats <= arguments.spark_up_to * 1e6 else []
-    ratio = median["bytes"] / plain_bytes(path, int(median["bits"]))
-    rates = [splats / seconds / 1e6 for seconds in warm]
-    cells = [
-        path.name,
-        f"{splats:,}",
-        f"{median['nodes']:,.0f}",
-        *(f"{median[stage]:.2f}" for stage in ("read", "build", "write", "wall")),
-        f"{median['peak'] / 1e6:.0f}",
-        f"{median['peak'] / path.stat().st_size:.1f}",
-        f"{median['bytes'] / 1e6:.1f}",
-        f"{ratio:.2f}",
-        f"{statistics.median(warm):.3f}",
-        f"{statistics.median(rates):.2f} ({min(rates):.2f} to {max(rates):.2f})",
-        f"{statistics.median(theirs):.2f}" if theirs else "",
-        f"{statistics.median(theirs) / statistics.median(warm):.1f}x" if theirs else "",
-    ]
-    print("| " + " | ".join(cells) + " |", flush=True)
+        TABLE.show(rows(paths, arguments.method, arguments.runs, spark_up_to=1e6 * arguments.spark_up_to))
 
 
 if __name__ == "__main__":

@@ -9,13 +9,15 @@ after another, and four at once. Bakes are whole processes, from file to file, w
 from __future__ import annotations
 
 import argparse
-import os
-import statistics
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterable
 from pathlib import Path
+
+from performance.process import SPARKLOD, environment
+from performance.rows import Row, Table, figure, label, ratio
 
 from sparklod_cli.lod.builders import METHODS
 from sparklod_cli.support.jit import WAIT_SETTINGS
@@ -30,23 +32,39 @@ WAYS: dict[str, tuple[dict[str, str], list[str]]] = {
     "one thread": ({}, ["--threads", "1"]),
 }
 
+#: Those that tell the most.
+MAIN_WAYS = ("OpenMP's default", "as shipped", "one thread")
+
 AT_ONCE = 4  # bakes at once
+
+TABLE = Table(
+    columns=(
+        label("way", "threads wait"),
+        figure("alone_s", "alone s", 2),
+        figure("beside_s", "beside a busy process s", 2),
+        figure("in_turn_s", f"{AT_ONCE} in turn s", 1),
+        figure("at_once_s", f"{AT_ONCE} at once s", 1),
+        ratio("at_once_s", "in_turn_s", "at once / in turn", 2),
+    ),
+    key=("way",),
+    judged=("alone_s", "beside_s", "in_turn_s", "at_once_s"),
+)
 
 
 class Bakes:
     """Starts bakes of a scene, each as a process."""
 
     def __init__(self, scene: Path, method: str, folder: Path) -> None:
-        self._line = [sys.executable, "-m", "sparklod_cli", "build-lod", str(scene), "--method", method, "-q"]
+        self._line = [*SPARKLOD, "build-lod", str(scene), "--method", method, "-q"]
         self._folder = folder
         self._started = 0
 
     def start(self, way: str) -> subprocess.Popen[bytes]:
         settings, options = WAYS[way]
-        clean = {name: value for name, value in os.environ.items() if name not in (*WAIT_SETTINGS, "OMP_WAIT_POLICY")}
+        unset = dict.fromkeys((*WAIT_SETTINGS, "OMP_WAIT_POLICY"))
         self._started += 1
         output = str(self._folder / f"{self._started}.spz")
-        return subprocess.Popen([*self._line, *options, "-o", output], env={**clean, **settings})
+        return subprocess.Popen([*self._line, *options, "-o", output], env=environment({**unset, **settings}))
 
     def run(self, way: str, count: int, *, at_once: bool) -> float:
         """Seconds that `count` bakes take, at once or one after the other."""
@@ -76,6 +94,25 @@ def beside_a_busy_process(bakes: Bakes, way: str) -> float:
         busy.wait()
 
 
+def rows(scene: Path, method: str, ways: Iterable[str], rounds: int) -> list[Row]:
+    """A row for each way of waiting; ways take turns, so that there is no row before the last round."""
+    runs: dict[str, list[dict[str, float]]] = {way: [] for way in ways}
+    with tempfile.TemporaryDirectory() as folder:
+        bakes = Bakes(scene, method, Path(folder))
+        bakes.run("as shipped", 1, at_once=False)  # compiles kernels and fills the system's file cache
+        for _ in range(rounds):
+            for way, found in runs.items():
+                found.append(
+                    {
+                        "alone_s": bakes.run(way, 1, at_once=False),
+                        "beside_s": beside_a_busy_process(bakes, way),
+                        "in_turn_s": bakes.run(way, AT_ONCE, at_once=False),
+                        "at_once_s": bakes.run(way, AT_ONCE, at_once=True),
+                    }
+                )
+    return [Row({"way": way}, {name: [run[name] for run in found] for name in found[0]}) for way, found in runs.items()]
+
+
 def main() -> None:
     """Prints a Markdown table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -83,25 +120,7 @@ def main() -> None:
     parser.add_argument("--method", choices=METHODS, default="quality")
     parser.add_argument("--rounds", type=int, default=3)
     arguments = parser.parse_args()
-    seconds: dict[str, list[tuple[float, ...]]] = {way: [] for way in WAYS}
-    with tempfile.TemporaryDirectory() as folder:
-        bakes = Bakes(arguments.scene, arguments.method, Path(folder))
-        bakes.run("as shipped", 1, at_once=False)  # compiles kernels and fills the system's file cache
-        for _ in range(arguments.rounds):
-            for way, rows in seconds.items():
-                rows.append(
-                    (
-                        bakes.run(way, 1, at_once=False),
-                        beside_a_busy_process(bakes, way),
-                        bakes.run(way, AT_ONCE, at_once=False),
-                        bakes.run(way, AT_ONCE, at_once=True),
-                    )
-                )
-    print(f"| threads wait | alone s | beside a busy process s | {AT_ONCE} in turn s | {AT_ONCE} at once s | ratio |")
-    print("|---|---|---|---|---|---|")
-    for way, rows in seconds.items():
-        alone, beside, in_turn, at_once = map(statistics.median, zip(*rows, strict=True))
-        print(f"| {way} | {alone:.2f} | {beside:.2f} | {in_turn:.1f} | {at_once:.1f} | {at_once / in_turn:.2f} |")
+    TABLE.show(rows(arguments.scene, arguments.method, WAYS, arguments.rounds))
 
 
 if __name__ == "__main__":

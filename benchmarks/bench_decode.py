@@ -7,26 +7,49 @@ import dataclasses
 import gc
 import json
 import os
-import statistics
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from bench_build import machine
+from bench_sog import splat_transform
+from performance.machine import machine
+from performance.rows import Row, Table, figure, label, ratio
 from scenes import load, tiled
 
 import sparklod_cli as sparklod
+from sparklod_cli import Splats
 
 HERE = Path(__file__).resolve().parent
 
-HEADINGS = (
-    *("file", "format", "splats", "SH", "MB", "sparklod s", "million splats/s (min to max)", "splat-transform s"),
-    *("million splats/s", "ratio", "peak / decoded"),
+TABLE = Table(
+    columns=(
+        *(label("file"), label("format"), label("splats"), label("SH")),
+        figure("file_bytes", "MB", 1, per=1e6),
+        figure("read_s", "sparklod s", 3, spread=True),
+        ratio("splats", "read_s", "million splats/s", 2, per=1e6),
+        ratio("file_bytes", "read_s", "GB/s", 2, per=1e9),
+        figure("transform_s", "splat-transform s", 3, spread=True),
+        ratio("transform_s", "read_s", "splat-transform's / ours", unit="x"),
+        ratio("peak_bytes", "decoded_bytes", "peak / decoded", 2),
+        figure("peak_bytes", "peak MB", 0, per=1e6),
+    ),
+    key=("file",),
+    judged=("read_s", "peak_bytes"),
 )
+
+#: Ends of the names of files that sparklod writes, with their SH degree: SOG is without SH, since clustering those of
+#: millions of splats takes long.
+OURS = {".ply": 3, ".splat": 0, ".rad": 3, "-v3.spz": 3, "-sh0.sog": 0}
+
+#: The same of files that splat-transform writes from the first of them.
+THEIRS = (".compressed.ply", "-v4.spz")
+
+#: Those that have goals at sizes where the others take long to make.
+LARGE = (".ply", ".splat", "-sh0.sog")
 
 #: Decodes a file and prints its peak resident memory in kB, less that of the interpreter and the codecs before.
 MEASURED = """
@@ -92,59 +115,51 @@ def peak(path: Path) -> int:
     return int(result.stdout) * 1024
 
 
-def made(source: Path, millions: float, folder: Path, transform: SplatTransform) -> Iterator[Path]:
-    """Tiles a scene to a size and yields a file of it in every format that sparklod or splat-transform writes.
-
-    SOG is written without SH: without a GPU, splat-transform takes hours to cluster those of a million splats.
-    """
-    splats = tiled(load(source), int(millions * 1e6))
-    stem = f"tiled-{millions:g}M"
-    plain, bare = folder / f"{stem}.ply", folder / f"{stem}-sh0.ply"
-    for path, degree in ((plain, 3), (bare, 0), (folder / f"{stem}.splat", 0), (folder / f"{stem}.rad", 3)):
-        sparklod.write(path, sparklod.Scene(splats.with_max_sh(degree)), overwrite=True)
-        if path != bare:
+def made(splats: Splats, stem: str, folder: Path, names: Sequence[str]) -> Iterator[Path]:
+    """Yields a file of some splats in each of `OURS` and `THEIRS` that is asked for, and can be had."""
+    for name in names:
+        path = folder / f"{stem}{name}"
+        if name in OURS:
+            sparklod.write(path, sparklod.Scene(splats.with_max_sh(OURS[name])), overwrite=True)
             yield path
-    del splats
-    for name, origin, options in (
-        (f"{stem}.compressed.ply", plain, {}),
-        (f"{stem}-v3.spz", plain, {"spzVersion": 3}),
-        (f"{stem}-v4.spz", plain, {"spzVersion": 4}),
-        (f"{stem}-sh0.sog", bare, {}),
-    ):
-        if transform.ask(write=str(folder / name), source=str(origin), options=options) is not None:
-            yield folder / name
+        elif "FOREIGN_DIR" in os.environ:
+            splat_transform(folder / f"{stem}.ply", path)
+            yield path
 
 
-def row(path: Path, transform: SplatTransform, runs: int) -> None:
-    """Measures one file and prints its row."""
-    scene = sparklod.read(path)
-    splats, degree, form = len(scene.splats), scene.splats.sh_degree, scene.format
-    decoded = sum(getattr(scene.splats, field.name).nbytes for field in dataclasses.fields(scene.splats))
-    del scene
-    transform.seconds(path)
-    ours, theirs = [], []
-    for _ in range(runs):
-        ours.append(our_seconds(path))
-        theirs.append(transform.seconds(path))
-    median = statistics.median(ours)
-    rates = [splats / seconds / 1e6 for seconds in ours]
-    known = [seconds for seconds in theirs if seconds is not None]
-    other = statistics.median(known) if known else None
-    size = sum(file.stat().st_size for file in path.parent.glob("*")) if path.suffix == ".json" else path.stat().st_size
-    cells = [
-        path.name,
-        form,
-        f"{splats:,}",
-        str(degree),
-        f"{size / 1e6:.1f}",
-        f"{median:.3f}",
-        f"{statistics.median(rates):.2f} ({min(rates):.2f} to {max(rates):.2f})",
-        f"{other:.3f}" if other else "",
-        f"{splats / other / 1e6:.2f}" if other else "",
-        f"{other / median:.1f}x" if other else "",
-        f"{peak(path) / decoded:.2f}",
-    ]
-    print("| " + " | ".join(cells) + " |", flush=True)
+def rows(paths: Iterable[Path], transform: SplatTransform, runs: int) -> Iterator[Row]:
+    """A row for each file, which both programs read in turns."""
+    for path in paths:
+        scene = sparklod.read(path)
+        labels = {
+            "file": path.name,
+            "format": scene.format or "",
+            "splats": len(scene),
+            "SH": scene.splats.sh_degree,
+            "file_bytes": _bytes_of(path),
+            "decoded_bytes": sum(getattr(scene.splats, each.name).nbytes for each in dataclasses.fields(scene.splats)),
+        }
+        del scene
+        known = transform.seconds(path) is not None
+        turns = [(our_seconds(path), transform.seconds(path) if known else None) for _ in range(runs)]
+        ours, theirs = [ours for ours, _ in turns], [theirs for _, theirs in turns if theirs is not None]
+        yield Row(labels, {"read_s": ours, "transform_s": theirs, "peak_bytes": [peak(path)]})
+
+
+def tiled_rows(
+    source: Path, million: float, transform: SplatTransform, runs: int, names: Sequence[str] = (*OURS, *THEIRS)
+) -> Iterator[Row]:
+    """Rows of files of a scene tiled to a size, in all formats or in some."""
+    splats = tiled(load(source), round(million * 1e6))
+    with tempfile.TemporaryDirectory() as folder:
+        files = made(splats, f"tiled-{million:g}M", Path(folder), names)
+        yield from rows(files, transform, runs)
+
+
+def _bytes_of(path: Path) -> int:
+    """Of the file, or of all beside it if it only lists them."""
+    files = path.parent.glob("*") if path.suffix == ".json" else [path]
+    return sum(file.stat().st_size for file in files)
 
 
 def main() -> None:
@@ -155,15 +170,11 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=5, help="number of runs, in turns; medians are printed")
     arguments = parser.parse_args()
     print(f"Machine: {machine()}. Medians of {arguments.runs} runs.\n")
-    print("| " + " | ".join(HEADINGS) + " |")
-    print("|---" * len(HEADINGS) + "|")
     transform = SplatTransform()
-    for path in arguments.scenes:
-        row(path, transform, arguments.runs)
-    for millions in arguments.millions:
-        with tempfile.TemporaryDirectory() as folder:
-            for path in made(arguments.scenes[-1], millions, Path(folder), transform):
-                row(path, transform, arguments.runs)
+    TABLE.show(rows(arguments.scenes, transform, arguments.runs))
+    for million in arguments.millions:
+        for row in tiled_rows(arguments.scenes[-1], million, transform, arguments.runs):
+            print(TABLE.line(row), flush=True)
     transform.close()
 
 

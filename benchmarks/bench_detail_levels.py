@@ -7,10 +7,10 @@ import statistics
 import time
 from pathlib import Path
 
-from bench_build import machine
 from fidelity_report import markdown
 from fidelity_trees import SHARES, decimated, seconds_of_decimations
 from fidelity_views import FullDetail, cameras_of
+from performance.machine import machine
 
 import sparklod_cli as sparklod
 from sparklod_cli.lod import quality

@@ -14,12 +14,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from bench_build import machine
 from fidelity_report import WITH_SH, add_outputs, report
 from fidelity_trees import METHODS, SHARES, Source, build, decimated
 from fidelity_views import CAMERAS, MOVING, OF_PATHS, SIZE, Figures, FullDetail, cameras_of, of_tree
 from fine_structure import fine_structure
 from glossy_knot import glossy_knot
+from performance.machine import machine
 from scenes import write_ply
 
 import sparklod_cli as sparklod

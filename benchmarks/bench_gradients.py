@@ -6,53 +6,69 @@ Times are those of the processor, which other work on the machine changes less t
 from __future__ import annotations
 
 import argparse
-import math
-import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 
 import numpy as np
-from bench_build import machine
-from bench_render import scattered
+from bench_render import ahead, scattered
+from performance.machine import machine
+from performance.rows import Row, Table, figure, label, ratio
 
-from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.render import gradients
 from sparklod_cli.render.settings import RasterSettings
 from sparklod_cli.support import jit
 
+TABLE = Table(
+    columns=(
+        label("splats"),
+        figure("picture_cpu_s", "picture ms", 1, per=1e-3),
+        figure("gradients_cpu_s", "gradients ms", 1, per=1e-3, spread=True),
+        ratio("gradients_cpu_s", "picture_cpu_s", "ratio"),
+    ),
+    key=("splats",),
+    judged=("picture_cpu_s", "gradients_cpu_s"),
+)
 
-def milliseconds(work: Callable[[], object], runs: int) -> float:
-    """Median time of one thread, after a first run."""
+#: Width and height in pixels, and numbers of splats.
+SIZE, SPLATS = (480, 270), (5_000, 20_000, 100_000)
+
+
+def seconds_of(work: Callable[[], object], runs: int) -> list[float]:
+    """Processor time of one thread, after a first run."""
     work()
     times = []
     for _ in range(runs):
         start = time.thread_time()
         work()
         times.append(time.thread_time() - start)
-    return 1e3 * statistics.median(times)
+    return times
+
+
+def rows(counts: Iterable[int], size: tuple[int, int], runs: int) -> Iterator[Row]:
+    """A row for each number of splats."""
+    jit.use_threads(1)
+    width, height = size
+    camera = ahead(size)
+    by_image = np.random.default_rng(0).normal(size=(height, width, 4)).astype(np.float32)
+    for count in counts:
+        splats = scattered(count, camera)
+        drawing = gradients.draw(splats, camera, RasterSettings())
+        forward = seconds_of(partial(gradients.draw, splats, camera, RasterSettings()), runs)
+        backward = seconds_of(partial(drawing.gradients, by_image), runs)
+        yield Row({"splats": count}, {"picture_cpu_s": forward, "gradients_cpu_s": backward})
 
 
 def main() -> None:
     """Prints a Markdown table."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--splats", type=int, nargs="*", default=[5_000, 20_000, 100_000], help="numbers of splats")
-    parser.add_argument("--size", type=int, nargs=2, default=[480, 270], help="width and height in pixels")
+    parser.add_argument("--splats", type=int, nargs="*", default=SPLATS, help="numbers of splats")
+    parser.add_argument("--size", type=int, nargs=2, default=SIZE, help="width and height in pixels")
     parser.add_argument("--runs", type=int, default=15, help="number of runs after the first; medians are printed")
     arguments = parser.parse_args()
-    jit.use_threads(1)
     width, height = arguments.size
-    focal = height / (2 * math.tan(math.radians(30)))
-    camera = Camera(np.eye(4), width, height, (focal, focal), (width / 2, height / 2))
-    by_image = np.random.default_rng(0).normal(size=(height, width, 4)).astype(np.float32)
     print(f"Machine: {machine()}. {width} x {height} pixels, one thread, medians of {arguments.runs} runs.\n")
-    print("| splats | picture ms | gradients ms | ratio |\n|---|---|---|---|")
-    for count in arguments.splats:
-        splats = scattered(count, camera)
-        drawing = gradients.draw(splats, camera, RasterSettings())
-        forward = milliseconds(partial(gradients.draw, splats, camera, RasterSettings()), arguments.runs)
-        backward = milliseconds(partial(drawing.gradients, by_image), arguments.runs)
-        print(f"| {count:,} | {forward:.1f} | {backward:.1f} | {backward / forward:.1f} |", flush=True)
+    TABLE.show(rows(arguments.splats, (width, height), arguments.runs))
 
 
 if __name__ == "__main__":

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import argparse
-import statistics
-import subprocess
 import sys
 import tempfile
-import time
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import NamedTuple
 
-from bench_build import MEASURED, machine
+from performance.machine import machine
+from performance.process import SPARKLOD, in_turn, run, runs_of
+from performance.rows import Row, Table, figure, label, ratio
 from scenes import load, tiled
 
 import sparklod_cli as sparklod
@@ -19,53 +18,39 @@ from sparklod_cli import Scene, Splats
 
 #: Decompresses a file as the codec does and keeps nothing, which every way to inspect it has to do at least.
 INFLATE = """
-import re, sys
-from pathlib import Path
+import sys
 from sparklod_cli.codecs.inflate import Inflate
 with open(sys.argv[1], "rb") as file:
     data = Inflate(file)
     while data.read(1 << 20):
         pass
-print(re.search(r"VmHWM:\\s+(\\d+)", Path("/proc/self/status").read_text())[1])
 """
 
-#: Ways to inspect a file: a program and its arguments, to which the file is added.
+#: Ways to inspect a file: a command, to which the file is added.
 WAYS = {
-    "inflate": (INFLATE,),
-    "--json": (MEASURED, "inspect", "--json"),
-    "--json --stats": (MEASURED, "inspect", "--json", "--stats"),
-    "--check": (MEASURED, "inspect", "--check", "-q"),
+    "inflate": (sys.executable, "-c", INFLATE),
+    "--json": (*SPARKLOD, "inspect", "--json"),
+    "--json --stats": (*SPARKLOD, "inspect", "--json", "--stats"),
+    "--check": (*SPARKLOD, "inspect", "--check", "-q"),
 }
 
-HEADINGS = (
-    "SH",
-    "leaves",
-    "nodes",
-    "MB",
-    "way",
-    "s (min to max)",
-    "million nodes/s",
-    "x inflate",
-    "peak MB",
-    "bytes a node",
+TABLE = Table(
+    columns=(
+        label("SH"),
+        label("leaves"),
+        label("nodes"),
+        figure("file_bytes", "MB", 1, per=1e6),
+        label("way"),
+        figure("wall_s", "s", 2, spread=True),
+        figure("cpu_s", "processors' s", 2),
+        ratio("nodes", "wall_s", "million nodes/s", 1, per=1e6),
+        ratio("wall_s", "inflate_s", "x inflate"),
+        figure("peak_bytes", "peak MB", 0, per=1e6),
+        ratio("peak_bytes", "nodes", "bytes a node", 0),
+    ),
+    key=("SH", "nodes", "way"),
+    judged=("wall_s", "cpu_s", "peak_bytes"),
 )
-
-
-class Run(NamedTuple):
-    """Wall time of a process in s, and its peak resident memory in bytes."""
-
-    seconds: float
-    bytes: int
-
-
-def run_of(way: str, path: Path) -> Run:
-    """Runs one of `WAYS` on a file, whether or not `inspect` has findings."""
-    start = time.perf_counter()
-    done = subprocess.run([sys.executable, "-c", *WAYS[way], str(path)], capture_output=True, text=True, check=False)
-    seconds = time.perf_counter() - start
-    if done.returncode not in (0, 3):
-        raise SystemExit(f"{way} failed on {path}: {done.stderr}")
-    return Run(seconds, 1024 * int(done.stdout.splitlines()[-1]))
 
 
 def bake(source: Splats, nodes: int, path: Path) -> tuple[int, int]:
@@ -78,31 +63,19 @@ def bake(source: Splats, nodes: int, path: Path) -> tuple[int, int]:
     return leaves, len(tree)
 
 
-def rows(source: Splats, nodes: int, folder: Path, runs: int) -> None:
-    """Measures all ways on one size of file, in turns, and prints a row for each."""
-    path = folder / "tree.spz"
-    leaves, nodes = bake(source, nodes, path)
-    for way in WAYS:
-        run_of(way, path)  # fills the caches of the operating system and of numba
-    turns = [{way: run_of(way, path) for way in WAYS} for _ in range(runs)]
-    medians = {way: statistics.median(turn[way].seconds for turn in turns) for way in WAYS}
-    for way in WAYS:
-        seconds = [turn[way].seconds for turn in turns]
-        peak = statistics.median(turn[way].bytes for turn in turns)
-        cells = [
-            str(source.sh_degree),
-            f"{leaves:,}",
-            f"{nodes:,}",
-            f"{path.stat().st_size / 1e6:.1f}",
-            way,
-            f"{medians[way]:.2f} ({min(seconds):.2f} to {max(seconds):.2f})",
-            f"{nodes / medians[way] / 1e6:.1f}",
-            f"{medians[way] / medians['inflate']:.1f}",
-            f"{peak / 1e6:.0f}",
-            f"{peak / nodes:.0f}",
-        ]
-        print("| " + " | ".join(cells) + " |", flush=True)
-    path.unlink()
+def rows(source: Path, degrees: Iterable[int], millions: Iterable[float], runs: int) -> Iterator[Row]:
+    """A row for each way, in turns, on LoD files of each SH degree and number of nodes of a tiled scene."""
+    splats = load(source)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "tree.spz"
+        for degree in degrees:
+            for million in millions:
+                leaves, nodes = bake(splats.with_max_sh(degree), round(million * 1e6), path)
+                found = in_turn(runs, [lambda way=way: run([*way, path], codes=(0, 3)) for way in WAYS.values()])
+                took = {way: runs_of(each) for way, each in zip(WAYS, found, strict=True)}
+                labels = {"SH": degree, "leaves": leaves, "nodes": nodes, "file_bytes": path.stat().st_size}
+                for way, figures in took.items():
+                    yield Row({**labels, "way": way}, {**figures, "inflate_s": took["inflate"]["wall_s"]})
 
 
 def main() -> None:
@@ -114,13 +87,7 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=5, help="number of runs, in turns; medians are printed")
     arguments = parser.parse_args()
     print(f"Machine: {machine()}. Medians of {arguments.runs} runs.\n")
-    print("| " + " | ".join(HEADINGS) + " |")
-    print("|---" * len(HEADINGS) + "|")
-    scene = load(arguments.scene)
-    with tempfile.TemporaryDirectory() as folder:
-        for degree in arguments.sh:
-            for millions in arguments.millions:
-                rows(scene.with_max_sh(degree), int(millions * 1e6), Path(folder), arguments.runs)
+    TABLE.show(rows(arguments.scene, arguments.sh, arguments.millions, arguments.runs))
 
 
 if __name__ == "__main__":

@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from bench_build import machine
 from fidelity_report import head, line
 from fidelity_views import cameras_of, count_of, difference
+from performance.machine import machine
 from scenes import load
 
 import sparklod_cli as sparklod

@@ -18,7 +18,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from bench_build import machine
+from performance.machine import machine
 from scale_scenes import bytes_of, write_tiled
 from scenes import load
 

@@ -10,10 +10,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
-from bench_build import machine
 from fidelity_report import head, line
 from fidelity_views import Image, cameras_of
 from numpy.typing import NDArray
+from performance.machine import machine
 
 import sparklod_cli as sparklod
 from sparklod_cli.codecs.sh_palette import cluster, visible_weight

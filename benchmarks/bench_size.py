@@ -7,8 +7,10 @@ to nearly the file.
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
+from performance.rows import Row, Table, label, ratio
 from scenes import load
 
 import sparklod_cli as sparklod
@@ -25,10 +27,20 @@ from sparklod_cli.support.progress import silent
 #: Streams of SPZ in file order; some scenes have no SH, and plain files no children.
 STREAMS = ("positions", "alphas", "colors", "scales", "rotations", "sh", "child_counts", "child_starts")
 
+TABLE = Table(
+    columns=(
+        *(label("scene"), label("method"), label("spz_bytes", "SPZ bytes")),
+        ratio("nodes", "leaves", "nodes / leaves", 3),
+        ratio("spz_bytes", "plain_spz_bytes", "SPZ / plain", 3),
+        ratio("rad_bytes", "plain_rad_bytes", "RAD / plain", 3),
+    ),
+    key=("scene", "method"),
+)
 
-def line(cells: list[str]) -> None:
-    """Prints a row in Markdown."""
-    print("| " + " | ".join(cells) + " |", flush=True)
+#: The same, and the share of each stream in the plain SPZ.
+STREAMS_TABLE = Table(
+    columns=(*TABLE.columns, *(ratio(name, "plain_spz_bytes", name, 3) for name in STREAMS)), key=TABLE.key
+)
 
 
 def of_streams(scene: Scene, options: WriteOptions) -> dict[str, int]:
@@ -43,33 +55,42 @@ def of_streams(scene: Scene, options: WriteOptions) -> dict[str, int]:
     }
 
 
-def measure(path: Path, method: str) -> None:
-    """Prints the row of a scene."""
+def rows(paths: Iterable[Path], methods: Iterable[str]) -> Iterator[Row]:
+    """A row for each scene and builder; sizes do not vary from run to run."""
+    for path in paths:
+        for method in methods:
+            yield _row(path, method)
+
+
+def _row(path: Path, method: str) -> Row:
     plain = sparklod.Scene(load(path))
     tree = sparklod.build_lod(plain, method=method)
     options = spz.settled(tree, DEFAULTS)
-    base = sum(map(len, spz.encode(plain, options)))
-    whole = sum(map(len, spz.encode(tree, options)))
-    streams = of_streams(tree, options)
     in_chunks = Scene(*arrange(tree.splats, tree.tree))
-    rads = [sum(map(len, rad.encode(scene, rad.settled(in_chunks, DEFAULTS)))) for scene in (in_chunks, plain)]
-    columns = [f"{streams[name] / base:.3f}" if name in streams else "" for name in STREAMS]
-    ratios = [f"{len(tree) / len(plain):.3f}", f"{whole / base:.3f}", f"{rads[0] / rads[1]:.3f}"]
-    line([path.name, method, f"{whole:,}", *ratios, *columns])
+    rad_options = rad.settled(in_chunks, DEFAULTS)
+    return Row(
+        {
+            "scene": path.name,
+            "method": method,
+            "nodes": len(tree),
+            "leaves": len(plain),
+            "spz_bytes": sum(map(len, spz.encode(tree, options))),
+            "plain_spz_bytes": sum(map(len, spz.encode(plain, options))),
+            "rad_bytes": sum(map(len, rad.encode(in_chunks, rad_options))),
+            "plain_rad_bytes": sum(map(len, rad.encode(plain, rad_options))),
+            **of_streams(tree, options),
+        },
+        {},
+    )
 
 
 def main() -> None:
-    """Prints a Markdown table; columns of SPZ are shares of the plain file."""
+    """Prints a Markdown table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("scenes", nargs="+", type=Path, help="splat files without a tree")
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS), help="builders")
     arguments = parser.parse_args()
-    heads = ["scene", "builder", "SPZ bytes", "nodes / leaves", "SPZ / plain", "RAD / plain", *STREAMS]
-    line(heads)
-    print("|---" * len(heads) + "|")
-    for path in arguments.scenes:
-        for method in arguments.methods:
-            measure(path, method)
+    STREAMS_TABLE.show(rows(arguments.scenes, arguments.methods))
 
 
 if __name__ == "__main__":

@@ -12,10 +12,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from bench_build import machine
 from fidelity_report import head, line
 from fidelity_views import Image, cameras_of, difference
 from numpy.typing import NDArray
+from performance.machine import machine
 from scenes import load, write_ply
 
 import sparklod_cli as sparklod

@@ -3,40 +3,74 @@
 from __future__ import annotations
 
 import argparse
+import inspect
 import json
 import statistics
 import subprocess
 import tempfile
 import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from bench_build import machine
+from fidelity_views import cameras_of
+from performance.machine import machine
+from performance.rows import Column, Label, Row, Table, figure, label, ratio
 from scenes import load, tiled
 
 import sparklod_cli as sparklod
 from sparklod_cli.cameras.framing import framing
 from sparklod_cli.cameras.pose import look_at
 from sparklod_cli.codecs.gpu import lod_tree
+from sparklod_cli.lod.continuous import ContinuousCuts
+from sparklod_cli.lod.cut_statistics import Changes, measure
 from sparklod_cli.lod.traversal import Forest, Traversal, TreeInstance, View
 from sparklod_cli.model.nodes import Nodes
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
+from sparklod_cli.scenes.finder import view_of
+from sparklod_cli.support import jit
 from sparklod_cli.support.parallel import ordered_map, processors
 
-HEADINGS = (
-    "million nodes",
-    "budget",
-    "drawn",
-    "a frame of a path, ms (min to max)",
-    "ns a splat",
-    "on one thread, ms",
-    "a first frame, ms",
-    "Spark ms (min to max)",
-    "ratio",
-    "ratio on one thread",
-)
+#: Nodes of the trees of tiled scenes in millions, budgets in nodes, and frames of their path.
+MILLIONS, BUDGETS, FRAMES = (0.5, 1, 2, 5, 10, 20), (50_000, 200_000, 500_000, 1_500_000), 24
+
+#: Budgets of real scenes.
+REAL_BUDGETS = (20_000, 50_000, 200_000)
+
+#: Nodes up to which continuous cuts are measured, for they look at every inner node.
+CONTINUOUS_UP_TO = 1_200_000
+
+#: Width and height of the picture that statistics are of.
+SIZE = (1280, 720)
+
+
+def _table(*names: Column) -> Table:
+    return Table(
+        columns=(
+            *names,
+            *(label("budget"), label("drawn")),
+            figure("path_s", "a frame of a path, ms", 2, per=1e-3, spread=True),
+            ratio("path_s", "drawn", "ns a splat", per=1e-9),
+            figure("alone_s", "on one thread, ms", 2, per=1e-3),
+            figure("first_s", "a first frame, ms", 2, per=1e-3, spread=True),
+            figure("first_alone_s", "on one thread, ms", 2, per=1e-3),
+            figure("measure_s", "its statistics, ms", 2, per=1e-3),
+            figure("continuous_s", "a continuous cut, ms", 1, per=1e-3),
+            figure("spark_s", "Spark ms", 1, per=1e-3, spread=True),
+            ratio("spark_s", "path_s", "Spark / path", unit="x"),
+            ratio("spark_s", "first_s", "Spark / first frame", unit="x"),
+        ),
+        key=("tree", "budget"),
+        judged=("path_s", "alone_s", "first_s", "first_alone_s", "measure_s", "continuous_s"),
+    )
+
+
+TILED = _table(label("tree", "million nodes"))
+REAL = _table(label("tree"), label("nodes"))
 
 
 class Spark:
@@ -74,107 +108,182 @@ def tree_of(source: Splats, nodes: int) -> Nodes:
     """Tiles and bakes a scene to a tree of about `nodes` nodes; returns them as Spark stores them."""
     sample = min(nodes // 4, 500_000)  # the ratio of nodes to leaves hardly depends on the number
     growth = len(sparklod.build_lod(Scene(tiled(source, sample)))) / sample
-    tree = sparklod.build_lod(Scene(tiled(source, round(nodes / growth))))
+    return _as_stored(sparklod.build_lod(Scene(tiled(source, round(nodes / growth)))))
+
+
+def _as_stored(tree: Scene) -> Nodes:
     return lod_tree.unpack(sparklod.pack(tree, "lodtree"))
 
 
-def seconds_of(traversal: Traversal, views: list[View], budget: int, threads: int) -> float:
-    """Seconds per frame of a whole path."""
-    start = time.perf_counter()
-    for _ in ordered_map(lambda view: len(traversal.cut(view, budget=budget)), views, threads):
-        pass
-    return (time.perf_counter() - start) / len(views)
+@dataclass(frozen=True)
+class Flight:
+    """A tree and the views of a path.
+
+    Attributes:
+        labels: of its rows.
+        nodes: of the tree.
+        views: of the path.
+    """
+
+    labels: dict[str, Label]
+    nodes: Nodes
+    views: Sequence[View]
 
 
-def first(forest: Forest, view: View, budget: int) -> float:
-    """Seconds of a cut that cannot start from the one before it; its buffers are allocated already."""
-    traversal = Traversal(forest, [TreeInstance()])
-    traversal.cut(view, budget=budget)
-    traversal.forget()
+def rows(flights: Iterable[Flight], budgets: Sequence[int], runs: int, spark: Spark | None) -> Iterator[Row]:
+    """A row for each tree and budget, in turns with Spark.
+
+    Budgets near or above the number of leaves are left out: they limit nothing.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        for flight in flights:
+            if spark:
+                _give(spark, flight.nodes, Path(folder, "tree.u32"))
+            measured = Measured(flight)
+            for budget in budgets:
+                if budget < len(flight.nodes.size) / 2:
+                    yield measured.row(budget, runs, spark, Path(folder, "nodes.u32"))
+
+
+class Measured:
+    """Measures the cuts of one tree.
+
+    Args:
+        flight: the tree and its views.
+    """
+
+    def __init__(self, flight: Flight) -> None:
+        self._labels, self._views = flight.labels, flight.views
+        self._forest = Forest([flight.nodes])
+        self._traversal = Traversal(self._forest, [TreeInstance()])
+        self._depths = flight.nodes.tree.depths()
+        small = len(flight.nodes.size) <= CONTINUOUS_UP_TO
+        self._continuous = ContinuousCuts(self._traversal) if small else None
+
+    def row(self, budget: int, runs: int, spark: Spark | None, indices: Path) -> Row:
+        """Everything of one budget; a run of a path is its mean frame."""
+        asked = [
+            {"viewToObjectCols": view.camera_to_world.T.ravel().tolist(), "maxSplats": budget, "pixelScaleLimit": 0}
+            for view in self._views
+        ]
+        self._path(budget, processors())
+        cut = self._traversal.cut(self._views[-1], budget=budget).indices()[0]
+        if spark:
+            spark.ask(views=asked[-1:], indices=str(indices))
+            if not np.array_equal(cut, np.sort(np.fromfile(indices, np.uint32))):
+                raise SystemExit(f"the cut of {budget:,} of {self._labels['tree']} is not Spark's")
+        jobs: dict[str, Callable[[], float]] = {
+            "path_s": lambda: self._path(budget, processors()),
+            "alone_s": lambda: self._path(budget, 1),
+            "first_s": lambda: self._first(budget, processors()),
+            "first_alone_s": lambda: self._first(budget, 1),
+            "measure_s": lambda: self._statistics(budget),
+        }
+        if self._continuous:
+            jobs["continuous_s"] = lambda: self._blended(budget)
+        if spark:
+            jobs["spark_s"] = lambda: statistics.mean(spark.ask(views=asked)) / 1e3
+        figures: dict[str, list[float]] = {name: [] for name in jobs}
+        for _ in range(runs):
+            for name, job in jobs.items():
+                figures[name].append(job())
+        return Row({**self._labels, "nodes": len(self._forest.nodes), "budget": budget, "drawn": len(cut)}, figures)
+
+    def _path(self, budget: int, threads: int) -> float:
+        """Seconds per frame of a whole path."""
+        start = time.perf_counter()
+        for _ in ordered_map(lambda view: len(self._traversal.cut(view, budget=budget)), self._views, threads):
+            pass
+        return (time.perf_counter() - start) / len(self._views)
+
+    def _first(self, budget: int, threads: int) -> float:
+        """Seconds of a cut that cannot start from the one before it; its buffers are allocated already.
+
+        The mean of the first, the middle and the last view.
+        """
+        seconds = []
+        for view in (self._views[0], self._views[len(self._views) // 2], self._views[-1]):
+            find = partial(self._traversal.cut, view, budget=budget, **_on(threads))
+            find()
+            self._traversal.forget()
+            seconds.append(_seconds(find))
+        return statistics.mean(seconds)
+
+    def _statistics(self, budget: int) -> float:
+        """Seconds per frame of the statistics of cuts, and of what changes from one to the next, on one thread."""
+        jit.use_threads(1)
+        changes = Changes(self._forest, self._traversal.instances)
+        seconds = []
+        for view in self._views:
+            cut = self._traversal.cut(view, budget=budget)
+            seconds.append(
+                _seconds(lambda cut=cut, view=view: measure(self._forest, self._depths, cut, view, size=SIZE))
+                + _seconds(lambda cut=cut: changes.next(cut))
+            )
+        jit.use_threads(processors())
+        return statistics.mean(seconds)
+
+    def _blended(self, budget: int) -> float:
+        """Seconds of a continuous cut."""
+        assert self._continuous
+        return _seconds(lambda: self._continuous.cut(self._views[0], budget=budget))
+
+
+def _on(threads: int) -> dict[str, int]:
+    return {"threads": threads} if "threads" in inspect.signature(Traversal.cut).parameters else {}
+
+
+def _seconds(work: Callable[[], object]) -> float:
     start = time.perf_counter()
-    traversal.cut(view, budget=budget)
+    work()
     return time.perf_counter() - start
 
 
-def rows(nodes: Nodes, spark: Spark, budgets: list[int], frames: int, runs: int, radius: float, folder: Path) -> None:
-    """Measures one tree with every budget, in turns with Spark, and prints a row for each budget."""
-    forest = Forest([nodes])
-    center, _ = framing(nodes.center)
-    views = flight(center, radius, frames)
-    words, indices = folder / "tree.u32", folder / "nodes.u32"
-    words_of(nodes).tofile(words)
-    spark.ask(tree=str(words))
-    words.unlink()
-    traversal = Traversal(forest, [TreeInstance()])
-    for budget in budgets:
-        asked = [
-            {"viewToObjectCols": view.camera_to_world.T.ravel().tolist(), "maxSplats": budget, "pixelScaleLimit": 0}
-            for view in views
-        ]
-        seconds_of(traversal, views, budget, processors())
-        spark.ask(views=asked[-1:], indices=str(indices))
-        cut = traversal.cut(views[-1], budget=budget).indices()[0]
-        if not np.array_equal(cut, np.sort(np.fromfile(indices, np.uint32))):
-            raise SystemExit(f"the cut of {budget:,} is not Spark's")
-        paths, alone, firsts, theirs = [], [], [], []
-        for _ in range(runs):
-            paths.append(seconds_of(traversal, views, budget, processors()))
-            alone.append(seconds_of(traversal, views, budget, 1))
-            firsts.append(first(forest, views[0], budget))
-            theirs += spark.ask(views=asked)
-        ours, spark_ms = 1e3 * statistics.median(paths), statistics.median(theirs)
-        cells = [
-            f"{len(nodes.size) / 1e6:.1f}",
-            f"{budget:,}",
-            f"{len(cut):,}",
-            f"{ours:.2f} ({1e3 * min(paths):.2f} to {1e3 * max(paths):.2f})",
-            f"{1e6 * ours / len(cut):.1f}",
-            f"{1e3 * statistics.median(alone):.2f}",
-            f"{1e3 * statistics.median(firsts):.2f}",
-            f"{spark_ms:.1f} ({min(theirs):.1f} to {max(theirs):.1f})",
-            f"{spark_ms / ours:.1f}x",
-            f"{spark_ms / 1e3 / statistics.median(alone):.1f}x",
-        ]
-        print("| " + " | ".join(cells) + " |", flush=True)
-
-
-def words_of(nodes: Nodes) -> np.ndarray:
-    """Returns the words of nodes that were unpacked from words."""
+def _give(spark: Spark, nodes: Nodes, file: Path) -> None:
+    """Has Spark load a tree."""
     rows = np.empty(len(nodes.size), lod_tree.NODE)
     rows["center"], rows["size"] = nodes.center, nodes.size
     rows["child_count"], rows["child_start"] = nodes.tree.child_count, nodes.tree.child_start
-    return rows
+    rows.tofile(file)
+    spark.ask(tree=str(file))
+    file.unlink()
+
+
+def tiled_flights(source: Path, millions: Iterable[float], frames: int) -> Iterator[Flight]:
+    """Trees of a scene tiled to so many million nodes."""
+    splats = load(source).with_max_sh(0)
+    _, radius = framing(splats.center)
+    for million in millions:
+        nodes = tree_of(splats, round(million * 1e6))
+        center, _ = framing(nodes.center)
+        yield Flight({"tree": f"{len(nodes.size) / 1e6:.1f}"}, nodes, flight(center, radius, frames))
+
+
+def real_flights(paths: Iterable[Path], method: str = "quality") -> Iterator[Flight]:
+    """Trees of scenes, from the twelve cameras around them."""
+    for path in paths:
+        scene = Scene(load(path).with_max_sh(0))
+        views = [view_of(camera) for camera in cameras_of("around", scene, SIZE)]
+        yield Flight({"tree": path.name}, _as_stored(sparklod.build_lod(scene, method=method)), views)
 
 
 def main() -> None:
     """Prints a Markdown table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("scene", type=Path, help="splat file to tile and bake")
-    parser.add_argument(
-        "--millions",
-        type=float,
-        nargs="*",
-        default=[0.5, 1, 2, 5, 10, 20],
-        help="nodes of the trees",
-    )
-    parser.add_argument(
-        "--budgets", type=int, nargs="*", default=[50_000, 200_000, 500_000, 1_500_000], help="in nodes"
-    )
-    parser.add_argument("--frames", type=int, default=24, help="frames of the path")
+    parser.add_argument("--millions", type=float, nargs="*", default=MILLIONS, help="nodes of the trees")
+    parser.add_argument("--budgets", type=int, nargs="*", default=BUDGETS, help="in nodes")
+    parser.add_argument("--frames", type=int, default=FRAMES, help="frames of the path")
+    parser.add_argument("--real", type=Path, nargs="*", default=[], help="scenes seen from cameras around them")
     parser.add_argument("--runs", type=int, default=5, help="number of runs, in turns; medians are printed")
     arguments = parser.parse_args()
     print(f"Machine: {machine()}. Medians of {arguments.runs} runs of {arguments.frames} frames.\n")
-    print("| " + " | ".join(HEADINGS) + " |")
-    print("|---" * len(HEADINGS) + "|")
-    scene = load(arguments.scene).with_max_sh(0)
-    _, radius = framing(scene.center)
     spark = Spark()
-    with tempfile.TemporaryDirectory() as folder:
-        for millions in arguments.millions:
-            nodes = tree_of(scene, round(millions * 1e6))
-            # Skip budgets near or above the number of leaves: they limit nothing.
-            budgets = [budget for budget in arguments.budgets if budget < len(nodes.size) / 2]
-            rows(nodes, spark, budgets, arguments.frames, arguments.runs, radius, Path(folder))
+    flights = tiled_flights(arguments.scene, arguments.millions, arguments.frames)
+    TILED.show(rows(flights, arguments.budgets, arguments.runs, spark))
+    if arguments.real:
+        print()
+        REAL.show(rows(real_flights(arguments.real), REAL_BUDGETS, arguments.runs, spark))
     spark.close()
 
 

@@ -1,9 +1,8 @@
-// Reads and writes splat files with splat-transform's library: node --expose-gc transform_read.mjs.
+// Reads splat files with splat-transform's library: node --expose-gc transform_read.mjs.
 // FOREIGN_DIR names a folder whose node_modules has @playcanvas/splat-transform and playcanvas.
 //
 // Reads a request a line on stdin and writes an answer a line on stdout:
-//   {read: path}                    {splats, seconds}: the time from the file to a table of float32 columns
-//   {write: path, source, options}  {}: writes the file in the format that its name says
+//   {read: path}  {splats, seconds}: the time from the file to a table of float32 columns
 // The answer to a request that fails is {error}.
 import fs from 'node:fs';
 import path from 'node:path';
@@ -12,26 +11,13 @@ import { pathToFileURL } from 'node:url';
 
 console.log = console.error; // stdout is for the answers
 const entry = path.resolve(process.env.FOREIGN_DIR ?? '.', 'node_modules/@playcanvas/splat-transform/dist/index.mjs');
-const { readFile, getInputFormat, writeFile, getOutputFormat, MemoryReadFileSystem } = await import(pathToFileURL(entry));
+const { readFile, getInputFormat, MemoryReadFileSystem } = await import(pathToFileURL(entry));
 
 const disk = {
   async createSource(name) {
     const memory = new MemoryReadFileSystem();
     memory.set(name, new Uint8Array(await fs.promises.readFile(name)));
     return memory.createSource(name);
-  },
-  async createWriter(name) {
-    const file = fs.openSync(name, 'w');
-    const writer = { bytesWritten: 0 };
-    writer.write = async (data) => {
-      for (let done = 0; done < data.byteLength; ) done += fs.writeSync(file, data, done);
-      writer.bytesWritten += data.byteLength;
-    };
-    writer.close = async () => fs.closeSync(file);
-    return writer;
-  },
-  async mkdir(name) {
-    fs.mkdirSync(name, { recursive: true });
   },
 };
 
@@ -41,13 +27,7 @@ async function table(filename) {
   return decoded;
 }
 
-async function answer({ read, write, source, options }) {
-  if (write !== undefined) {
-    const wanted = { iterations: 1, ...options };
-    const dataTable = await table(source);
-    await writeFile({ filename: write, outputFormat: getOutputFormat(write, wanted), dataTable, options: wanted }, disk);
-    return {};
-  }
+async function answer({ read }) {
   globalThis.gc(); // so that this run does not collect the garbage of earlier ones
   const start = performance.now();
   const { numRows } = await table(read);

@@ -147,6 +147,7 @@ def _print_kernels() -> None:
     from . import bake, warmup  # noqa: F401
     from .support import jit
 
+    jit.require_compiler()
     about = {
         "folder": None if jit.CACHE_FOLDER is None else str(jit.CACHE_FOLDER.resolve()),
         "wanted": len({name for job in warmup.JOBS.values() for name in job.kernels}),

@@ -59,9 +59,10 @@ JOBS = {
     "inspect": Job(
         (
             *("tree_links.find_cycles", "tree_links.find_depths", "tree_links.find_parents"),
-            *("tree_links.add_child_sizes", "tree_links.sum_by_depth"),
+            *("tree_links.add_weighted", "tree_links.fill_weights", "tree_links.sum_by_depth"),
+            *("digits.count_digits", "digits.sh_lengths"),
         ),
-        ("inspect tree.spz --check",),
+        ("inspect shiny.spz --check --stats --json",),
     ),
     "quality": Job(
         (
@@ -112,8 +113,18 @@ JOBS = {
         ("build-lod shiny.spz --format rad --cluster-sh 4 -o palette.rad",),
     ),
     "streamed-sog": Job(
-        ("region_errors.compare_levels", "row_hash.hash_rows", "shade.add_sh", "tree_links.find_parents"),
-        ("build-lod shiny.spz -o web/lod-meta.json",),
+        (
+            *("region_errors.compare_levels", "row_hash.hash_rows", "shade.add_sh", "tree_links.find_parents"),
+            *(
+                "texels.fill_quats",
+                "texels.gather_rows",
+                "texels.look_up",
+                "texels.look_up_words",
+                "texels.place_bytes",
+            ),
+            *("webp_codes.read_codes", "webp_pixels.read_pixels", "webp_transforms.undo"),
+        ),
+        ("build-lod shiny.spz -o web/lod-meta.json", "inspect web/lod-meta.json --check"),
     ),
 }
 

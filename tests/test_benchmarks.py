@@ -16,7 +16,7 @@ import pytest
 import sparklod_cli as sparklod
 from tests.conftest import ROOT
 
-BENCHMARKS = sorted(path.stem for path in (ROOT / "benchmarks").glob("bench_*.py"))
+BENCHMARKS = [*sorted(path.stem for path in (ROOT / "benchmarks").glob("bench_*.py")), "run_all"]
 
 
 @pytest.mark.parametrize("name", BENCHMARKS)

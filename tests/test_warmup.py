@@ -12,19 +12,19 @@ import pytest
 
 from sparklod_cli import warmup
 from sparklod_cli.cli import run
-from sparklod_cli.support import jit
+from sparklod_cli.support import jit, jit_link
 from tests.conftest import ROOT
 
-#: Runs a command line of JSON and prints which kernels Python has called, since numba knows what it has code for.
+#: Runs a command line of JSON and prints which kernels Python has called, and whether numba was loaded.
 CALLED = """
 import json, sys
 from sparklod_cli.cli import run
+from sparklod_cli.support.jit import Kernel
 from sparklod_cli.support.jit_cache import stem_of
 code = run(json.loads(sys.argv[1]))
-from numba.core.dispatcher import Dispatcher
 kernels = {f for name, module in list(sys.modules.items()) if ".kernels." in name for f in vars(module).values()
-           if isinstance(f, Dispatcher) and f.signatures}
-print(json.dumps([code, sorted(stem_of(kernel.py_func) for kernel in kernels)]))
+           if isinstance(f, Kernel) and f.called}
+print(json.dumps([code, sorted(stem_of(kernel.py_func) for kernel in kernels), "numba" in sys.modules]))
 """
 
 
@@ -38,8 +38,9 @@ def test_the_table_has_just_the_kernels_that_a_job_calls(job: str, tmp_path: Pat
         done = subprocess.run(
             line, cwd=tmp_path, capture_output=True, text=True, check=True, env={**os.environ, "PYTHONPATH": path}
         )
-        code, kernels = json.loads(done.stdout.splitlines()[-1])
+        code, kernels, needs_numba = json.loads(done.stdout.splitlines()[-1])
         assert code == 0, done.stderr
+        assert needs_numba == (not jit_link.is_tested())
         called |= set(kernels)
     assert called == set(warmup.JOBS[job].kernels)
 

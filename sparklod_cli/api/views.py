@@ -11,6 +11,7 @@ import numpy as np
 
 from ..cameras.camera import Camera
 from ..cameras.path import CameraPath
+from ..codecs.gpu.table import PRECISIONS
 from ..images import metrics
 from ..lod import detail_rule
 from ..lod.budget import LARGEST, Budget, parse_budget
@@ -26,7 +27,7 @@ from ..scenes.finder import CutFinder, FixedCut
 from ..scenes.loaded import Cut, Scenes
 from ..scenes.loaded_scene import UNNAMED
 from ..scenes.reading import read_scenes
-from ..support.defaults import BLEND, PRECISIONS
+from ..support.defaults import BLEND
 from ..support.errors import FormatError, memory_errors_translated
 from ..support.threads import on_threads, thread_count
 from ..tables.comparison import COLUMNS as OF_COMPARISON
@@ -66,7 +67,9 @@ def cut(
         settings: foveation, pixel-scale limit and so on; Spark 2's on a desktop unless given, and for detail levels
             those of PlayCanvas.
         continuous: a cut that fades nodes into their children; the width of that, or True for 1.25.
-        precision: "float32", or "float16" for the centres and sizes that Spark holds of a tree.
+        precision: of the centres and sizes of a tree: "float32", or their half floats, "float16"; or what Spark has of
+            it, for the same cut to the last node: "ext" with `extSplats`, else "packed", or "packed-pages" where Spark
+            streams a RAD file. Of a tree that was not read from a file, Spark's are taken to be its own numbers.
         threads: to prepare the trees on; None for all processors.
 
     Raises:

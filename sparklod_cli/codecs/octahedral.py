@@ -23,6 +23,9 @@ Words = NDArray[np.uint32]
 STEPS_8_8_8 = (255, 255)
 STEPS_10_10_12 = (1023, 4095)
 
+#: Units of the last place by which the logarithm, the exponential and the square root of an alpha may miss it together.
+_STEPS_TO_STORED = (0, 1, -1, 2, -2, 3, -3, 4, -4)
+
 _PI = np.float32(np.pi)
 #: Sine of half the angle below which the axis is noise: Spark uses the x axis instead.
 _NO_ROTATION = np.float32(1e-6)
@@ -97,7 +100,30 @@ def encode_lod_alpha(opacity: FloatArray) -> FloatArray:
 
 def decode_lod_alpha(alpha: FloatArray) -> FloatArray:
     """Spark's alpha to linear opacity A; above 1, D is 4 * alpha - 3. Largest error: that of float32."""
-    return linear_opacity(np.where(alpha > 1, 4 * alpha - 3, alpha))
+    return linear_opacity(lod_opacity_of_alpha(alpha))
+
+
+def lod_opacity_of_alpha(alpha: FloatArray) -> FloatArray:
+    """Spark's alpha to LoD opacity D: alpha up to 1, 4 * alpha - 3 above."""
+    return np.where(alpha > 1, 4 * alpha - 3, alpha)
+
+
+def stored_lod_alpha(opacity: FloatArray) -> FloatArray:
+    """The alpha that linear opacity A was decoded from, to the last bit.
+
+    `encode_lod_alpha` may miss it by some units of the last place, and then another number nearby decodes to A. Where
+    none does, A was not decoded from an alpha, and has that of `encode_lod_alpha`.
+    """
+    alpha = encode_lod_alpha(opacity)
+    left = np.flatnonzero(alpha > 1)  # usually few
+    for steps in _STEPS_TO_STORED:
+        if not left.size:
+            break
+        near = (alpha[left].view(np.int32) + np.int32(steps)).view(np.float32)
+        found = decode_lod_alpha(near) == opacity[left]
+        alpha[left[found]] = near[found]
+        left = left[~found]
+    return alpha
 
 
 def checked_words(arrays: Mapping[str, NDArray[Any]], columns: Mapping[str, int]) -> dict[str, Words]:

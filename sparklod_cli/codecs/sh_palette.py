@@ -111,7 +111,7 @@ def cluster(
     if len(rows) and not (np.isfinite(rows.min()) and np.isfinite(rows.max())):
         raise ValueError("sh holds NaN or infinity; give finite coefficients")
     of_rows = _weights(weight, len(rows))
-    with _KERNELS, on_threads(threads):  # loads numba
+    with _KERNELS, on_threads(threads):
         first, inverse = _distinct(rows)
         if len(first) <= codes:
             return ShPalette(sh[first], inverse)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -74,22 +75,49 @@ def decode_linear(codes: NDArray[np.uint8], low: float, high: float) -> FloatArr
     return quantize.of_range(codes.astype(np.float32) / np.float32(255), np.float32(low), np.float32(high))
 
 
-def encode_log_scale(scale: FloatArray, low: float, high: float) -> Words:
-    """Linear scales to codes: 0 for scales below e ** -30, 1..255 for logarithms from low to high."""
+def nearest_log(values: FloatArray) -> FloatArray:
+    """Natural logarithms, rounded once."""
+    found: FloatArray = np.log(values.astype(np.float64)).astype(np.float32)
+    return found
+
+
+@np.errstate(over="ignore")  # a stranger's range may be any
+def nearest_exp(values: FloatArray) -> FloatArray:
+    """Exponentials, rounded once."""
+    found: FloatArray = np.exp(values.astype(np.float64)).astype(np.float32)
+    return found
+
+
+def encode_log_scale(
+    scale: FloatArray,
+    low: float,
+    high: float,
+    *,
+    log: Callable[[FloatArray], FloatArray] = nearest_log,
+    least: np.float32 = SCALE_ZERO,
+) -> Words:
+    """Linear scales to codes: 0 for scales below e ** -30, 1..255 for logarithms from low to high.
+
+    Args:
+        scale: of any shape.
+        low, high: ends of the range.
+        log: of Spark's worker, `spark_math.log`, or rounded once.
+        least: scales below it are 0.
+    """
     first = np.float32(low)
     width = np.float32(high) - first
-    zero = scale < SCALE_ZERO
-    log = np.log(np.where(zero, 1, scale).astype(np.float64)).astype(np.float32)
-    codes = 1 + to_code(np.clip((log - first) / width, 0, 1) * np.float32(254), 254)
+    zero = scale < least
+    logs = log(np.where(zero, np.float32(1), scale))
+    codes = 1 + to_code(np.clip((logs - first) / width, 0, 1) * np.float32(254), 254)
     codes[zero] = 0
     return codes
 
 
 @np.errstate(over="ignore")  # a stranger's range may be any
-def log_scale_table(low: float, high: float) -> FloatArray:
+def log_scale_table(low: float, high: float, *, exp: Callable[[FloatArray], FloatArray] = nearest_exp) -> FloatArray:
     """(256,) linear scales of the codes. Largest error: a factor of e ** ((high - low) / 508); exact for 0."""
     first = np.float32(low)
-    log = first + np.arange(-1, 255, dtype=np.float32) * ((np.float32(high) - first) / np.float32(254))
-    table = np.exp(log.astype(np.float64)).astype(np.float32)
+    logs = first + np.arange(-1, 255, dtype=np.float32) * ((np.float32(high) - first) / np.float32(254))
+    table = exp(logs)
     table[0] = 0
     return table

@@ -10,6 +10,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from ..model.coding import FileCoding, ScaleCoding
 from ..model.lod_tree import LodTree
 from ..model.scene import Scene
 from ..model.sh import notes_on_degree
@@ -23,6 +24,7 @@ from . import compression, quantize
 from .content import HAS_TREE, Content, Scratch
 from .inflate import GZIP_MAGIC, Inflate
 from .sound import with_sound_tree
+from .spz_coded import CodedSpz, sound
 from .spz_layout import ANTIALIASED, EXTENSIONS, HEADER, LOD, MAGIC, Layout, Stream, StreamRows, column_of
 from .stream import Positioned, Read, rows_between, rows_of, size_of
 
@@ -31,6 +33,9 @@ STREAM_SIZES = struct.Struct("<QQ")  # of a version 4 stream: compressed, uncomp
 
 #: Versions that are read.
 READABLE = (1, 2, 3, 4)
+
+#: How all versions hold scales.
+CODING = FileCoding((ScaleCoding("spz"),), 1)
 
 
 def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> Scene:
@@ -72,7 +77,7 @@ def examine(
         done += count
         progress("reading", done, layout.total, "B")
     antialiased, notes = bool(layout.flags & ANTIALIASED), _notes(layout, header)
-    return Scene(splats, tree, antialiased, _name_of(layout), notes, _facts(layout) | header)
+    return Scene(splats, tree, antialiased, _name_of(layout), notes, _facts(layout) | header, coding=CODING)
 
 
 def stream(file: BinaryIO, *, scratch: Scratch, threads: int = 1, progress: Progress = silent) -> SceneStream:
@@ -128,6 +133,28 @@ def read_codes(file: BinaryIO) -> tuple[Layout, dict[str, quantize.Bytes]]:
     for each, part, some in rows:
         codes[each.name][part] = some
     return layout, codes
+
+
+def read_coded(
+    file: BinaryIO, *, columns: Collection[str] = COLUMNS, threads: int = 1, progress: Progress = silent
+) -> CodedSpz:
+    """The codes of a file for inspection, see `examine`.
+
+    Those of the given columns of `Splats`, and of the tree; of a file that may hold invalid splats, those of all.
+    """
+    layout, rows, header = _opened(file, threads)
+    columns = columns if sound(layout) else COLUMNS
+    streams = [each for each in layout.streams() if each.column in {*columns, "child_count", "child_start"}]
+    codes = {each.name: np.empty((layout.count, each.size), np.uint8) for each in streams}
+    done = 0
+    for each, part, some in rows:
+        if each.name in codes:
+            codes[each.name][part] = some
+        done += some.size
+        progress("reading", done, layout.total, "B")
+    facts, degree = _facts(layout) | header, min(layout.sh_degree, MAX_SH_DEGREE)
+    antialiased, notes = bool(layout.flags & ANTIALIASED), _notes(layout, header)
+    return CodedSpz(layout, codes, degree, antialiased, _name_of(layout), notes, facts)
 
 
 def _opened(file: BinaryIO, threads: int) -> tuple[Layout, Iterator[StreamRows], dict[str, int]]:

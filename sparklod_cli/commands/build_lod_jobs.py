@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 def job_of(
     ctx: click.Context, outputs: Outputs, general: General, console: Console, engine: ClusterEngine | None
 ) -> tuple[Make, Callable[..., None]]:
-    """What makes outputs of inputs, and what reports one; the point where numpy and numba are loaded."""
+    """What makes outputs of inputs, and what reports one; the point where numpy is loaded."""
     from ..api.bake_jobs import bake, bake_side_by_side, bake_unless_there, extract_leaves
 
     shared: dict[str, Any] = {"overwrite": outputs.overwrite, "progress": console.progress}

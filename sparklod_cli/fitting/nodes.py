@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from ..cameras.camera import Camera
 from ..lod.traversal import Forest, Traversal, TreeInstance, View
+from ..model.coding import PLAIN
 from ..model.foveation import Cones
 from ..model.gaussian import linear_opacity, lod_opacity, normalized_quat, size_factor
 from ..model.lod_tree import LodTree
@@ -46,7 +47,7 @@ class FittedNodes:
         self.columns = Columns(*(column.copy() for column in self.old))
         self.leaves: Index = np.flatnonzero(tree.is_leaf)
         self.merged: Index = np.flatnonzero(~tree.is_leaf)
-        self._forest = Forest([nodes_of(nodes, tree, "float16", threads)])
+        self._forest = Forest([nodes_of(nodes, tree, PLAIN, precision="float16", threads=threads)])
         self._traversal = Traversal(self._forest, [TreeInstance(foveation=Cones())])
 
     def cut(self, camera: Camera, share: float) -> Index:

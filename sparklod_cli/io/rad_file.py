@@ -11,6 +11,7 @@ from typing import Any, BinaryIO
 from ..codecs.rad.by_chunk import ByChunk, bytes_decoded
 from ..codecs.rad.codec import name_of
 from ..codecs.rad.records import RadHeader
+from ..model.coding import FileCoding
 from ..model.lod_tree import LodTree
 from ..model.splats import Splats
 from ..support.machine import available_memory
@@ -86,8 +87,8 @@ class RadFile:
             assert found is not None
             yield from self._chunks.read_all(*found, columns, thorough=thorough, threads=threads)
 
-    def chunk(self, number: int, columns: Collection[str]) -> tuple[Splats, LodTree | None]:
-        """One chunk, of which only these columns are unpacked; several threads may ask.
+    def chunk(self, number: int, columns: Collection[str]) -> tuple[Splats, LodTree | None, FileCoding]:
+        """One chunk and its coding; only these columns are unpacked. Several threads may ask.
 
         Raises:
             FormatError: it is damaged.

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..support.errors import InvalidSplatsError
+from .coding import PLAIN, FileCoding
 from .lod_tree import LodTree
 from .sh import COEFFICIENTS
 from .splats import Splats, describe_invalid
@@ -26,6 +27,7 @@ class Scene:
         notes: what the reader had to leave out, for display.
         header: numbers of the file's header that the splats do not tell, by name ("version", "fractional_bits").
         chunk_bytes: of each of its chunks in the file, where its format has chunks; None elsewhere.
+        coding: how the file holds its scales; `coding.PLAIN` where it has the very numbers.
     """
 
     splats: Splats
@@ -35,6 +37,7 @@ class Scene:
     notes: tuple[str, ...] = ()
     header: Mapping[str, int] = field(default_factory=dict)
     chunk_bytes: tuple[int, ...] | None = None
+    coding: FileCoding = PLAIN
 
     @classmethod
     def from_arrays(

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ..codecs.gpu.table import PRECISIONS
 from ..lod import detail_rule
 from ..lod.budget import Budget
 from ..lod.continuous import faded
@@ -22,7 +23,6 @@ from ..model.instances import Instance, Matrix
 from ..model.nodes import Nodes
 from ..model.scene import Scene
 from ..model.splats import Splats
-from ..support.defaults import PRECISIONS
 from ..support.units import count_of
 from .detail_scene import LoadedDetail
 from .loaded_scene import Index, LoadedScene, depth_of, nodes_of
@@ -199,7 +199,7 @@ class Scenes:
 
     def _nodes(self, scene: Scene) -> Nodes:
         assert scene.tree is not None
-        return nodes_of(scene.splats, scene.tree, self.precision, self.threads)
+        return nodes_of(scene.splats, scene.tree, scene.coding, precision=self.precision, threads=self.threads)
 
     def tree_instances(self, foveation: Foveation) -> list[TreeInstance]:
         """The instances of which cuts are drawn; those without a foveation of their own have this one."""

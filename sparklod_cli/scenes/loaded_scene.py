@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..codecs.gpu import lod_tree
+from ..codecs.gpu import loaded_nodes, lod_tree
+from ..model.coding import FileCoding
 from ..model.lod_tree import LodTree
 from ..model.nodes import CHUNK_NODES, Nodes
 from ..model.scene import Scene
@@ -123,8 +124,10 @@ def depth_of(loaded: LoadedScene) -> NDArray[np.int32]:
     return loaded.depth
 
 
-def nodes_of(splats: Splats, tree: LodTree, precision: str, threads: int) -> Nodes:
-    """Nodes as a traversal reads them, in one of `defaults.PRECISIONS`."""
+def nodes_of(splats: Splats, tree: LodTree, coding: FileCoding, *, precision: str, threads: int) -> Nodes:
+    """Nodes as a traversal reads them, in one of `gpu.table.PRECISIONS`."""
+    if precision == "float32":
+        return Nodes.of(splats, tree)
     if precision == "float16":
         return lod_tree.unpack(lod_tree.pack(splats, tree, threads=threads))
-    return Nodes.of(splats, tree)
+    return loaded_nodes.nodes(splats, tree, precision, coding, threads=threads)

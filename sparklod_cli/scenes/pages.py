@@ -12,12 +12,16 @@ from numpy.typing import NDArray
 
 from ..io import RadFile
 from ..lod.kernels.pixel_scale import NODE
+from ..model.coding import FileCoding
 from ..model.lod_tree import LodTree
 from ..model.nodes import CHUNK_BITS, CHUNK_NODES, Nodes
 from ..model.splats import COLUMNS, Splats
 from ..support.errors import SparklodError, TreeError
 from ..support.machine import available_memory
 from ..support.parallel import ordered_map
+
+#: Makes nodes of the splats, the tree and the coding of a chunk.
+NodesOf = Callable[[Splats, LodTree, FileCoding], Nodes]
 
 #: Columns that nodes are made of.
 TRAVERSED = ("center", "scale", "opacity")
@@ -36,7 +40,7 @@ class Pages:
     Args:
         file: of a tree in chunks of `CHUNK_NODES`.
         name: of the file, for errors.
-        nodes_of: makes nodes of the splats and the tree of a chunk.
+        nodes_of: makes the nodes of a chunk.
         threads: to decode splats with.
 
     Attributes:
@@ -44,7 +48,9 @@ class Pages:
         depth: (N,) int32 edges from the root, of the nodes that the present chunks lead to; 0 of others.
     """
 
-    def __init__(self, file: RadFile, name: str, nodes_of: Callable[[Splats, LodTree], Nodes], threads: int) -> None:
+    def __init__(
+        self, file: RadFile, name: str, nodes_of: Callable[[Splats, LodTree, FileCoding], Nodes], threads: int
+    ) -> None:
         self.file, self._name, self._nodes_of, self._threads = file, name, nodes_of, threads
         self.count = file.header.count
         self.present = np.zeros(len(file.header.chunks), np.bool_)
@@ -74,11 +80,11 @@ class Pages:
                     self._read(number)
 
     def _read(self, number: int) -> None:
-        splats, tree = self._decoded(number, TRAVERSED)
+        splats, tree, coding = self._decoded(number, TRAVERSED)
         assert tree is not None
         start = number << CHUNK_BITS
         self._check(tree, start)
-        found, part = self._nodes_of(splats, tree), self.nodes[start : start + len(tree)]
+        found, part = self._nodes_of(splats, tree, coding), self.nodes[start : start + len(tree)]
         part["x"], part["y"], part["z"] = found.center.T
         part["size"] = found.size
         part["child_start"], part["child_count"] = tree.child_start, tree.child_count
@@ -168,7 +174,7 @@ class Pages:
         found = [np.flatnonzero(tree.is_leaf) for _, tree in self.blocks(())]
         return np.concatenate([number * CHUNK_NODES + leaves for number, leaves in enumerate(found)])
 
-    def _decoded(self, number: int, columns: Collection[str]) -> tuple[Splats, LodTree | None]:
+    def _decoded(self, number: int, columns: Collection[str]) -> tuple[Splats, LodTree | None, FileCoding]:
         try:
             return self.file.chunk(number, columns)
         except SparklodError as error:

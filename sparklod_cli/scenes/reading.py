@@ -7,6 +7,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from ..codecs.gpu.table import PRECISIONS
 from ..codecs.rounding import after
 from ..io import RadFile, examine_scene, has_levels, read_level_files, read_levels, size_of_input
 from ..model.detail import DetailScene
@@ -15,7 +16,6 @@ from ..model.nodes import CHUNK_NODES
 from ..model.scene import Scene
 from ..model.selection import Selection, describe
 from ..model.splats import COLUMNS, Splats
-from ..support.defaults import PRECISIONS
 from ..support.errors import FormatError, InvalidSplatsError, SparklodError, TreeError, memory_errors_translated
 from ..support.progress import Progress, silent
 from ..support.stdin import DASH

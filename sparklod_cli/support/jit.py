@@ -1,18 +1,20 @@
-"""Compiles kernels; the only module that configures numba."""
+"""Kernels: functions that are compiled, and run as machine code. numba, which compiles, is loaded only to compile."""
 
 from __future__ import annotations
 
 import contextlib
+import functools
+import inspect
 import os
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Hashable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 #: How long OpenMP's threads spin while they wait for one another at the end of a parallel loop. By default they
 #: spin for milliseconds, which on a busy machine takes the processor from the thread they wait for: four concurrent
 #: bakes then take 1.5 times as long as four in sequence (docs/decisions/2026-11-21-kernels.md). The variables are read
-#: when numba starts its threads; variables that are already set are left unchanged.
+#: when the threads start; variables that are already set are left unchanged.
 WAIT_SETTINGS = {
     "GOMP_SPINCOUNT": "1000",  # GNU: iterations, about 20 microseconds
     "KMP_BLOCKTIME": "0",  # LLVM and Intel: milliseconds
@@ -21,11 +23,10 @@ if "OMP_WAIT_POLICY" not in os.environ:
     for _name, _value in WAIT_SETTINGS.items():
         os.environ.setdefault(_name, _value)
 
-import numba  # noqa: E402
-from numba import prange as prange  # noqa: E402
-from numba.core import event  # noqa: E402
-
-from .jit_cache import KernelCache, Trouble, is_whole, pattern_of, stem_of  # noqa: E402
+from . import jit_cache, jit_link, jit_threads  # noqa: E402
+from .errors import out_of_memory  # noqa: E402
+from .jit_cache import CODE, SUFFIX, Trouble, is_whole, pattern_of, start_of  # noqa: E402
+from .jit_types import describe, key_of  # noqa: E402
 from .kernel_sources import PACKAGE, digest_of, sources_of  # noqa: E402
 
 #: Called with the name of a kernel when its compilation begins, and with its duration in seconds when it ends.
@@ -42,7 +43,8 @@ def _cache_folder() -> Path | None:
 
     Its name is a digest of the code that compiles; the names of files depend on the sources of their kernels.
     """
-    digest = digest_of(sources_of(Path(__file__)))
+    here = Path(__file__)
+    digest = digest_of(sources_of(here) | sources_of(here.with_name("jit_numba.py")))
     given = os.environ.get("NUMBA_CACHE_DIR")
     places = [Path(given)] if given else [PACKAGE / "__pycache__"]
     if not given:
@@ -61,6 +63,116 @@ def _cache_folder() -> Path | None:
 CACHE_FOLDER = _cache_folder()
 
 
+class prange:  # noqa: N801 - it is numba's, and Python's `range` where kernels are not compiled
+    """A range whose iterations run on several threads in a compiled kernel that is `parallel`."""
+
+    def __new__(cls, *bounds: int) -> range:  # type: ignore[misc]
+        return range(*bounds)
+
+
+def prefetch(array: Any, index: int) -> None:
+    """In a compiled kernel: asks the processor to fetch an element of a C-contiguous row of records; changes nothing.
+
+    For loops that read elements in an order that the processor cannot foresee: with some iterations' notice, their
+    cache misses overlap. An index beyond the end is harmless.
+    """
+
+
+@dataclass(frozen=True)
+class Options:
+    """How a kernel is compiled; see `kernel`."""
+
+    parallel: bool
+    nogil: bool
+    inline: bool
+    contract: bool
+
+
+class Kernel:
+    """A function that runs as machine code, one for each combination of types of its arguments.
+
+    Machine code comes from the cache, or from numba where the cache has none.
+
+    Args:
+        function: the Python function.
+        options: how to compile it.
+
+    Attributes:
+        py_func: the Python function.
+        options: how to compile it.
+        compiler: see `jit_numba.compiler_of`; None as long as nothing had to be compiled.
+        called: what runs with arguments of the types of a key, see `jit_types.key_of`.
+    """
+
+    def __init__(self, function: Callable[..., Any], options: Options) -> None:
+        functools.update_wrapper(self, function)
+        self.py_func, self.options = function, options
+        self.compiler: Any = None
+        self.called: dict[Hashable, Callable[..., Any]] = {}
+
+    def __call__(self, *arguments: Any, **named: Any) -> Any:
+        if named or self.py_func.__defaults__:
+            bound = inspect.signature(self.py_func).bind(*arguments, **named)
+            bound.apply_defaults()
+            arguments = bound.args
+        key = key_of(arguments)
+        called = self.called.get(key)
+        if called is None:
+            called = self._find(key, arguments)
+        return called(*arguments)
+
+    def __reduce__(self) -> str:
+        return self.py_func.__qualname__
+
+    def _find(self, key: Hashable | None, arguments: tuple[Any, ...]) -> Callable[..., Any]:
+        """What to call with arguments of these types."""
+        text = None if key is None else describe(arguments)
+        if text is None:
+            return self._dispatcher()
+        path = None
+        if CACHE_FOLDER is not None and jit_link.is_tested():
+            path = CACHE_FOLDER / f"{start_of(self.py_func)}-{jit_cache.digest(text)}{CODE}"
+        called = None if path is None else self._load(path)
+        if called is None:
+            called = self._compile(path, arguments)
+        self.called[key] = called
+        return called
+
+    def _dispatcher(self) -> Callable[..., Any]:
+        """What numba calls with arguments of any types, or refuses them with."""
+        from . import jit_numba
+
+        dispatcher: Callable[..., Any] = jit_numba.compiler_of(self).dispatcher
+        return dispatcher
+
+    def _load(self, path: Path) -> Callable[..., Any] | None:
+        """Loads machine code from a file; None if there is none, or none that can be used."""
+        try:
+            content = jit_cache.read(path)
+            return None if content is None else jit_link.link(jit_link.MachineCode.from_bytes(content), self.py_func)
+        except Exception as error:
+            if out_of_memory(error):
+                raise
+        jit_cache.discard(path, report_trouble)
+        return None
+
+    def _compile(self, path: Path | None, arguments: tuple[Any, ...]) -> Callable[..., Any]:
+        """Compiles the kernel, and writes the machine code to a file if it can be linked, as it is in this process."""
+        from . import jit_numba
+
+        called, code = jit_numba.compiler_of(self).compile(arguments)
+        if path is None or code is None:
+            return called
+        try:
+            linked = jit_link.link(code, self.py_func)
+        except Exception as error:
+            if out_of_memory(error):
+                raise
+            return called
+        jit_cache.write(path, code.pieces(), report_trouble)
+        return linked
+
+
 def kernel(
     *, parallel: bool = False, nogil: bool = False, inline: bool = False, contract: bool = False
 ) -> Callable[[Callable[..., Any]], Any]:
@@ -75,36 +187,43 @@ def kernel(
         inline: always inlines the function into its callers, which LLVM does not always do by itself.
         contract: allows fused multiply-add, which rounds once instead of twice, on processors that have it.
     """
+    options = Options(parallel, nogil, inline, contract)
 
     def decorate(function: Callable[..., Any]) -> Any:
-        compiled: Any = numba.njit(
-            error_model="numpy",
-            parallel=parallel,
-            nogil=nogil,
-            inline="always" if inline else "never",
-            fastmath={"contract"} if contract else False,
-        )(function)
-        if CACHE_FOLDER is not None and hasattr(compiled, "enable_caching"):  # not with NUMBA_DISABLE_JIT
-            compiled._cache = KernelCache(function, CACHE_FOLDER, _report_trouble)
-        return compiled
+        return function if _is_disabled() else Kernel(function, options)
 
     return decorate
+
+
+def _is_disabled() -> bool:
+    """Whether the environment asks numba to compile nothing."""
+    try:
+        return bool(int(os.environ.get("NUMBA_DISABLE_JIT") or 0))
+    except ValueError:
+        return False
 
 
 def is_cached(name: str) -> bool:
     """Whether this process can load the compiled code of a kernel, which is named "module.function"."""
     if CACHE_FOLDER is None:
         return False
-    sources = PACKAGE.glob(f"*/kernels/{name.partition('.')[0]}.py")
+    suffixes = [CODE, SUFFIX] if jit_link.is_tested() else [SUFFIX]
+    sources = list(PACKAGE.glob(f"*/kernels/{name.partition('.')[0]}.py"))
     with contextlib.suppress(OSError):
-        files = (file for source in sources for file in CACHE_FOLDER.glob(pattern_of(name, source)))
+        patterns = (pattern_of(name, source, suffix) for suffix in suffixes for source in sources)
+        files = (file for pattern in patterns for file in CACHE_FOLDER.glob(pattern))
         return any(file.is_file() and is_whole(file.read_bytes()) for file in files)
     return False
 
 
 def use_threads(count: int) -> None:
-    """Runs kernels on `count` threads, or on all of numba's threads if it has fewer."""
-    numba.set_num_threads(min(count, numba.config.NUMBA_NUM_THREADS))
+    """Runs kernels that this thread calls on `count` threads, or on all if there are fewer."""
+    jit_threads.layer().use(count)
+
+
+def threads_in_use() -> int:
+    """The number of threads that kernels called by this thread run on."""
+    return jit_threads.layer().in_use()
 
 
 @contextlib.contextmanager
@@ -114,40 +233,52 @@ def threads_for(rows: int) -> Iterator[int]:
     Waking the other threads takes longer than processing a few thousand rows; on a busy machine, where the threads
     sleep, a thousand times longer.
     """
-    threads = numba.get_num_threads()
+    threads = threads_in_use()
     use_threads(1 if rows < PARALLEL_ROWS else threads)
     try:
-        yield numba.get_num_threads()
+        yield threads_in_use()
     finally:
         use_threads(threads)
 
 
-#: Callbacks for messages about a cache that does not work.
-_trouble_listeners: list[Trouble] = []
+def threading_layer() -> str:
+    """The layer that runs parallel loops: omp, tbb or workqueue. Starts its threads.
+
+    Raises:
+        ValueError: no threading layer can be loaded.
+    """
+    return jit_threads.layer().name
 
 
-def _report_trouble(text: str) -> None:
-    for report in _trouble_listeners:
-        report(text)
+def require_compiler() -> None:
+    """Loads numba, which otherwise happens when something has to be compiled.
+
+    Raises:
+        ImportError: it is missing or broken.
+    """
+    from . import jit_numba  # noqa: F401
 
 
-class _OnCompile(event.Listener):
-    """Reports the compilation of kernels called from Python, not of the kernels that those call."""
+#: Who is told of compilations and of a cache that does not work, see `listen`.
+_listeners: list[tuple[Begun, Done, Trouble]] = []
 
-    def __init__(self, begun: Begun, done: Done) -> None:
-        self._begun, self._done = begun, done
-        self._depth, self._since = 0, 0.0
 
-    def on_start(self, event: event.Event) -> None:
-        self._depth += 1  # numba compiles on one thread at a time
-        if self._depth == 1:
-            self._since = time.perf_counter()
-            self._begun(stem_of(event.data["dispatcher"].py_func))
+def report_begun(name: str) -> None:
+    """Tells listeners which kernel is being compiled."""
+    for begun, _, _ in _listeners:
+        begun(name)
 
-    def on_end(self, event: event.Event) -> None:
-        self._depth -= 1
-        if self._depth == 0:
-            self._done(time.perf_counter() - self._since)
+
+def report_done(seconds: float) -> None:
+    """Tells listeners how long that took."""
+    for _, done, _ in _listeners:
+        done(seconds)
+
+
+def report_trouble(text: str) -> None:
+    """Tells listeners what is wrong with the cache."""
+    for _, _, trouble in _listeners:
+        trouble(text)
 
 
 def listen(begun: Begun, done: Done, trouble: Trouble) -> Callable[[], None]:
@@ -161,31 +292,6 @@ def listen(begun: Begun, done: Done, trouble: Trouble) -> Callable[[], None]:
     Returns:
         a function that stops the reports.
     """
-    listener = _OnCompile(begun, done)
-    event.register("numba:compile", listener)
-    _trouble_listeners.append(trouble)
-
-    def stop() -> None:
-        event.unregister("numba:compile", listener)
-        _trouble_listeners.remove(trouble)
-
-    return stop
-
-
-def threads_in_use() -> int:
-    """The number of threads that kernels run on."""
-    threads: int = numba.get_num_threads()
-    return threads
-
-
-def threading_layer() -> str:
-    """The layer that runs parallel loops: omp, tbb or workqueue. Starts its threads.
-
-    Raises:
-        ValueError: no threading layer can be loaded.
-    """
-    from numba.np.ufunc.parallel import _launch_threads
-
-    _launch_threads()
-    layer: str = numba.threading_layer()
-    return layer
+    listener = begun, done, trouble
+    _listeners.append(listener)
+    return lambda: _listeners.remove(listener)

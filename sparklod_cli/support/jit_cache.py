@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import hashlib
-import pickle
-import platform
-from collections.abc import Callable, Collection
+import importlib.util
+import os
+import sys
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import numba
-from numba.core import caching, compiler
-from numba.core.registry import cpu_target
-from numba.core.serialize import dumps
-
 from . import atomic
-from .errors import out_of_memory
 from .kernel_sources import digest_of, sources_of
 
-#: Suffix of the files of compiled kernels.
+#: Suffix of the files with machine code, which `jit_link` loads without numba.
+CODE = ".code"
+
+#: Suffix of the files with what numba needs to compile the callers of a kernel as well.
 SUFFIX = ".kernel"
 
 #: Bytes of the checksum at the start of a file. 16 make an accidental match impossible in practice.
@@ -28,100 +27,93 @@ CHECKSUM = 16
 #: Called with a one-line message if the cache cannot be used; see `jit.listen`.
 Trouble = Callable[[str], None]
 
+#: Variables for numba that do not change the machine code. All others count, although few of them change it.
+NEUTRAL = (
+    "NUMBA_CACHE_DIR",
+    "NUMBA_DISABLE_JIT",
+    "NUMBA_NUM_THREADS",
+    "NUMBA_THREADING_LAYER",
+    "NUMBA_THREADING_LAYER_PRIORITY",
+)
 
-class KernelCache(caching._Cache):
-    """The cache of one function's compiled code, in place of numba's own.
-
-    numba's cache trusts its files: an empty one ends in an `EOFError`, a flipped bit in an error of LLVM or a crash, a
-    full disk in an `OSError`; and two processes that compile two signatures of one function at the same time can each
-    take the other's file for its own. Besides, it looks at the file of a kernel only, not at the kernels and constants
-    that it uses. Here each signature has its own file, named by all that its code depends on. A file is written
-    atomically and begins with a checksum. If a file is damaged, the kernel is compiled again; if the folder cannot be
-    used, the kernel is compiled but not stored.
-
-    Args:
-        function: the Python function.
-        folder: folder of the files.
-        trouble: called with a one-line message if the cache cannot be used.
-    """
-
-    def __init__(self, function: Callable[..., Any], folder: Path, trouble: Trouble) -> None:
-        self._folder, self._trouble = folder, trouble
-        self._stem, self._sources = stem_of(function), sources_of(Path(function.__code__.co_filename))
-        self._enabled = True
-
-    @property
-    def cache_path(self) -> str:
-        return str(self._folder)
-
-    def enable(self) -> None:
-        self._enabled = True
-
-    def disable(self) -> None:
-        self._enabled = False
-
-    def flush(self) -> None:
-        for path in self._folder.glob(f"{self._stem}-*{SUFFIX}"):
-            path.unlink(missing_ok=True)
-
-    def load_overload(self, signature: Any, target_context: Any) -> Any:
-        """Loads the compiled function; returns None if it has to be compiled."""
-        target_context.refresh()
-        path = self._path(signature, target_context.codegen())
-        try:
-            content = path.read_bytes() if self._enabled and path.is_file() else None  # not a pipe or a device
-        except OSError:
-            return None
-        if content is None:
-            return None
-        if is_whole(content):
-            try:
-                return compiler.CompileResult._rebuild(target_context, *pickle.loads(content[CHECKSUM:]))
-            except Exception as error:
-                # An undamaged file may still be unusable, for example if it refers to types of another numpy.
-                if out_of_memory(error):
-                    raise
-        self._trouble(f"compiled code in {self._folder} is damaged; the damaged kernels are compiled again")
-        with contextlib.suppress(OSError):
-            path.unlink()
-        return None
-
-    def save_overload(self, signature: Any, compiled: Any) -> None:
-        """Writes a compiled function to the cache, if it can be cached."""
-        if not self._enabled or compiled.lifted or compiled.library.has_dynamic_globals:
-            return
-        payload = dumps(compiled._reduce())
-        try:
-            self._folder.mkdir(parents=True, exist_ok=True)
-            atomic.write(self._path(signature, compiled.codegen), [_checksum(payload), payload], overwrite=True)
-        except OSError as error:
-            reason = (error.strerror or str(error)).lower()
-            self._trouble(f"cannot cache compiled code in {self._folder} ({reason}); it is compiled in every run")
-
-    def _path(self, signature: Any, codegen: Any) -> Path:
-        start = _start(self._stem, self._sources, codegen)
-        return self._folder / f"{start}-{_digest(str(signature))}{SUFFIX}"
+#: File of settings that numba reads in the working directory.
+SETTINGS = Path(".numba_config.yaml")
 
 
-def pattern_of(stem: str, source: Path) -> str:
+def start_of(function: Callable[..., Any]) -> str:
+    """The start of the names of a function's files, which stands for its sources and for this machine."""
+    return _start(stem_of(function), Path(function.__code__.co_filename))
+
+
+def pattern_of(stem: str, source: Path, suffix: str = CODE) -> str:
     """Glob pattern of the files of a kernel that this process can load: those for its processor, numba and Python.
 
     Args:
         stem: "module.function".
         source: the module.
+        suffix: `CODE` or `SUFFIX`.
     """
-    return f"{_start(stem, sources_of(source), cpu_target.target_context.codegen())}-*{SUFFIX}"
+    return f"{_start(stem, source)}-*{suffix}"
 
 
-def _start(stem: str, sources: Collection[Path], codegen: Any) -> str:
-    return f"{stem}-{digest_of(sources)}-{_digest(*_machine(codegen))}"
+def _start(stem: str, source: Path) -> str:
+    return f"{stem}-{digest_of(sources_of(source))}-{_machine()}"
 
 
-def _machine(codegen: Any) -> tuple[Any, ...]:
-    return codegen.magic_tuple(), numba.__version__, platform.python_version()
+@functools.cache
+def _machine() -> str:
+    """A digest of all that machine code depends on besides the sources, found without loading numba."""
+    binding = llvm()
+    try:
+        features = binding.get_host_cpu_features().flatten()
+    except RuntimeError:  # LLVM does not know them, and numba does not use them
+        features = ""
+    variables = {name: value for name, value in os.environ.items() if name.startswith("NUMBA_") and name not in NEUTRAL}
+    settings = SETTINGS.read_bytes() if SETTINGS.is_file() else b""
+    host = binding.get_process_triple(), binding.get_host_cpu_name(), features
+    return digest(host, sorted(variables.items()), settings, numba_version(), sys.version)
 
 
-def _digest(*depends_on: Any) -> str:
+def llvm() -> Any:
+    """llvmlite's module of LLVM.
+
+    Raises:
+        MemoryError: LLVM does not fit into memory.
+        ImportError, OSError: it cannot be loaded.
+    """
+    try:
+        from llvmlite import binding
+    except OSError as error:
+        reasons = f"{error} {error.__cause__} {error.__context__}"
+        if "failed to map segment" in reasons or "annot allocate memory" in reasons:
+            raise MemoryError from error
+        raise
+    return binding
+
+
+@functools.cache
+def numba_folder() -> Path | None:
+    """Where numba is installed; None if it is not, or not in a folder."""
+    try:
+        spec = importlib.util.find_spec("numba")
+    except ValueError:  # loaded in an unusual way
+        return None
+    return Path(spec.submodule_search_locations[0]) if spec and spec.submodule_search_locations else None
+
+
+def numba_version() -> bytes:
+    """What tells the installed version of numba from others: the content of its module of the version."""
+    folder = numba_folder()
+    if folder is not None:
+        with contextlib.suppress(OSError):
+            return (folder / "_version.py").read_bytes()
+    from importlib import metadata  # takes long to load
+
+    return metadata.version("numba").encode()
+
+
+def digest(*depends_on: Any) -> str:
+    """A short digest of some values, made of their representations."""
     return hashlib.blake2b(repr(depends_on).encode(), digest_size=8).hexdigest()
 
 
@@ -130,10 +122,47 @@ def stem_of(function: Callable[..., Any]) -> str:
     return f"{function.__module__.rpartition('.')[2]}.{function.__name__}"
 
 
+def read(path: Path) -> bytes | None:
+    """The content of a file of the cache; None if there is none that can be read.
+
+    Raises:
+        ValueError: the file is damaged.
+    """
+    try:
+        content = path.read_bytes() if path.is_file() else None  # not a pipe or a device
+    except OSError:
+        return None
+    if content is None:
+        return None
+    if not is_whole(content):
+        raise ValueError("the checksum does not match")
+    return content[CHECKSUM:]
+
+
+def discard(path: Path, trouble: Trouble) -> None:
+    """Removes a damaged file."""
+    trouble(f"compiled code in {path.parent} is damaged; the damaged kernels are compiled again")
+    with contextlib.suppress(OSError):
+        path.unlink()
+
+
+def write(path: Path, pieces: Sequence[bytes], trouble: Trouble) -> None:
+    """Writes a file atomically."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        atomic.write(path, [_checksum(*pieces), *pieces], overwrite=True)
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        trouble(f"cannot cache compiled code in {path.parent} ({reason}); it is compiled in every run")
+
+
 def is_whole(content: bytes) -> bool:
     """Whether the content of a file matches its checksum."""
     return content[:CHECKSUM] == _checksum(content[CHECKSUM:])
 
 
-def _checksum(payload: bytes) -> bytes:
-    return hashlib.blake2b(payload, digest_size=CHECKSUM).digest()
+def _checksum(*pieces: bytes) -> bytes:
+    checksum = hashlib.blake2b(digest_size=CHECKSUM)
+    for piece in pieces:
+        checksum.update(piece)
+    return checksum.digest()

@@ -32,7 +32,7 @@ def on_threads(threads: int | None) -> Iterator[int]:
     Raises:
         ValueError: it is less than 1.
     """
-    from . import jit  # loading numba takes half a second
+    from . import jit  # loads numpy
 
     count, before = thread_count(threads), jit.threads_in_use()
     jit.use_threads(count)

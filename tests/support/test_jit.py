@@ -9,11 +9,14 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numba
+import numpy as np
 import pytest
 
 from sparklod_cli.support import jit
+from sparklod_cli.support.jit import prefetch as jit_prefetch
 from sparklod_cli.support.kernel_sources import sources_of
 from tests.conftest import ROOT
 
@@ -85,8 +88,12 @@ def test_kernels_run_without_compilation() -> None:
     assert float(done.stdout) == pytest.approx(12.566, abs=1e-3)
 
 
-def test_compilations_are_reported_but_not_nested_ones() -> None:
-    inner = numba.njit(lambda x: x + 1)
+def test_compilations_are_reported_but_not_nested_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(jit, "CACHE_FOLDER", None)
+
+    @jit.kernel()
+    def inner(x: int) -> int:
+        return x + 1
 
     def outer(x: int) -> int:
         result: int = inner(x)
@@ -96,14 +103,31 @@ def test_compilations_are_reported_but_not_nested_ones() -> None:
     seconds: list[float] = []
     stop = jit.listen(begun.append, seconds.append, lambda text: None)
     try:
-        assert numba.njit(outer)(1) == 2
-        numba.njit(add)(1, 2)
+        assert jit.kernel()(outer)(1) == 2
+        jit.kernel()(add)(1, 2)
     finally:
         stop()
-    numba.njit(add)(1, 2)
+    jit.kernel()(add)(1, 2)
     assert begun == ["test_jit.outer", "test_jit.add"]
     assert len(seconds) == 2
     assert all(value > 0 for value in seconds)
+
+
+def test_prefetch_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(jit, "CACHE_FOLDER", None)
+
+    @jit.kernel()
+    def total(values: Any) -> int:
+        found = 0
+        for index in range(len(values)):
+            jit_prefetch(values, index + 16)  # beyond the end, at last
+            found += values[index]["count"]
+        return found
+
+    rows = np.zeros(100, [("count", np.int64), ("share", np.float32)])
+    rows["count"] = np.arange(100)
+    assert total(rows) == total.py_func(rows) == 4950
+    assert np.array_equal(rows["count"], np.arange(100))
 
 
 @pytest.mark.parametrize("given", [{}, {"OMP_WAIT_POLICY": "ACTIVE"}, {"GOMP_SPINCOUNT": "7"}])

@@ -5,15 +5,15 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numba
 import pytest
 
-from sparklod_cli.support import atomic
-from sparklod_cli.support.jit_cache import SUFFIX, KernelCache, pattern_of
+from sparklod_cli.support import atomic, jit, jit_link
+from sparklod_cli.support.jit_cache import CODE, SUFFIX, pattern_of
 from tests.conftest import ROOT
 
 DAMAGE: dict[str, Callable[[bytes], bytes]] = {
@@ -25,99 +25,144 @@ DAMAGE: dict[str, Callable[[bytes], bytes]] = {
     "another file": lambda content: b"\x80\x04N.",
 }
 
+#: What a compiled kernel leaves in the cache.
+SUFFIXES = [CODE, SUFFIX] if jit_link.is_tested() else [SUFFIX]
+
 
 def twice(x: float) -> float:
     return x * 2
 
 
-def compiled(folder: Path, told: list[str]) -> Any:
-    """`twice`, compiled anew, with a cache."""
-    kernel: Any = numba.njit(twice)
-    kernel._cache = KernelCache(twice, folder, told.append)
-    return kernel
+@dataclass
+class Cache:
+    """A cache of kernels, and what was said of it."""
+
+    folder: Path
+    begun: list[str] = field(default_factory=list)
+    told: list[str] = field(default_factory=list)
+
+    def files(self, suffix: str = "") -> list[Path]:
+        return sorted(self.folder.glob(f"*{suffix}"))
+
+    def compiles(self, argument: float = 2.0) -> bool:
+        """Calls `twice` as in a new process; whether it had to be compiled."""
+        before = len(self.begun)
+        assert jit.kernel()(twice)(argument) == argument * 2
+        return len(self.begun) > before
 
 
-def was_cached(kernel: Any) -> bool:
-    return bool(kernel.stats.cache_hits) and not kernel.stats.cache_misses
+@pytest.fixture
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Cache]:
+    found = Cache(tmp_path / "cache")
+    monkeypatch.setattr(jit, "CACHE_FOLDER", found.folder)
+    stop = jit.listen(found.begun.append, lambda seconds: None, found.told.append)
+    yield found
+    stop()
 
 
-def test_code_compiled_for_another_processor_is_not_used(tmp_path: Path) -> None:
-    compiled(tmp_path, [])(2.0)
-    assert list(tmp_path.glob(pattern_of("test_jit_cache.twice", Path(__file__))))
-    call = f"pattern_of('test_jit_cache.twice', Path({__file__!r}))"
-    code = f"from pathlib import Path; from sparklod_cli.support.jit_cache import pattern_of; print({call})"
-    environment = {**os.environ, "NUMBA_CPU_NAME": "generic"}
-    other = subprocess.run([sys.executable, "-c", code], cwd=ROOT, env=environment, capture_output=True, text=True)
-    assert other.stdout.startswith("test_jit_cache.twice-")
-    assert not list(tmp_path.glob(other.stdout.strip()))
+def test_code_compiled_for_another_processor_is_not_used(cache: Cache) -> None:
+    cache.compiles()
+    for suffix in SUFFIXES:
+        pattern = pattern_of("test_jit_cache.twice", Path(__file__), suffix)
+        assert list(cache.folder.glob(pattern))
+        call = f"pattern_of('test_jit_cache.twice', Path({__file__!r}), {suffix!r})"
+        code = f"from pathlib import Path; from sparklod_cli.support.jit_cache import pattern_of; print({call})"
+        for changed, same in (({}, True), ({"NUMBA_NUM_THREADS": "1"}, True), ({"NUMBA_CPU_NAME": "generic"}, False)):
+            command, environment = [sys.executable, "-c", code], {**os.environ, **changed}
+            other = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
+            assert other.stdout.startswith("test_jit_cache.twice-")
+            assert (other.stdout.strip() == pattern) == same
 
 
-def test_memory_that_runs_out_is_no_damage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    told: list[str] = []
-    compiled(tmp_path, told)(2.0)
+def test_settings_in_a_file_for_numba_count(tmp_path: Path) -> None:
+    code = """
+from pathlib import Path
+from sparklod_cli.support import jit_cache, jit_link
+print(jit_cache.pattern_of('fast_math.exp2', Path(jit_cache.__file__)), jit_link.is_tested())
+"""
+    found = []
+    for settings in ("", "opt: 1\n"):
+        if settings:
+            (tmp_path / ".numba_config.yaml").write_text(settings)
+        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+        command = [sys.executable, "-c", code]
+        done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True)
+        found.append(done.stdout.split())
+    assert found[0][0] != found[1][0]
+    assert found[1][1] == "False"
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_memory_that_runs_out_is_no_damage(cache: Cache, monkeypatch: pytest.MonkeyPatch, suffix: str) -> None:
+    cache.compiles()
+    before = cache.files(suffix)
+    for path in set(cache.files()) - set(before):
+        path.unlink()
 
     def starved(*arguments: object) -> None:
         raise MemoryError
 
-    monkeypatch.setattr("sparklod_cli.support.jit_cache.pickle.loads", starved)
+    monkeypatch.setattr("sparklod_cli.support.jit_cache.is_whole", starved)
     with pytest.raises(MemoryError):
-        compiled(tmp_path, told)(2.0)
-    assert told == []
-    assert len(list(tmp_path.iterdir())) == 1
+        cache.compiles()
+    assert cache.told == []
+    assert cache.files() == before
 
 
-def test_a_second_process_finds_what_the_first_has_compiled(tmp_path: Path) -> None:
-    told: list[str] = []
-    for cached in (False, True):
-        kernel = compiled(tmp_path, told)
-        assert kernel(2.0) == 4
-        assert was_cached(kernel) == cached
-    assert kernel(2) == 4  # another signature, in a file of its own
-    assert len(list(tmp_path.iterdir())) == 2
-    assert told == []
+def test_a_second_process_finds_what_the_first_has_compiled(cache: Cache) -> None:
+    assert [cache.compiles(), cache.compiles()] == [True, False]
+    assert cache.compiles(2)  # another signature, in files of its own
+    assert len(cache.files()) == 2 * len(SUFFIXES)
+    assert cache.told == []
 
 
 @pytest.mark.parametrize("damage", DAMAGE.values(), ids=DAMAGE)
-def test_a_damaged_file_is_told_of_and_compiled_again(tmp_path: Path, damage: Callable[[bytes], bytes]) -> None:
-    told: list[str] = []
-    compiled(tmp_path, told)(2.0)
-    (path,) = tmp_path.iterdir()
-    whole = path.read_bytes()
-    path.write_bytes(damage(whole))
-    kernel = compiled(tmp_path, told)
-    assert kernel(2.0) == 4
-    assert not was_cached(kernel)
-    assert told == [f"compiled code in {tmp_path} is damaged; the damaged kernels are compiled again"]
-    kernel = compiled(tmp_path, told)
-    assert kernel(2.0) == 4
-    assert was_cached(kernel)
-    assert len(told) == 1
+def test_damaged_files_are_told_of_and_compiled_again(cache: Cache, damage: Callable[[bytes], bytes]) -> None:
+    cache.compiles()
+    for path in cache.files():
+        path.write_bytes(damage(path.read_bytes()))
+    assert cache.compiles()
+    assert set(cache.told) == {f"compiled code in {cache.folder} is damaged; the damaged kernels are compiled again"}
+    before = len(cache.told)
+    assert not cache.compiles()
+    assert len(cache.told) == before == len(SUFFIXES)
 
 
-def test_a_folder_that_takes_no_file_is_told_of_and_does_no_harm(tmp_path: Path) -> None:
-    told: list[str] = []
-    (tmp_path / "file").touch()
-    assert compiled(tmp_path / "file" / "folder", told)(2.0) == 4
-    assert len(told) == 1
-    assert "not a directory" in told[0]
+@pytest.mark.skipif(not jit_link.is_tested(), reason="machine code is not linked on this system")
+@pytest.mark.parametrize("damage", DAMAGE.values(), ids=DAMAGE)
+def test_damaged_machine_code_is_told_of_and_replaced(cache: Cache, damage: Callable[[bytes], bytes]) -> None:
+    cache.compiles()
+    (path,) = cache.files(CODE)
+    content = path.read_bytes()
+    path.write_bytes(damage(content))
+    assert not cache.compiles()  # numba loads what it has stored
+    assert len(cache.told) == 1
+    assert path.read_bytes() == content
 
 
-def test_a_folder_that_was_removed_is_made_again(tmp_path: Path) -> None:
-    told: list[str] = []
-    compiled(tmp_path / "gone", told)(2.0)
-    assert len(list((tmp_path / "gone").glob(f"*{SUFFIX}"))) == 1
-    assert told == []
+def test_a_folder_that_takes_no_file_is_told_of_and_does_no_harm(cache: Cache, monkeypatch: pytest.MonkeyPatch) -> None:
+    cache.folder.touch()
+    monkeypatch.setattr(jit, "CACHE_FOLDER", cache.folder / "folder")
+    assert cache.compiles()
+    assert len(cache.told) == 1
+    assert "not a directory" in cache.told[0]
 
 
-def test_a_full_disk_leaves_no_part_of_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_that_was_removed_is_made_again(cache: Cache) -> None:
+    assert not cache.folder.exists()
+    cache.compiles()
+    assert len(cache.files()) == len(SUFFIXES)
+    assert cache.told == []
+
+
+def test_a_full_disk_leaves_no_part_of_a_file(cache: Cache, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(file: object, pieces: object, **_: object) -> int:
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(atomic, "fill", full)
-    told: list[str] = []
-    assert compiled(tmp_path, told)(2.0) == 4
-    assert "no space left on device" in told[0]
-    assert list(tmp_path.iterdir()) == []
+    assert cache.compiles()
+    assert "no space left on device" in cache.told[0]
+    assert cache.files() == []
 
 
 def test_a_bake_heals_a_cache_in_which_every_file_is_damaged(tmp_path: Path) -> None:
@@ -129,8 +174,8 @@ def test_a_bake_heals_a_cache_in_which_every_file_is_damaged(tmp_path: Path) -> 
     command = [sys.executable, "-m", "sparklod_cli", "inspect", tree, "--check"]
     how: dict[str, Any] = {"cwd": ROOT, "env": environment, "capture_output": True, "text": True, "check": True}
     subprocess.run(command, **how)
-    files = sorted((tmp_path / "cache").rglob(f"*{SUFFIX}"))
-    assert len(files) >= 4
+    files = sorted(path for path in (tmp_path / "cache").rglob("*") if path.is_file())
+    assert len(files) >= 4 * len(SUFFIXES)
     for number, path in enumerate(files):
         path.write_bytes([*DAMAGE.values()][number % len(DAMAGE)](path.read_bytes()))
     healed = subprocess.run(command, **how)

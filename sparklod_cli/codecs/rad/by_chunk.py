@@ -8,13 +8,14 @@ from typing import BinaryIO
 
 import numpy as np
 
+from ...model.coding import FileCoding
 from ...model.lod_tree import LodTree
 from ...model.sh import COEFFICIENTS
 from ...model.splats import FloatArray, Splats
 from ...support.parallel import ordered_map
 from .decoding import Packed
 from .places import Beside
-from .reading import checked_header, chunks_of, facts_of, fill_known
+from .reading import checked_header, chunks_of, coding_of, facts_of, fill_known
 from .records import RadHeader
 
 
@@ -53,8 +54,9 @@ class ByChunk:
 
     def read(
         self, number: int, file: BinaryIO, beside: Beside | None, columns: Collection[str], *, thorough: bool = True
-    ) -> tuple[Splats, LodTree | None]:
-        """One chunk: its splats, and its nodes where there is a tree, whose children have the numbers of the file.
+    ) -> tuple[Splats, LodTree | None, FileCoding]:
+        """One chunk: its splats, its nodes where there is a tree, whose children have the numbers of the file, and its
+        coding.
 
         Args:
             number: of the chunk, from 0.
@@ -67,7 +69,8 @@ class ByChunk:
             FormatError: the chunk is cut short, corrupt, or not the one that the header means.
         """
         (packed,) = chunks_of(file, self.header, beside, range(number, number + 1))
-        return self._decoded(packed, columns, thorough=thorough)
+        coding = coding_of(self.header, [packed.scale_coding()])
+        return *self._decoded(packed, columns, thorough=thorough), coding
 
     def read_all(
         self, file: BinaryIO, beside: Beside | None, columns: Collection[str], *, thorough: bool, threads: int

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...model.coding import ScaleCoding
 from ...model.lod_tree import LodTree
 from ...model.sh import COEFFICIENTS
 from ...model.splats import FloatArray, Splats
@@ -53,6 +54,13 @@ class Packed:
     def property(self, name: str) -> Property | None:
         """A property by its name; None where the chunk has none."""
         return next((each for each in self.header.properties if each.name == name), None)
+
+    def scale_coding(self) -> ScaleCoding:
+        """How the chunk holds its scales."""
+        found = self.property("scales")
+        if found is None or not found.encoding.startswith("ln_"):
+            return ScaleCoding()
+        return ScaleCoding(found.encoding, found.min or 0.0, found.max or 0.0)
 
     def palette(self, header: RadHeader) -> FloatArray | None:
         """(codes, K, 3) SH coefficients that labels point to; None where the chunk has no palette.

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ...model.coding import FileCoding, ScaleCoding
 from ...model.lod_tree import LodTree
 from ...model.scene import Scene
 from ...model.sh import COEFFICIENTS
@@ -71,7 +72,10 @@ def examine(
     first = next(chunks, None)
     palette = first.palette(header) if first is not None else None
 
+    codings: list[ScaleCoding] = [ScaleCoding()] * max(len(header.chunks), 1)
+
     def run(packed: Packed) -> int:
+        codings[packed.number] = packed.scale_coding()
         part = slice(packed.header.base, packed.header.base + packed.header.count)
         nodes = None if tree is None else LodTree(tree.child_count[part], tree.child_start[part])
         fill_known(packed, header, rows_in(splats, part), nodes, palette, columns)
@@ -86,7 +90,8 @@ def examine(
         progress("reading", done, header.count, "splat")
     sizes = tuple(entry.bytes for entry in header.chunks)
     facts = facts_of(header, palette)
-    return Scene(splats, tree, header.antialiased, name_of(header), header=facts, chunk_bytes=sizes)
+    coding = coding_of(header, codings)
+    return Scene(splats, tree, header.antialiased, name_of(header), header=facts, chunk_bytes=sizes, coding=coding)
 
 
 def stream(
@@ -140,6 +145,13 @@ def facts_of(header: RadHeader, palette: FloatArray | None) -> dict[str, int]:
     facts = {"version": 1, "chunks": len(header.chunks), "chunk_size": header.chunk_size}
     facts |= {"header_bytes": header.bytes, "chunked": int(header.chunked)}
     return facts | ({"sh_codes": len(palette)} if palette is not None else {})
+
+
+def coding_of(header: RadHeader, scales: Sequence[ScaleCoding]) -> FileCoding:
+    """How a file holds its scales, of those of its chunks, or of a single chunk."""
+    found = header.encoding
+    ranges = None if found is None else (found.ln_scale_min, found.ln_scale_max)
+    return FileCoding(tuple(scales), header.chunk_size, ranges)
 
 
 def fill_known(

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from ...codecs.gpu import table
 from ...lod import detail_rule
 from ...support import defaults
 from ..command import COMMON, option, with_options
@@ -69,7 +70,7 @@ class Cut:
         pixel_scale_limit: the same as size over distance.
         cone_fov0, cone_fov: full angles of the foveation cones, degrees.
         cone_foveate, outside_foveate, behind_foveate: priorities, of 1.
-        precision: one of `defaults.PRECISIONS`.
+        precision: one of `table.PRECISIONS`.
     """
 
     budget: tuple[Budget, ...] | None
@@ -275,9 +276,10 @@ def cut_options(command: Command, *, pictures: bool = False) -> Command:
         ),
         add(
             "--precision",
-            type=click.Choice(defaults.PRECISIONS),
-            default=defaults.PRECISIONS[0],
-            help="Precision of the centres and sizes that cuts are found with: the file's, or half floats, which is"
-            " nearly what Spark holds.",
+            type=click.Choice(table.PRECISIONS),
+            default=table.PRECISIONS[0],
+            help="Precision of the centres and sizes that cuts are found with: the file's, its half floats, or what"
+            " Spark has of the file, for the same cuts to the last node: ext with extSplats, else packed, or"
+            " packed-pages of a RAD file that it streams.",
         ),
     )

@@ -37,7 +37,7 @@ MORE = ("second.spz", "third.spz")
 GIVEN: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "files": ((), (str(FIXTURES / "sh1.ply"),)),
     "scene": ((), ("--scene", "scene.json")),
-    "precision": (("--budget", "150"), ("--precision", "float16")),
+    "precision": (("--budget", "150"), ("--precision", "packed")),
     "camera_path": ((), ("--camera-path", str(CAMERAS / "inria.json"))),
     "camera_format": (("--camera-path", str(CAMERAS / "inria.json")), ("--camera-format", "colmap")),
     "camera_axes": (("--camera-path", str(CAMERAS / "inria.json")), ("--camera-axes", "opengl-c2w")),

@@ -23,7 +23,7 @@ CAMERAS = FIXTURES / "cameras"
 OWN: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "files": ((), (str(FIXTURES / "golden" / "hand-tree-v3.spz"),)),
     "scene": ((), ("--scene", "scene.json")),
-    "precision": (("--budget", "5k"), ("--precision", "float16")),
+    "precision": (("--budget", "5k"), ("--precision", "ext")),
     "preset": ((), ("--preset", "quest")),
     "lod_splat_scale": ((), ("--lod-splat-scale", "1e-4")),
     "cone_fov0": (("--budget", "5k"), ("--cone-fov0", "0")),

@@ -1,0 +1,159 @@
+"""Nodes as Spark has them once it has loaded a file: measured after its own coding of the splats.
+
+Spark decodes a file to float32, codes the splats as ExtSplats or PackedSplats, decodes those, and takes of them centres
+and sizes, which it rounds to half floats. All of that is repeated here in the same arithmetic, for the columns that
+matter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...model.coding import PLAIN, FileCoding, ScaleCoding
+from ...model.gaussian import size_factor
+from ...model.lod_tree import LodTree
+from ...model.nodes import Nodes
+from ...model.splats import FloatArray, Splats
+from ...support.parallel import for_blocks
+from .. import octahedral, quantize, spark_math, splat_encoding
+from ..splat_encoding import SplatEncoding
+
+Recode = Callable[[FloatArray], FloatArray]
+
+#: Every half float.
+_HALVES = np.arange(1 << 16, dtype=np.uint16).view(np.float16)
+
+#: Spark's worker codes no other scales as 0 than those below this; its documentation says e ** -30.
+_LEAST = np.finfo(np.float32).smallest_subnormal
+
+#: Share of a scale by which it may differ from that of its code: several times what exponentials disagree by.
+_SAME = np.float32(2**-20)
+
+
+class Layout(NamedTuple):
+    """What splats in memory keep of numbers.
+
+    Attributes:
+        alpha: of alphas, 0..2.
+        scale: of linear scales.
+    """
+
+    alpha: Recode
+    scale: Recode
+
+
+def nodes(splats: Splats, tree: LodTree, layout: str, coding: FileCoding = PLAIN, *, threads: int = 1) -> Nodes:
+    """The nodes of a tree as Spark's traversal reads them.
+
+    Args:
+        splats: N, as they were decoded; their centres, scales and opacities matter.
+        tree: of them.
+        layout: one of `table.LOADED`.
+        coding: of the file that they were read from. Scales that do not come from its codes, or of splats that were not
+            read from a file, are taken to be those that Spark has.
+        threads: to work on.
+    """
+    held = _layout(layout, coding.packed_range)
+    found = Nodes(np.empty((len(splats), 3), np.float32), np.empty(len(splats), np.float32), tree)
+    for rows, scales in coding.parts(len(splats)):
+        recode = _recoded(scales, held.scale)
+
+        @np.errstate(over="ignore", invalid="ignore")
+        def measure(part: slice, start: int = rows.start, recode: Recode = recode) -> None:
+            part = slice(start + part.start, start + part.stop)
+            alpha = held.alpha(octahedral.stored_lod_alpha(splats.opacity[part]))
+            x, y, z = recode(np.ascontiguousarray(splats.scale[part].T))
+            factor = np.float32(2) * size_factor(octahedral.lod_opacity_of_alpha(alpha))
+            found.center[part] = splats.center[part].astype(np.float16)
+            found.size[part] = (factor * ((x + y + z) / np.float32(3))).astype(np.float16)
+
+        for_blocks(measure, rows.stop - rows.start, threads, lambda _: None)
+    return found
+
+
+def _layout(name: str, packed_range: tuple[float, float] | None) -> Layout:
+    """What one of `table.LOADED` keeps, with the range of logarithms that a file sets for PackedSplats."""
+    if name == "ext":
+        scales = spark_math.exp(_HALVES.astype(np.float32))
+        return Layout(
+            lambda alpha: alpha.astype(np.float16).astype(np.float32),
+            lambda scale: scales[spark_math.log(scale).astype(np.float16).view(np.uint16)],
+        )
+    own = SplatEncoding(lod_opacity=True)
+    low, high = own.ln_scale_min, own.ln_scale_max
+    if name == "packed" and packed_range is not None:
+        low, high = packed_range
+    table = splat_encoding.log_scale_table(low, high, exp=spark_math.exp)
+
+    def alpha_held(alpha: FloatArray) -> FloatArray:
+        codes = splat_encoding.encode_linear(alpha, 0, own.alpha_max)
+        return splat_encoding.decode_linear(codes.astype(np.uint8), 0, own.alpha_max)
+
+    def scale_held(scale: FloatArray) -> FloatArray:
+        known = np.where(np.isnan(scale), _LEAST, scale)
+        return table[splat_encoding.encode_log_scale(known, low, high, log=spark_math.log, least=_LEAST)]
+
+    return Layout(alpha_held, scale_held)
+
+
+class _Codes(NamedTuple):
+    """The codes of a file's scales.
+
+    Attributes:
+        of: whole numbers from 0 on, of scales.
+        ours: the scale of each, as `Splats` has it.
+        theirs: the same as Spark has it.
+    """
+
+    of: Callable[[FloatArray], NDArray[np.unsignedinteger[Any]]]
+    ours: FloatArray
+    theirs: FloatArray
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def _codes(coding: ScaleCoding) -> _Codes | None:
+    """Those of a coding; None for plain numbers."""
+    if coding.name == "ln_0r8":
+        low, high = coding.low, coding.high
+        ours = splat_encoding.log_scale_table(low, high)
+        theirs = splat_encoding.log_scale_table(low, high, exp=spark_math.exp)
+        return _Codes(lambda scale: splat_encoding.encode_log_scale(scale, low, high), ours, theirs)
+    if coding.name == "spz":
+        logs = np.arange(256, dtype=np.float32) / quantize.SCALE_STEPS - quantize.SCALE_OFFSET
+        return _Codes(quantize.encode_log_scale, np.exp(logs), spark_math.exp(logs))
+    if coding.name == "ln_f16":
+        logs = _HALVES.astype(np.float32)
+        return _Codes(_half_log, np.exp(logs), spark_math.exp(logs))
+    return None
+
+
+@np.errstate(divide="ignore", invalid="ignore")
+def _half_log(scale: FloatArray) -> NDArray[np.uint16]:
+    return np.log(scale).astype(np.float16).view(np.uint16)
+
+
+def _recoded(coding: ScaleCoding, held: Recode) -> Recode:
+    """What a layout keeps of scales that come from codes: the last bits of those are others in Spark.
+
+    Args:
+        coding: of the scales in the file.
+        held: what the layout keeps of numbers.
+    """
+    codes = _codes(coding)
+    if codes is None:
+        return held
+    of_code = held(codes.theirs)
+
+    def of_scale(scale: FloatArray) -> FloatArray:
+        code = codes.of(scale)
+        found, ours = of_code[code], codes.ours[code]
+        other = ~((ours == scale) | (np.abs(ours - scale) <= _SAME * scale))
+        if other.any():
+            found[other] = held(scale[other])
+        return found
+
+    return of_scale

@@ -1,0 +1,266 @@
+"""Compiles kernels; the only module that imports numba, loaded where machine code is not in the cache."""
+
+from __future__ import annotations
+
+import pickle
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import CellType, FunctionType
+from typing import Any
+
+import numba
+import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.core import caching, cgutils, compiler, event
+from numba.core.serialize import dumps
+from numba.extending import intrinsic
+from numba.np.ufunc import parallel
+
+from . import jit, jit_cache, jit_threads
+from .errors import out_of_memory
+from .jit_cache import Trouble, start_of, stem_of
+from .jit_link import MachineCode
+
+_lock = threading.RLock()
+
+
+class Compiler:
+    """A kernel as numba has it.
+
+    Args:
+        kernel: the kernel.
+        folder: folder of the cache; None to cache nothing.
+        trouble: called with a one-line message if the cache cannot be used.
+
+    Attributes:
+        dispatcher: numba's, which compiles the kernel for the types of its arguments.
+    """
+
+    def __init__(self, kernel: jit.Kernel, folder: Path | None, trouble: Trouble) -> None:
+        options = kernel.options
+        decorate: Any = numba.njit(
+            error_model="numpy",
+            parallel=options.parallel,
+            nogil=options.nogil,
+            inline="always" if options.inline else "never",
+            fastmath={"contract"} if options.contract else False,
+        )
+        self.dispatcher = decorate(_for_numba(kernel.py_func))
+        self._cache = None if folder is None else KernelCache(kernel.py_func, folder, trouble)
+        if self._cache is not None:
+            self.dispatcher._cache = self._cache
+
+    def compile(self, arguments: Sequence[Any]) -> tuple[Callable[..., Any], MachineCode | None]:
+        """What to call with arguments of these types, and the machine code if other processes can link it."""
+        signature = tuple(map(numba.typeof, arguments))
+        called: Callable[..., Any] = self.dispatcher.compile(signature)
+        return called, None if self._cache is None else self._cache.machine_code(signature)
+
+
+def compiler_of(kernel: jit.Kernel) -> Compiler:
+    """The compiler of a kernel, and those of all kernels of its module."""
+    with _lock:
+        if kernel.compiler is None:
+            kernel.compiler = Compiler(kernel, jit.CACHE_FOLDER, jit.report_trouble)
+            _fill_namespace(kernel.py_func.__globals__)
+        found: Compiler = kernel.compiler
+        return found
+
+
+#: Copies of modules' globals as numba has them, and the originals, by the identity of the original.
+_namespaces: dict[int, tuple[dict[str, Any], dict[str, Any]]] = {}
+
+
+def _for_numba(function: Callable[..., Any]) -> FunctionType:
+    """A copy of a function whose globals and closure are what numba knows.
+
+    Nothing is replaced in the modules themselves, since other threads may be calling their functions.
+    """
+    assert isinstance(function, FunctionType)
+    namespace, _ = _namespaces.setdefault(id(function.__globals__), ({}, function.__globals__))
+    cells = tuple(CellType(_known(cell.cell_contents)) for cell in function.__closure__ or ())
+    copy = FunctionType(function.__code__, namespace, function.__name__, function.__defaults__, cells)
+    copy.__module__, copy.__qualname__ = function.__module__, function.__qualname__
+    copy.__kwdefaults__ = function.__kwdefaults__
+    return copy
+
+
+def _fill_namespace(original: dict[str, Any]) -> None:
+    namespace, _ = _namespaces[id(original)]
+    for name, value in list(original.items()):
+        namespace[name] = _known(value)
+
+
+def _lower_prefetch(typing_context: Any, array: Any, index: Any) -> Any:
+    """`jit.prefetch` in machine code."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        row = context.make_array(signature.args[0])(context, builder, arguments[0])
+        shape, strides = cgutils.unpack_tuple(builder, row.shape), cgutils.unpack_tuple(builder, row.strides)
+        place = cgutils.get_item_pointer2(context, builder, row.data, shape, strides, "C", [arguments[1]])
+        byte, word = ir.IntType(8).as_pointer(), ir.IntType(32)
+        kind = ir.FunctionType(ir.VoidType(), [byte, word, word, word])
+        fetch = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0i8")
+        read, all_levels, data = word(0), word(3), word(1)
+        builder.call(fetch, [builder.bitcast(place, byte), read, all_levels, data])
+        return context.get_dummy_value()
+
+    return types.void(array, types.int64), generate
+
+
+_prefetch: Any = intrinsic(_lower_prefetch)
+
+
+def _known(value: Any) -> Any:
+    """What numba knows a global as: its own `prange`, and dispatchers instead of kernels."""
+    if value is jit.prange:
+        return numba.prange
+    if value is jit.prefetch:
+        return _prefetch
+    return compiler_of(value).dispatcher if isinstance(value, jit.Kernel) else value
+
+
+class KernelCache(caching._Cache):
+    """The cache of what numba makes of one function, in place of numba's own.
+
+    numba's cache trusts its files: an empty one ends in an `EOFError`, a flipped bit in an error of LLVM or a crash, a
+    full disk in an `OSError`; and two processes that compile two signatures of one function at the same time can each
+    take the other's file for its own. Besides, it looks at the file of a kernel only, not at the kernels and constants
+    that it uses. Here each signature has its own file, named by all that its code depends on. A file is written
+    atomically and begins with a checksum. If a file is damaged, the kernel is compiled again; if the folder cannot be
+    used, the kernel is compiled but not stored.
+
+    Args:
+        function: the Python function.
+        folder: folder of the files.
+        trouble: called with a one-line message if the cache cannot be used.
+    """
+
+    def __init__(self, function: Callable[..., Any], folder: Path, trouble: Trouble) -> None:
+        self._function, self._folder, self._trouble = function, folder, trouble
+        self._enabled = True
+
+    @property
+    def cache_path(self) -> str:
+        return str(self._folder)
+
+    def enable(self) -> None:
+        self._enabled = True
+
+    def disable(self) -> None:
+        self._enabled = False
+
+    def flush(self) -> None:
+        for path in self._folder.glob(f"{stem_of(self._function)}-*{jit_cache.SUFFIX}"):
+            path.unlink(missing_ok=True)
+
+    def load_overload(self, signature: Any, target_context: Any) -> Any:
+        """Loads the compiled function; returns None if it has to be compiled."""
+        target_context.refresh()
+        path = self._path(signature)
+        try:
+            content = jit_cache.read(path) if self._enabled else None
+            if content is None:
+                return None
+            return compiler.CompileResult._rebuild(target_context, *pickle.loads(content))
+        except Exception as error:
+            # An undamaged file may still be unusable, for example if it refers to types of another numpy.
+            if out_of_memory(error):
+                raise
+        jit_cache.discard(path, self._trouble)
+        return None
+
+    def save_overload(self, signature: Any, compiled: Any) -> None:
+        """Writes a compiled function to the cache, if it can be cached."""
+        if self._enabled and not compiled.lifted and not compiled.library.has_dynamic_globals:
+            jit_cache.write(self._path(signature), [dumps(compiled._reduce())], self._trouble)
+
+    def machine_code(self, signature: Any) -> MachineCode | None:
+        """The machine code in the cache; None if there is none that can be linked without numba."""
+        try:
+            content = jit_cache.read(self._path(signature))
+            return None if content is None else _machine_code(*pickle.loads(content))
+        except Exception as error:
+            if out_of_memory(error):
+                raise
+            return None  # another process has just damaged it, or this numba stores something else
+
+    def _path(self, signature: Any) -> Path:
+        name = f"{start_of(self._function)}-{jit_cache.digest(str(signature))}{jit_cache.SUFFIX}"
+        return self._folder / name
+
+
+def _machine_code(
+    library: Any,
+    function: Any,
+    environment: Any,
+    _signature: Any,
+    objectmode: bool,
+    lifted: Any,
+    _annotation: Any,
+    reloads: Sequence[Callable[[], None]],
+    referenced: Sequence[Any],
+) -> MachineCode | None:
+    """The machine code in what numba stores of a compiled function; None if it takes more than `jit_link` gives."""
+    _, kind, data = library
+    environments = [environment, *(other for other in referenced if other.env_name != environment.env_name)]
+    constants = [value for each in environments for value in each.consts]
+    known = all(isinstance(value, np.dtype) and value.fields is None and value.isnative for value in constants)
+    starts_threads = [reload.__name__ == "_reload_parfors" for reload in reloads or ()]
+    if kind != "object" or objectmode or lifted or not known or not all(starts_threads):
+        return None
+    return MachineCode(
+        name=function.qualname.rpartition(".")[2],
+        wrapper=function.llvm_cpython_wrapper_name,
+        environments=tuple((each.env_name, tuple(value.str for value in each.consts)) for each in environments),
+        parallel=bool(starts_threads),
+        code=data[0],
+    )
+
+
+class _OnCompile(event.Listener):
+    """Reports the compilation of kernels called from Python, not of the kernels that those call."""
+
+    def __init__(self) -> None:
+        self._depth, self._since = 0, 0.0
+
+    def on_start(self, event: event.Event) -> None:
+        self._depth += 1  # numba compiles on one thread at a time
+        if self._depth == 1:
+            self._since = time.perf_counter()
+            jit.report_begun(stem_of(event.data["dispatcher"].py_func))
+
+    def on_end(self, event: event.Event) -> None:
+        self._depth -= 1
+        if self._depth == 0:
+            jit.report_done(time.perf_counter() - self._since)
+
+
+event.register("numba:compile", _OnCompile())
+
+
+def threading_layer() -> jit_threads.Layer:
+    """The threading layer that numba chooses; starts its threads.
+
+    Raises:
+        ValueError: no threading layer can be loaded.
+    """
+    parallel._launch_threads()
+    name: str = numba.threading_layer()
+    return jit_threads.Layer(name, sys.modules[f"numba.{jit_threads.LAYERS[name]}"], numba.config.NUMBA_NUM_THREADS)
+
+
+def _keep_threads() -> None:
+    """Has numba start its threads now if they run already, which sets their number anew, and puts the number back."""
+    layer = jit_threads.started()
+    if layer is not None:
+        count = layer.in_use()
+        parallel._launch_threads()
+        layer.use(count)
+
+
+_keep_threads()

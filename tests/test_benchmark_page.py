@@ -1,0 +1,208 @@
+"""docs/performance.md is made of its template and the committed figures; what is met or fell behind is computed.
+
+Nothing is timed here: figures are the committed ones, or made up.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.conftest import ROOT
+
+BENCHMARKS = ROOT / "benchmarks"
+
+
+@pytest.fixture
+def modules(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Imports a module of `benchmarks/performance` by its name."""
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    return lambda name: importlib.import_module(f"performance.{name}")
+
+
+def measured(modules: Any, rows: Sequence[Any], speed: float = 1.0, notes: Sequence[str] = ()) -> Any:
+    """A section on a machine of some speed."""
+    calibration = modules("calibration").Calibration(*[[speed, speed, speed]] * 4)
+    made = modules("figures").Measured
+    return made("2026-01-02", "a machine", 0.25, 7.0, calibration, calibration, rows, notes)
+
+
+def test_the_page_is_what_the_template_and_the_committed_figures_give(modules: Any) -> None:
+    page = modules("page")
+    figures = modules("figures").read(BENCHMARKS / "figures.json")
+    assert figures, "figures.json is committed"
+    told = page.page(page.TEMPLATE.read_text(), figures)
+    assert (ROOT / "docs" / "performance.md").read_text() == told, "run `python benchmarks/run_all.py --write-page`"
+
+
+def test_every_section_and_every_goal_has_a_place(modules: Any) -> None:
+    page, goals, sections = modules("page"), modules("goal_list").GOALS, modules("sections").SECTIONS
+    template = page.TEMPLATE.read_text()
+    assert page.places(template, "table") == [section.name for section in sections]
+    assert set(page.places(template, "goals")) == {goal.group for goal in goals}
+    assert {goal.section for goal in goals} <= {section.name for section in sections}
+    assert all((goal.most is None) != (goal.least is None) for goal in goals), "one bound each"
+    assert len({(goal.group, goal.text) for goal in goals}) == len(goals)
+
+
+def test_a_place_without_anything_to_put_there_is_told(modules: Any) -> None:
+    page = modules("page")
+    for text in ("{{ table nonsense }}", "{{ goals nonsense }}", "before {{ machine }}"):
+        with pytest.raises(page.TemplateError, match=r"nonsense|cannot fill in"):
+            page.page(text, {})
+
+
+def test_a_section_that_was_not_measured_says_so(modules: Any) -> None:
+    page = modules("page")
+    assert page.page("{{ table gradients }}\n", {}) == "*Not measured yet.*\n"
+    goals = page.page("{{ goals gradients }}", {})
+    assert goals.count("| not measured |") == 2
+
+
+def test_a_table_has_what_was_measured_and_how_fast_the_machine_was(modules: Any) -> None:
+    row = modules("rows").Row({"splats": 20_000}, {"picture_cpu_s": [0.010], "gradients_cpu_s": [0.02, 0.03, 0.07]})
+    section = measured(modules, [row], 5.0, ["there is no scene x.ply"])
+    told = modules("page").page("{{ machine }}\n{{ table gradients }}", {"gradients": section})
+    assert "a machine" in told
+    assert "| 20,000 | 10.0 | 30.0 (20.0 to 70.0) | 3.0 |" in told
+    assert "copies 5.0 / 5.0 GB/s into new memory" in told
+    assert "Left out: there is no scene x.ply." in told
+
+
+def gradients(modules: Any, picture: float, backward: float) -> Any:
+    """Figures of gradients, of 20,000 splats."""
+    row = modules("rows").Row({"splats": 20_000}, {"picture_cpu_s": [picture], "gradients_cpu_s": [backward]})
+    return {"gradients": measured(modules, [row])}
+
+
+def test_a_missed_goal_is_said_missed_and_by_how_much(modules: Any) -> None:
+    told = modules("page").page("{{ goals gradients }}", gradients(modules, 0.010, 0.030))
+    assert "| gradients take at most 3 times as long as the picture | met: 3.0 |" in told
+    assert "| gradients of 20,000 splats within 25 ms | **missed** by 20 %: 30.0 ms |" in told
+    told = modules("page").page("{{ goals gradients }}", gradients(modules, 0.010, 0.02505))
+    assert "**missed** by 0.2 %: 25.1 ms" in told or "**missed** by 0.2 %: 25.0 ms" in told
+
+
+def test_a_goal_of_several_rows_is_met_only_if_all_keep_to_it(modules: Any) -> None:
+    goals, row = modules("goals"), modules("rows").Row
+    goal = goals.Goal("a", "b", "c", lambda each: each.value("x_s"), least=2, name=("scene",), form="{:.1f}")
+    rows = [row({"scene": name}, {"x_s": [value]}) for name, value in {"a": 4.0, "b": 2.0, "c": 1.6}.items()]
+    told = goals.judged(goal, {"c": measured(modules, rows)})
+    assert told.met is False
+    assert told.text == "**missed** by 25 %: c: 1.6; met by the other 2"
+    told = goals.judged(goal, {"c": measured(modules, rows[:2])})
+    assert (told.met, told.text) == (True, "met: 4.0 to 2.0")
+    rows.append(row({"scene": "d"}, {}))
+    assert goals.judged(goal, {"c": measured(modules, rows[3:])}).met is None
+    with pytest.raises(ValueError, match="does not tell the rows of c apart"):
+        goals.judged(goals.Goal("a", "b", "c", goal.figure, least=2), {"c": measured(modules, rows[:2])})
+    spread = goals.Goal("a", "b", "c", goal.figure, most=2.5, across=lambda values: max(values) / min(values))
+    assert goals.judged(spread, {"c": measured(modules, rows[:3])}).text == "met: 2.50"
+    assert goals.judged(spread, {"c": measured(modules, [*rows[:3], row({"scene": "e"}, {"x_s": [1.0]})])}).met is False
+
+
+TABLES = {"judged": ("x_s", "peak_bytes"), "key": ("scene",), "columns": ()}
+
+
+@pytest.mark.parametrize(
+    ("before", "now", "speed", "fell"),
+    [
+        ([1.0, 1.1, 1.2], [1.3, 1.4, 1.5], 1.0, True),
+        ([1.0, 1.1, 1.2], [1.1, 1.4, 1.5], 1.0, False),  # their ranges overlap
+        ([1.0, 1.01, 1.02], [1.03, 1.04, 1.05], 1.0, False),  # apart, but by little
+        ([1.0, 1.1, 1.2], [1.3, 1.4, 1.5], 0.7, False),  # the machine is slower
+        ([1.0, 1.1, 1.2], [2.6, 2.8, 3.0], 0.7, True),  # but not by that much
+        ([1.0, 1.1, 1.2], [1.0, 1.1, 1.2], 2.0, True),  # it is faster, and the code is not
+        ([1.0, 1.1, 1.2], [0.5, 0.6, 0.7], 1.0, False),
+        ([1.0], [1.2], 1.0, False),  # a single run varies more
+        ([1.0], [1.4], 1.0, True),
+        ([], [1.4], 1.0, False),
+    ],
+)
+def test_what_fell_behind_by_more_than_noise_is_found(
+    modules: Any, before: list[float], now: list[float], speed: float, fell: bool
+) -> None:
+    row, table = modules("rows").Row, modules("rows").Table(**TABLES)
+    old = measured(modules, [row({"scene": "a"}, {"x_s": before}), row({"scene": "gone"}, {"x_s": [1e-9, 1e-9]})])
+    new = measured(modules, [row({"scene": "a"}, {"x_s": now}), row({"scene": "new"}, {"x_s": [1e9, 1e9]})], speed)
+    found = list(modules("behind").behind(table, old, new))
+    assert [(each.key, each.name) for each in found] == ([(("a",), "x_s")] if fell else [])
+    assert all(str(each).startswith("a: x_s ") for each in found)
+
+
+def test_memory_does_not_depend_on_how_fast_the_machine_is(modules: Any) -> None:
+    row, table = modules("rows").Row, modules("rows").Table(**TABLES)
+    old = measured(modules, [row({"scene": "a"}, {"peak_bytes": [100, 101]})])
+    new = measured(modules, [row({"scene": "a"}, {"peak_bytes": [120, 121]})], 0.1)
+    assert [each.name for each in modules("behind").behind(table, old, new)] == ["peak_bytes"]
+
+
+def test_figures_are_written_and_read_again(modules: Any, tmp_path: Path) -> None:
+    store, file = modules("figures"), tmp_path / "figures.json"
+    rows = [modules("rows").Row({"scene": "a", "splats": 3}, {"x_s": [0.1234567, 2e9], "y_s": []})]
+    store.write(file, {"gradients": measured(modules, rows, 2.0, ["a note"]), "short": measured(modules, [])})
+    again = store.read(file)
+    assert list(again) == ["gradients", "short"]
+    assert again["gradients"].rows[0].runs["x_s"] == [0.123457, 2e9]
+    assert again["gradients"].as_json() == measured(modules, rows, 2.0, ["a note"]).as_json()
+    assert store.committed(file).keys() == again.keys(), "the file itself, where nothing is committed"
+    assert store.read(tmp_path / "none.json") == {}
+
+
+def test_a_process_is_measured_from_outside(modules: Any, tmp_path: Path) -> None:
+    process = modules("process")
+    code = "import os, sys; a = bytearray(60_000_000); print(os.environ['GIVEN'], os.getcwd())"
+    took = process.run([sys.executable, "-c", code], cwd=tmp_path, variables={"GIVEN": "x"})
+    assert took.output.split() == ["x", str(tmp_path)]
+    assert 60e6 < took.peak_bytes < 120e6, "its own memory, not that of this process"
+    assert took.cpu_s > 0
+    with pytest.raises(process.CommandError, match="ValueError: no"):
+        process.run([sys.executable, "-c", "raise ValueError('no')"])
+    assert process.run([sys.executable, "-c", "raise SystemExit(3)"], codes=(0, 3)).output == ""
+
+
+def test_jobs_take_turns_and_their_first_run_does_not_count(modules: Any) -> None:
+    order: list[str] = []
+
+    def job(name: str) -> Any:
+        return lambda: (order.append(name), len(order))[1]
+
+    assert modules("process").in_turn(2, [job("a"), job("b")]) == [[3, 5], [4, 6]]
+    assert order == ["a", "b"] * 3
+    order.clear()
+    assert modules("process").in_turn(1, [job("a"), job("b")], first=False) == [[1], [2]]
+
+
+def test_a_section_that_fails_is_told_and_the_others_go_on(
+    modules: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    run_all = importlib.import_module("run_all")
+    row = modules("rows").Row({"splats": 20_000}, {"picture_cpu_s": [0.1], "gradients_cpu_s": [0.2]})
+
+    def made_up(name: str, context: Any) -> Any:
+        if name == "sizes":
+            raise FileNotFoundError("there is no scene")
+        return measured(modules, [row] if name == "gradients" else [])
+
+    figures, page = tmp_path / "figures.json", tmp_path / "page.md"
+    modules("figures").write(figures, {"sizes": measured(modules, [], notes=["of before"])})
+    line = ["run_all.py", "--sections", "short", "sizes", "gradients", "--figures", str(figures), "--page", str(page)]
+    monkeypatch.setattr(run_all, "measured", made_up)
+    monkeypatch.setattr(sys, "argv", line)
+    assert run_all.main() == 1
+    told = capsys.readouterr().out
+    assert "sizes failed: there is no scene" in told
+    assert "gradients of 20,000 splats within 25 ms: **missed** by 700 %" in told
+    assert list(modules("figures").read(figures)) == ["sizes", "short", "gradients"]
+    assert modules("figures").read(figures)["sizes"].notes == ["of before"]
+    assert "| 20,000 | 100.0 | 200.0 (200.0 to 200.0) | 2.0 |" in page.read_text()
+    monkeypatch.setattr(sys, "argv", ["run_all.py", "--write-page", "--figures", str(figures), "--page", str(page)])
+    page.write_text("old")
+    assert run_all.main() == 0
+    assert "| 20,000 | 100.0 |" in page.read_text()
