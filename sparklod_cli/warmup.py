@@ -59,9 +59,10 @@ JOBS = {
     "inspect": Job(
         (
             *("tree_links.find_cycles", "tree_links.find_depths", "tree_links.find_parents"),
-            *("tree_links.add_child_sizes", "tree_links.sum_by_depth"),
+            *("tree_links.add_weighted", "tree_links.fill_weights", "tree_links.sum_by_depth"),
+            *("digits.count_digits", "digits.sh_lengths"),
         ),
-        ("inspect tree.spz --check",),
+        ("inspect shiny.spz --check --stats --json",),
     ),
     "quality": Job(
         (
