@@ -53,15 +53,23 @@ JOBS = {
         ("build-lod scene.ply -o quick.spz",),
     ),
     "traverse": Job(
-        ("cut.find_cut", "cut_statistics.measure_cut", "cut_statistics.replace_drawn"),
+        (
+            *(
+                "cut_parts.take_step",
+                "cut_statistics.measure_cut",
+                "cut_statistics.replace_drawn",
+                "cut_statistics.select",
+            ),
+        ),
         ("traverse tree.spz --orbit 2 -o frames.csv",),
     ),
     "inspect": Job(
         (
             *("tree_links.find_cycles", "tree_links.find_depths", "tree_links.find_parents"),
-            *("tree_links.add_child_sizes", "tree_links.sum_by_depth"),
+            *("tree_links.add_weighted", "tree_links.fill_weights", "tree_links.sum_by_depth"),
+            *("digits.count_digits", "digits.sh_lengths"),
         ),
-        ("inspect tree.spz --check",),
+        ("inspect shiny.spz --check --stats --json",),
     ),
     "quality": Job(
         (
@@ -83,7 +91,8 @@ JOBS = {
     ),
     "render": Job(
         (
-            *("bands.count_fragments", "bands.draw_discs", "cut.find_cut", "pixel_scale.pixel_scales"),
+            *("bands.count_fragments", "bands.draw_discs", "continuous.blend", "continuous.find_limits"),
+            *("continuous.order_inner", "cut_parts.take_step"),
             *("project.gather_drawn", "project.project", "raster.draw_tiles", "raster.sort_into_tiles"),
         ),
         (
@@ -95,7 +104,7 @@ JOBS = {
     ),
     "refine": Job(
         (
-            *("adam.step", "backward.first_rows", "backward.weigh_tiles", "cut.find_cut", "difference.by_image"),
+            *("adam.step", "backward.first_rows", "backward.weigh_tiles", "cut_parts.take_step", "difference.by_image"),
             *("difference.squared_differences", "project.gather_drawn", "project.project"),
             *("project_gradients.carry_back", "raster.draw_tiles", "raster.sort_into_tiles", "shade.add_sh"),
             *("shade.sh_gradients", "tree_links.add_child_sizes", "tree_links.find_parents", "view.gather"),
@@ -112,8 +121,18 @@ JOBS = {
         ("build-lod shiny.spz --format rad --cluster-sh 4 -o palette.rad",),
     ),
     "streamed-sog": Job(
-        ("region_errors.compare_levels", "row_hash.hash_rows", "shade.add_sh", "tree_links.find_parents"),
-        ("build-lod shiny.spz -o web/lod-meta.json",),
+        (
+            *("region_errors.compare_levels", "row_hash.hash_rows", "shade.add_sh", "tree_links.find_parents"),
+            *(
+                "texels.fill_quats",
+                "texels.gather_rows",
+                "texels.look_up",
+                "texels.look_up_words",
+                "texels.place_bytes",
+            ),
+            *("webp_codes.read_codes", "webp_pixels.read_pixels", "webp_transforms.undo"),
+        ),
+        ("build-lod shiny.spz -o web/lod-meta.json", "inspect web/lod-meta.json --check"),
     ),
 }
 

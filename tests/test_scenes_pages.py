@@ -83,7 +83,7 @@ def chunks_read(scenes: Scenes) -> int:
 
 
 @pytest.mark.usefixtures("little_memory")
-@pytest.mark.parametrize("precision", ["float32", "float16"])
+@pytest.mark.parametrize("precision", ["float32", "packed"])
 @pytest.mark.parametrize(
     ("budget", "streaming"),
     [

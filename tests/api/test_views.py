@@ -32,12 +32,16 @@ def test_invalid_budgets_are_refused(held: sparklod.Tree, budget: Any) -> None:
         sparklod.cut(held, camera(), budget=budget)
 
 
-def test_cuts_in_half_precision_are_those_of_rounded_numbers(file: Path, held: sparklod.Tree, tmp_path: Path) -> None:
+@pytest.mark.parametrize("precision", ["float16", "ext", "packed"])
+def test_cuts_in_another_precision_are_those_of_the_command(
+    file: Path, held: sparklod.Tree, tmp_path: Path, precision: str
+) -> None:
+    """A tree that was read knows how its file holds scales."""
     path = FIXTURES / "cameras" / "sparklod.json"
-    half = ["--camera-path", path, "--budget", 300, "--precision", "float16", "--no-timing"]
+    half = ["--camera-path", path, "--budget", 300, "--precision", precision, "--no-timing"]
     command("traverse", file, *half, "-o", tmp_path / "theirs.csv", "-q")
     theirs = list(csv.DictReader(io.StringIO((tmp_path / "theirs.csv").read_text())))
-    frames = sparklod.traverse(held, sparklod.read_cameras(path), budget=300, precision="float16")
+    frames = sparklod.traverse(held, sparklod.read_cameras(path), budget=300, precision=precision)
     assert [str(row["pixel_scale_min"]) for row in frames] == [row["pixel_scale_min"] for row in theirs]
     exact = sparklod.traverse(held, sparklod.read_cameras(path), budget=300)
     assert frames.column("pixel_scale_min") != exact.column("pixel_scale_min")

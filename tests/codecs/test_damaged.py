@@ -62,6 +62,14 @@ def format_of(name: str, data: bytes) -> Format | None:
     return sniff(data[:HEAD], Path(name).suffix)
 
 
+@functools.cache
+def _compile_kernels() -> None:
+    """Decodes a file of the format that needs kernels, which may have to be compiled: nothing that a file can help."""
+    form = format_of("golden/sh3-v2.sog", content("golden/sh3-v2.sog"))
+    assert form is not None
+    form.codec().decode(io.BytesIO(content("golden/sh3-v2.sog")))
+
+
 def attempt(name: str, data: bytes, *, files: Mapping[str, bytes] | None = None, threads: int = 1) -> str:
     """What comes of bytes in a file of this name, among others if need be: "scene" or the error's text."""
     form = format_of(name, data)
@@ -76,6 +84,7 @@ def attempt(name: str, data: bytes, *, files: Mapping[str, bytes] | None = None,
     among = files_of(name) if name and files is None and form.folders else files or {}
 
     more = {"beside": beside} if form.companions else {}
+    _compile_kernels()
     start = time.perf_counter()
     try:
         scene = form.codec().decode(io.BytesIO(data), threads=threads, **more)

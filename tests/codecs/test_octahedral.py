@@ -196,3 +196,23 @@ def test_arrays_may_be_slices() -> None:
     assert list(found) == ["a"]
     assert found["a"].flags.c_contiguous
     np.testing.assert_array_equal(found["a"], words)
+
+
+def test_the_alpha_that_an_opacity_was_decoded_from_is_found() -> None:
+    """To the last bit, for every alpha of a merged splat that half floats, bytes or chance may give."""
+    halves = np.arange(0x3C00, 0x4001, dtype=np.uint16).view(np.float16).astype(np.float32)
+    alphas = [halves, np.arange(256, dtype=np.float32) / np.float32(255) * 2]
+    alphas += [np.random.default_rng(0).uniform(0, 2, 200_000).astype(np.float32)]
+    alphas += [np.linspace(0x3F800000, 0x3F800400, 1025).astype(np.int32).view(np.float32)]  # just above 1
+    alpha = np.concatenate(alphas)
+    opacity = octahedral.decode_lod_alpha(alpha)
+    found = octahedral.stored_lod_alpha(opacity)
+    assert np.array_equal(octahedral.decode_lod_alpha(found), opacity)
+    assert np.array_equal(found, alpha)
+    assert not np.array_equal(octahedral.encode_lod_alpha(opacity), alpha)
+
+
+def test_an_opacity_that_no_alpha_has_gets_the_nearest() -> None:
+    opacity = np.random.default_rng(1).uniform(1, 900, 10_000).astype(np.float32)
+    found = octahedral.stored_lod_alpha(opacity)
+    assert np.abs(found - octahedral.encode_lod_alpha(opacity)).max() < 1e-6

@@ -207,7 +207,9 @@ class Spark:
         self._node.ask({"method": "updateLodTrees", "path": str(path), "options": {"ranges": ranges}})
         path.unlink()
 
-    def traverse(self, budget: int, smallest: float, instances: Sequence[Mapping[str, Any]]) -> Traversed:
+    def traverse(
+        self, budget: int, smallest: float, instances: Sequence[Mapping[str, Any]], mode: str = "standard"
+    ) -> Traversed:
         """Finds a cut, as `SparkRenderer` does.
 
         Args:
@@ -215,11 +217,12 @@ class Spark:
             smallest: the pixel-scale limit.
             instances: lodId, viewToObjectCols, lodScale, behindFoveate, coneFov0, coneFov and coneFoveate of each, and
                 of paged trees rootPage.
+            mode: of the traversal, "standard" or "dynamic".
         """
         options = {
             "maxSplats": budget,
             "pixelScaleLimit": smallest,
-            "traverseMode": "standard",
+            "traverseMode": mode,
             "instances": list(instances),
         }
         out = self._scratch / "cut"

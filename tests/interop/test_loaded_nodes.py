@@ -28,8 +28,9 @@ from sparklod_cli.scenes.reading import read_scenes
 from tests.conftest import FIXTURES, real_scene
 from tests.interop.spark import NODE, Spark
 from tests.interop.test_rad import chunks_of
-from tests.interop.test_traversal import BUDGETS, FOV_Y, FOVEATIONS, LIMITS, LOD_SCALES, cameras
+from tests.interop.test_traversal import BUDGETS, FOV_Y, FOVEATIONS, LIMITS, LOD_SCALES, SPARKS_CONES, cameras
 from tests.interop.ties import Words
+from tests.references.dynamic_cuts import dynamic_limit
 from tests.scenes import random_splats
 
 #: What Spark's worker is asked for, by precision.
@@ -93,6 +94,28 @@ def check_cuts(spark: Spark, path: Path, precision: str, views: int) -> None:
         np.testing.assert_array_equal(ours.indices()[0], np.sort(theirs.indices[0]))
 
 
+def check_dynamic_cuts(spark: Spark, path: Path, precision: str, views: int) -> None:
+    """Asserts that a dynamic cut of Spark is the cut of all nodes above the pixel scale at which it ends."""
+    scenes = read_scenes([Instance(path, "tree")], precision=precision, threads=2)
+    (loaded,) = scenes.trees
+    assert loaded.scene.tree is not None
+    tree = spark.keep_tree(spark.load_words(LAYOUTS[precision], path)["lodTree"])
+    splats, count = loaded.scene.splats, loaded.count
+    cones, limit = SPARKS_CONES, LIMITS[2]
+    found = Traversal(scenes.forest, [TreeInstance(0, foveation=cones)])
+    for number, camera in enumerate(cameras(Nodes.of(splats, loaded.scene.tree), views, seed=count)):
+        budget, view = BUDGETS[1 + number % 4], View(camera, FOV_Y, FOV_Y)
+
+        def nodes_at(scale: float, view: View = view) -> int:
+            return len(found.cut(view, budget=count, smallest=scale))
+
+        ours = found.cut(view, budget=count, smallest=dynamic_limit(nodes_at, budget, limit))
+        asked = {"lodId": tree, "viewToObjectCols": camera.T.ravel().tolist(), "lodScale": 1.0}
+        asked |= {"coneFov0": cones.fov0, "coneFov": cones.fov, "coneFoveate": cones.foveate}
+        theirs = spark.traverse(budget, limit, [asked | {"behindFoveate": cones.behind}], mode="dynamic")
+        np.testing.assert_array_equal(ours.indices()[0], np.sort(theirs.indices[0]))
+
+
 # --- Trees that builders make -----------------------------------------------------------------------------------------
 
 
@@ -113,7 +136,6 @@ BAKED = [
     ("demo.ply", "quality", ".spz"),
     ("demo.ply", "quality", ".rad"),
     ("biker.ply", "quick", ".spz"),
-    ("playbot-125k.ply", "quick", ".spz"),
     ("playbot-125k.ply", "quick", ".rad"),
     ("meadow.sog", "quick", ".rad"),
 ]
@@ -129,6 +151,12 @@ def test_files_and_their_cuts_are_those_of_spark(
         check_cuts(spark, path, precision, views=8)
     if suffix == ".rad":
         assert check_pages(spark, path, tmp_path) == -(-len(read_scene(path)) // CHUNK_NODES)
+
+
+@pytest.mark.parametrize("precision", LAYOUTS)
+@pytest.mark.parametrize("suffix", [".spz", ".rad"])
+def test_dynamic_cuts_are_those_of_spark(spark: Spark, folder: Path, suffix: str, precision: str) -> None:
+    check_dynamic_cuts(spark, baked(folder, "demo.ply", "quality", suffix), precision, views=12)
 
 
 def test_a_file_of_sparks_native_program_and_its_cuts_are_those_of_spark(spark: Spark, tmp_path: Path) -> None:

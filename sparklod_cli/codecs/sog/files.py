@@ -2,33 +2,29 @@
 
 from __future__ import annotations
 
-import io
-import struct
+import contextlib
+import threading
 import zipfile
-from collections.abc import Callable
-from typing import Any, BinaryIO
+from collections.abc import Callable, Iterator
+from typing import IO, Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL.WebPImagePlugin import WebPImageFile
 
 from ...support.errors import ChecksumError, FormatError, NotSplatsError
 from ...support.units import count_of
 from ...support.untrusted import ZIP_ERRORS, parse_json, quoted, quoted_value
 from ..compression import check_promise
 from ..stream import size_of
+from .lossless import PIECE, Pixels, Read
 from .names import META
-
-Texels = NDArray[np.uint8]
+from .webp import WebPHeader, bands, read_header
 
 #: Largest meta.json, bytes; codebooks take 15,000.
 MAX_META = 1 << 22
 
 #: Compression methods of a zip that SOG uses, and the flag of an encrypted member.
 METHODS, ENCRYPTED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED), 1
-
-#: Flag of a WebP file's extended header.
-ANIMATED = 2
 
 #: Texels that an image may have: a multiple of the splats, and some more, since writers make images square or round
 #: sides up to powers of two.
@@ -141,8 +137,8 @@ class Files:
         if len(data) > MAX_META:
             raise FormatError(f"{META} has more than {MAX_META:,} bytes, too many for a SOG")
         self.meta = Meta(data)
-        if not self._archive:
-            self.size += sum(map(self._size_beside, self._names()))
+        self._sizes = {} if self._archive else {name: self._size_beside(name) for name in self._names()}
+        self.size += sum(self._sizes.values())
 
     def _names(self) -> list[str]:
         textures = {"means": 2, "scales": 1, "quats": 1, "sh0": 1} | ({"shN": 2} if self.meta.has("shN") else {})
@@ -159,38 +155,49 @@ class Files:
         with self._open_beside(name) as file:
             return size_of(file)
 
-    def _read(self, name: str) -> bytes:
-        if self._archive:
-            return self._archive.read(name)
-        with self._open_beside(name) as file:
-            return file.read()
+    @contextlib.contextmanager
+    def _opened(self, name: str, most: int) -> Iterator[tuple[WebPHeader, Read]]:
+        """The header of an image that may have at most so many texels, and what reads on."""
+        with self._archive.opened(name) if self._archive else self._open_beside(name) as file:
+            header = read_header(file.read, name)
+            if header.width * header.height > most:
+                raise FormatError(f"{quoted_value(name)} has {header.width} x {header.height} texels, far too many")
+            check_promise(4 * header.width * header.height, self.size)
+            yield header, file.read
 
-    def image(self, texture: str, index: int, most: int) -> Texels:
-        """(height, width, 4) texels of one file of a texture; `FormatError` if there are more than `most`."""
+    def sides(self, texture: str, index: int, most: int) -> tuple[int, int]:
+        """Width and height of an image, as its header says; `FormatError` if it has more than `most` texels."""
+        with self._opened(self.meta.name(texture, "files", index), most) as (header, _):
+            return header.width, header.height
+
+    def pixels(self, texture: str, index: int, count: int) -> Iterator[tuple[slice, Pixels]]:
+        """The first `count` pixels of an image, row by row, some at a time, and which these are.
+
+        Raises:
+            FormatError: it is corrupt, or has fewer, or far more.
+        """
+        name, done = self.meta.name(texture, "files", index), 0
+        with self._opened(name, SPARE_FACTOR * count + SPARE_TEXELS) as (header, read):
+            total = header.width * header.height
+            if total < count:
+                raise FormatError(f"{quoted_value(name)} has {count_of(total, 'texel')} for {count_of(count, 'splat')}")
+            for band in bands(header, read, name):
+                part = slice(done, min(done + len(band), count))
+                if part.start < count:
+                    yield part, band[: part.stop - part.start]
+                done += len(band)
+
+    def bytes_of(self, texture: str, index: int) -> int:
+        """Bytes of an image, as they are stored."""
         name = self.meta.name(texture, "files", index)
-        data = self._read(name)
-        width, height = _webp_size(data, name)
-        if width * height > most:
-            raise FormatError(f"{quoted_value(name)} has {width} x {height} texels, far too many")
-        check_promise(4 * width * height, self.size)
-        return _decode_webp(data, name)
-
-    def texels(self, texture: str, index: int, count: int) -> Texels:
-        """(count, 4) texels of one file of a texture, row by row."""
-        texels = self.image(texture, index, SPARE_FACTOR * count + SPARE_TEXELS).reshape(-1, 4)
-        if len(texels) < count:
-            name = self.meta.name(texture, "files", index)
-            raise FormatError(
-                f"{quoted_value(name)} has {count_of(len(texels), 'texel')} for {count_of(count, 'splat')}"
-            )
-        return texels[:count]
+        return self._archive.bytes_of(name) if self._archive else self._sizes[name]
 
 
 class _Archive:
     """A zip with a meta.json, possibly inside a folder, and files beside it."""
 
     def __init__(self, file: BinaryIO, size: int) -> None:
-        self._size = size
+        self._size, self._lock = size, threading.Lock()
         try:
             self._zip = zipfile.ZipFile(file)
         except ZIP_ERRORS as error:
@@ -200,42 +207,62 @@ class _Archive:
             raise NotSplatsError(f"a zip archive without {META} is not a SOG")
         self._folder = min(names, key=len).removesuffix(META)
 
-    def read(self, name: str) -> bytes:
+    def _member(self, name: str) -> zipfile.ZipInfo:
         try:
-            member = self._zip.getinfo(self._folder + name)
+            return self._zip.getinfo(self._folder + name)
         except KeyError:
             raise FormatError(f"{META} names {quoted_value(name)}, which is not in the archive") from None
+
+    def bytes_of(self, name: str) -> int:
+        """Bytes of a member as it is stored."""
+        return self._member(name).compress_size
+
+    def read(self, name: str) -> bytes:
+        """The content of a member."""
+        with self.opened(name) as file:
+            return b"".join(iter(lambda: file.read(PIECE), b""))
+
+    @contextlib.contextmanager
+    def opened(self, name: str) -> Iterator[_Member]:
+        """A member, whose checksum is checked at the end, also if its content turns out to be corrupt."""
+        member = self._member(name)
         if member.compress_type not in METHODS or member.flag_bits & ENCRYPTED:
             raise FormatError(f"{quoted_value(name)} is encrypted, or compressed by a method that SOG does not use")
         check_promise(member.file_size, self._size)
+        with contextlib.ExitStack() as stack:
+            try:
+                with self._lock:
+                    file = stack.enter_context(self._zip.open(member))
+            except ZIP_ERRORS as error:
+                raise _unpacking_error(name, error) from None
+            opened = _Member(file, name)
+            try:
+                yield opened
+            except FormatError:
+                opened.finish()
+                raise
+            opened.finish()
+
+
+class _Member:
+    """A member of a zip, read from its beginning to its end."""
+
+    def __init__(self, file: IO[bytes], name: str) -> None:
+        self._file, self._name = file, name
+
+    def read(self, size: int) -> bytes:
+        """The next `size` bytes, or fewer at the end."""
         try:
-            with self._zip.open(member) as file:
-                return file.read(member.file_size)  # without a size it would unpack everything before checking the size
+            return self._file.read(size)
         except ZIP_ERRORS as error:
-            kind = ChecksumError if "CRC" in str(error) else FormatError
-            raise kind(f"{quoted_value(name)} cannot be unpacked: {quoted(error)}") from None
+            raise _unpacking_error(self._name, error) from None
+
+    def finish(self) -> None:
+        """Reads the rest, behind which the checksum is checked."""
+        while self.read(PIECE):
+            pass
 
 
-def _webp_size(data: bytes, name: str) -> tuple[int, int]:
-    """Width and height from the header of a WebP file: its first chunk, of one of three kinds."""
-    kind = data[12:16] if data[:4] == b"RIFF" and data[8:12] == b"WEBP" and len(data) >= 30 else b""
-    if kind == b"VP8X":  # 24 bits each, minus one
-        if data[20] & ANIMATED:
-            raise FormatError(f"{quoted_value(name)} is an animation, but SOG needs a still image")
-        return 1 + int.from_bytes(data[24:27], "little"), 1 + int.from_bytes(data[27:30], "little")
-    if kind == b"VP8L":  # 14 bits each, minus one, after a byte of signature
-        bits = int.from_bytes(data[21:25], "little")
-        return 1 + (bits & 0x3FFF), 1 + (bits >> 14 & 0x3FFF)
-    if kind == b"VP8 ":  # 14 bits each, after a frame tag and a start code
-        width, height = struct.unpack_from("<HH", data, 26)
-        return width & 0x3FFF, height & 0x3FFF
-    raise FormatError(f"{quoted_value(name)} is not a WebP image")
-
-
-def _decode_webp(data: bytes, name: str) -> Texels:
-    try:
-        # Not by Image.open, which warns of large images and refuses larger ones: the size has been checked above.
-        with WebPImageFile(io.BytesIO(data)) as image:
-            return np.asarray(image if image.mode == "RGBA" else image.convert("RGBA"))
-    except (OSError, ValueError, SyntaxError, EOFError) as error:
-        raise FormatError(f"{quoted_value(name)} is a corrupt WebP image: {error}") from None
+def _unpacking_error(name: str, error: Exception) -> FormatError:
+    kind = ChecksumError if "CRC" in str(error) else FormatError
+    return kind(f"{quoted_value(name)} cannot be unpacked: {quoted(error)}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import BinaryIO
@@ -14,20 +15,25 @@ from ...model.sh import COEFFICIENTS
 from ...model.splats import FloatArray, Splats
 from ...model.streams import SceneStream
 from ...support.errors import FormatError, VersionError
-from ...support.parallel import blocks_of, for_blocks
+from ...support.parallel import for_blocks, ordered_map
 from ...support.progress import Progress, silent
 from .. import quantize
 from ..compression import check_promise
 from ..content import Content, Scratch, rows_in
+from ..kernels import texels
 from ..stream import Positioned
 from . import codings
-from .files import Files, Meta, Texels
+from .files import Files, Meta
+from .lossless import Pixels
 
 #: Most entries of the palette of SH: a label has 16 bits.
 MAX_PALETTE = 1 << 16
 
 #: Most splats: a WebP image has at most this many texels.
 MAX_SPLATS = 1 << 28
+
+#: Where the channels stand in a pixel.
+RED_GREEN_BLUE, ALPHA = np.array([16, 8, 0], np.uint32), np.array([24], np.uint32)
 
 
 def decode(
@@ -65,27 +71,28 @@ def stream(
 
 @dataclass(frozen=True)
 class Step:
-    """What is decoded of some images.
+    """What is decoded of an image.
 
     Attributes:
-        images: the texture and the number of each.
-        fill: called with rows of a scene and, for each image, their (n, 4) texels.
+        texture, index: of the image.
+        fill: called with rows of a scene and their pixels.
     """
 
-    images: tuple[tuple[str, int], ...]
-    fill: Callable[[Splats, list[Texels]], None]
+    texture: str
+    index: int
+    fill: Callable[[Splats, Pixels], None]
 
 
-#: Gives the texels of a step that belong to some rows; called with the number of the step.
-TexelsOf = Callable[[int, slice], list[Texels]]
+#: Gives the pixels of a step that belong to some rows; called with the number of the step.
+PixelsOf = Callable[[int, slice], Pixels]
 
 
 def _content(
     file: BinaryIO,
     beside: Callable[[str], BinaryIO] | None,
-    unpacked: Callable[[Files, list[Step], int], TexelsOf] | None,
+    unpacked: Callable[[Files, list[Step], int], PixelsOf] | None,
 ) -> Content:
-    """The content of a file; without `unpacked` it can only be read as a whole, an image after the other."""
+    """The content of a file; without `unpacked` it can only be read as a whole."""
     files = Files(file, beside)
     meta = files.meta
     version = meta.integer("version") if meta.has("version") else 1
@@ -96,92 +103,104 @@ def _content(
     count = meta.integer("count") if version == 2 else meta.integer("means", "shape", 0)
     if not 0 < count <= MAX_SPLATS:
         raise FormatError(f"{count:,} splats, but a SOG holds 1 to {MAX_SPLATS:,}")
-    palette = _read_palette(files, version) if meta.has("shN") else None
-    degree = COEFFICIENTS.index(palette.shape[1]) if palette is not None else 0
+    palette = Palette(files, version) if meta.has("shN") else None
+    degree = COEFFICIENTS.index(palette.coefficients) if palette is not None else 0
     check_promise(count * 4 * (14 + 3 * COEFFICIENTS[degree]), files.size)
     steps = _steps(meta, version, palette)
+    center_tables = _center_tables(meta)
 
     def fill_all(out: Splats, start: int, threads: int, progress: Progress) -> None:
-        for number, step in enumerate(steps):
-            texels = _texels(files, step, count)  # of at most two images at a time
-            before = number * count
+        def work(step: Step) -> None:
+            for part, pixels in files.pixels(step.texture, step.index, count):
+                step.fill(rows_in(out, part), pixels)
 
-            def work(part: slice, step: Step = step, texels: list[Texels] = texels) -> None:
-                step.fill(rows_in(out, part), [each[part] for each in texels])
-
-            def report(done: int, before: int = before) -> None:
-                progress("reading", before + done, len(steps) * count, "texel")
-
-            for_blocks(work, count, threads, report)
+        # The largest first, so that no thread is left alone with it; but the labels of SH need the palette, which
+        # whoever needs it first decodes.
+        ordered = sorted(steps, key=lambda step: (step.texture == "shN", -files.bytes_of(step.texture, step.index)))
+        tasks: list[Callable[[], object]] = [] if palette is None else [palette.values]
+        tasks += [functools.partial(work, step) for step in ordered]
+        for number, _ in enumerate(ordered_map(lambda task: task(), tasks, threads)):
+            progress("reading", (number + 1) * count, len(tasks) * count, "texel")
+        for_blocks(lambda part: _finish(center_tables, rows_in(out, part)), count, threads, lambda done: None)
 
     def fill_some(out: Splats, start: int, threads: int, progress: Progress) -> None:
         assert unpacked is not None
-        texels_of = unpacked(files, steps, count)
+        pixels_of = unpacked(files, steps, count)
 
         def work(part: slice) -> None:
+            rows = rows_in(out, part)
             for number, step in enumerate(steps):
-                step.fill(rows_in(out, part), texels_of(number, slice(start + part.start, start + part.stop)))
+                step.fill(rows, pixels_of(number, slice(start + part.start, start + part.stop)))
+            _finish(center_tables, rows)
 
         for_blocks(work, len(out), threads, lambda done: None)
 
     antialiased = version == 2 and (meta.is_true("antialias") or meta.is_text("model", "antialiased"))
-    header = {"version": version, "palette": len(palette) if palette is not None else 0, "bytes": files.size}
+    header = {"version": version, "palette": palette.entries if palette is not None else 0, "bytes": files.size}
     fill = fill_some if unpacked is not None else fill_all
     return Content(count, degree, fill, f"SOG {version}", antialiased, header=header)
 
 
-def _texels(files: Files, step: Step, count: int) -> list[Texels]:
-    return [files.texels(texture, index, count) for texture, index in step.images]
-
-
-def _unpacked(scratch: Scratch, progress: Progress, files: Files, steps: list[Step], count: int) -> TexelsOf:
-    """Texels from a scratch file that has those of all images, one image after the other."""
-    images = [len(step.images) for step in steps]
+def _unpacked(scratch: Scratch, progress: Progress, files: Files, steps: list[Step], count: int) -> PixelsOf:
+    """Pixels from a scratch file that has those of all images, one image after the other."""
 
     def pieces() -> Iterator[bytes]:
         for number, step in enumerate(steps):
-            for texels in _texels(files, step, count):
-                yield from (texels[part].tobytes() for part in blocks_of(count))
+            yield from (pixels.tobytes() for _, pixels in files.pixels(step.texture, step.index, count))
             progress("reading", (number + 1) * count, len(steps) * count, "texel")
 
     source = Positioned(scratch(pieces))
 
-    def texels_of(number: int, part: slice) -> list[Texels]:
-        first, places = sum(images[:number]), range(images[number])
-        size = 4 * (part.stop - part.start)
-        data = (source.read(4 * ((first + place) * count + part.start), size) for place in places)
-        return [np.frombuffer(each, np.uint8).reshape(-1, 4) for each in data]
+    def pixels_of(number: int, part: slice) -> Pixels:
+        return np.frombuffer(source.read(4 * (number * count + part.start), 4 * (part.stop - part.start)), np.uint32)
 
-    return texels_of
+    return pixels_of
 
 
-def _steps(meta: Meta, version: int, palette: FloatArray | None) -> list[Step]:
+def _steps(meta: Meta, version: int, palette: Palette | None) -> list[Step]:
     scales = quantize.decode_log(_tables(meta, "scales", version, 3))
     colors = _tables(meta, "sh0", version, 4 if version == 1 else 3)
     byte = np.arange(256, dtype=np.uint8)
     opacity = quantize.decode_logit(colors[3]) if version == 1 else quantize.decode_unorm8(byte)
-    tables = np.stack([*quantize.decode_dc(colors[:3]), opacity])
     steps = [
-        Step((("means", 0), ("means", 1)), functools.partial(_fill_centers, _center_tables(meta))),
-        Step((("quats", 0),), _fill_quats),
-        Step((("scales", 0),), functools.partial(_fill_scales, scales)),
-        Step((("sh0", 0),), functools.partial(_fill_colors, tables)),
+        Step("means", 0, functools.partial(_fill_words, 0)),
+        Step("means", 1, functools.partial(_fill_words, 1)),
+        Step("quats", 0, _fill_quats),
+        Step("scales", 0, functools.partial(_fill_scales, scales)),
+        Step("sh0", 0, functools.partial(_fill_colors, quantize.decode_dc(colors[:3]), opacity[None])),
     ]
-    return steps if palette is None else [*steps, Step((("shN", 1),), functools.partial(_fill_sh, palette))]
+    return steps if palette is None else [*steps, Step("shN", 1, functools.partial(_fill_sh, palette))]
 
 
-def _look_up(columns: list[FloatArray], tables: FloatArray, texels: Texels) -> None:
-    """Fills each column, (n,), from a channel of (n, 4) texels by a table of 256 values."""
-    for channel, (column, table) in enumerate(zip(columns, tables, strict=True)):
-        column[:] = table[texels[:, channel]]
+def _fill_words(place: int, splats: Splats, pixels: Pixels) -> None:
+    """Puts a byte of the codes of coordinates where the coordinates will be; two threads do so at a time."""
+    texels.place_bytes(pixels, splats.center.view(np.uint8), place)
 
 
-def _fill_scales(tables: FloatArray, splats: Splats, texels: list[Texels]) -> None:
-    _look_up(list(splats.scale.T), tables, texels[0])
+def _finish(tables: FloatArray, splats: Splats) -> None:
+    """Decodes coordinates, whose codes of 16 bits stand in their place."""
+    texels.look_up_words(splats.center.view(np.uint32), tables, splats.center)
 
 
-def _fill_colors(tables: FloatArray, splats: Splats, texels: list[Texels]) -> None:
-    _look_up([*splats.rgb.T, splats.opacity], tables, texels[0])
+def _fill_scales(tables: FloatArray, splats: Splats, pixels: Pixels) -> None:
+    texels.look_up(pixels, RED_GREEN_BLUE, tables, splats.scale)
+
+
+def _fill_colors(tables: FloatArray, opacity: FloatArray, splats: Splats, pixels: Pixels) -> None:
+    texels.look_up(pixels, RED_GREEN_BLUE, tables, splats.rgb)
+    texels.look_up(pixels, ALPHA, opacity, splats.opacity[:, None])
+
+
+def _fill_quats(splats: Splats, pixels: Pixels) -> None:
+    texels.fill_quats(pixels, codings.quat_components(), splats.quat_xyzw)
+
+
+def _fill_sh(palette: Palette, splats: Splats, pixels: Pixels) -> None:
+    values = palette.values()
+    rows = values.reshape(len(values), -1)
+    largest = texels.gather_rows(pixels, rows, splats.sh.reshape(len(splats), -1))
+    if largest >= len(rows):
+        raise FormatError(f"SH label {largest} is beyond the {len(rows):,} entries of its palette")
 
 
 def _tables(meta: Meta, name: str, version: int, channels: int) -> FloatArray:
@@ -201,39 +220,45 @@ def _center_tables(meta: Meta) -> FloatArray:
     return codings.center_table(meta.numbers(3, "means", "mins"), meta.numbers(3, "means", "maxs"))
 
 
-def _fill_centers(tables: FloatArray, splats: Splats, texels: list[Texels]) -> None:
-    """Decodes coordinates: 16 bits over two images."""
-    low, high = texels
-    for axis, table in enumerate(tables):
-        splats.center[:, axis] = table[low[:, axis] | high[:, axis].astype(np.uint16) << np.uint16(8)]
+class Palette:
+    """The palette of SH, which is decoded when it is needed.
 
+    Attributes:
+        coefficients: K of each entry.
+        entries: how many.
 
-def _fill_quats(splats: Splats, texels: list[Texels]) -> None:
-    """Decodes rotations."""
-    splats.quat_xyzw[:] = codings.decode_quat(texels[0])
+    Raises:
+        FormatError: its header, or what meta.json says of it, is wrong.
+    """
 
+    def __init__(self, files: Files, version: int) -> None:
+        width, height = files.sides("shN", 0, MAX_PALETTE * COEFFICIENTS[3])
+        self.coefficients = width // codings.PALETTE_WIDTH
+        if self.coefficients not in COEFFICIENTS[1:4] or width % codings.PALETTE_WIDTH:
+            raise FormatError(f"its image of SH centroids is {width} texels wide, expected 64 times 3, 8 or 15")
+        self.entries, self._texels = height * codings.PALETTE_WIDTH, width * height
+        self._files, self._lock = files, threading.Lock()
+        self._values: FloatArray | None = None
+        if version == 1:
+            low, high = files.meta.number("shN", "mins"), files.meta.number("shN", "maxs")
+            self._book = quantize.range_table(low, high, 256).astype(np.float32)
+            return
+        bands, count = files.meta.integer("shN", "bands"), files.meta.integer("shN", "count")
+        if bands not in (1, 2, 3) or COEFFICIENTS[bands] != self.coefficients:
+            raise FormatError(
+                f"its image of SH centroids has {self.coefficients} coefficients, not those of {bands} bands"
+            )
+        if not 0 < count <= self.entries:
+            raise FormatError(f"its image of SH centroids has {self.entries:,} entries, not {count:,}")
+        self.entries = count
+        self._book = _codebook(files.meta, "shN")
 
-def _fill_sh(palette: FloatArray, splats: Splats, texels: list[Texels]) -> None:
-    label = texels[0][:, 0] | texels[0][:, 1].astype(np.uint16) << np.uint16(8)
-    if label.max(initial=0) >= len(palette):
-        raise FormatError(f"SH label {label.max()} is beyond the {len(palette):,} entries of its palette")
-    splats.sh[:] = palette[label]
-
-
-def _read_palette(files: Files, version: int) -> FloatArray:
-    """(entries, K, 3) SH coefficients of the palette."""
-    image = files.image("shN", 0, MAX_PALETTE * COEFFICIENTS[3])
-    width = image.shape[1]
-    coefficients = width // codings.PALETTE_WIDTH
-    if coefficients not in COEFFICIENTS[1:4] or width % codings.PALETTE_WIDTH:
-        raise FormatError(f"its image of SH centroids is {width} texels wide, expected 64 times 3, 8 or 15")
-    entries = image[:, :, :3].reshape(-1, coefficients, 3)
-    if version == 1:
-        low, high = files.meta.number("shN", "mins"), files.meta.number("shN", "maxs")
-        return quantize.range_table(low, high, 256).astype(np.float32)[entries]
-    bands, count = files.meta.integer("shN", "bands"), files.meta.integer("shN", "count")
-    if bands not in (1, 2, 3) or COEFFICIENTS[bands] != coefficients:
-        raise FormatError(f"its image of SH centroids has {coefficients} coefficients, not those of {bands} bands")
-    if not 0 < count <= len(entries):
-        raise FormatError(f"its image of SH centroids has {len(entries):,} entries, not {count:,}")
-    return _codebook(files.meta, "shN")[entries[:count]]
+    def values(self) -> FloatArray:
+        """(entries, K, 3) SH coefficients; for any thread."""
+        with self._lock:
+            if self._values is None:
+                values = np.empty((self._texels, 3), np.float32)
+                for part, pixels in self._files.pixels("shN", 0, self._texels):
+                    texels.look_up(pixels, RED_GREEN_BLUE, np.tile(self._book, (3, 1)), values[part])
+                self._values = values.reshape(-1, self.coefficients, 3)[: self.entries]
+            return self._values

@@ -1,0 +1,103 @@
+"""Fills columns of splats from the pixels of SOG's images: uint32 of A R G B from the most significant byte."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...support.jit import kernel
+
+_BYTE = np.uint32(255)
+_8, _16, _24 = np.uint32(8), np.uint32(16), np.uint32(24)
+
+
+@kernel(nogil=True)
+def place_bytes(pixels, out, place):
+    """Puts red, green and blue into one byte of each of three words.
+
+    Args:
+        pixels: (N,) uint32.
+        out: (N, 12) bytes of the words.
+        place: of the byte in its word.
+    """
+    for i in range(len(pixels)):
+        p = pixels[i]
+        out[i, place] = p >> _16 & _BYTE
+        out[i, 4 + place] = p >> _8 & _BYTE
+        out[i, 8 + place] = p & _BYTE
+
+
+@kernel(nogil=True)
+def look_up_words(words, tables, out):
+    """Fills (N, 3) float32 by (3, 65536) tables and the lower halves of (N, 3) uint32, which may be the same memory."""
+    for i in range(len(words)):
+        for axis in range(3):
+            out[i, axis] = tables[axis, words[i, axis] & np.uint32(0xFFFF)]
+
+
+@kernel(nogil=True)
+def look_up(pixels, shifts, tables, out):
+    """Fills (N, C) float32 by (C, 256) tables and the bytes that stand at (C,) uint32 `shifts` of (N,) pixels."""
+    for i in range(len(pixels)):
+        for k in range(len(shifts)):
+            out[i, k] = tables[k, pixels[i] >> shifts[k] & _BYTE]
+
+
+@kernel(nogil=True)
+def fill_quats(pixels, components, out):
+    """Fills (N, 4) quaternions x y z w.
+
+    Red, green and blue are the codes of all components but the largest, in the order w x y z; alpha minus 252 is the
+    index of that, and anything below gives NaN.
+
+    Args:
+        pixels: (N,) uint32.
+        components: (256,) float32 of each code.
+        out: filled.
+    """
+    one = np.float32(1)
+    for i in range(len(pixels)):
+        p = pixels[i]
+        largest = np.int64(p >> _24) - 252
+        a, b, c = components[p >> _16 & _BYTE], components[p >> _8 & _BYTE], components[p & _BYTE]
+        square = a * a + b * b + c * c
+        rest = np.float32(0)
+        if square < one:
+            rest = np.sqrt(one - square)
+        elif square > one:  # rounding made them longer than 1
+            over = one / np.sqrt(square)
+            a, b, c = a * over, b * over, c * over
+        if largest == 0:
+            w, x, y, z = rest, a, b, c
+        elif largest == 1:
+            w, x, y, z = a, rest, b, c
+        elif largest == 2:
+            w, x, y, z = a, b, rest, c
+        elif largest == 3:
+            w, x, y, z = a, b, c, rest
+        else:
+            w = x = y = z = np.float32(np.nan)
+        out[i, 0], out[i, 1], out[i, 2], out[i, 3] = x, y, z, w
+
+
+@kernel(nogil=True)
+def gather_rows(pixels, rows, out):
+    """Fills rows by their labels, red + 256 * green, unless one is beyond the last.
+
+    Args:
+        pixels: (N,) uint32.
+        rows: (P, D) float32.
+        out: (N, D) float32, filled.
+
+    Returns:
+        the largest label.
+    """
+    largest = np.int64(0)
+    for i in range(len(pixels)):
+        p = pixels[i]
+        largest = max(largest, np.int64(p >> _16 & _BYTE | p & np.uint32(0xFF00)))
+    if largest < len(rows):
+        for i in range(len(pixels)):
+            label = pixels[i] >> _16 & _BYTE | pixels[i] & np.uint32(0xFF00)
+            for k in range(rows.shape[1]):
+                out[i, k] = rows[label, k]
+    return largest
