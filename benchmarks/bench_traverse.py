@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import inspect
 import json
 import statistics
 import subprocess
@@ -203,7 +202,7 @@ class Measured:
         """
         seconds = []
         for view in (self._views[0], self._views[len(self._views) // 2], self._views[-1]):
-            find = partial(self._traversal.cut, view, budget=budget, **_on(threads))
+            find = partial(self._traversal.cut, view, budget=budget, threads=threads)
             find()
             self._traversal.forget()
             seconds.append(_seconds(find))
@@ -227,10 +226,6 @@ class Measured:
         """Seconds of a continuous cut."""
         assert self._continuous
         return _seconds(lambda: self._continuous.cut(self._views[0], budget=budget))
-
-
-def _on(threads: int) -> dict[str, int]:
-    return {"threads": threads} if "threads" in inspect.signature(Traversal.cut).parameters else {}
 
 
 def _seconds(work: Callable[[], object]) -> float:

@@ -11,7 +11,8 @@ import { pathToFileURL } from 'node:url';
 
 console.log = console.error; // stdout is for the answers
 const entry = path.resolve(process.env.FOREIGN_DIR ?? '.', 'node_modules/@playcanvas/splat-transform/dist/index.mjs');
-const { readFile, getInputFormat, MemoryReadFileSystem } = await import(pathToFileURL(entry));
+const library = await import(pathToFileURL(entry));
+const { readFile, getInputFormat, MemoryReadFileSystem } = library;
 
 const disk = {
   async createSource(name) {
@@ -24,7 +25,9 @@ const disk = {
 async function table(filename) {
   const request = { filename, inputFormat: getInputFormat(filename), options: {}, params: [], fileSystem: disk };
   const [decoded] = await readFile(request);
-  return decoded;
+  // Since version 3 this is a source, which has read a header only, or, of SOG, images, whose values it works out later.
+  if (!library.materializeToDataTable) return decoded;
+  return library.materializeToDataTable(decoded, library.createChunkDataPool());
 }
 
 async function answer({ read }) {

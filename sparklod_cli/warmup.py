@@ -53,15 +53,23 @@ JOBS = {
         ("build-lod scene.ply -o quick.spz",),
     ),
     "traverse": Job(
-        ("cut.find_cut", "cut_statistics.measure_cut", "cut_statistics.replace_drawn"),
+        (
+            *(
+                "cut_parts.take_step",
+                "cut_statistics.measure_cut",
+                "cut_statistics.replace_drawn",
+                "cut_statistics.select",
+            ),
+        ),
         ("traverse tree.spz --orbit 2 -o frames.csv",),
     ),
     "inspect": Job(
         (
             *("tree_links.find_cycles", "tree_links.find_depths", "tree_links.find_parents"),
-            *("tree_links.add_child_sizes", "tree_links.sum_by_depth"),
+            *("tree_links.add_weighted", "tree_links.fill_weights", "tree_links.sum_by_depth"),
+            *("digits.count_digits", "digits.sh_lengths"),
         ),
-        ("inspect tree.spz --check",),
+        ("inspect shiny.spz --check --stats --json",),
     ),
     "quality": Job(
         (
@@ -83,7 +91,8 @@ JOBS = {
     ),
     "render": Job(
         (
-            *("bands.count_fragments", "bands.draw_discs", "cut.find_cut", "pixel_scale.pixel_scales"),
+            *("bands.count_fragments", "bands.draw_discs", "continuous.blend", "continuous.find_limits"),
+            *("continuous.order_inner", "cut_parts.take_step"),
             *("project.project", "raster.draw_tiles", "raster.sort_into_tiles"),
         ),
         (
@@ -95,7 +104,7 @@ JOBS = {
     ),
     "refine": Job(
         (
-            *("adam.step", "backward.first_rows", "backward.weigh_tiles", "cut.find_cut", "difference.by_image"),
+            *("adam.step", "backward.first_rows", "backward.weigh_tiles", "cut_parts.take_step", "difference.by_image"),
             *("difference.squared_differences", "project.project"),
             *("project_gradients.carry_back", "raster.draw_tiles", "raster.sort_into_tiles", "shade.add_sh"),
             *("shade.sh_gradients", "tree_links.add_child_sizes", "tree_links.find_parents", "view.gather"),

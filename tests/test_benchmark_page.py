@@ -206,3 +206,9 @@ def test_a_section_that_fails_is_told_and_the_others_go_on(
     page.write_text("old")
     assert run_all.main() == 0
     assert "| 20,000 | 100.0 |" in page.read_text()
+
+
+def test_measured_processes_keep_bytecode(modules: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")
+    took = modules("process").run([sys.executable, "-c", "import sys; print(sys.dont_write_bytecode)"])
+    assert took.output == "False\n"

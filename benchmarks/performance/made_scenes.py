@@ -15,11 +15,13 @@ TILED = "playbot-125k.ply"
 HALF_MILLION, AS_PLY = "playbot.sog", "playbot-500k.ply"
 
 
-def tiled_ply(context: Context, millions: float) -> Path:
-    """A PLY of so many million splats of copies of `TILED`."""
+def tiled_ply(context: Context, millions: float, degree: int = 2) -> Path:
+    """A PLY of so many million splats of copies of `TILED`, with SH of a degree up to 2."""
     source = context.scene(TILED)
+    name = f"tiled-{millions:g}M" + ("" if degree == 2 else f"-sh{degree}")
     return context.made(
-        f"tiled-{millions:g}M.ply", lambda path: write_ply(path, tiled(load(source), round(millions * 1e6)))
+        f"{name}.ply",
+        lambda path: write_ply(path, tiled(load(source).with_max_sh(degree), round(millions * 1e6))),
     )
 
 

@@ -75,10 +75,15 @@ def run(
 
 
 def environment(variables: Mapping[str, str | None] | None = None) -> dict[str, str]:
-    """That of this process, with this checkout's package found from every folder, and some variables changed."""
+    """That of this process, with this checkout's package found from every folder, and some variables changed.
+
+    Python may keep the bytecode of modules, as that of an installed package is kept; compiling it anew in each process
+    takes longer than many commands.
+    """
     home = str(Path(sparklod.__file__).resolve().parents[1])
     path = os.pathsep.join(filter(None, (home, os.environ.get("PYTHONPATH"))))
-    every: dict[str, str | None] = {**os.environ, "PYTHONPATH": path, **(variables or {})}
+    every: dict[str, str | None] = {**os.environ, "PYTHONPATH": path, "PYTHONDONTWRITEBYTECODE": None}
+    every |= variables or {}
     return {name: value for name, value in every.items() if value is not None}
 
 

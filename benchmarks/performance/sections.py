@@ -64,7 +64,11 @@ def _quick(bench: Any, context: Context) -> Iterable[Row]:
 
 
 def _quality(bench: Any, context: Context) -> Iterable[Row]:
-    return _baking(bench, context, "quality", (0.5, 2), 0)
+    from performance.made_scenes import tiled_ply
+
+    yield from _baking(bench, context, "quality", (0.5, 2), 0)
+    if not context.quick:
+        yield from bench.rows([tiled_ply(context, 2, degree=0)], "quality", context.count(2), warm=False)
 
 
 def _baking(

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..cameras.sources import read_path
 from ..fitting.settings import FitReport, FitSettings
 from ..model.scene import Scene
 from ..model.splats import Splats, describe_invalid
@@ -40,6 +39,8 @@ def fit_settings(settings: BakeSettings) -> FitSettings | None:
     """
     if settings.refine is None or settings.camera_path is None:
         return settings.refine
+    from ..cameras.sources import read_path  # most bakes read no cameras
+
     return dataclasses.replace(settings.refine, path=read_path(settings.camera_path))
 
 

@@ -10,6 +10,7 @@ import uuid
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ..model.streams import SceneStream
 from ..support.addresses import Place, absolute
@@ -18,11 +19,7 @@ from ..support.progress import Progress
 from ..support.stdin import name_of
 from ..support.units import count_of, format_size
 from .out_of_core import estimate
-from .out_of_core.cluster_engine import ClusterEngine
 from .out_of_core.contracts import Engine
-from .out_of_core.engine import LocalEngine
-from .out_of_core.flow import BakedOutOfCore, bake_out_of_core
-from .out_of_core.job import forget
 from .out_of_core.manifest import at_work, scratch_folder
 from .out_of_core.store import FileStore, store_of
 from .output import Output
@@ -30,6 +27,9 @@ from .recipe import Recipe, recipe_of
 from .resources import Resources
 from .settings import BakeSettings
 from .sources import Merged, Source, absolute_source, opened_source, placement_of, places_of
+
+if TYPE_CHECKING:
+    from .out_of_core.flow import BakedOutOfCore
 
 #: The folder in the scratch folder for what is unpacked of an input.
 UNPACKED = "input"
@@ -111,6 +111,9 @@ def bake_scaled(
             with _work(store, recipe, 0, resources, overwrite, say):
                 pass
         return None
+    from .out_of_core.engine import LocalEngine  # what most bakes do without takes long to load
+    from .out_of_core.flow import bake_out_of_core
+
     degree = min(size.sh_degree, settings.max_sh)
     block_splats = resources.block_splats or _block_splats(
         size.splats, degree, settings.method, memory, in_chunks=output.in_chunks
@@ -229,12 +232,16 @@ def _work(
     overwrite: bool,
     say: Callable[[str], None],
 ) -> contextlib.AbstractContextManager[int]:
+    from .out_of_core.job import forget
+
     return at_work(store, recipe, block_splats, resume=resources.resume, overwrite=overwrite, forget=forget, say=say)
 
 
 @contextlib.contextmanager
 def _opened(source: Source, folder: Place, threads: int, engine: Engine | None) -> Iterator[SceneStream]:
     """The input, which the processes of an engine can open, too, whatever folders they work in."""
+    from .out_of_core.cluster_engine import ClusterEngine
+
     if isinstance(folder, Path):
         with opened_source(absolute_source(source), scratch=folder.absolute() / UNPACKED, threads=threads) as stream:
             yield stream

@@ -19,6 +19,7 @@ from .spz_options import needed as needed
 from .spz_options import settled as settled
 from .spz_reading import decode as decode
 from .spz_reading import examine as examine
+from .spz_reading import read_coded as read_coded
 from .spz_reading import stream as stream
 from .spz_stored import stored as stored
 

@@ -24,6 +24,7 @@ from . import compression, quantize
 from .content import HAS_TREE, Content, Scratch
 from .inflate import GZIP_MAGIC, Inflate
 from .sound import with_sound_tree
+from .spz_coded import CodedSpz, sound
 from .spz_layout import ANTIALIASED, EXTENSIONS, HEADER, LOD, MAGIC, Layout, Stream, StreamRows, column_of
 from .stream import Positioned, Read, rows_between, rows_of, size_of
 
@@ -132,6 +133,28 @@ def read_codes(file: BinaryIO) -> tuple[Layout, dict[str, quantize.Bytes]]:
     for each, part, some in rows:
         codes[each.name][part] = some
     return layout, codes
+
+
+def read_coded(
+    file: BinaryIO, *, columns: Collection[str] = COLUMNS, threads: int = 1, progress: Progress = silent
+) -> CodedSpz:
+    """The codes of a file for inspection, see `examine`.
+
+    Those of the given columns of `Splats`, and of the tree; of a file that may hold invalid splats, those of all.
+    """
+    layout, rows, header = _opened(file, threads)
+    columns = columns if sound(layout) else COLUMNS
+    streams = [each for each in layout.streams() if each.column in {*columns, "child_count", "child_start"}]
+    codes = {each.name: np.empty((layout.count, each.size), np.uint8) for each in streams}
+    done = 0
+    for each, part, some in rows:
+        if each.name in codes:
+            codes[each.name][part] = some
+        done += some.size
+        progress("reading", done, layout.total, "B")
+    facts, degree = _facts(layout) | header, min(layout.sh_degree, MAX_SH_DEGREE)
+    antialiased, notes = bool(layout.flags & ANTIALIASED), _notes(layout, header)
+    return CodedSpz(layout, codes, degree, antialiased, _name_of(layout), notes, facts)
 
 
 def _opened(file: BinaryIO, threads: int) -> tuple[Layout, Iterator[StreamRows], dict[str, int]]:

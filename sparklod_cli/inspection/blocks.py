@@ -3,21 +3,39 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..codecs.spz_coded import CodedSpz
 from ..io import RadFile
 from ..model.lod_tree import LodTree
 from ..model.nodes import CHUNK_NODES
 from ..model.scene import Scene
-from ..model.splats import COLUMNS, Splats
+from ..model.splats import COLUMNS, FloatArray, Splats
+from ..support.parallel import ordered_map
 from ..support.progress import Progress, silent
 from .findings import Finding
 
 Mask = NDArray[np.bool_]
+Result = TypeVar("Result")
+
+
+def largest(rows: FloatArray) -> FloatArray:
+    """(n,) the largest number of each of (n, 3) rows, NaN if one is; ten times as fast as `rows.max(axis=1)`."""
+    x, y, z = rows.T
+    found: FloatArray = np.maximum(np.maximum(x, y), z)
+    return found
+
+
+def smallest(rows: FloatArray) -> FloatArray:
+    """(n,) the smallest, as `largest`."""
+    x, y, z = rows.T
+    found: FloatArray = np.minimum(np.minimum(x, y), z)
+    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,16 +46,18 @@ class Block:
         start: index of the first.
         splats: n of them; columns that were not asked for may be 0.
         tree: (n,) of them where they are nodes of a tree, with children as the whole tree numbers them.
+        sound: no splat can be invalid, whatever its codes are.
     """
 
     start: int
     splats: Splats
     tree: LodTree | None
+    sound: bool = False
 
     @functools.cached_property
     def invalid(self) -> dict[str, Mask]:
-        """As `Splats.invalid`; all columns must be there."""
-        return self.splats.invalid()
+        """As `Splats.invalid`; all columns must be there, unless it is sound."""
+        return {} if self.sound else self.splats.invalid()
 
     @functools.cached_property
     def valid(self) -> Mask:
@@ -57,6 +77,11 @@ class Blocks:
         sh_degree: of the splats.
         is_tree: whether they are the nodes of a tree.
         read: called with columns of `Splats`, gives the blocks in order; may be called again.
+        at: called with the index of the first splat of a block, and columns, gives the block, on any thread; None where
+            blocks are not in memory.
+        starts: the indices of the first splats.
+        tree: of all splats, where it is in memory.
+        sound: no splat can be invalid, so that whoever looks for those needs no more columns.
         antialiased, format, notes, header, chunk_bytes: as in `Scene`.
     """
 
@@ -64,6 +89,10 @@ class Blocks:
     sh_degree: int
     is_tree: bool
     read: Callable[[Collection[str]], Iterator[Block]]
+    at: Callable[[int, Collection[str]], Block] | None = None
+    starts: Sequence[int] = ()
+    tree: LodTree | None = None
+    sound: bool = False
     antialiased: bool = False
     format: str = ""
     notes: tuple[str, ...] = ()
@@ -75,26 +104,47 @@ class Blocks:
         """Those of a scene in memory, as long as its chunks are, or `CHUNK_NODES`."""
         count, step = len(scene.splats), scene.header.get("chunk_size") or CHUNK_NODES
 
-        def read(columns: Collection[str]) -> Iterator[Block]:
-            for start in range(0, count, step):
-                part = slice(start, start + step)
-                rows = Splats(**{name: getattr(scene.splats, name)[part] for name in COLUMNS})
-                tree = scene.tree
-                yield Block(
-                    start, rows, None if tree is None else LodTree(tree.child_count[part], tree.child_start[part])
-                )
+        def at(start: int, columns: Collection[str]) -> Block:
+            part, tree = slice(start, start + step), scene.tree
+            rows = Splats(**{name: getattr(scene.splats, name)[part] for name in COLUMNS})
+            return Block(start, rows, None if tree is None else LodTree(tree.child_count[part], tree.child_start[part]))
 
-        return cls(
-            count,
-            scene.splats.sh_degree,
-            scene.tree is not None,
-            read,
-            scene.antialiased,
-            scene.format,
-            scene.notes,
-            scene.header,
-            scene.chunk_bytes,
-        )
+        about = scene.antialiased, scene.format, scene.notes, scene.header, scene.chunk_bytes
+        return cls._in_memory(count, scene.splats.sh_degree, at, step, scene.tree, False, *about)
+
+    @classmethod
+    def of_codes(cls, coded: CodedSpz) -> Blocks:
+        """Those of an SPZ file, whose codes are decoded whenever they are read."""
+
+        def at(start: int, columns: Collection[str]) -> Block:
+            return Block(start, *coded.decode(slice(start, start + CHUNK_NODES), columns), coded.sound)
+
+        about = coded.antialiased, coded.format, coded.notes, coded.header
+        return cls._in_memory(coded.count, coded.sh_degree, at, CHUNK_NODES, coded.tree, coded.sound, *about)
+
+    @classmethod
+    def _in_memory(
+        cls,
+        count: int,
+        sh_degree: int,
+        at: Callable[[int, Collection[str]], Block],
+        step: int,
+        tree: LodTree | None,
+        *about: Any,
+    ) -> Blocks:
+        starts = range(0, count, step)
+
+        def read(columns: Collection[str]) -> Iterator[Block]:
+            return (at(start, columns) for start in starts)
+
+        return cls(count, sh_degree, tree is not None, read, at, starts, tree, *about)
+
+    def map(self, work: Callable[[Block], Result], columns: Collection[str], threads: int) -> Iterator[Result]:
+        """What `work` returns of each block with these columns, in order; on several threads, if they are in memory."""
+        if self.at is None:
+            return map(work, self.read(columns))
+        at = self.at
+        return ordered_map(lambda start: work(at(start, columns)), self.starts, threads)
 
     @classmethod
     def of_file(cls, file: RadFile, *, threads: int = 1, progress: Progress = silent) -> Blocks:
@@ -113,6 +163,10 @@ class Blocks:
             header.max_sh,
             header.lod_tree,
             read,
+            None,
+            (),
+            None,
+            False,
             header.antialiased,
             file.format,
             (),
@@ -134,6 +188,11 @@ class Tally:
         if count and not self.count:
             self.first = start + int(np.argmax(mask))
         self.count += count
+
+    def merge(self, other: Tally) -> None:
+        """Adds what was counted of what follows."""
+        self.first = self.first if self.count else other.first
+        self.count += other.count
 
     def finding(self, code: str, text: str) -> list[Finding]:
         """A finding about them, if there are any; in its text, {first} is the first and {more} how many others."""

@@ -63,9 +63,9 @@ class Rows:
         self._blocks = blocks
         self._rows: list[dict[str, Any]] = []
 
-    def add(self, block: Block) -> None:
-        """Adds the chunk of a block, with the columns `USED`."""
-        center, size, chunk = block.splats.center, spark_size(block.splats), len(self._rows)
+    def part_of(self, block: Block) -> dict[str, Any]:
+        """The row of the chunk of a block, with the columns `USED`, but for its number."""
+        center, size = block.splats.center, spark_size(block.splats)
         low, high = center.min(axis=0), center.max(axis=0)
         with np.errstate(invalid="ignore", over="ignore"):
             extent = np.linalg.norm(high.astype(np.float64) - low)
@@ -73,10 +73,15 @@ class Rows:
         numbers |= {f"min_{axis}": low[at] for at, axis in enumerate("xyz")}
         numbers |= {f"max_{axis}": high[at] for at, axis in enumerate("xyz")}
         row: dict[str, Any] = dict.fromkeys(column.name for column in COLUMNS)
-        row |= {"chunk": chunk, "base": block.start, "splats": len(center)}
-        row["bytes"] = None if self._blocks.chunk_bytes is None else self._blocks.chunk_bytes[chunk]
+        row |= {"base": block.start, "splats": len(center)}
         row["leaves"] = None if block.tree is None else int(np.count_nonzero(block.tree.is_leaf))
         row |= {name: float(value) for name, value in numbers.items() if np.isfinite(value)}
+        return row
+
+    def merge(self, row: dict[str, Any]) -> None:
+        """Adds the row of the next chunk."""
+        row["chunk"] = chunk = len(self._rows)
+        row["bytes"] = None if self._blocks.chunk_bytes is None else self._blocks.chunk_bytes[chunk]
         self._rows.append(row)
 
     def rows(self, columns: tree.Columns | None) -> list[Row]:
@@ -105,11 +110,11 @@ class Rows:
 def rows_of(scene: Scene) -> list[Row]:
     """The rows of a scene in memory, see `Rows`."""
     blocks = Blocks.of(scene)
-    found, columns = Rows(blocks), tree.Columns.of(blocks.count) if blocks.is_tree else None
+    found, columns = Rows(blocks), tree.Columns.of(blocks) if blocks.is_tree else None
     for block in blocks.read(USED):
-        found.add(block)
+        found.merge(found.part_of(block))
         if columns is not None:
-            columns.add(block)
+            columns.merge(columns.part_of(block))
     return found.rows(columns if blocks.count else None)
 
 

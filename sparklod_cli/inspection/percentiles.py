@@ -8,10 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..lod.kernels.digits import DIGIT_BITS, count_digits
 from ..model.splats import FloatArray
-
-#: Bits of a number that a pass settles, from the highest on.
-DIGIT_BITS = 16
 
 #: As many numbers are kept and sorted, which takes less time. Chosen.
 KEPT = 1 << 18
@@ -20,9 +18,10 @@ KEPT = 1 << 18
 class Percentiles:
     """Exact percentiles, as numpy's are (linear between two numbers), and the mean.
 
-    More than `KEPT` numbers pass once for each 16 of their bits, 2 times as float32 and 4 times as float64: a pass
-    counts the next digit of those numbers whose digits before are those of a number that is looked for (radix
-    selection). Fewer pass once.
+    More than `KEPT` numbers pass at most once for each 16 of their bits, 2 times as float32 and 4 times as float64: a
+    pass counts the next digit of those numbers whose digits before are those of a number that is looked for (radix
+    selection), until all that share these digits are equal, as those of a format with few codes soon are. Fewer numbers
+    pass once.
 
     Args:
         levels: percentiles, 0 to 100.
@@ -41,35 +40,39 @@ class Percentiles:
         self.passes = 8 * self._float.itemsize // DIGIT_BITS
         self._first = True
         self._kept: list[FloatArray] | None = []  # in the first pass, as long as they are few
-        self._prefixes = np.zeros(1, self._key)  # what begins the keys of numbers that are looked for
-        self._counts = np.zeros((1, 1 << DIGIT_BITS), np.int64)
+        self._look_for(np.zeros(1, self._key))
         self._ranks = np.zeros(0, np.int64)  # places of these numbers among all in order
         self._places = np.zeros(0, np.int64)  # the same, among those with the same prefix
         self._found = np.zeros(0, self._key)  # prefix of each
 
-    def add(self, values: FloatArray) -> None:
-        """Adds some numbers; all finite, and the same in every pass."""
-        if not self.passes or not len(values):
-            return
-        if self._first:
-            self.count += len(values)
-            self._sum += float(values.sum(dtype=np.float64))
-        if self._kept is None:
-            self._tally(values)
-            return
-        self._kept.append(values)
-        if self.count > KEPT:
-            for each in self._kept:
-                self._tally(each)
-            self._kept = None
+    def _look_for(self, prefixes: NDArray[np.unsignedinteger]) -> None:
+        """Begins a pass that counts the numbers whose keys begin so."""
+        shape = len(prefixes), 1 << DIGIT_BITS
+        self._prefixes, self._counts = prefixes, np.zeros(shape, np.int64)
+        self._seen, self._mixed = np.zeros(shape, self._key), np.zeros(shape, np.bool_)
 
-    def _tally(self, values: FloatArray) -> None:
-        keys = _keys(values, self._key)
-        shift = self._key.type(DIGIT_BITS * (self.passes - 1))
-        for row, prefix in enumerate(self._prefixes):
-            some = keys if self._first else keys[keys >> shift >> self._key.type(DIGIT_BITS) == prefix]
-            digits = (some >> shift & self._key.type((1 << DIGIT_BITS) - 1)).astype(np.int64)
-            self._counts[row] += np.bincount(digits, minlength=1 << DIGIT_BITS)
+    def add(self, values: FloatArray) -> None:
+        """Adds (n,) numbers, the same in every pass; those that are not finite are left out."""
+        if not self.passes:
+            return
+        values = np.ascontiguousarray(values)
+        count, total = count_digits(
+            values,
+            values.view(self._key),
+            DIGIT_BITS * (self.passes - 1),
+            self._prefixes,
+            self._counts,
+            self._seen,
+            self._mixed,
+        )
+        if not self._first:
+            return
+        self.count += count
+        self._sum += total
+        if self._kept is not None:
+            self._kept.append(values[np.isfinite(values)])
+            if self.count > KEPT:
+                self._kept = None
 
     def end_pass(self) -> None:
         """Ends a pass over all numbers."""
@@ -88,13 +91,18 @@ class Percentiles:
             self._kept, self.passes = None, 0
             return
         sums = np.cumsum(self._counts, axis=1)
-        for at, row in enumerate(np.searchsorted(self._prefixes, self._found)):
-            digit = int(np.searchsorted(sums[row], self._places[at], side="right"))
-            self._places[at] -= sums[row, digit - 1] if digit else 0
-            self._found[at] = (int(self._found[at]) << DIGIT_BITS) | digit
-        self._prefixes = np.unique(self._found)
-        self._counts = np.zeros((len(self._prefixes), 1 << DIGIT_BITS), np.int64)
-        self.passes -= 1
+        rows = np.searchsorted(self._prefixes, self._found)
+        digits = [
+            int(np.searchsorted(sums[row], place, side="right")) for row, place in zip(rows, self._places, strict=True)
+        ]
+        if not self._mixed[rows, digits].any():
+            self._found, self.passes = self._seen[rows, digits], 0
+        else:
+            for at, (row, digit) in enumerate(zip(rows, digits, strict=True)):
+                self._places[at] -= sums[row, digit - 1] if digit else 0
+                self._found[at] = (int(self._found[at]) << DIGIT_BITS) | digit
+            self.passes -= 1
+        self._look_for(np.unique(self._found) if self.passes else self._prefixes[:0])
 
     def values(self) -> NDArray[np.float64]:
         """The percentiles, after the last pass; there must be numbers."""

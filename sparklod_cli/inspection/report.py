@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from ..codecs.spz_layout import KNOWN_FLAGS
-from ..io import RadFile, examine_scene, read_arrays, size_of_input
+from ..io import RadFile, examine_scene, read_arrays, read_coded, size_of_input
 from ..model.scene import Scene
 from ..model.sh import COEFFICIENTS
 from ..model.splats import COLUMNS
@@ -62,7 +62,7 @@ class ReportSettings:
         chunks: a row for each chunk.
         headers_only: read no more than headers where a format has those; tree and values are left out.
         at_once: have the whole scene in memory, as those need who look at it besides; False reads RAD files chunk by
-            chunk; None does so with large ones, see `RadFile.fits`.
+            chunk; None does so with large ones, see `RadFile.fits`. SPZ files are decoded as a whole for True only.
     """
 
     chunks: bool = False
@@ -148,8 +148,8 @@ def inspect(
 ) -> tuple[Report, Scene | None]:
     """The report on a file, and its scene as far as it was read.
 
-    A file that cannot be read gives a finding, not an error, and None for the scene. A large RAD file is
-    read chunk by chunk, which gives the same report, but no scene.
+    A file that cannot be read gives a finding, not an error, and None for the scene. Unless the scene is wanted, a
+    large RAD file is read chunk by chunk, and an SPZ file stays codes, which gives the same report, but no scene.
 
     Args:
         path: of the file, or of the folder of an unpacked SOG.
@@ -176,13 +176,28 @@ def inspect(
             file = RadFile.open(path)
             if file is not None and not (settings.at_once is None and file.fits):
                 blocks = Blocks.of_file(file, threads=threads, progress=progress)
-                return _of_blocks(path, blocks, size, settings, surveyed), None
+                return _of_blocks(path, blocks, size, settings, surveyed, threads), None
+        if settings.at_once is not True:
+            coded = read_coded(path, columns=_columns_of(settings), threads=threads, progress=progress)
+            if coded is not None:
+                return _of_blocks(path, Blocks.of_codes(coded), size, settings, surveyed, threads), None
         scene = examine_scene(path, columns=columns, threads=threads, progress=progress)
     except FormatError as error:
         found = surveyed.findings if surveyed is not None and settings.check else []
         known = any(each.code == error.code for each in found)
         return Report(str(path), size, findings=[*found, *([] if known else [Finding(error.code, str(error))])]), None
-    return _of_blocks(path, Blocks.of(scene), size, settings, surveyed), scene
+    return _of_blocks(path, Blocks.of(scene), size, settings, surveyed, threads), scene
+
+
+def _columns_of(settings: ReportSettings) -> set[str]:
+    """Columns of `Splats` that a report on sound splats needs."""
+    return {
+        *TREE_COLUMNS,
+        *(value_checks.USED if settings.check else ()),
+        *(chunks.USED if settings.chunks else ()),
+        *(values.USED if settings.values else ()),
+        *(("rgb", "sh") if settings.values and settings.all_quantities else ()),
+    }
 
 
 def _of_headers(path: Path, surveyed: Surveyed) -> Report:
@@ -210,13 +225,20 @@ def _facts_of(surveyed: Surveyed | None) -> dict[str, Any]:
 
 
 class _Passed(Protocol):
-    """What blocks pass through."""
+    """What blocks pass through: parts are made on several threads, and merged in order."""
 
-    def add(self, block: Block) -> None: ...
+    def part_of(self, block: Block, /) -> Any: ...
+
+    def merge(self, part: Any, /) -> None: ...
 
 
 def _of_blocks(
-    path: Path, blocks: Blocks, size: int | None, settings: ReportSettings, surveyed: Surveyed | None
+    path: Path,
+    blocks: Blocks,
+    size: int | None,
+    settings: ReportSettings,
+    surveyed: Surveyed | None,
+    threads: int,
 ) -> Report:
     """The report on a file that can be read, block by block."""
     size = blocks.header.get("bytes", size)
@@ -227,26 +249,32 @@ def _of_blocks(
         findings += surveyed.findings
     if isinstance(surveyed, rad.Survey) and surveyed.facts is not None:
         ends = rad.ends_of(surveyed.facts)
-    columns = tree.Columns.of(blocks.count) if blocks.is_tree and blocks.count else None
+    columns = tree.Columns.of(blocks) if blocks.is_tree and blocks.count else None
     statistics = values.Statistics(blocks.sh_degree, all_quantities=settings.all_quantities)
     checks = value_checks.ValueChecks(ends, is_tree=blocks.is_tree)
     rows = chunks.Rows(blocks)
     wanted: list[tuple[_Passed, Collection[str]]] = [
         *([] if columns is None else [(columns, tree.USED)]),
-        *([(statistics, COLUMNS)] if settings.values else []),
-        *([(checks, COLUMNS)] if settings.check else []),
+        *([(statistics, values.USED if blocks.sound else COLUMNS)] if settings.values else []),
+        *([(checks, value_checks.USED if blocks.sound else COLUMNS)] if settings.check else []),
         *([(rows, chunks.USED)] if settings.chunks else []),
     ]
-    for block in blocks.read({name for _, names in wanted for name in names}):
-        for each, _ in wanted:
-            each.add(block)
+    used = {name for _, names in wanted for name in names}
+    for parts in blocks.map(lambda block: [each.part_of(block) for each, _ in wanted], used, threads):
+        for (each, _), part in zip(wanted, parts, strict=True):
+            each.merge(part)
     if settings.values:
-        _finish(statistics, blocks)
+        statistics.finish(blocks, threads=threads)
     facts = None
     in_order = rows.rows(columns) if settings.chunks else None
     if columns is not None:
         facts, found = tree.examine_blocks(
-            blocks, columns, check=settings.check, scale_ends=ends.scale, in_chunks=isinstance(surveyed, rad.Survey)
+            blocks,
+            columns,
+            check=settings.check,
+            scale_ends=ends.scale,
+            in_chunks=isinstance(surveyed, rad.Survey),
+            threads=threads,
         )
         findings += found
     if settings.check:
@@ -268,15 +296,6 @@ def _of_blocks(
         findings=findings if settings.check else None,
         **_facts_of(surveyed),
     )
-
-
-def _finish(statistics: values.Statistics, blocks: Blocks) -> None:
-    """Ends the first pass of the statistics, and makes those that they need besides."""
-    statistics.end_pass()
-    while statistics.passes:
-        for block in blocks.read(statistics.columns):
-            statistics.add(block)
-        statistics.end_pass()
 
 
 def _bytes_per_splat(size: int | None, count: int) -> float | None:

@@ -5,18 +5,26 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..lod.kernels.tree_links import add_child_sizes, find_cycles, find_depths, find_parents, sum_by_depth
+from ..lod.kernels.tree_links import (
+    add_weighted,
+    fill_weights,
+    find_cycles,
+    find_depths,
+    find_parents,
+    sum_by_depth,
+)
 from ..model.gaussian import spark_size
 from ..model.lod_tree import LodTree
 from ..model.nodes import CHUNK_BITS, CHUNK_NODES
 from ..model.scene import Scene
 from ..model.splats import FloatArray, Splats
 from ..support.parallel import blocks_of
-from .blocks import Block, Blocks, Mask, Tally
+from .blocks import Block, Blocks, Mask, Tally, largest
 from .findings import Finding
 
 #: Smallest feature size of a node over the mean of its children's, weighted by area. A merged splat has at least their
@@ -86,31 +94,42 @@ class Columns:
     """What the facts of a tree of N nodes need of each of them, 10 bytes.
 
     Attributes:
-        tree: children, (N,) as far as the blocks have come.
+        tree: children, (N,); as far as the blocks have come, unless all are in memory.
+        is_whole: the tree is in memory.
         size: (N,) float32 feature sizes, world units.
         tallies: merged nodes of D > 1, and leaves of D > 1.
     """
 
     tree: LodTree
+    is_whole: bool
     size: FloatArray
     opaque: Tally
     opaque_leaves: Tally
 
     @classmethod
-    def of(cls, count: int) -> Columns:
-        """For so many nodes, without any."""
-        tree = LodTree(np.empty(count, np.uint16), np.empty(count, np.uint32))
-        return cls(tree, np.empty(count, np.float32), Tally(), Tally())
+    def of(cls, blocks: Blocks) -> Columns:
+        """For the nodes of some blocks, none of which has been added."""
+        count, tree = blocks.count, blocks.tree
+        if tree is None:
+            tree = LodTree(np.empty(count, np.uint16), np.empty(count, np.uint32))
+        return cls(tree, blocks.tree is not None, np.empty(count, np.float32), Tally(), Tally())
 
-    def add(self, block: Block) -> None:
-        """Adds the nodes of a block, with the columns `USED`."""
+    def part_of(self, block: Block) -> tuple[Tally, Tally]:
+        """Sets what is here of the nodes of a block, with the columns `USED`; the tallies are to be merged in order."""
         assert block.tree is not None
         part = slice(block.start, block.start + len(block.splats))
-        self.tree.child_count[part], self.tree.child_start[part] = block.tree.child_count, block.tree.child_start
+        if not self.is_whole:
+            self.tree.child_count[part], self.tree.child_start[part] = block.tree.child_count, block.tree.child_start
         self.size[part] = spark_size(block.splats)
-        opaque = block.splats.opacity > 1
-        self.opaque.add(opaque, block.start)
-        self.opaque_leaves.add(opaque & block.tree.is_leaf, block.start)
+        found, more = (Tally(), Tally()), block.splats.opacity > 1
+        found[0].add(more, block.start)
+        found[1].add(more & block.tree.is_leaf, block.start)
+        return found
+
+    def merge(self, part: tuple[Tally, Tally]) -> None:
+        """Adds the tallies of the next block."""
+        self.opaque.merge(part[0])
+        self.opaque_leaves.merge(part[1])
 
 
 def examine(
@@ -124,9 +143,10 @@ def examine(
         check: look for faults.
         scale_ends: smallest and largest scale that the format holds, world units.
     """
-    blocks, columns = Blocks.of(Scene(splats, tree)), Columns.of(len(tree))
+    blocks = Blocks.of(Scene(splats, tree))
+    columns = Columns.of(blocks)
     for block in blocks.read(USED):
-        columns.add(block)
+        columns.merge(columns.part_of(block))
     return examine_blocks(blocks, columns, check=check, scale_ends=scale_ends)
 
 
@@ -137,6 +157,7 @@ def examine_blocks(
     check: bool,
     scale_ends: tuple[float, float] = (0.0, math.inf),
     in_chunks: bool = False,
+    threads: int = 1,
 ) -> tuple[TreeFacts, list[Finding]]:
     """The facts of a tree and findings about it; of a broken tree, the facts of the nodes that its root leads to.
 
@@ -149,6 +170,7 @@ def examine_blocks(
         scale_ends: smallest and largest scale that the format holds, world units. A scale at one of them may have been
             clamped.
         in_chunks: the format orders nodes by chunks, so that they need not be coarse before fine.
+        threads: to work on.
     """
     tree, size = columns.tree, columns.size
     depth, limit = find_depths(tree.child_count, tree.child_start, size)
@@ -180,7 +202,7 @@ def examine_blocks(
     found = _link_findings(tree, parent, references, depth)
     del references, depth
     found += columns.opaque_leaves.finding("tree.leaf-opacity", _told(columns.opaque_leaves, "is a leaf with D > 1"))
-    found += _size_findings(blocks, parent, size, scale_ends)
+    found += _size_findings(blocks, parent, size, scale_ends, threads)
     return facts, found if in_chunks else [*found, *_order_findings(parent, limit)]
 
 
@@ -262,20 +284,41 @@ def _link_findings(
     return [found for code, what in faults.items() for found in tallies[code].finding(code, _told(tallies[code], what))]
 
 
+class _Sized(NamedTuple):
+    """What the comparison of nodes with their children needs of a block.
+
+    Attributes:
+        part: of all nodes.
+        weight: (n,) float64, of each node in the mean size of its parent's children.
+        line: (n,) bool, the format cannot hold the width of the line that it is, so that its area is unknown.
+        clamped: (n,) bool, nor a scale as large as it may have.
+    """
+
+    part: slice
+    weight: NDArray[np.float64]
+    line: Mask
+    clamped: Mask
+
+
 def _size_findings(
-    blocks: Blocks, parent: NDArray[np.int32], size: FloatArray, scale_ends: tuple[float, float]
+    blocks: Blocks, parent: NDArray[np.int32], size: FloatArray, scale_ends: tuple[float, float], threads: int
 ) -> list[Finding]:
     sums, weights, excused = np.zeros(len(parent)), np.zeros(len(parent)), np.zeros(len(parent), np.bool_)
-    least, largest = scale_ends
-    for block in blocks.read(USED):
-        part = slice(block.start, block.start + len(block.splats))
-        above, scale = parent[part], block.splats.scale
-        add_child_sizes(above, size[part], scale, block.splats.opacity, sums, weights)
-        # Where the format cannot hold a scale that small, the width of a line, and so its area, is unknown; where it
-        # cannot hold one that large, so is the size that the node was meant to have.
-        line = np.count_nonzero(scale <= least, axis=1) >= 2
+    low, high = scale_ends
+
+    def sized(block: Block) -> _Sized:
+        part, scale = slice(block.start, block.start + len(block.splats)), block.splats.scale
+        weight = np.empty(len(scale), np.float64)
+        fill_weights(parent[part], size[part], scale, block.splats.opacity, weight)
+        x, y, z = scale.T
+        line = (x <= low) & (y <= low) | (x <= low) & (z <= low) | (y <= low) & (z <= low)
+        return _Sized(part, weight, line, ~(largest(scale) < high))
+
+    for part, weight, line, clamped in blocks.map(sized, USED, threads):
+        above = parent[part]
+        add_weighted(above, size[part], weight, sums, weights)
         excused[above[line & (above >= 0)]] = True
-        excused[part] |= ~(scale.max(axis=1) < largest)
+        excused[part] |= clamped
     small = Tally()
     for part in blocks_of(len(parent), CHUNK_NODES):
         weight = weights[part]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..codecs import quantize
 from ..model.scene import Scene
 from ..model.splats import COLUMNS
-from .blocks import Block, Blocks, Tally
+from .blocks import Block, Blocks, Tally, largest
 from .findings import Finding
 
 #: Code and message of each reason that makes a splat invalid (`splats.INVALID`).
@@ -22,6 +22,9 @@ OF_INVALID = {
     "negative_scale": ("values.negative-scale", "a scale is below 0"),
     "negative_opacity": ("values.opacity", "the opacity is below 0"),
 }
+
+#: Columns of `Splats` that are looked at besides those that make a splat invalid.
+USED = ("center", "scale", "opacity")
 
 #: Shares of splats above which clamped scales and invisible splats are findings: a few of either are the rounding of
 #: good files.
@@ -62,13 +65,13 @@ def check(scene: Scene, ends: Ends | None = None) -> list[Finding]:
     """
     found = ValueChecks(ends_of(scene.header) if ends is None else ends, is_tree=scene.tree is not None)
     for block in Blocks.of(scene).read(COLUMNS):
-        found.add(block)
+        found.merge(found.part_of(block))
     return found.findings()
 
 
 @dataclass
 class ValueChecks:
-    """Looks for faults in splats that pass once, block by block, with all columns.
+    """Looks for faults in splats that pass once, block by block, with all columns, or those `USED` of sound ones.
 
     Attributes:
         ends: of the codes of their file.
@@ -91,6 +94,21 @@ class ValueChecks:
     def _add(self, what: str, mask: NDArray[np.bool_], block: Block) -> None:
         self.tallies.setdefault(what, Tally()).add(mask, block.start)
 
+    def part_of(self, block: Block) -> ValueChecks:
+        """What is wrong in a block, to be merged."""
+        part = ValueChecks(self.ends, is_tree=self.is_tree)
+        part.add(block)
+        return part
+
+    def merge(self, part: ValueChecks) -> None:
+        """Adds what was found in the next block."""
+        self.count += part.count
+        self.checked += part.checked
+        self.invisible += part.invisible
+        self.small += part.small
+        for what, tally in part.tallies.items():
+            self.tallies.setdefault(what, Tally()).merge(tally)
+
     def add(self, block: Block) -> None:
         """Looks at a block."""
         splats, valid = block.splats, block.valid
@@ -102,11 +120,11 @@ class ValueChecks:
         if not self.is_tree:
             self._add("opaque", valid & (splats.opacity > 1), block)
         # Merged splats of thin leaves far apart may be fainter than any code, or larger.
-        most = splats.scale.max(axis=1)
+        most = largest(splats.scale)
         invisible = some & ((splats.opacity == 0) | (most == 0))
         self.invisible += int(np.count_nonzero(invisible))
         self._add("invisible", valid & invisible, block)
-        furthest = np.abs(splats.center).max(axis=1)
+        furthest = largest(np.abs(splats.center))
         self._add("center", valid & (furthest >= self.ends.center), block)
         low, high = self.ends.scale
         if high < math.inf:  # a smallest scale that was clamped is not visible

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..lod.kernels.digits import sh_lengths
 from ..model.gaussian import spark_size
 from ..model.scene import Scene
 from ..model.sh import COEFFICIENTS
 from ..model.splats import COLUMNS, FloatArray, Splats
+from ..support.parallel import ordered_map
 from ..tables.histograms import Histogram, histogram
-from .blocks import Block, Blocks
+from .blocks import Block, Blocks, largest, smallest
 from .percentiles import Percentiles
 
 #: The quantities of a splat by name, as functions of N splats to (N,) numbers. Splats with SH have `SH_QUANTITIES` too.
@@ -22,9 +24,9 @@ QUANTITIES: dict[str, Callable[[Splats], FloatArray]] = {
     "x": lambda splats: splats.center[:, 0],
     "y": lambda splats: splats.center[:, 1],
     "z": lambda splats: splats.center[:, 2],
-    "scale": lambda splats: splats.scale.max(axis=1),
-    "scale_min": lambda splats: splats.scale.min(axis=1),
-    "anisotropy": lambda splats: splats.scale.max(axis=1).astype(np.float64) / splats.scale.min(axis=1),
+    "scale": lambda splats: largest(splats.scale),
+    "scale_min": lambda splats: smallest(splats.scale),
+    "anisotropy": lambda splats: np.divide(largest(splats.scale), smallest(splats.scale), dtype=np.float64),
     "opacity": lambda splats: splats.opacity,
     "size": spark_size,
     "red": lambda splats: splats.rgb[:, 0],
@@ -44,6 +46,13 @@ SH_QUANTITIES = ("sh1", "sh2", "sh3")
 
 #: Quantities whose histograms have bins of equal width, however many decades the numbers span.
 LINEAR = ("x", "y", "z", "opacity", "red", "green", "blue")
+
+#: Coordinates, whose percentiles are those of the box.
+AXES = ("x", "y", "z")
+#: Columns of `Splats` that are counted in; sound splats need no other.
+USED = ("center", "scale", "opacity")
+#: What is counted, by name.
+COUNTED = ("good", "non_finite", "negative_scale", "zero_opacity", "zero_scale", "more_than_opaque")
 
 #: The quantities of a report without --stats.
 MAIN = ("scale", "opacity", "anisotropy")
@@ -93,10 +102,9 @@ def quantity(splats: Splats, name: str) -> FloatArray:
     with np.errstate(all="ignore"):
         if name in QUANTITIES:
             return QUANTITIES[name](splats)
-        degree = SH_QUANTITIES.index(name)
-        return np.sqrt(
-            np.square(splats.sh[:, COEFFICIENTS[degree] : COEFFICIENTS[degree + 1]], dtype=np.float64).mean((1, 2))
-        )
+        degree, lengths = SH_QUANTITIES.index(name), np.empty(len(splats), np.float64)
+        sh_lengths(splats.sh, COEFFICIENTS[degree], COEFFICIENTS[degree + 1], lengths)
+        return lengths
 
 
 def columns_of(name: str) -> tuple[str, ...]:
@@ -112,15 +120,38 @@ def histogram_of(splats: Splats, name: str, *, bins: int = 40) -> Histogram:
 def examine(splats: Splats, *, all_quantities: bool = False) -> ValueFacts:
     """Statistics of N splats in memory, see `Statistics`."""
     blocks, found = Blocks.of(Scene(splats)), Statistics(splats.sh_degree, all_quantities=all_quantities)
-    while found.passes:
-        for block in blocks.read(COLUMNS):
-            found.add(block)
-        found.end_pass()
+    for block in blocks.read(COLUMNS):
+        found.merge(found.part_of(block))
+    found.finish(blocks, threads=1)
     return found.facts()
 
 
+class Part(NamedTuple):
+    """What is counted of a block.
+
+    Attributes:
+        start: of the block.
+        valid: (n,) bool; None where all splats are valid.
+        good: valid splats.
+        non_finite, negative_scale: invalid splats.
+        zero_opacity, zero_scale, more_than_opaque: among the valid.
+        low, high: (3,) box of their centres.
+    """
+
+    start: int
+    valid: NDArray[np.bool_] | None
+    good: int
+    non_finite: int
+    negative_scale: int
+    zero_opacity: int
+    zero_scale: int
+    more_than_opaque: int
+    low: FloatArray
+    high: FloatArray
+
+
 class Statistics:
-    """Statistics of splats that pass block by block, as often as `passes` says.
+    """Statistics of splats: parts of all blocks are added in order, then `finish` makes further passes.
 
     Args:
         sh_degree: of the splats.
@@ -131,69 +162,73 @@ class Statistics:
         none = Splats.empty(0, sh_degree)
         self._numbers = {
             name: Percentiles((0, *PERCENTILES.values(), 100), quantity(none, name).dtype)
-            for name in (names_of(none) if all_quantities else MAIN)
+            for name in dict.fromkeys((*AXES, *(names_of(none) if all_quantities else MAIN)))
         }
-        self._center = [Percentiles((1, 99), np.float32) for _ in range(3)]
+        self._shown = [name for name in self._numbers if all_quantities or name in MAIN]
         self._low, self._high = np.full(3, np.inf, np.float32), np.full(3, -np.inf, np.float32)
-        self._counts = dict.fromkeys(("good", "non_finite", "negative_scale"), 0)
-        self._counts |= dict.fromkeys(("zero_opacity", "zero_scale", "more_than_opaque"), 0)
+        self._counts = dict.fromkeys(COUNTED, 0)
         self._valid: dict[int, NDArray[np.bool_]] = {}  # by the start of each block in which some are not
-        self._first = True
 
-    @property
-    def passes(self) -> int:
-        """How often all blocks have to pass from here on."""
-        return int(self._first) or max(each.passes for each in (*self._center, *self._numbers.values()))
-
-    @property
-    def columns(self) -> set[str]:
-        """Columns of `Splats` that the next pass needs."""
-        if self._first:
-            return set(COLUMNS)
-        needed = {column for name, each in self._numbers.items() if each.passes for column in columns_of(name)}
-        return needed | ({"center"} if self._center[0].passes else set())
-
-    def add(self, block: Block) -> None:
-        """Adds a block; the first time with all columns."""
-        if self._first and block.invalid:
-            self._valid[block.start] = block.valid
-            for kind in ("non_finite", "negative_scale"):
-                self._counts[kind] += int(np.count_nonzero(block.invalid.get(kind, False)))
-        valid = self._valid.get(block.start)
+    @staticmethod
+    def part_of(block: Block) -> Part:
+        """What is counted of a block with all columns, or with those `USED` where it is sound."""
+        invalid = {kind: int(np.count_nonzero(mask)) for kind, mask in block.invalid.items()}
+        valid = block.valid if invalid else None
         good = block.splats if valid is None else block.splats.take(valid)
-        if self._first:
-            self._count(good)
-        for axis, each in enumerate(self._center):
-            if each.passes:
-                each.add(np.ascontiguousarray(good.center[:, axis]))
-        for name, each in self._numbers.items():
-            if each.passes:
-                values = quantity(good, name)
-                each.add(np.ascontiguousarray(values[np.isfinite(values)]))
+        return Part(
+            block.start,
+            valid,
+            len(good),
+            invalid.get("non_finite", 0),
+            invalid.get("negative_scale", 0),
+            int(np.count_nonzero(good.opacity == 0)),
+            int(np.count_nonzero(largest(good.scale) == 0)),
+            int(np.count_nonzero(good.opacity > 1)),
+            np.array([axis.min(initial=np.inf) for axis in good.center.T]),
+            np.array([axis.max(initial=-np.inf) for axis in good.center.T]),
+        )
 
-    def _count(self, good: Splats) -> None:
-        self._counts["good"] += len(good)
-        self._low = np.minimum(self._low, good.center.min(axis=0, initial=np.inf))
-        self._high = np.maximum(self._high, good.center.max(axis=0, initial=-np.inf))
-        self._counts["zero_opacity"] += int(np.count_nonzero(good.opacity == 0))
-        self._counts["zero_scale"] += int(np.count_nonzero(good.scale.max(axis=1, initial=0) == 0))
-        self._counts["more_than_opaque"] += int(np.count_nonzero(good.opacity > 1))
+    def merge(self, part: Part) -> None:
+        """Adds what was counted of the next block."""
+        if part.valid is not None:
+            self._valid[part.start] = part.valid
+        for name in COUNTED:
+            self._counts[name] += getattr(part, name)
+        self._low, self._high = np.minimum(self._low, part.low), np.maximum(self._high, part.high)
 
-    def end_pass(self) -> None:
-        """Ends a pass over all blocks."""
-        self._first = False
-        for each in (*self._center, *self._numbers.values()):
-            each.end_pass()
+    def finish(self, blocks: Blocks, *, threads: int) -> None:
+        """Passes all blocks as often as percentiles need.
+
+        Args:
+            blocks: those whose parts were added.
+            threads: to work on, each on quantities of some columns, where blocks are in memory.
+        """
+        groups: dict[tuple[str, ...], list[str]] = {}
+        for name in self._numbers:
+            groups.setdefault(columns_of(name) if blocks.at is not None else (), []).append(name)
+        for _ in ordered_map(lambda names: self._pass_all(blocks, names), groups.values(), threads):
+            pass
+
+    def _pass_all(self, blocks: Blocks, names: list[str]) -> None:
+        while left := [name for name in names if self._numbers[name].passes]:
+            for block in blocks.read({column for name in left for column in columns_of(name)}):
+                valid = self._valid.get(block.start)
+                good = block.splats if valid is None else block.splats.take(valid)
+                for name in left:
+                    self._numbers[name].add(quantity(good, name))
+            for name in left:
+                self._numbers[name].end_pass()
 
     def facts(self) -> ValueFacts:
-        """What was found, after the last pass."""
+        """What was found."""
         box = box_98 = None
         counts = dict(self._counts)
         if counts.pop("good"):
             box = Box(_numbers(self._low), _numbers(self._high))
-            low, high = np.stack([each.values() for each in self._center], axis=1)
+            places = [list(PERCENTILES.values()).index(level) + 1 for level in (1, 99)]
+            low, high = np.stack([self._numbers[axis].values()[places] for axis in AXES], axis=1)
             box_98 = Box(_numbers(low), _numbers(high))
-        quantities = {name: _summary(each) for name, each in self._numbers.items()}
+        quantities = {name: _summary(self._numbers[name]) for name in self._shown}
         return ValueFacts(box=box, box_98=box_98, quantities=quantities, **counts)
 
 

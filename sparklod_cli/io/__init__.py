@@ -7,7 +7,7 @@ from .identity import Identity, content_of, files_of, identity_of
 from .level_files import LevelFiles, has_levels, read_level_files
 from .names import is_file_name
 from .rad_file import RadFile
-from .reading import examine_scene, opened, read_arrays, read_levels, read_scene, read_stored, size_of_input
+from .reading import examine_scene, opened, read_arrays, read_coded, read_levels, read_scene, read_stored, size_of_input
 from .scenes import SceneSink, scene_sink
 from .streams import PlacedFile, open_stream, open_streams
 from .texts import MAX_TEXT, read_rgba, read_text, read_together
@@ -38,6 +38,7 @@ __all__ = [
     "open_streams",
     "opened",
     "read_arrays",
+    "read_coded",
     "read_level_files",
     "read_levels",
     "read_rad_chunk",

@@ -13,6 +13,7 @@ from ..codecs.encoder import Stored
 from ..codecs.formats import FORMATS, HEAD, Format, sniff
 from ..codecs.gpu import dump
 from ..codecs.gpu.table import NPZ, RAW_SUFFIXES
+from ..codecs.spz_coded import CodedSpz
 from ..model.detail import DetailScene
 from ..model.scene import Scene
 from ..model.splats import COLUMNS
@@ -98,6 +99,24 @@ def examine_scene(
         else:
             scene = codec.decode(file, threads=threads, progress=progress, **more)
     return scene
+
+
+def read_coded(
+    path: Place, *, columns: Collection[str] = COLUMNS, threads: int = 1, progress: Progress = silent
+) -> CodedSpz | None:
+    """The codes of an SPZ file, for a report on it; None where a file is of another format.
+
+    Args:
+        path, columns, threads, progress: as for `examine_scene`.
+
+    Raises:
+        FormatError: as `examine_scene`.
+    """
+    with opened(path) as (file, form, _):
+        if form.name != "SPZ":
+            return None
+        coded: CodedSpz = form.codec().read_coded(file, columns=columns, threads=threads, progress=progress)
+    return coded
 
 
 @contextlib.contextmanager

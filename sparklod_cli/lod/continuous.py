@@ -22,7 +22,6 @@ continuous and falls with T; so there is such a T, and ln T changes by no more t
 
 from __future__ import annotations
 
-import itertools
 import math
 from dataclasses import dataclass
 
@@ -30,10 +29,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..model.gaussian import linear_opacity, lod_opacity
-from ..model.lod_tree import LodTree
 from ..model.splats import FloatArray
 from ..support.defaults import BLEND
-from .kernels.pixel_scale import pixel_scales
+from .kernels import continuous as kernels
+from .kernels.cut_arrays import BUCKET_BITS, BUCKETS
 from .traversal import Traversal, View, views_of
 
 #: Bisections of the threshold's interval, whose ends differ by a factor of the width; 40 leave a share of 1e-12 of it.
@@ -98,18 +97,20 @@ class ContinuousCuts:
         )
 
 
-def shares(limit: Shares, threshold: float, width: float) -> Shares:
+def shares(limit: NDArray[np.float32], threshold: float, width: float) -> Shares:
     """(M,) the shares by which nodes are refined, 0..1: t(n) above.
 
     Args:
-        limit: (M,) of nodes with children; at least 0.
+        limit: (M,) float32 of nodes with children; at least 0.
         threshold: at least 0; at 0, all nodes with a limit above 0 are refined.
         width: above 1.
     """
-    with np.errstate(divide="ignore"):
-        if not threshold:
-            return (limit > 0).astype(np.float64)
-        return _smoothstep(np.log(limit / threshold) / math.log(width))
+    share = np.zeros(len(limit))
+    above = np.flatnonzero(limit > threshold)
+    share[above] = (
+        _smoothstep(np.log(limit[above].astype(np.float64) / threshold) / math.log(width)) if threshold else 1
+    )
+    return share
 
 
 def _smoothstep(x: Shares) -> Shares:
@@ -117,25 +118,23 @@ def _smoothstep(x: Shares) -> Shares:
     return x * x * (3 - 2 * x)
 
 
-def find_threshold(limit: Shares, more: NDArray[np.int64], room: int, width: float) -> float:
+def find_threshold(limit: NDArray[np.float32], more: NDArray[np.int64], room: int, width: float) -> float:
     """The threshold at which `shares` of nodes add `room` to the sum of weights; 0 if all nodes can be refined.
 
     Args:
-        limit: (M,) of nodes with children.
+        limit: (M,) float32 of nodes with children; finite, at least 0.
         more: (M,) number of children minus 1.
         room: the budget minus the number of roots.
         width: above 1.
     """
-    order = np.argsort(-limit, kind="stable")
-    total = np.cumsum(more[order])
-    over = int(np.searchsorted(total, room, side="right"))
-    if over == len(order) or not limit[order[over]]:
-        return 0.0
     # At the limit of the first node that exceeds it, the shares add too little; `width` times lower, too much.
-    most = float(limit[order[over]])
-    undecided = (limit * width > most) & (limit < most * width)
-    room -= int(more[limit >= most * width].sum())
-    places, adds = np.log(limit[undecided] / most) / math.log(width), more[undecided]
+    most = _first_over(limit, more, room)
+    if not most:
+        return 0.0
+    wide = limit.astype(np.float64)
+    undecided = np.flatnonzero((wide * width > most) & (wide < most * width))
+    room -= int(more[wide >= most * width].sum())
+    places, adds = np.log(wide[undecided] / most) / math.log(width), more[undecided].astype(np.float64)
     low, high = -1.0, 0.0
     for _ in range(HALVINGS):
         middle = (low + high) / 2
@@ -146,6 +145,20 @@ def find_threshold(limit: Shares, more: NDArray[np.int64], room: int, width: flo
     return most * float(width**high)
 
 
+def _first_over(limit: NDArray[np.float32], more: NDArray[np.int64], room: int) -> float:
+    """The limit of the first node that adds too much, if nodes are refined by descending limits; 0 if none does."""
+    # Only nodes that have the upper half of its bits are sorted; the bits of floats >= 0 are in their order.
+    upper = limit.view(np.int32) >> BUCKET_BITS
+    totals = np.cumsum(np.bincount(upper, weights=more, minlength=BUCKETS)[::-1])
+    place = int(np.searchsorted(totals, room, side="right"))
+    if place == BUCKETS:
+        return 0.0
+    some = np.flatnonzero(upper == BUCKETS - 1 - place)
+    some = some[np.argsort(-limit[some], kind="stable")]
+    before = totals[place - 1] if place else 0
+    return float(limit[some[np.searchsorted(np.cumsum(more[some]), room - before, side="right")]])
+
+
 class _Inner:
     """The M inner nodes of a tree, by depth.
 
@@ -154,49 +167,23 @@ class _Inner:
     """
 
     def __init__(self, nodes: NDArray[np.void]) -> None:
-        tree = LodTree(nodes["child_count"].astype(np.uint16), nodes["child_start"])
-        depth = tree.depths()
-        inner = np.flatnonzero(tree.child_count)
-        self._node = inner[np.argsort(depth[inner], kind="stable")]
-        self._count = tree.child_count[self._node].astype(np.int64)
-        self._start = tree.child_start[self._node].astype(np.int64)
-        self.more = self._count - 1
-        self._place = np.full(len(tree), -1, np.int64)  # of each node among the inner nodes; -1 for a leaf
-        self._place[self._node] = np.arange(len(self._node))
-        above = np.zeros(len(tree), np.int64)
-        above[_ranges(self._start, self._count)] = np.repeat(np.arange(len(self._node)), self._count)
-        self._above = above[self._node]
-        ends = np.cumsum(np.bincount(depth[self._node]))
-        self._levels = [slice(a, b) for a, b in itertools.pairwise(ends)]
+        children = nodes["child_count"]
         self._nodes = nodes
+        self._node, self._above = (np.empty(np.count_nonzero(children), np.int64) for _ in range(2))
+        kernels.order_inner(nodes, self._node, self._above)
+        self.more = children[self._node].astype(np.int64) - 1
 
-    def limits(self, views: NDArray[np.void], number: int) -> Shares:
+    def limits(self, views: NDArray[np.void], number: int) -> NDArray[np.float32]:
         """(M,) the least pixel scale on the path from the root to each node, in the view of an instance."""
         limit = np.empty(len(self._node), np.float32)
-        pixel_scales(self._nodes, self._node, views, number, limit)
-        for level in self._levels:
-            limit[level] = np.minimum(limit[level], limit[self._above[level]])
-        return np.minimum(limit, np.finfo(np.float32).max).astype(np.float64)
+        kernels.find_limits(self._nodes, self._node, self._above, views, number, limit)
+        return limit
 
     def blended(self, share: Shares) -> tuple[NDArray[np.uint32], Shares]:
         """The nodes with a weight above 0, ascending, and their weights, of (M,) shares by which nodes are refined."""
-        if not len(share):
-            return np.zeros(1, np.uint32), np.ones(1)
-        refined = np.flatnonzero(share > 0)
-        count = self._count[refined]
-        node = np.concatenate([[0], _ranges(self._start[refined], count)])
-        weight = np.concatenate([[1.0], np.repeat(share[refined], count)])
-        own = self._place[node]
-        weight -= np.where(own >= 0, share[own], 0)
-        drawn = np.flatnonzero(weight > 0)
-        drawn = drawn[np.argsort(node[drawn])]
-        return node[drawn].astype(np.uint32), weight[drawn]
-
-
-def _ranges(start: NDArray[np.int64], count: NDArray[np.int64]) -> NDArray[np.int64]:
-    """start[0], start[0] + 1, ..., count[0] numbers in all, then those of start[1] and so on."""
-    first = np.cumsum(count) - count
-    return np.repeat(start - first, count) + np.arange(count.sum())
+        node, weight = np.empty(len(self._nodes), np.uint32), np.empty(len(self._nodes))
+        found = kernels.blend(self._nodes, self._node, share, node, weight)
+        return node[:found].copy(), weight[:found].copy()
 
 
 def faded(opacity: FloatArray, weight: Shares) -> FloatArray:

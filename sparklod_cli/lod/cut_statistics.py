@@ -63,7 +63,7 @@ def measure(
     """
     width, height = size
     counts = np.empty((len(cut.views), kernels.COUNTS), np.int64)
-    sizes = np.empty(len(cut), np.float32)
+    sizes, owners = np.empty(len(cut), np.float32), np.empty(len(cut), np.uint16)
     screen = kernels.Screen(
         np.float32(math.tan(view.fov_x / 2)),
         np.float32(math.tan(view.fov_y / 2)),
@@ -71,22 +71,23 @@ def measure(
         float(width * height),
     )
     nodes = CutNodes(cut.node, cut.limit.view(np.int32), cut.instance)
-    kernels.measure_cut(forest.nodes, level, cut.views, nodes, screen, counts, sizes)
+    found = kernels.measure_cut(forest.nodes, level, cut.views, nodes, screen, counts, sizes, owners)
+    sizes, owners = sizes[:found], owners[:found]
     total = counts.sum(axis=0)
     total[kernels.DEPTH_MIN] = counts[:, kernels.DEPTH_MIN].min()
     total[kernels.DEPTH_MAX] = counts[:, kernels.DEPTH_MAX].max()
     whole = _measured(total, sizes, width * height)
     if not by_instance:
         return whole, []
-    order = np.argsort(cut.instance, kind="stable")
-    parts = np.split(sizes[order], np.cumsum(counts[:-1, kernels.SELECTED]))
+    order = np.argsort(owners, kind="stable")
+    parts = np.split(sizes[order], np.cumsum(np.bincount(owners, minlength=len(cut.views)))[:-1])
     return whole, [_measured(row, part, width * height) for row, part in zip(counts, parts, strict=True)]
 
 
 def _measured(row: NDArray[np.int64], sizes: NDArray[np.float32], pixels: int) -> CutStatistics:
     count = [int(value) for value in row]
     selected = count[kernels.SELECTED]
-    inside = np.sort(sizes[sizes >= 0])  # several times as fast as numpy.percentile
+    median, high = _percentiles(sizes, (0.50, 0.95))
     return CutStatistics(
         selected=selected,
         leaves=count[kernels.LEAVES],
@@ -97,20 +98,24 @@ def _measured(row: NDArray[np.int64], sizes: NDArray[np.float32], pixels: int) -
         level_min=count[kernels.DEPTH_MIN] if selected else None,
         level_mean=count[kernels.DEPTH_SUM] / selected if selected else None,
         level_max=count[kernels.DEPTH_MAX] if selected else None,
-        px_p50=_percentile(inside, 0.50),
-        px_p95=_percentile(inside, 0.95),
+        px_p50=median,
+        px_p95=high,
         overdraw=count[kernels.AREA] / kernels.AREA_PARTS / pixels,
     )
 
 
-def _percentile(ascending: NDArray[np.float32], share: float) -> float | None:
-    """A percentile, interpolated linearly between two numbers; None if there are none."""
-    if not len(ascending):
-        return None
-    at = share * (len(ascending) - 1)
-    low = int(at)
-    below, above = float(ascending[low]), float(ascending[min(low + 1, len(ascending) - 1)])
-    return below + (at - low) * (above - below) if above > below else below  # both may be infinite
+def _percentiles(values: NDArray[np.float32], shares: Sequence[float]) -> list[float | None]:
+    """Percentiles of numbers >= 0, by ascending shares, interpolated linearly between two; None if there are none."""
+    if not len(values):
+        return [None] * len(shares)
+    places = [share * (len(values) - 1) for share in shares]
+    pairs = [(int(at), min(int(at) + 1, len(values) - 1)) for at in places]
+    found = np.empty((len(pairs), 2), np.float32)
+    kernels.select(values, np.array(pairs, np.int64).ravel(), found.ravel())
+    return [
+        below + (at - int(at)) * (above - below) if above > below else below  # both may be infinite
+        for at, (below, above) in zip(places, found.tolist(), strict=True)
+    ]
 
 
 class Changes:
@@ -127,23 +132,23 @@ class Changes:
         # Each instance begins with a new word.
         ends = np.cumsum([-(-count // 32) * 32 for count in bits])
         self._base = np.concatenate([[0], ends[:-1]]).astype(np.int64)
-        self._drawn = np.zeros(int(ends[-1]) // 32, np.uint32)
+        self._drawn, self._before = (np.zeros(int(ends[-1]) // 32, np.uint32) for _ in range(2))
         self._last: tuple[NDArray[np.uint32], NDArray[np.uint16]] | None = None
-        self._counts = np.zeros(len(bits), np.int64)
+        self._counts = [0] * len(bits)
 
     def next(self, cut: TreeCut) -> list[tuple[int, int | None, int]]:
         """For each instance: nodes in this cut, nodes in both this and the last cut, and nodes in the last cut.
 
         The second is None for the first cut.
         """
-        common = np.zeros(len(self._base), np.int64)
+        found = np.empty((len(self._base), 2), np.int64)
         old = self._last or (cut.node[:0], cut.instance[:0])
-        kernels.replace_drawn(self._drawn, self._base, cut.node, cut.instance, *old, common)
-        counts = np.bincount(cut.instance, minlength=len(self._base))
+        kernels.replace_drawn(self._drawn, self._before, self._base, cut.node, cut.instance, *old, found)
         first = self._last is None
         result = [
-            (int(new), None if first else int(same), int(before))
-            for new, same, before in zip(counts, common, self._counts, strict=True)
+            (new, None if first else same, before)
+            for (new, same), before in zip(found.tolist(), self._counts, strict=True)
         ]
-        self._last, self._counts = (cut.node, cut.instance), counts
+        self._drawn, self._before = self._before, self._drawn
+        self._last, self._counts = (cut.node, cut.instance), found[:, 0].tolist()
         return result

@@ -76,14 +76,20 @@ class DetailTraversal:
         self._before: list[Levels | None] = [None] * len(self.instances)
 
     def cut(
-        self, view: View, *, budget: int, smallest: float = 0.0, resident: NDArray[np.bool_] | None = None
+        self,
+        view: View,
+        *,
+        budget: int,
+        smallest: float = 0.0,
+        resident: NDArray[np.bool_] | None = None,
+        threads: int = 1,
     ) -> TreeCut:
         """The cut that a viewer draws: the splats of the levels of all regions, and the environments.
 
         Args:
             view: the camera.
             budget: maximum number of splats, all instances together; those of environments do not count.
-            smallest: has no meaning here; traversals of trees have it.
+            smallest, threads: have no meaning here; traversals of trees have them.
             resident: (chunks,) bool, which chunk files of all scenes are there; all are unless given.
         """
         start = time.perf_counter()

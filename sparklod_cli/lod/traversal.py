@@ -13,19 +13,11 @@ from numpy.typing import NDArray
 
 from ..model.foveation import Cones, Foveation
 from ..model.nodes import CHUNK_BITS, CHUNK_NODES, Nodes
+from .cut_search import CutSearch
 from .foveation import set_foveation
 from .kernels import cut_arrays, pixel_scale
-from .kernels.cut import find_cut
 
 Matrix = NDArray[np.float64]
-
-#: Initial size of the buffers, in visited nodes per node of a cut: enough if every refined node has two or more
-#: children; for other trees the buffers grow.
-VISITS = 2
-
-#: The first threshold for a cut, as a share of the last cut's: slightly lower, because visiting some nodes
-#: unnecessarily costs less than another round. Chosen; cuts do not depend on it.
-GUESS = 0.97
 
 #: Why a cut is not finer, by the kernel's code.
 REASONS = {
@@ -183,7 +175,13 @@ class Traversal:
         self._most = sum(int(sizes[instance.tree]) for instance in self.instances)
 
     def cut(
-        self, view: View, *, budget: int, smallest: float = 0.0, resident: NDArray[np.bool_] | None = None
+        self,
+        view: View,
+        *,
+        budget: int,
+        smallest: float = 0.0,
+        resident: NDArray[np.bool_] | None = None,
+        threads: int = 1,
     ) -> TreeCut:
         """The cut that a viewer draws.
 
@@ -192,84 +190,48 @@ class Traversal:
             budget: maximum number of splats, all instances together; at least one per instance.
             smallest: nodes of this pixel scale or less are not refined; see `settings.pixel_limit`.
             resident: (chunks,) bool, of all trees; all chunks are resident unless given.
+            threads: that find a large cut, if all chunks are resident; the cut is the same for any number. For several
+                cuts, it is faster to find one on each thread.
         """
         if resident is not None:
             self.forest.read(resident)
-            return self._cut(view, budget, smallest, resident)
+            return self._cut(view, budget, smallest, resident, threads)
         while True:
             # As long as chunks are not in memory that would be read next, the cut is one of a viewer that lacks them.
             present = self.forest.present()
-            found = self._cut(view, budget, smallest, present)
+            found = self._cut(view, budget, smallest, present, threads)
             if not self.forest.read_some(found.wanted, present):
                 return found
 
-    def _cut(self, view: View, budget: int, smallest: float, present: NDArray[np.bool_]) -> TreeCut:
+    def _cut(self, view: View, budget: int, smallest: float, present: NDArray[np.bool_], threads: int) -> TreeCut:
         """The cut with these chunks, which are in memory."""
         start = time.perf_counter()
         views = views_of(self.forest, self.instances, view)
-        work = self._work(VISITS * budget + CHUNK_NODES)
-        wanted = np.empty(self.forest.chunks, np.float32)
-        length = min(budget, self._most) + 1
-        cut = cut_arrays.CutNodes(np.empty(length, np.uint32), np.empty(length, np.int32), np.empty(length, np.uint16))
         trees = cut_arrays.Trees(self.forest.nodes, views, present, CHUNK_BITS)
-        stop = cut_arrays.Stop(np.float32(smallest).view(np.int32), budget)
-        while True:
-            selected, reason, missing, least, last = find_cut(
-                trees, stop, np.float32(work.guess), work.slots, wanted, cut
-            )
-            if reason != cut_arrays.FULL:
-                break
-            work = self._work(2 * len(work.slots.node))
-        # The next cut is likely to be similar.
-        work.guess = GUESS * least if reason == cut_arrays.BUDGET else smallest
+        found = self._search().find(trees, smallest, budget, threads)
         return TreeCut(
             views=views,
-            node=cut.node[:selected],
-            instance=cut.instance[:selected],
-            limit=cut.limit[:selected].view(np.float32),
-            reason=REASONS[reason],
-            missing=missing,
-            least=float(least),
-            stop=None if last < 0 else work.slot(last),
-            wanted=wanted,
+            node=found.nodes.node,
+            instance=found.nodes.instance,
+            limit=found.nodes.limit.view(np.float32),
+            reason=REASONS[found.reason],
+            missing=found.missing,
+            least=found.least,
+            stop=found.stop,
+            wanted=found.wanted,
             seconds=time.perf_counter() - start,
         )
 
     def forget(self) -> None:
         """Discards the threshold of this thread's last cut. The next cut is the same either way."""
-        work: _Work | None = getattr(self._local, "work", None)
-        if work is not None:
-            work.guess = 0.0
+        self._search().guess = 0.0
 
-    def _work(self, slots: int) -> _Work:
-        """Buffers of this thread with this many slots, or as many as can be needed if those are fewer."""
-        slots = min(slots, 2 * self._most)  # a node is visited by its threshold, and once more by the queue
-        work: _Work | None = getattr(self._local, "work", None)
-        if work is None or len(work.slots.node) < slots:
-            work = self._local.work = _Work(slots)
-        return work
-
-
-class _Work:
-    """Working memory for finding a cut, and the threshold at which the last one ended."""
-
-    def __init__(self, slots: int) -> None:
-        self.slots = cut_arrays.Slots(
-            node=np.empty(slots + 1, np.uint32),
-            limit=np.empty(slots + 1, np.int32),
-            instance=np.empty(slots + 1, np.uint16),
-            first=np.empty(slots + 1, np.int32),
-            queue=np.empty(slots + 1, np.int32),
-            pending=np.empty(slots + 1, np.int32),
-            heap=np.empty(slots + 1, np.int32),
-            sums=np.empty(cut_arrays.BUCKETS, np.int32),
-        )
-        self.guess = 0.0
-
-    def slot(self, at: int) -> tuple[float, int, int]:
-        """The pixel scale, instance and index of the node in a slot."""
-        slots = self.slots
-        return float(slots.limit.view(np.float32)[at]), int(slots.instance[at]), int(slots.node[at])
+    def _search(self) -> CutSearch:
+        """This thread's."""
+        search: CutSearch | None = getattr(self._local, "search", None)
+        if search is None:
+            search = self._local.search = CutSearch(self._most)
+        return search
 
 
 def views_of(forest: Forest, instances: Sequence[TreeInstance], view: View) -> NDArray[np.void]:

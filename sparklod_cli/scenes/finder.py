@@ -45,13 +45,14 @@ class CutFinder:
     Args:
         scenes: with trees or detail levels, or without.
         settings: of the viewer; None draws full detail.
+        threads: that find each cut of a tree, if it is large. Where several threads ask, one is faster.
 
     Raises:
         ValueError: the budget is too small for the roots, or there are too many instances.
     """
 
-    def __init__(self, scenes: Scenes, settings: LodSettings | None) -> None:
-        self.scenes, self.settings = scenes, settings
+    def __init__(self, scenes: Scenes, settings: LodSettings | None, *, threads: int = 1) -> None:
+        self.scenes, self.settings, self._threads = scenes, settings, threads
         self._traversal: Traversal | DetailTraversal | None = None
         self._continuous: ContinuousCuts | None = None
         if settings is not None and scenes.with_cuts:
@@ -73,7 +74,7 @@ class CutFinder:
             return self.scenes.full()
         view, limit = view_of(camera), self.settings.limit(camera.fov_y, camera.height)
         if self._continuous is None or self.settings.continuous is None:
-            found = self._traversal.cut(view, budget=self.settings.budget, smallest=limit)
+            found = self._traversal.cut(view, budget=self.settings.budget, smallest=limit, threads=self._threads)
             return self.scenes.cut_of(found)
         blended = self._continuous.cut(
             view, budget=self.settings.budget, smallest=limit, width=self.settings.continuous

@@ -318,9 +318,9 @@ def test_whatever_the_bytes_are_there_is_a_report(path: Path, tmp_path: Path) ->
         if attempt == 0:
             broken.write_bytes(data)
         for wanted in (ReportSettings(check=True), ReportSettings(values=True, all_quantities=True)):
-            report, scene = inspect(broken, wanted)
+            report, _ = inspect(broken, wanted)
             plain = json.loads(json.dumps(report.as_dict(), allow_nan=False))
-            if scene is not None:
+            if report.format is not None:
                 assert "\n".join(lines(path.name, plain))
             else:
                 assert ERROR in [found["severity"] for found in plain["findings"]]

@@ -239,7 +239,8 @@ def test_many_files_are_listed() -> None:
     "name", ["golden/tree-v3.spz", "golden/sh3-v2.sog", "golden/sh1-streamed-sog", "sh1.ply", "points.ply"]
 )
 def test_a_page_of_a_real_file_says_what_its_report_says(name: str) -> None:
-    report, scene = inspect(FIXTURES / name, ReportSettings(values=True, all_quantities=True, check=True))
+    settings = ReportSettings(values=True, all_quantities=True, check=True, at_once=True)
+    report, scene = inspect(FIXTURES / name, settings)
     counted = {} if scene is None else {name: histogram_of(scene.splats, name) for name in names_of(scene.splats)}
     text = said(Section(report.as_dict(), histograms=counted))
     assert name in text

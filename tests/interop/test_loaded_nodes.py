@@ -136,7 +136,6 @@ BAKED = [
     ("demo.ply", "quality", ".spz"),
     ("demo.ply", "quality", ".rad"),
     ("biker.ply", "quick", ".spz"),
-    ("playbot-125k.ply", "quick", ".spz"),
     ("playbot-125k.ply", "quick", ".rad"),
     ("meadow.sog", "quick", ".rad"),
 ]

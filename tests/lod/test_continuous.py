@@ -16,7 +16,7 @@ from sparklod_cli.lod.traversal import Forest, Traversal, TreeInstance, View
 from sparklod_cli.model.foveation import Cones
 from sparklod_cli.model.gaussian import lod_opacity
 from tests.lod.forests import Case, cases, random_tree, transform
-from tests.references import budgeted_cuts
+from tests.references import budgeted_cuts, continuous_cuts
 
 WIDTHS = (1.05, 1.25, 2.0)
 SPARK = Cones(90, 120, 0.4, 0.2)
@@ -54,6 +54,30 @@ def some_case(seed: int, count: int = 400, foveation: Cones = SPARK) -> Case:
     tree = random_tree(rng, count, 5)
     instances = [TreeInstance(0, np.eye(4), 1.0, foveation), TreeInstance(0, transform(rng, spread=4), 0.7, foveation)]
     return Case([tree], instances, view_from((0.3, -0.2, 6.0)), count // 2, 0.0)
+
+
+@given(cases(), st.sampled_from(WIDTHS))
+def test_the_cut_is_that_of_numpy_to_the_last_bit(case: Case, width: float) -> None:
+    check_against_numpy(case, width)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_cuts_of_larger_trees_are_those_of_numpy_to_the_last_bit(seed: int) -> None:
+    check_against_numpy(some_case(seed, 6000), 1.25)
+
+
+def check_against_numpy(case: Case, width: float) -> None:
+    cut = ContinuousCuts(case.traversal()).cut(case.view, budget=case.budget, smallest=case.smallest, width=width)
+    found = case.traversal()
+    sizes = [len(case.trees[instance.tree].size) for instance in case.instances]
+    views = found.cut(case.view, budget=len(case.instances)).views
+    nodes, weights, threshold = continuous_cuts.continuous_cut(
+        found.forest.nodes, views, sizes, case.budget, case.smallest, width
+    )
+    assert cut.threshold == threshold
+    assert cut.node.tolist() == np.concatenate(nodes).tolist()
+    assert cut.weight.tolist() == np.concatenate(weights).tolist()
+    assert np.bincount(cut.instance, minlength=len(nodes)).tolist() == [len(each) for each in nodes]
 
 
 @given(cases(), st.sampled_from(WIDTHS))
@@ -195,10 +219,10 @@ def test_pixel_scales_are_those_of_the_traversal(case: Case) -> None:
 
 
 def test_shares_rise_from_nothing_at_the_threshold_to_all_at_its_multiple() -> None:
-    limit = np.array([0, 0.5, 1, math.sqrt(1.5), 1.5, 3, np.inf])
-    np.testing.assert_allclose(shares(limit, 1.0, 1.5), [0, 0, 0, 0.5, 1, 1, 1], atol=1e-15)
+    limit = np.array([0, 0.5, 1, math.sqrt(1.5), 1.5, 3, np.inf], np.float32)
+    np.testing.assert_allclose(shares(limit, 1.0, 1.5), [0, 0, 0, 0.5, 1, 1, 1], atol=1e-6)
     np.testing.assert_array_equal(shares(limit, 0.0, 1.5), [0, 1, 1, 1, 1, 1, 1])
-    fine = shares(np.geomspace(0.9, 1.7, 1000), 1.0, 1.5)
+    fine = shares(np.geomspace(0.9, 1.7, 1000, dtype=np.float32), 1.0, 1.5)
     assert (np.diff(fine) >= 0).all()
 
 
@@ -208,7 +232,7 @@ def test_shares_rise_from_nothing_at_the_threshold_to_all_at_its_multiple() -> N
     st.sampled_from(WIDTHS),
 )
 def test_the_threshold_uses_the_budget_and_no_more(nodes: list[tuple[float, int]], room: int, width: float) -> None:
-    limit = np.array([node[0] for node in nodes])
+    limit = np.array([node[0] for node in nodes], np.float32)
     more = np.array([node[1] for node in nodes], np.int64)
     threshold = find_threshold(limit, more, room, width)
     used = float(more @ shares(limit, threshold, width)) if len(nodes) else 0.0

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ...lod.chunk_order import FAMILY_BYTES, MOST_FAMILIES
 from ...model.sh import COEFFICIENTS
 from ...support import machine
 
@@ -83,6 +82,8 @@ def out_of_core_bytes(method: str, splats: int, sh_degree: int, block_splats: in
         block_splats: of a block.
         in_chunks: families are put in an order for streaming at the end.
     """
+    from ...lod.chunk_order import FAMILY_BYTES, MOST_FAMILIES  # takes long to load, and this is asked out of core only
+
     window = OF_WINDOW.of(min(2 * splats, WINDOW), sh_degree)
     block = OF_BLOCK[method].of(min(splats, block_splats), sh_degree)
     families = int(FAMILIES * splats) if in_chunks else 0

@@ -125,7 +125,9 @@ class Coded:
         tables = _read_codes(bits, int(tiles.max()) + 1, 1 << cached if cached else 0)
         cache = np.zeros(1 << cached, np.uint32)
         self._codes = webp_pixels.Codes(*tables[:3], tiles, across, shift, cache, 32 - cached, width, width * height)
-        self._pixels = np.empty(min(self._codes.total, 2 * REACH) + LONGEST, np.uint32)
+        # An image that a transform needs is kept whole; it has a pixel for each tile of 16 pixels or more.
+        kept = min(self._codes.total, 2 * REACH) if tiled else self._codes.total
+        self._pixels = np.empty(kept + LONGEST, np.uint32)
         self._first = 0
         self._at = np.zeros(3, np.uint64)
 

@@ -69,15 +69,19 @@ class CutNodes(NamedTuple):
 class Slots(NamedTuple):
     """Working memory for nodes that have been visited: of roots, then of the children of each refined node, run by run.
 
+    Each part of a cut, which one thread works on at a time, has a row; `row_of` is the slots of one.
+
     Attributes:
-        node: (slots,) uint32 index in its tree.
-        limit: (slots,) int32, see `limit_bits`.
-        instance: (slots,) uint16.
-        first: (slots + 1,) int32, the first slot of each run.
-        queue: (slots,) int32 slots that have been refined, one for each run, then those that will be.
-        pending: (slots,) int32 slots below the threshold.
-        heap: (slots,) int32.
-        sums: (BUCKETS,) int32, for each bucket of limits the number of nodes that refining its nodes adds to the cut.
+        node: (parts, slots) uint32 index in its tree.
+        limit: (parts, slots) int32, see `limit_bits`.
+        instance: (parts, slots) uint16.
+        first: (parts, slots) int32, the first slot of each run.
+        queue: (parts, slots) int32 slots that have been refined, one for each run, then those that will be.
+        pending: (parts, slots) int32 slots below the threshold.
+        heap: (parts, slots) int32.
+        sums: (parts, BUCKETS) int32, for each bucket of limits the number of nodes that refining its nodes adds to the
+            cut.
+        tally: (parts, TALLIES) int64, see COUNT.
     """
 
     node: Any
@@ -88,6 +92,36 @@ class Slots(NamedTuple):
     pending: Any
     heap: Any
     sums: Any
+    tally: Any
+
+
+#: Columns of `Slots.tally`. While nodes are refined: slots in use; refined nodes; pending ones; nodes of the cut before
+#: anything is refined; nodes of the cut once all of bucket LOW and above are refined; LOW itself; refined nodes whose
+#: children are not resident; whether the slots did not suffice.
+COUNT, RUNS, WAITING, BASE, DRAWN, LOW, GAPS, OVERFLOW = range(8)
+#: When the cut is collected: its nodes so far; nodes of the last bucket, in `Slots.heap`; nodes whose children are
+#: missing; whether a node with children is too small to be refined; bits of the least limit of a refined node.
+SELECTED, QUEUED, ABSENT, SMALL, LEAST = range(8, 13)
+#: Where several threads find a cut: what the part does next, see `cut_parts`; bits of the threshold; most nodes of the
+#: cut in the part; index of its first node in the cut.
+NEXT, THRESHOLD, ROOM, BEGIN = range(13, 17)
+TALLIES = 17
+
+
+@kernel(inline=True)
+def row_of(slots, part):
+    """The slots of one part, in arrays without the first dimension."""
+    return Slots(
+        slots.node[part],
+        slots.limit[part],
+        slots.instance[part],
+        slots.first[part],
+        slots.queue[part],
+        slots.pending[part],
+        slots.heap[part],
+        slots.sums[part],
+        slots.tally[part],
+    )
 
 
 @kernel(inline=True)

@@ -6,7 +6,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...support.jit import kernel
+from ...support.jit import kernel, prefetch
+from .cut_arrays import BUCKET_BITS, BUCKETS, LEAF
 from .pixel_scale import NEAREST, ONE, ZERO
 
 #: Columns of the counts of an instance: nodes of each kind; least, sum and largest of their depths; area covered.
@@ -18,6 +19,15 @@ AREA_PARTS = 1024
 
 #: Radius of a drawn splat in standard deviations, squared: Spark's `maxStdDev` is sqrt(8).
 EXTENT_SQUARED = 8
+
+#: Nodes that are measured together: few enough for a block of them to stay in the processor's cache.
+BLOCK_NODES = 512
+
+#: Nodes ahead of the one being read that are fetched into the processor's cache. Chosen.
+AHEAD = 64
+
+#: Bits are cleared all together rather than one by one if there are fewer words than this many times the nodes. Chosen.
+CLEAR_WORDS = 4
 
 
 class Screen(NamedTuple):
@@ -36,7 +46,7 @@ class Screen(NamedTuple):
 
 
 @kernel(nogil=True)
-def measure_cut(nodes, depths, views, cut, screen, counts, sizes):
+def measure_cut(nodes, depths, views, cut, screen, counts, sizes, owners):
     """Counts the nodes of a cut by where their centres are, and measures those inside the frustum.
 
     Args:
@@ -46,60 +56,163 @@ def measure_cut(nodes, depths, views, cut, screen, counts, sizes):
         cut: `CutNodes`, as `find_cut` fills it.
         screen: `Screen`.
         counts: (instances, COUNTS) int64, filled.
-        sizes: (cut,) float32, filled with the feature size, in pixels on the screen, of nodes inside the frustum, and
-            -1 for others.
+        sizes: (cut,) float32, filled from the start with the feature sizes, in pixels on the screen, of nodes inside
+            the frustum; without NaN.
+        owners: (cut,) uint16, filled with the instance of each of these.
+
+    Returns:
+        number of sizes.
     """
     node, limit, instance = cut
-    tan_x, tan_y, pixel_limit, most_area = screen
     counts[:] = 0
     counts[:, DEPTH_MIN] = 1 << 31
-    for at in range(len(node)):
-        number = instance[at]
-        view = views[number]
-        index = view.node_base + node[at]
-        counts[number, SELECTED] += 1
-        counts[number, LEAVES] += nodes[index].child_count == 0
-        counts[number, FRONTIER] += limit[at] >= 0  # not what the queue has taken out
-        depth = depths[index]
-        counts[number, DEPTH_MIN] = min(counts[number, DEPTH_MIN], depth)
-        counts[number, DEPTH_SUM] += depth
-        counts[number, DEPTH_MAX] = max(counts[number, DEPTH_MAX], depth)
-        dx, dy, dz = nodes[index].x - view.origin_x, nodes[index].y - view.origin_y, nodes[index].z - view.origin_z
-        ahead = dx * view.forward_x + dy * view.forward_y + dz * view.forward_z
-        across = dx * view.right_x + dy * view.right_y + dz * view.right_z
-        along = dx * view.up_x + dy * view.up_y + dz * view.up_z
-        sizes[at] = -ONE
-        if not ahead > ZERO:
-            counts[number, BEHIND] += 1
-        elif abs(across) <= tan_x * ahead and abs(along) <= tan_y * ahead:
-            counts[number, IN_FRUSTUM] += 1
-            distance = max(np.sqrt(dx * dx + dy * dy + dz * dz), NEAREST)
-            size = nodes[index].size / distance / pixel_limit
-            sizes[at] = size
-            area = np.float64(np.pi / 4 * EXTENT_SQUARED) * size * size
-            counts[number, AREA] += np.int64((area if area < most_area else most_area) * AREA_PARTS)
-        else:
-            counts[number, OUTSIDE] += 1
+    x, y = np.empty(BLOCK_NODES, np.float32), np.empty(BLOCK_NODES, np.float32)
+    z, size = np.empty(BLOCK_NODES, np.float32), np.empty(BLOCK_NODES, np.float32)
+    found, begin = 0, 0
+    while begin < len(node):
+        # A block is of nodes of an instance that follow one another. They are copied together first, so that the
+        # arithmetic is done on several at a time.
+        number = instance[begin]
+        end, last = begin + 1, min(begin + BLOCK_NODES, len(node))
+        while end < last and instance[end] == number:
+            end += 1
+        row = counts[number]
+        base = views[number].node_base
+        leaves, frontier, total = 0, 0, 0
+        least, most = row[DEPTH_MIN], row[DEPTH_MAX]
+        for at in range(begin, end):
+            ahead = base + node[min(at + AHEAD, len(node) - 1)]
+            prefetch(nodes, ahead)
+            prefetch(depths, ahead)
+            index = base + node[at]
+            record = nodes[index]
+            to = at - begin
+            x[to], y[to], z[to], size[to] = record.x, record.y, record.z, record.size
+            leaves += record.child_count == 0
+            frontier += limit[at] >= 0  # not what the queue has taken out
+            depth = np.int64(depths[index])
+            least, most = min(least, depth), max(most, depth)
+            total += depth
+        inside, behind, area = measure_block(x, y, z, size, end - begin, views[number], screen)
+        row[SELECTED] += end - begin
+        row[LEAVES] += leaves
+        row[FRONTIER] += frontier
+        row[DEPTH_MIN], row[DEPTH_MAX] = least, most
+        row[DEPTH_SUM] += total
+        row[BEHIND] += behind
+        row[IN_FRUSTUM] += inside
+        row[OUTSIDE] += end - begin - inside - behind
+        row[AREA] += area
+        for at in range(end - begin):
+            sizes[found], owners[found] = size[at], number
+            found += size[at] >= ZERO
+        begin = end
+    return found
 
 
 @kernel(nogil=True)
-def replace_drawn(drawn, base, node, instance, old_node, old_instance, kept):
-    """Replaces the old cut by the new one in a set of drawn nodes, and counts the nodes of both.
+def measure_block(x, y, z, size, count, view, screen):
+    """Measures the splats of a block.
 
     Args:
-        drawn: uint32 words with a bit for each node of each instance: the old cut on entry, the new one on return.
-        base: (instances,) int64, the first bit of each.
-        node, instance: of the new cut.
-        old_node, old_instance: of the old cut.
-        kept: (instances,) int64, filled with the number of nodes in both cuts.
+        x, y, z: (BLOCK_NODES,) float32 centres.
+        size: (BLOCK_NODES,) float32; overwritten with feature sizes in pixels, -1 of splats that are not inside the
+            frustum.
+        count: number of splats.
+        view: a record of `VIEW`.
+        screen: `Screen`.
+
+    Returns:
+        inside: number inside the frustum.
+        behind: number behind the camera.
+        area: that those inside cover, in 1 / AREA_PARTS square pixels.
     """
-    kept[:] = 0
+    tan_x, tan_y, pixel_limit, most_area = screen
+    origin_x, origin_y, origin_z = view.origin_x, view.origin_y, view.origin_z
+    forward_x, forward_y, forward_z = view.forward_x, view.forward_y, view.forward_z
+    right_x, right_y, right_z = view.right_x, view.right_y, view.right_z
+    up_x, up_y, up_z = view.up_x, view.up_y, view.up_z
+    inside, behind, area = 0, 0, 0
+    for at in range(count):
+        dx, dy, dz = x[at] - origin_x, y[at] - origin_y, z[at] - origin_z
+        ahead = dx * forward_x + dy * forward_y + dz * forward_z
+        across = dx * right_x + dy * right_y + dz * right_z
+        along = dx * up_x + dy * up_y + dz * up_z
+        in_front = ahead > ZERO
+        seen = in_front & (abs(across) <= tan_x * ahead) & (abs(along) <= tan_y * ahead)
+        distance = max(np.sqrt(dx * dx + dy * dy + dz * dz), NEAREST)
+        pixels = size[at] / distance / pixel_limit
+        size[at] = pixels if seen else -ONE
+        covered = np.float64(np.pi / 4 * EXTENT_SQUARED) * pixels * pixels
+        covered = covered if covered < most_area else most_area
+        area += np.int64(covered * AREA_PARTS) if seen else 0
+        inside += seen
+        behind += not in_front
+    return inside, behind, area
+
+
+@kernel(nogil=True)
+def select(values, places, found):
+    """The values that would be at some places if all were in ascending order.
+
+    Args:
+        values: (n,) float32, at least 0.
+        places: (k,) int64, ascending.
+        found: (k,) float32, filled.
+    """
+    # The upper halves of their bits put them into buckets; only the buckets that are asked for are sorted.
+    bits = values.view(np.int32)
+    ends = np.zeros(BUCKETS, np.int32)
+    for at in range(len(values)):
+        ends[(bits[at] & ~LEAF) >> BUCKET_BITS] += 1
+    total = 0
+    for bucket in range(BUCKETS):
+        total += ends[bucket]
+        ends[bucket] = total
+    asked, first = -1, 0
+    some = values[:0]
+    for entry in range(len(places)):
+        bucket = np.searchsorted(ends, places[entry], side="right")
+        if bucket != asked:
+            asked, first = bucket, ends[bucket - 1] if bucket else 0
+            some = np.empty(ends[bucket] - first + 1, np.float32)  # one more, to write without a branch
+            count = 0
+            for at in range(len(values)):
+                some[count] = values[at]
+                count += (bits[at] & ~LEAF) >> BUCKET_BITS == bucket
+            some = np.sort(some[:count])
+        found[entry] = some[places[entry] - first]
+
+
+@kernel(nogil=True)
+def replace_drawn(drawn, before, base, node, instance, old_node, old_instance, counts):
+    """Counts the nodes of a cut, and those that the cut before it had, too.
+
+    Args:
+        drawn: uint32 words of zeros, a bit for each node of each instance; filled with the nodes of the cut.
+        before: the same for the cut before; set to zeros.
+        base: (instances,) int64, the first bit of each.
+        node, instance: of the cut.
+        old_node, old_instance: of the cut before.
+        counts: (instances, 2) int64, filled with the number of nodes in the cut, and in both.
+    """
+    counts[:] = 0
     one = np.uint32(1)
-    for at in range(len(node)):
-        bit = base[instance[at]] + node[at]
-        kept[instance[at]] += (drawn[bit >> 5] >> np.uint32(bit & 31)) & one
+    begin = 0
+    while begin < len(node):
+        number = instance[begin]
+        first = base[number]
+        kept, end = np.int64(0), begin
+        while end < len(node) and instance[end] == number:
+            bit = first + node[end]
+            kept += (before[bit >> 5] >> np.uint32(bit & 31)) & one
+            drawn[bit >> 5] |= one << np.uint32(bit & 31)
+            end += 1
+        counts[number, 0] += end - begin
+        counts[number, 1] += kept
+        begin = end
+    if len(before) < CLEAR_WORDS * len(old_node):
+        before[:] = 0
+        return
     for at in range(len(old_node)):
-        drawn[(base[old_instance[at]] + old_node[at]) >> 5] = 0
-    for at in range(len(node)):
-        bit = base[instance[at]] + node[at]
-        drawn[bit >> 5] |= one << np.uint32(bit & 31)
+        before[(base[old_instance[at]] + old_node[at]) >> 5] = 0

@@ -118,12 +118,33 @@ def add_child_sizes(parent, size, scale, opacity, sums, weights):
         opacity: (n,) float32, linear.
         sums, weights: (N,) float64 of all nodes.
     """
+    weight = np.empty(len(parent), np.float64)
+    fill_weights(parent, size, scale, opacity, weight)
+    add_weighted(parent, size, weight, sums, weights)
+
+
+@kernel(nogil=True)
+def fill_weights(parent, size, scale, opacity, weight):
+    """The weights of `add_child_sizes`: opacity times surface area, -1 of nodes that do not count.
+
+    Args:
+        parent, size, scale, opacity: of n nodes, as there.
+        weight: (n,) float64, filled.
+    """
     for node in range(len(parent)):
+        weight[node] = -1
         if parent[node] >= 0 and opacity[node] > 0 and 0 < size[node] < np.inf:
             area = ellipsoid_area(scale[node, 0], scale[node, 1], scale[node, 2])
-            weight = opacity[node] * max(area, LEAST_AREA)
-            weights[parent[node]] += weight
-            sums[parent[node]] += weight * size[node]
+            weight[node] = opacity[node] * max(area, LEAST_AREA)
+
+
+@kernel(nogil=True)
+def add_weighted(parent, size, weight, sums, weights):
+    """The sums of `add_child_sizes`, of n nodes with the weights of `fill_weights`."""
+    for node in range(len(parent)):
+        if not weight[node] < 0:
+            weights[parent[node]] += weight[node]
+            sums[parent[node]] += weight[node] * size[node]
 
 
 @kernel()

@@ -121,6 +121,15 @@ def test_memory_does_not_grow_with_the_image() -> None:
     assert peaks[2] < 1.2 * peaks[1]
 
 
+def test_an_image_that_a_transform_needs_is_whole_however_large() -> None:
+    """No cache, and five simple codes of one symbol of 8 bits: green, red, blue, alpha, distance."""
+    code = "0" + "".join("101" + f"{symbol:08b}"[::-1] for symbol in (3, 2, 4, 1, 0))
+    data = int(code[::-1], 2).to_bytes(-(-len(code) // 8), "little")
+    coded = lossless.Coded(lossless.Bits(io.BytesIO(data).read), 2 * lossless.REACH // 1000 + 9, 1000)
+    assert len(coded.all()) > 2 * lossless.REACH + lossless.LONGEST
+    assert (coded.all() == 0x01020304).all()
+
+
 # --- What is damaged --------------------------------------------------------------------------------------------------
 
 
