@@ -129,6 +129,15 @@ def test_needles_are_drawn_as_the_twin_draws_them() -> None:
 
 
 @pytest.mark.parametrize("most", [1.0, 5.0])
+def test_the_longest_needles_are_exact(most: float) -> None:
+    """As long as a splat may be; in float32 the terms of a quadratic form would cancel to 1e-2."""
+    needles = shown(12, seed=5, spread=0.4, most=most)
+    needles.scale[:] = np.float32([2.0, 0.001, 0.001])
+    image = check(needles, camera_at(size=(960, 540), focal=(1500.0, 1500.0)), most=2e-4)
+    assert (image[..., 3] > 0.01).sum() > 300
+
+
+@pytest.mark.parametrize("most", [1.0, 5.0])
 @pytest.mark.parametrize("thin", [1.0, 0.01])
 def test_no_splat_is_larger_than_512_pixels(thin: float, most: float) -> None:
     huge = shown(6, seed=6, scale=6.0, spread=0.5, most=most)
