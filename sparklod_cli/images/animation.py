@@ -2,26 +2,21 @@
 
 from __future__ import annotations
 
-import functools
 import io
 import itertools
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from types import ModuleType
-from typing import Any
 
 import numpy as np
 from PIL import Image
 
 from ..support.errors import SparklodError
 from ..support.optional import optional_import
-from ..support.progress import Progress, silent
+from . import animated_webp, gif
 from .pixels import Pixels
 
-#: GIF counts time in steps of 10 ms; players slow down frames that are shorter than this many steps.
-GIF_STEP, GIF_LEAST = 10, 2
-
 #: Longest duration of a frame, ms: 16 bits of hundredths in GIF, 24 bits of ms in WebP, ffmpeg's limit for videos.
-LONGEST = {"gif": 10 * 0xFFFF, "webp": 0xFFFFFF, "mp4": 1_000_000, "webm": 1_000_000}
+LONGEST = {"gif": gif.STEP * gif.MOST_STEPS, "webp": animated_webp.LONGEST, "mp4": 1_000_000, "webm": 1_000_000}
 
 #: Quality of WebP (0 to 100), rate factors of H.264 (51 to 0) and VP9 (63 to 0): losses are hardly visible.
 WEBP_QUALITY, H264_QUALITY, VP9_QUALITY = 90, 16, 24
@@ -64,29 +59,29 @@ def load_imageio(form: str) -> ModuleType:
     return module
 
 
-def animate(frames: Iterable[Pixels], form: str, fps: float, progress: Progress = silent) -> bytes:
-    """The bytes of an animation in an endless loop ("gif", "webp") or of a video ("mp4", "webm").
+def animate(frames: Iterable[Pixels], form: str, fps: float) -> Iterator[bytes]:
+    """The bytes of an animation in an endless loop ("gif", "webp") or of a video ("mp4", "webm"), piece by piece.
+
+    Frames are encoded as they come; the memory that takes does not depend on their number, but for the bytes of videos.
 
     Args:
         frames: at least one, all of one size; with alpha for "webp" only.
         form: one of `defaults.MOVING`.
         fps: frames per second.
-        progress: called for each frame that GIF and WebP write, which they do at the end; videos write frames as they
-            come, without calling it.
 
     Raises:
-        SparklodError: videos cannot be written here.
+        SparklodError: videos cannot be written here, or the animation is too large for its format.
     """
-    out = io.BytesIO()
     if form in VIDEOS:
+        out = io.BytesIO()
         _write_video(out, frames, form, fps)
+        yield out.getvalue()
     elif form == "gif":
         pictures = (Image.fromarray(frame).convert("P", palette=Image.Palette.ADAPTIVE, colors=256) for frame in frames)
-        _write_images(out, "GIF", pictures, _times(fps, GIF_STEP, GIF_LEAST), progress)
+        yield from gif.written(pictures, _times(fps, gif.STEP, gif.LEAST_STEPS))
     else:
         pictures = (Image.fromarray(frame) for frame in frames)
-        _write_images(out, "WEBP", pictures, _times(fps, 1, 1), progress, quality=WEBP_QUALITY, method=4)
-    return out.getvalue()
+        yield from animated_webp.written(pictures, _times(fps, 1, 1), quality=WEBP_QUALITY, method=4)
 
 
 def _times(fps: float, step: int, least: int) -> Iterator[int]:
@@ -96,27 +91,6 @@ def _times(fps: float, step: int, least: int) -> Iterator[int]:
         end = max(round(1000 * number / (fps * step)), elapsed + least)
         yield (end - elapsed) * step
         elapsed = end
-
-
-def _write_images(
-    out: io.BytesIO,
-    name: str,
-    pictures: Iterable[Image.Image],
-    times: Iterator[int],
-    progress: Progress,
-    **options: Any,
-) -> None:
-    first, *others = every = list(pictures)
-    durations = list(itertools.islice(times, len(every)))
-    for number, picture in enumerate(every):
-        # Pillow seeks each picture before it writes it, which is the only sign of its progress.
-        picture.seek = functools.partial(_seek, picture.seek, progress, number, len(every))  # type: ignore[method-assign]
-    first.save(out, name, save_all=True, append_images=others, duration=durations, loop=0, **options)
-
-
-def _seek(seek: Callable[[int], None], progress: Progress, number: int, total: int, frame: int) -> None:
-    seek(frame)
-    progress("encoding", number + 1, total, "frame")
 
 
 def _write_video(out: io.BytesIO, frames: Iterable[Pixels], form: str, fps: float) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -108,7 +108,7 @@ def write_pictures(
         settings: settings of the files.
         reference: cuts to compare with; the pictures are then differences from it.
         overwrite: replace existing files.
-        progress: called with the number of frames scanned for the colour scale, compared, drawn and encoded.
+        progress: called with the number of frames scanned for the colour scale, compared and drawn.
 
     Raises:
         BackendError: the backend cannot draw here.
@@ -159,16 +159,16 @@ class _Writer:
 
         if output.kind == "frames":
             for number, frame in zip(self._path.numbers, drawn(), strict=True):
-                self._write(output.path(number), frame.data)
+                self._write(output.path(number), [frame.data])
         elif output.kind == "picture":
             (frame,) = drawn()
-            self._write(output.name, frame.data)
+            self._write(output.name, [frame.data])
         elif output.kind == "animation":
             pictures = (_pixels(frame) for frame in drawn())
-            self._write(output.name, animate(pictures, output.form, frame_rate(self._path), self._progress))
+            self._write(output.name, animate(pictures, output.form, frame_rate(self._path)))
         else:
             whole = sheet([_pixels(frame) for frame in drawn()], self._captions())
-            self._write(output.name, self._encode(whole))
+            self._write(output.name, [self._encode(whole)])
         return Pictures(facts, self._bytes, self._gain if self._reference is not None else None, empty)
 
     def _captions(self) -> list[str]:
@@ -249,12 +249,11 @@ class _Writer:
     def _encode(self, pixels: Pixels) -> bytes:
         return codes.encode(pixels, self._output.form, self._settings.jpeg_quality)
 
-    def _write(self, target: Path | None, data: bytes) -> None:
-        self._bytes += len(data)
+    def _write(self, target: Path | None, pieces: Iterable[bytes]) -> None:
         if target is None:
-            write_stdout([data])
+            self._bytes += write_stdout(pieces)
         else:
-            write_whole(target, [data], overwrite=self._overwrite)
+            self._bytes += write_whole(target, pieces, overwrite=self._overwrite)
 
 
 def _pixels(frame: _Frame) -> Pixels:

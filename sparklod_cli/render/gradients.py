@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ from . import rasterizer
 from .kernels import backward, project_gradients
 from .kernels.project_gradients import CENTER, LOD_OPACITY, LOG_SCALE, RGB, TURN
 from .kernels.shade import sh_gradients
-from .rasterizer import Image, Tiles
+from .rasterizer import Image, Projected, Tiles
 from .settings import MIN_ALPHA, RasterSettings
 from .shading import ShadedSplats
 
@@ -44,8 +44,7 @@ class Drawing:
     Attributes:
         image: (height, width, 4) float32, as `rasterizer.draw` gives it.
         splats, camera, settings: what it was drawn of. The arrays of `splats` must not have changed before `gradients`.
-        screen: (M, `project.COLUMNS`) float32 splats that are drawn, from near to far.
-        keys: (M,) uint64, which they are; see `rasterizer.project_splats`.
+        seen: the splats on the screen.
         tiles: of the picture.
     """
 
@@ -53,8 +52,7 @@ class Drawing:
     splats: ShadedSplats
     camera: Camera
     settings: RasterSettings
-    screen: NDArray[np.float32]
-    keys: NDArray[np.uint64]
+    seen: Projected
     tiles: Tiles
 
     def gradients(self, by_image: Image) -> SplatGradients:
@@ -67,15 +65,16 @@ class Drawing:
             by_image: (height, width, 4) float32 derivatives of the loss by the image's red, green and blue, which are
                 multiplied by alpha, and by alpha.
         """
-        across, down = rasterizer.tiles_across(self.camera)
-        first = backward.first_rows(self.screen, across, down)
+        across, _ = rasterizer.tiles_across(self.camera)
+        screen, boxes = self.seen.screen, self.seen.boxes
+        first = backward.first_rows(boxes)
         sums = np.empty((first[-1], backward.SUMS), np.float32)
-        drawn = backward.Drawn(self.screen, self.tiles.start, self.tiles.splats, self.tiles.stop, across)
+        drawn = backward.Drawn(screen, boxes, self.tiles.start, self.tiles.splats, self.tiles.stop, across)
         by_image = np.ascontiguousarray(by_image, np.float32)
         backward.weigh_tiles(drawn, first, np.float32(MIN_ALPHA), self.image, by_image, sums)
         found = np.zeros((len(self.splats), project_gradients.GRADIENT_COLUMNS), np.float32)
         arguments = rasterizer.arguments(self.splats, self.camera, self.settings)
-        project_gradients.carry_back(*arguments, project_gradients.Rows(self.screen, self.keys, first, sums), found)
+        project_gradients.carry_back(*arguments, project_gradients.Rows(screen, first, sums), found)
         return SplatGradients(
             center=found[:, CENTER : CENTER + 3],
             log_scale=found[:, LOG_SCALE : LOG_SCALE + 3],
@@ -93,10 +92,11 @@ def draw(splats: ShadedSplats, camera: Camera, settings: RasterSettings) -> Draw
     """
     if settings.profile == "shifted":
         raise ValueError("gradients of the profile shifted are not implemented; use the profile spark")
-    screen, keys = rasterizer.project_splats(splats, camera, settings)
-    screen = screen.copy()  # the buffer is overwritten by the next picture
-    image, tiles = rasterizer.draw_projected(screen, camera, settings)
-    return Drawing(image, splats, camera, settings, screen, keys, tiles)
+    seen = rasterizer.project_splats(splats, camera, settings)
+    # The buffers are overwritten by the next picture.
+    seen = replace(seen, screen=seen.screen.copy(), boxes=seen.boxes.copy())
+    image, tiles = rasterizer.draw_projected(seen, camera, settings)
+    return Drawing(image, splats, camera, settings, seen, tiles)
 
 
 def by_sh(

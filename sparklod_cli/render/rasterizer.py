@@ -19,8 +19,26 @@ Image = NDArray[np.float32]
 
 _kept = threading.local()
 
+#: Bytes that processors fetch from memory at once.
+CACHE_LINE = 64
+
 #: Pieces a thread to sort splats into tiles in.
 CHUNKS = 2
+
+
+@dataclass(frozen=True)
+class Projected:
+    """N splats on the screen, of which M are drawn.
+
+    Attributes:
+        screen: (N, `project.COLUMNS`) float32, filled for splats that are drawn.
+        boxes: (N, 4) int32 first and last tile across and down that each overlaps; empty for splats that are not drawn.
+        keys: (M,) uint64 from near to far, see `kernels.project.project`.
+    """
+
+    screen: NDArray[np.float32]
+    boxes: NDArray[np.int32]
+    keys: NDArray[np.uint64]
 
 
 @dataclass(frozen=True)
@@ -29,7 +47,7 @@ class Tiles:
 
     Attributes:
         start: (T + 1,) int64 where in `splats` each tile begins.
-        splats: (total,) int32 rows of the projected splats, tile by tile, from near to far.
+        splats: (total,) int32 splats, tile by tile, from near to far.
         stop: (T,) int64 up to where in `splats` each tile was drawn; it is opaque before the rest.
     """
 
@@ -43,40 +61,30 @@ def draw(splats: ShadedSplats, camera: Camera, settings: RasterSettings) -> Imag
 
     The image is the same for any number of threads.
     """
-    return draw_projected(seen(splats, camera, settings), camera, settings)[0]
+    return draw_projected(project_splats(splats, camera, settings), camera, settings)[0]
 
 
-def draw_projected(screen: NDArray[np.float32], camera: Camera, settings: RasterSettings) -> tuple[Image, Tiles]:
-    """The picture of splats on the screen, (M, `project.COLUMNS`) from near to far, and its tiles."""
+def draw_projected(seen: Projected, camera: Camera, settings: RasterSettings) -> tuple[Image, Tiles]:
+    """The picture of splats on the screen, and its tiles."""
     across, down = tiles_across(camera)
-    start, order = raster.sort_into_tiles(screen, across, down, CHUNKS * threads_in_use())
+    start, order = raster.sort_into_tiles(seen.keys, seen.boxes, across, down, CHUNKS * threads_in_use())
     tiles = Tiles(start, order, np.empty(across * down, np.int64))
     image = np.empty((camera.height, camera.width, 4), np.float32)
     is_design = settings.profile == "shifted"
-    raster.draw_tiles(screen, start, order, across, is_design, np.float32(MIN_ALPHA), image, tiles.stop)
+    raster.draw_tiles(seen.screen, start, order, across, is_design, np.float32(MIN_ALPHA), image, tiles.stop)
     return image, tiles
 
 
 def tiles_across(camera: Camera) -> tuple[int, int]:
     """Numbers of tiles across and down the picture of a camera."""
-    return -(-camera.width // raster.TILE), -(-camera.height // raster.TILE)
+    return -(-camera.width // project.TILE), -(-camera.height // project.TILE)
 
 
-def seen(splats: ShadedSplats, camera: Camera, settings: RasterSettings) -> NDArray[np.float32]:
-    """The splats on the screen, (M, `project.COLUMNS`) from near to far; a buffer, which the next call overwrites."""
-    return project_splats(splats, camera, settings)[0]
-
-
-def project_splats(
-    splats: ShadedSplats, camera: Camera, settings: RasterSettings
-) -> tuple[NDArray[np.float32], NDArray[np.uint64]]:
-    """What `seen` returns, and (M,) keys, whose lower half is `project.MAX_INDEX` minus the index of a splat."""
-    screen, arranged, keys = _buffers(len(splats))
-    project.project(*arguments(splats, camera, settings), settings.sort == "radial", screen, keys)
-    keys = np.sort(keys[keys != project.NOT_DRAWN])
-    arranged = arranged[: len(keys)]
-    project.gather_drawn(screen, keys, arranged)
-    return arranged, keys
+def project_splats(splats: ShadedSplats, camera: Camera, settings: RasterSettings) -> Projected:
+    """The splats on the screen; `screen` and `boxes` are buffers, which the next call overwrites."""
+    screen, boxes, keys = _buffers(len(splats))
+    project.project(*arguments(splats, camera, settings), settings.sort == "radial", screen, keys, boxes)
+    return Projected(screen, boxes, np.sort(keys[keys != project.NOT_DRAWN]))
 
 
 def arguments(
@@ -90,13 +98,19 @@ def arguments(
     return columns, world_to_camera(camera), lens, limits
 
 
-def _buffers(count: int) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint64]]:
+def _buffers(count: int) -> tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.uint64]]:
     """Working memory for projected splats, reused by each thread, because the first access to new memory is slow."""
     if len(getattr(_kept, "keys", ())) < count:
-        _kept.screens = [np.empty((count, project.COLUMNS), np.float32) for _ in range(2)]
+        _kept.screen, _kept.boxes = _aligned(count), np.empty((count, 4), np.int32)
         _kept.keys = np.empty(count, np.uint64)
-    first, second = _kept.screens
-    return first[:count], second[:count], _kept.keys[:count]
+    return _kept.screen[:count], _kept.boxes[:count], _kept.keys[:count]
+
+
+def _aligned(count: int) -> NDArray[np.float32]:
+    """(count, `project.COLUMNS`) of which each row is one line of the processor's cache."""
+    floats = np.empty((count + 1) * project.COLUMNS, np.float32)
+    first = -floats.ctypes.data % CACHE_LINE // floats.itemsize
+    return floats[first : first + count * project.COLUMNS].reshape(count, project.COLUMNS)
 
 
 def world_to_camera(camera: Camera) -> NDArray[np.float32]:

@@ -118,7 +118,7 @@ def overdraw(splats: ShadedSplats, camera: Camera, settings: RasterSettings) -> 
     """
     counts = np.zeros((camera.height, camera.width), np.int32)
     if len(splats.center):
-        bands.count_fragments(
-            rasterizer.seen(splats, camera, settings), settings.profile == "shifted", np.float32(MIN_ALPHA), counts
-        )
+        seen = rasterizer.project_splats(splats, camera, settings)
+        is_design = settings.profile == "shifted"
+        bands.count_fragments(seen.screen, seen.keys, is_design, np.float32(MIN_ALPHA), counts)
     return counts.astype(np.float32)

@@ -86,3 +86,47 @@ def test_progress_tells_of_the_cuts_that_colours_are_found_with(tmp_path: Path) 
     colours = [each for each in told if each[0] == "colours"]
     assert [each[1:] for each in colours] == [(number, 14, "cut") for number in range(1, 15)]
     assert told[-1] == ("drawing", 40, 40, "frame")
+
+
+@pytest.mark.parametrize("name", ["x.gif", "x.webp"])
+def test_an_interrupted_animation_leaves_nothing_and_what_was_there(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / name).write_bytes(b"before")
+    draw, drawn = Renderer.draw, []
+
+    def interrupted(self: Renderer, camera: object) -> Drawn:
+        drawn.append(camera)
+        if len(drawn) == 30:
+            raise KeyboardInterrupt
+        return draw(self, camera)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(Renderer, "draw", interrupted)
+    finder = CutFinder(read_scenes(instances_of([TOWN])), LodSettings(900))
+    output = output_for(tmp_path / name, Path("x"), 40, sheet=False)
+    with pytest.raises(KeyboardInterrupt):
+        write_pictures(finder, path_of(40), output, RenderSettings(), PictureSettings(jobs=1), overwrite=True)
+    assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"before"]
+
+
+@pytest.mark.parametrize("name", ["x.gif", "x.webp"])
+def test_an_animation_is_written_while_frames_are_drawn(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No more frames wait than are encoded together."""
+    events: list[str] = []
+    draw, animate = Renderer.draw, sequence.animate
+
+    def drawn(self: Renderer, camera: object) -> Drawn:
+        events.append("draw")
+        return draw(self, camera)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(Renderer, "draw", drawn)
+    monkeypatch.setattr(
+        sequence, "animate", lambda frames, *rest: animate((events.append("taken") or each for each in frames), *rest)
+    )
+    finder = CutFinder(read_scenes(instances_of([TOWN])), LodSettings(900))
+    output = output_for(tmp_path / name, Path("x"), 40, sheet=False)
+    write_pictures(finder, path_of(40), output, RenderSettings(), PictureSettings(jobs=1))
+    ahead = [events[:at].count("draw") - events[:at].count("taken") for at in range(len(events))]
+    assert events.count("taken") == 40 and max(ahead) <= 3

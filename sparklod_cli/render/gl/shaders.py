@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..kernels.falloff import LEAST_EXPONENT, LEAST_REST, MINUS_HALF_LOG2E
+from ..kernels.falloff import HALF_LOG2E, LEAST_EXPONENT, LEAST_REST
 from ..kernels.project import LEAST_COVARIANCE, MAX_D, MAX_VARIANCE
 from ..settings import BLUR, CLIP, MAX_STD_DEV, MIN_ALPHA, STD_DEV_PER_D
 
@@ -31,7 +31,7 @@ _CONSTANTS = "\n".join(
         "MAX_D": float(MAX_D),
         "MAX_STD_DEV": MAX_STD_DEV,
         "MAX_VARIANCE": float(MAX_VARIANCE),
-        "MINUS_HALF_LOG2E": float(MINUS_HALF_LOG2E),
+        "MINUS_HALF_LOG2E": -float(HALF_LOG2E),
         "MIN_ALPHA": MIN_ALPHA,
         "STD_DEV_PER_D": STD_DEV_PER_D,
     }.items()

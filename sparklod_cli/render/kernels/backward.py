@@ -12,14 +12,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...support.jit import kernel, prange
-from .falloff import gauss, merged_parts
-from .project import BLUE, END, GREEN, OPACITY, POWER, RED, A, B, C
-from .raster import LANES, TILE, box_in_tile, lines_of, tiles_of, tilt_of
+from .falloff import merged_parts, plain
+from .project import ACROSS, ALONG, BLUE, COLUMNS, GREEN, LEAST, LOG, OPACITY, POWER, RED, SHEAR, TILE, X, Y
+from .raster import BLOCKS, LANES, measure
 
 f32 = np.float32
 
-#: Columns of a row of sums over pixels, float32: derivatives by z^2, times dx, dy, dx^2, dx dy and dy^2, where dx and
-#: dy are from the splat's centre to the pixel; by D, of merged splats by the power; by red, green and blue.
+#: Columns of a row of sums over pixels, float32: derivatives by z^2, times v, dy, v^2, v dy and dy^2, where v is the
+#: distance along a row of `project.exponent`; by D, of merged splats by the power; by red, green and blue.
 BY_X, BY_Y, BY_XX, BY_XY, BY_YY, BY_SHAPE, BY_RED, BY_GREEN, BY_BLUE = range(9)
 SUMS = 9
 
@@ -44,12 +44,13 @@ class Drawn(NamedTuple):
     """A picture's splats and tiles.
 
     Attributes:
-        screen: (M, COLUMNS) float32, from near to far.
+        screen, boxes: (N, COLUMNS) float32 and (N, 4) int32 of `project`.
         start, splats, stop: of `draw_tiles`.
         across: number of tiles in a row of them.
     """
 
     screen: Any
+    boxes: Any
     start: Any
     splats: Any
     stop: Any
@@ -57,20 +58,19 @@ class Drawn(NamedTuple):
 
 
 @kernel()
-def first_rows(screen, across, down):
-    """(M + 1,) int64 where the rows of each splat begin, one for each tile that its box overlaps."""
-    first = np.empty(len(screen) + 1, np.int64)
+def first_rows(boxes):
+    """(N + 1,) int64 where the rows of each splat begin, one for each tile that its box overlaps."""
+    first = np.empty(len(boxes) + 1, np.int64)
     total = 0
-    for i in range(len(screen)):
+    for i in range(len(boxes)):
         first[i] = total
-        left, right, top, bottom = tiles_of(screen[i], across, down)
-        total += max(0, right - left + 1) * max(0, bottom - top + 1)
-    first[len(screen)] = total
+        total += max(0, boxes[i, 1] - boxes[i, 0] + 1) * max(0, boxes[i, 3] - boxes[i, 2] + 1)
+    first[len(boxes)] = total
     return first
 
 
 @kernel(inline=True)
-def weigh(record, i, alpha, by_z2, by_shape, is_drawn, red, green, blue, dx, dy):
+def weigh(record, i, alpha, by_z2, by_shape, is_drawn, red, green, blue, v, dy):
     """Moves one pixel behind a splat, and writes the terms of the splat's sums; branch-free, as `raster.blend`.
 
     Args:
@@ -80,7 +80,7 @@ def weigh(record, i, alpha, by_z2, by_shape, is_drawn, red, green, blue, dx, dy)
         by_z2, by_shape: derivatives of alpha.
         is_drawn: the splat is drawn at the pixel.
         red, green, blue: of the splat.
-        dx, dy: from its centre to the pixel, pixels.
+        v, dy: from its centre to the pixel; see `SUMS`.
     """
     alpha = alpha if is_drawn else f32(0)
     through = record[THROUGH * LANES + i]
@@ -100,10 +100,10 @@ def weigh(record, i, alpha, by_z2, by_shape, is_drawn, red, green, blue, dx, dy)
     record[THROUGH * LANES + i] = through - through * alpha
     # Where a splat is not drawn, derivatives of alpha may be anything.
     along = by_alpha * by_z2 if is_drawn else f32(0)
-    along_x, along_y = along * dx, along * dy
+    along_x, along_y = along * v, along * dy
     record[(FIELDS + BY_X) * LANES + i] = record[BY_X * LANES + i] + along_x
     record[(FIELDS + BY_Y) * LANES + i] = record[BY_Y * LANES + i] + along_y
-    record[(FIELDS + BY_XX) * LANES + i] = record[BY_XX * LANES + i] + along_x * dx
+    record[(FIELDS + BY_XX) * LANES + i] = record[BY_XX * LANES + i] + along_x * v
     record[(FIELDS + BY_XY) * LANES + i] = record[BY_XY * LANES + i] + along_x * dy
     record[(FIELDS + BY_YY) * LANES + i] = record[BY_YY * LANES + i] + along_y * dy
     record[(FIELDS + BY_SHAPE) * LANES + i] = record[BY_SHAPE * LANES + i] + (
@@ -117,26 +117,26 @@ def weigh(record, i, alpha, by_z2, by_shape, is_drawn, red, green, blue, dx, dy)
 
 @kernel(inline=True)
 def weigh_lanes(record, row, x, dy, least):
-    """Moves adjacent pixels of a row behind a splat; see `weigh` and `raster.blend_lanes`."""
-    a, b, c, edge, d, power = row[A], f32(2) * row[B] * dy, row[C] * dy * dy, row[END], row[OPACITY], row[POWER]
+    """Moves adjacent pixels of a row behind a splat; see `weigh` and `raster.blend_column`."""
+    along, d, power, end = row[ALONG], row[OPACITY], row[POWER], row[LEAST]
     red, green, blue = row[RED], row[GREEN], row[BLUE]
+    middle, most = along * (x + row[SHEAR] * dy), row[LOG] - row[ACROSS] * dy * dy
     if d <= 1:
+        inverse = f32(1) / d
         for i in range(LANES):
-            dx = f32(i) - x
-            z2 = (a * dx + b) * dx + c
-            fall = gauss(z2)
-            alpha = d * fall
-            is_drawn = (z2 <= edge) & (alpha >= least)
-            weigh(record, i, alpha, f32(-0.5) * alpha, fall, is_drawn, red, green, blue, dx, dy)
+            v = along * f32(i) - middle
+            t = most - v * v
+            alpha = plain(t)
+            weigh(record, i, alpha, f32(-0.5) * alpha, alpha * inverse, t >= end, red, green, blue, v, dy)
     else:
         for i in range(LANES):
-            dx = f32(i) - x
-            z2 = (a * dx + b) * dx + c
-            fall, rest, log, through = merged_parts(z2, power)
+            v = along * f32(i) - middle
+            t = most - v * v
+            fall, rest, log, through = merged_parts(t, power)
             alpha = f32(1) - through
-            is_drawn = (z2 <= edge) & (alpha >= least)
+            is_drawn = (t >= end) & (alpha >= least)
             by_z2 = f32(-0.5) * fall * power * (through / rest)
-            weigh(record, i, alpha, by_z2, -LN2 * through * log, is_drawn, red, green, blue, dx, dy)
+            weigh(record, i, alpha, by_z2, -LN2 * through * log, is_drawn, red, green, blue, v, dy)
 
 
 @kernel(inline=True)
@@ -174,30 +174,28 @@ def weigh_tiles(drawn, first, least, image, by_image, sums):
     """
     height, width = image.shape[:2]
     across = drawn.across
-    down = len(drawn.stop) // across
     for tile in prange(len(drawn.stop)):
         left, top = tile % across * TILE, tile // across * TILE
         rows, columns = min(TILE, height - top), min(TILE, width - left)
-        records = np.empty((TILE // LANES, (TILE + 1) * RECORD), np.float32)
+        records = np.empty((BLOCKS, (TILE + 1) * RECORD), np.float32)
+        row, lines = np.empty(COLUMNS, np.float32), np.empty((BLOCKS, 2), np.int32)
         start_pixels(records, left, top, rows, columns, image, by_image)
         for entry in range(drawn.start[tile], drawn.start[tile + 1]):
             i = drawn.splats[entry]
-            row = drawn.screen[i]
-            first_x, last_x, first_y, _ = tiles_of(row, across, down)
-            out = sums[first[i] + (tile // across - first_y) * (last_x - first_x + 1) + tile % across - first_x]
+            box = drawn.boxes[i]
+            out = sums[first[i] + (tile // across - box[2]) * (box[1] - box[0] + 1) + tile % across - box[0]]
             out[:] = 0
             if entry >= drawn.stop[tile]:
                 continue
-            x, y, first_line, last_line, begin, end = box_in_tile(row, left, top, rows, columns)
-            lean, slope, tall, narrow, slack = tilt_of(row)
-            for block in range(begin, end):
-                away = x - f32(LANES * block)
-                top_line, bottom_line = lines_of(away, y, lean, slope, tall, narrow, slack, first_line, last_line)
+            row[:] = drawn.screen[i]
+            measure(row, left, top, rows, columns, lines)
+            for block in range(BLOCKS):
+                top_line, bottom_line = np.int64(lines[block, 0]), np.int64(lines[block, 1])
                 if top_line >= bottom_line:
                     continue
                 column = records[block]
                 column[top_line * RECORD : top_line * RECORD + SUMS * LANES] = 0
                 for line in range(top_line, bottom_line):
                     record = column[line * RECORD : (line + 1) * RECORD + SUMS * LANES]
-                    weigh_lanes(record, row, away, f32(line) - y, least)
+                    weigh_lanes(record, row, row[X] - f32(LANES * block), f32(line) - row[Y], least)
                 add_lanes(column[bottom_line * RECORD : bottom_line * RECORD + SUMS * LANES], out)

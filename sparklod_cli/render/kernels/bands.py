@@ -8,7 +8,7 @@ import numpy as np
 
 from ...support.jit import kernel, prange
 from .falloff import alpha_at
-from .project import END, HALF_HEIGHT, HALF_WIDTH, OPACITY, POWER, A, B, C, X, Y
+from .project import HALF_HEIGHT, HALF_WIDTH, LEAST, OPACITY, POWER, X, Y, exponent, index_of
 
 f32 = np.float32
 
@@ -50,11 +50,12 @@ def draw_discs(x, y, radius, rgb, alpha, image):
 
 
 @kernel(parallel=True)
-def count_fragments(screen, design, least, counts):
+def count_fragments(screen, keys, design, least, counts):
     """Counts the splats that cover each pixel, hidden ones included.
 
     Args:
-        screen: (N, COLUMNS) of `project`, splats that are drawn, in any order.
+        screen: (N, COLUMNS) of `project`.
+        keys: (M,) uint64 of it, of splats that are drawn, in any order.
         design: merged splats have the falloff `shifted`, that of Spark's LoD design.
         least: float32, least alpha that is drawn.
         counts: (height, width) int32, added to.
@@ -63,8 +64,8 @@ def count_fragments(screen, design, least, counts):
     for band in prange((height + ROWS - 1) // ROWS):
         top = band * ROWS
         bottom = min(top + ROWS, height)
-        for i in range(len(screen)):
-            row = screen[i]
+        for key in keys:
+            row = screen[index_of(key)]
             first_line = max(top, math.ceil(row[Y] - row[HALF_HEIGHT] - f32(0.5)))
             last_line = min(bottom - 1, math.floor(row[Y] + row[HALF_HEIGHT] - f32(0.5)))
             if first_line > last_line:
@@ -76,8 +77,8 @@ def count_fragments(screen, design, least, counts):
                 dy = f32(line) + f32(0.5) - row[Y]
                 for column in range(first, last + 1):
                     dx = f32(column) + f32(0.5) - row[X]
-                    z2 = row[A] * dx * dx + f32(2) * row[B] * dx * dy + row[C] * dy * dy
-                    if z2 > row[END]:
+                    t = exponent(row, dx, dy)
+                    if t < row[LEAST]:
                         continue
-                    if alpha_at(z2, d, row[POWER], design) >= least:
+                    if alpha_at(t, d, row[POWER], design) >= least:
                         counts[line, column] += 1

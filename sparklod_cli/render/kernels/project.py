@@ -2,20 +2,35 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ...model import gaussian
+from ...support.fast_math import log2
 from ...support.jit import kernel, prange
+from .falloff import HALF_LOG2E
 
-f32 = np.float32
+f32, f64 = np.float32, np.float64
 
-#: Columns of a splat on the screen, float32: centre, in pixels from the upper left corner; A, B and C of z^2 = A dx^2 +
-#: 2 B dx dy + C dy^2, the squared distance of a pixel in standard deviations; z^2 up to which the splat is drawn; D;
-#: the exponent of the falloff, linear opacity above D = 1 and 1 up to it; colour; half the sides of its box, pixels.
-X, Y, A, B, C, END, OPACITY, POWER, RED, GREEN, BLUE, HALF_WIDTH, HALF_HEIGHT = range(13)
-COLUMNS = 13
+#: Columns of a splat on the screen, float32, 64 bytes:
+#: X, Y: its centre, in pixels from the upper left corner.
+#: ALONG, SHEAR, ACROSS, LOG: of the exponent t of its falloff 2 ** t, dx and dy pixels from its centre:
+#: t = LOG - (ALONG (dx - SHEAR dy))^2 - ACROSS dy^2. A dx^2 + 2 B dx dy + C dy^2 is the same, but its terms cancel in
+#: needles. LOG is log2(D) up to D = 1, so that 2 ** t is alpha, and 0 above.
+#: LEAST: the splat is drawn where t is at least this.
+#: OPACITY, POWER: D, and the exponent of the falloff, linear opacity above D = 1 and 1 up to it.
+#: RED, GREEN, BLUE: its colour.
+#: HALF_WIDTH, HALF_HEIGHT: half the sides of its box, pixels.
+#: SLOPE, TALL: y by x of the middle between the upper and the lower side of its ellipse, and half the height of the
+#: ellipse above its centre, pixels.
+X, Y, ALONG, SHEAR, ACROSS, LOG, LEAST, OPACITY = range(8)
+POWER, RED, GREEN, BLUE, HALF_WIDTH, HALF_HEIGHT, SLOPE, TALL = range(8, 16)
+COLUMNS = 16
+
+#: Side of a tile of the picture, pixels.
+TILE = 16
 
 #: Largest D, as in Spark's encodings, and largest colour value, that of the float16 that Spark keeps colours in.
 MAX_D, MAX_COLOR = f32(5), f32(65504)
@@ -156,8 +171,10 @@ def project_splat(splats, i, world_to_camera, lens, limits, radial, row):
     u, v, w = in_camera(m, x, y, z)
     if not (w > limits.near and w < limits.far and d >= limits.min_alpha):
         return NOT_SEEN
-    inverse = f32(1) / w
-    dx, dy = lens.focal_x * u * inverse, lens.focal_y * v * inverse
+    # In float64 up to the covariance: a direction in float32 is off by hundredths of a pixel at the ends of a needle.
+    exact_u, exact_v, exact_w = in_camera(m, f64(x), f64(y), f64(z))
+    inverse = f64(1) / exact_w
+    dx, dy = lens.focal_x * exact_u * inverse, lens.focal_y * exact_v * inverse
     half_width, half_height = f32(0.5) * lens.width, f32(0.5) * lens.height
     if abs(lens.principal_x + dx - half_width) > limits.clip * half_width or (
         abs(lens.principal_y + dy - half_height) > limits.clip * half_height
@@ -167,26 +184,25 @@ def project_splat(splats, i, world_to_camera, lens, limits, radial, row):
     # the covariance on the screen is (T R S) (T R S)^T; p and q are the rows of T R S.
     jx, jy, kx, ky = jacobian(lens, inverse, dx, dy)
     across, down = per_world_unit(m, 0, jx, kx), per_world_unit(m, 1, jy, ky)
-    one = f32(1)
-    rotation = rotation_matrix(quat[i, 0], quat[i, 1], quat[i, 2], quat[i, 3], one)
+    rotation = rotation_matrix(f64(quat[i, 0]), f64(quat[i, 1]), f64(quat[i, 2]), f64(quat[i, 3]), f64(1))
     sx, sy, sz = scale[i, 0], scale[i, 1], scale[i, 2]
     px, py, pz = turned(across, rotation)
     qx, qy, qz = turned(down, rotation)
     p0, p1, p2 = px * sx, py * sy, pz * sz
     q0, q1, q2 = qx * sx, qy * sy, qz * sz
-    a, b, c = p0 * p0 + p1 * p1 + p2 * p2, p0 * q0 + p1 * q1 + p2 * q2, q0 * q0 + q1 * q1 + q2 * q2
+    xx, xy, yy = p0 * p0 + p1 * p1 + p2 * p2, p0 * q0 + p1 * q1 + p2 * q2, q0 * q0 + q1 * q1 + q2 * q2
     # Determinants before and after the blur as sums of terms >= 0: for needles, a * c - b * b would cancel.
-    before = (p0 * q1 - p1 * q0) ** 2 + (p0 * q2 - p2 * q0) ** 2 + (p1 * q2 - p2 * q1) ** 2
-    det = before + limits.blur * (a + c) + limits.blur * limits.blur
-    a += limits.blur
-    c += limits.blur
+    minor, other, third = p0 * q1 - p1 * q0, p0 * q2 - p2 * q0, p1 * q2 - p2 * q1
+    area = minor * minor + other * other + third * third
+    before, a, b, c = f32(area), f32(xx + limits.blur), f32(xy), f32(yy + limits.blur)
+    det = f32(area + limits.blur * (xx + yy) + limits.blur * limits.blur)
     if not (det > 0 and a < MAX_VARIANCE and c < MAX_VARIANCE):
         return NOT_SEEN
+    one = f32(1)
     deviations = limits.std_devs + limits.std_devs_per_d * max(d - one, f32(0))
     d *= np.sqrt(before / det)
     if not d >= limits.min_alpha:
         return NOT_SEEN
-    row[END] = deviations * deviations
     mean = f32(0.5) * (a + c)
     spread = np.sqrt(max(mean * mean - det, f32(0)))
     longest = deviations * np.sqrt(mean + spread)
@@ -206,18 +222,29 @@ def project_splat(splats, i, world_to_camera, lens, limits, radial, row):
         det = first * second
         if not det > 0:
             return NOT_SEEN
+    end = deviations * deviations
+    log = f32(0)
+    if d <= one:
+        log = log2(f32(d))
+        # Where alpha is least: a faint splat ends there.
+        end = min(end, (log - log2(limits.min_alpha)) / HALF_LOG2E)
+    end = max(end, f32(0))
     row[X] = lens.principal_x + dx
     row[Y] = lens.principal_y + dy
-    row[A] = c / det
-    row[B] = -b / det
-    row[C] = a / det
+    row[ALONG] = np.sqrt(HALF_LOG2E * c / det)
+    row[SHEAR] = b / c
+    row[ACROSS] = HALF_LOG2E / c
+    row[LOG] = log
+    row[LEAST] = log - HALF_LOG2E * end
     row[OPACITY] = d
     row[POWER] = linear_opacity_above_1(d, one, f32(np.e)) if d > one else one
     for channel in range(3):
         value = rgb[i, channel]
         row[RED + channel] = min(value, MAX_COLOR) if value > 0 else f32(0)
-    row[HALF_WIDTH] = deviations * np.sqrt(a)
-    row[HALF_HEIGHT] = deviations * np.sqrt(c)
+    row[HALF_WIDTH] = np.sqrt(end * a)
+    row[HALF_HEIGHT] = np.sqrt(end * c)
+    row[SLOPE] = b / a
+    row[TALL] = np.sqrt(end * det / a)
     if (
         row[X] + row[HALF_WIDTH] < 0
         or row[X] - row[HALF_WIDTH] > lens.width
@@ -228,8 +255,31 @@ def project_splat(splats, i, world_to_camera, lens, limits, radial, row):
     return np.sqrt(u * u + v * v + w * w) if radial else w
 
 
+@kernel(inline=True)
+def exponent(row, dx, dy):
+    """t of the falloff 2 ** t of a splat on the screen, from its centre to a pixel; see `COLUMNS`."""
+    along = row[ALONG] * (dx - row[SHEAR] * dy)
+    return row[LOG] - along * along - row[ACROSS] * dy * dy
+
+
+@kernel(inline=True)
+def tiles_of(row, across, down):
+    """First and last tile on each axis that overlap the box of a splat on the screen."""
+    left = max(0, math.floor((row[X] - row[HALF_WIDTH]) / TILE))
+    right = min(across - 1, math.floor((row[X] + row[HALF_WIDTH]) / TILE))
+    top = max(0, math.floor((row[Y] - row[HALF_HEIGHT]) / TILE))
+    bottom = min(down - 1, math.floor((row[Y] + row[HALF_HEIGHT]) / TILE))
+    return left, right, top, bottom
+
+
+@kernel(inline=True)
+def index_of(key):
+    """Which splat a key is of."""
+    return MAX_INDEX - np.int64(key & np.uint64(MAX_INDEX))
+
+
 @kernel(parallel=True)
-def project(splats, world_to_camera, lens, limits, radial, screen, keys):
+def project(splats, world_to_camera, lens, limits, radial, screen, keys, boxes):
     """Splats on the screen; see `project_splat`.
 
     Args:
@@ -237,24 +287,14 @@ def project(splats, world_to_camera, lens, limits, radial, screen, keys):
         screen: (N, COLUMNS) float32, filled for splats that are drawn.
         keys: (N,) uint64, filled with distance and index, so that they sort from near to far, and among equal
             distances the last splat is in front, as in Spark; NOT_DRAWN for splats that are not drawn.
+        boxes: (N, 4) int32, filled with the `tiles_of` splats that are drawn, and for others with an empty box.
     """
+    across, down = -(-np.int64(lens.width) // TILE), -(-np.int64(lens.height) // TILE)
     for i in prange(len(splats.center)):
-        keys[i] = NOT_DRAWN
         depth = project_splat(splats, i, world_to_camera, lens, limits, radial, screen[i])
         if depth >= 0:
             keys[i] = (np.uint64(np.float32(depth).view(np.uint32)) << np.uint64(32)) | np.uint64(MAX_INDEX - i)
-
-
-@kernel(parallel=True)
-def gather_drawn(screen, keys, drawn):
-    """Copies the drawn splats, from near to far.
-
-    Args:
-        screen: (N, COLUMNS) of `project`.
-        keys: (M,) uint64 of it, sorted, without NOT_DRAWN.
-        drawn: (M, COLUMNS) float32, filled.
-    """
-    for i in prange(len(keys)):
-        at = MAX_INDEX - np.int64(keys[i] & np.uint64(MAX_INDEX))
-        for column in range(COLUMNS):
-            drawn[i, column] = screen[at, column]
+            boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3] = tiles_of(screen[i], across, down)
+        else:
+            keys[i] = NOT_DRAWN
+            boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3] = 0, -1, 0, -1

@@ -12,15 +12,14 @@ import numpy as np
 
 from ...support.jit import kernel, prange
 from .backward import BY_RED, BY_SHAPE, BY_X, BY_XX, BY_XY, BY_Y, BY_YY, SUMS
+from .falloff import HALF_LOG2E
 from .project import (
-    END,
+    ACROSS,
+    ALONG,
     MAX_COLOR,
     MAX_D,
-    MAX_INDEX,
     OPACITY,
-    A,
-    B,
-    C,
+    SHEAR,
     in_camera,
     jacobian,
     per_world_unit,
@@ -40,14 +39,12 @@ class Rows(NamedTuple):
     """Splats on the screen, and their sums, tile by tile.
 
     Attributes:
-        screen: (M, COLUMNS) float32 of `project`, sorted.
-        keys: (M,) uint64 of `project`, sorted.
-        first: (M + 1,) int64 of `first_rows`.
+        screen: (N, COLUMNS) float32 of `project`.
+        first: (N + 1,) int64 of `first_rows`.
         sums: (first[-1], SUMS) float32 of `weigh_tiles`.
     """
 
     screen: Any
-    keys: Any
     first: Any
     sums: Any
 
@@ -82,13 +79,14 @@ def carry_back(splats, world_to_camera, lens, limits, rows, gradients):
         rows: `Rows`.
         gradients: (N, GRADIENT_COLUMNS) float32, filled for the splats that are drawn.
     """
-    for k in prange(len(rows.keys)):
-        i = MAX_INDEX - np.int64(rows.keys[k] & np.uint64(MAX_INDEX))
+    for i in prange(len(rows.screen)):
+        if rows.first[i] == rows.first[i + 1]:
+            continue
         total = np.zeros(SUMS)
-        for entry in range(rows.first[k], rows.first[k + 1]):
+        for entry in range(rows.first[i], rows.first[i + 1]):
             for column in range(SUMS):
                 total[column] += rows.sums[entry, column]
-        carry_splat_back(splats, i, world_to_camera, lens, limits, rows.screen[k], total, gradients[i])
+        carry_splat_back(splats, i, world_to_camera, lens, limits, rows.screen[i], total, gradients[i])
 
 
 @kernel(inline=True)
@@ -110,7 +108,7 @@ def carry_splat_back(splats, i, m, lens, limits, seen, total, row):
     p_unit, q_unit = turned(across, rotation), turned(down, rotation)
     p = (p_unit[0] * s[0], p_unit[1] * s[1], p_unit[2] * s[2])
     q = (q_unit[0] * s[0], q_unit[1] * s[1], q_unit[2] * s[2])
-    a, b, c = dot(p, p), dot(p, q), dot(q, q)
+    a, c = dot(p, p), dot(q, q)
     normal = cross(p, q)
     before = dot(normal, normal)
     det = before + limits.blur * (a + c) + limits.blur * limits.blur
@@ -124,16 +122,18 @@ def carry_splat_back(splats, i, m, lens, limits, seen, total, row):
     row[LOD_OPACITY] = by_d * kept if splats.lod_opacity[i] <= MAX_D else f64(0)
     by_before = half * by_d * d * (one / before - one / det)
     by_blurred = -half * by_d * d / det * limits.blur  # by a and by c through det
-    # The shape: z^2 is of the inverse K of the covariance, whose derivative is -K (derivative by K) K.
+    # The shape: z^2 = (dx - (b / c) dy)^2 c / det + dy^2 / c, so that v^2 is the first term times HALF_LOG2E.
+    along, shear = f64(seen[ALONG]), f64(seen[SHEAR])
     mean = half * (a + c)
-    longest = math.sqrt(seen[END] * (mean + math.sqrt(max(mean * mean - det, f64(0)))))
-    xx, xy, yy = c / det, -b / det, a / det
+    deviations = limits.std_devs + limits.std_devs_per_d * max(min(splats.lod_opacity[i], MAX_D) - one, f64(0))
+    longest = deviations * math.sqrt(mean + math.sqrt(max(mean * mean - det, f64(0))))
     by_a, by_b, by_c = f64(0), f64(0), f64(0)
     if not longest > limits.max_radius:
-        gx, gy, gz = total[BY_XX], total[BY_XY], total[BY_YY]
-        by_a = -(xx * xx * gx + two * xx * xy * gy + xy * xy * gz)
-        by_b = -(xx * xy * gx + (xx * yy + xy * xy) * gy + xy * yy * gz)
-        by_c = -(xy * xy * gx + two * xy * yy * gy + yy * yy * gz)
+        by_width = -total[BY_XX] / HALF_LOG2E * c / det  # by a - b^2 / c, the variance along a row of pixels
+        by_shear = -two * total[BY_XY] * along / HALF_LOG2E  # by b / c
+        by_a = by_width
+        by_b = -shear * by_width + half * by_shear / c  # half of it, since b stands twice in the covariance
+        by_c = shear * shear * by_width - shear * by_shear / c - total[BY_YY] / (c * c)
     by_a += by_blurred
     by_c += by_blurred
     by_p = weighed(two * by_a, p, two * by_b, q, two * by_before, cross(q, normal))
@@ -161,8 +161,8 @@ def carry_splat_back(splats, i, m, lens, limits, seen, total, row):
     right, below, ahead = (m[0, 0], m[0, 1], m[0, 2]), (m[1, 0], m[1, 1], m[1, 2]), (m[2, 0], m[2, 1], m[2, 2])
     by_jx, by_kx = dot(by_across, right), dot(by_across, ahead)
     by_jy, by_ky = dot(by_down, below), dot(by_down, ahead)
-    by_x = -two * (seen[A] * total[BY_X] + seen[B] * total[BY_Y])
-    by_y = -two * (seen[B] * total[BY_X] + seen[C] * total[BY_Y])
+    by_x = -two * along / HALF_LOG2E * total[BY_X]
+    by_y = -shear * by_x - two * f64(seen[ACROSS]) / HALF_LOG2E * total[BY_Y]
     by_u = by_x * jx - by_kx * jx * inverse
     by_v = by_y * jy - by_ky * jy * inverse
     by_w = by_x * kx + by_y * ky - (by_jx * jx + by_jy * jy) * inverse - two * (by_kx * kx + by_ky * ky) * inverse

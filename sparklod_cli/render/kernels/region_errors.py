@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...support.jit import kernel, prange
-from .project import COLUMNS, Lens, ShadedColumns, project_splat
-from .raster import LANES, TILE, draw_tile, tiles_of
+from .project import COLUMNS, TILE, Lens, ShadedColumns, project_splat, tiles_of
+from .raster import LANES, draw_tile
 
 f32 = np.float32
 

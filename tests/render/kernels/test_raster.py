@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sparklod_cli.render.kernels.project import END, A, B, C, X, Y
-from sparklod_cli.render.kernels.raster import LANES, TILE, box_in_tile, lines_of, tilt_of
-from sparklod_cli.render.rasterizer import seen
+from sparklod_cli.render.kernels.project import HALF_HEIGHT, HALF_WIDTH, LEAST, TILE, X, Y, exponent, index_of
+from sparklod_cli.render.kernels.raster import BLOCKS, LANES, measure
+from sparklod_cli.render.rasterizer import project_splats
 from sparklod_cli.render.settings import RasterSettings
 from tests.render.test_rasterizer import camera_at, shown
 
@@ -19,18 +19,25 @@ def test_rows_beside_an_ellipse_are_those_without_a_pixel_of_it(scale: tuple[flo
     splats.scale[:] = np.float32(scale)
     camera = camera_at(size=(200, 150), focal=(300.0, 300.0))
     kept = boxed = 0
-    for row in seen(splats, camera, RasterSettings()):
-        tilt = tilt_of(row)
+    seen = project_splats(splats, camera, RasterSettings())
+    across, down = np.meshgrid(np.arange(TILE), np.arange(TILE))
+    for key in seen.keys:
+        row, box = seen.screen[index_of(key)], seen.boxes[index_of(key)]
         for left in range(0, camera.width, TILE):
             for top in range(0, camera.height, TILE):
-                x, y, first, last, begin, end = box_in_tile(row, left, top, TILE, TILE)
-                dx, dy = np.arange(TILE, dtype=np.float32) - x, (np.arange(TILE, dtype=np.float32) - y)[:, None]
-                z2 = (row[A] * dx + 2 * row[B] * dy) * dx + row[C] * dy * dy
-                for block in range(begin, end):
-                    inside = (z2[:, LANES * block : LANES * (block + 1)] <= row[END]).any(axis=1)
-                    inside[:first] = inside[max(first, last) :] = False
-                    above, below = lines_of(np.float32(x - LANES * block), y, *tilt, first, last)
-                    lines = np.flatnonzero(inside)
-                    assert not lines.size or (above <= lines[0] and lines[-1] < below), (row[X], row[Y], left, top)
-                    kept, boxed = kept + max(0, below - above), boxed + max(0, last - first)
+                local, lines = row.copy(), np.empty((BLOCKS, 2), np.int32)
+                size = min(TILE, camera.height - top), min(TILE, camera.width - left)
+                measure(local, left, top, *size, lines)
+                inside = exponent(row, left + across + 0.5 - row[X], top + down + 0.5 - row[Y]) >= row[LEAST]
+                inside[size[0] :] = inside[:, size[1] :] = False
+                in_box = (box[0] * TILE <= left <= box[1] * TILE) and (box[2] * TILE <= top <= box[3] * TILE)
+                assert in_box or not inside.any(), (row[X], row[Y], left, top)
+                rows = np.abs(top + np.arange(TILE) + 0.5 - row[Y]) <= row[HALF_HEIGHT]
+                for block, (above, below) in enumerate(lines):
+                    assert 0 <= above <= TILE and 0 <= below <= size[0]
+                    drawn = np.flatnonzero(inside[:, LANES * block : LANES * (block + 1)].any(axis=1))
+                    assert not drawn.size or (above <= drawn[0] and drawn[-1] < below), (row[X], row[Y], left, top)
+                    first = left + LANES * block
+                    if first - row[HALF_WIDTH] <= row[X] <= first + LANES + row[HALF_WIDTH]:
+                        kept, boxed = kept + max(0, below - above), boxed + rows.sum()
     assert kept < 0.95 * boxed
