@@ -117,8 +117,8 @@ class InOrder:
 
 @pytest.mark.parametrize("first", [False, True])
 @given(case=cases())
-def test_no_part_writes_what_another_has_written(first: bool, case: Case) -> None:
-    """Whichever thread is faster."""
+def test_it_does_not_matter_which_thread_is_faster(first: bool, case: Case) -> None:
+    """Other parts are taken all before the first, or all after it."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(cut_search, "ThreadPoolExecutor", lambda threads: InOrder(first))
         check(case, find(case, 3))
