@@ -107,7 +107,7 @@ def write(path: Path, pieces: Iterable[bytes]) -> int:
 
 def reported(source: Path) -> None:
     """Makes everything that `inspect` can say of a file."""
-    report, scene = inspect(source, ReportSettings(values=True, all_quantities=True, check=True))
+    report, scene = inspect(source, ReportSettings(values=True, all_quantities=True, check=True, at_once=True))
     json.dumps(report.as_dict(), allow_nan=False)
     assert scene is not None
     for name in values.names_of(scene.splats):
@@ -116,7 +116,7 @@ def reported(source: Path) -> None:
 
 def checked(output: Path, source: Path) -> list[Finding]:
     """What `inspect --check --leaves-of` finds."""
-    report, scene = inspect(output, ReportSettings(check=True))
+    report, scene = inspect(output, ReportSettings(check=True, at_once=True))
     assert scene is not None
     return [*(report.findings or []), *leaves.check(scene, read_scene(source))]
 

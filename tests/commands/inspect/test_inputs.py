@@ -67,7 +67,7 @@ def test_a_scene_is_freed_before_the_next_is_read(monkeypatch: pytest.MonkeyPatc
         return report, scene
 
     monkeypatch.setattr(reports, "inspect", look)
-    assert inspect(*[TREE] * 4, "--json") == 0
+    assert inspect(*[FOLDER] * 4, "--json") == 0
     assert len(seen) == 4
 
 
