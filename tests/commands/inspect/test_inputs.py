@@ -17,7 +17,7 @@ from sparklod_cli.inspection import report as reports
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
-from tests.commands.inspect.runs import FAULTS, FOLDER, TREE, Said, inspect, records
+from tests.commands.inspect.runs import FAULTS, FOLDER, Said, inspect, records
 
 
 def test_an_unpacked_sog_counts_as_one_file(tmp_path: Path, capsys: Said) -> None:
