@@ -11,8 +11,7 @@ from PIL import Image
 #: GIF counts time in steps of 10 ms, up to 16 bits of them; players slow down frames of fewer steps than this.
 STEP, LEAST_STEPS, MOST_STEPS = 10, 2, 0xFFFF
 
-#: Bytes of a file's header, with the size of the picture; of a frame's header, with its place; and of what introduces
-#: a colour table's size, of 2 to 256 colours in 3 bytes.
+#: Bytes of a file's header, with the size of the picture, and of a frame's header, with its place.
 HEADER, FRAME_HEADER = 13, 10
 
 #: First bytes of an extension, of the one that has a frame's duration, and of the end of the file.

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from .splats import FloatArray, Splats
 
-#: Linear opacity A of a merged splat is clamped to this range; 1000 is D = 4.45 of the 5 that Spark's encodings hold.
+#: Least and largest linear opacity A of a merged splat; 1000 is D = 4.45 of the 5 that Spark's encodings hold. Builders
+#: clamp at the least; the largest D that they give a splat, `profile.MAX_D`, keeps them well below the other.
 MIN_OPACITY, MAX_OPACITY = 1e-6, 1e3
 
 #: Range of a quaternion's length in which float32 holds the squares of its components: 1e-30 to 1e30.

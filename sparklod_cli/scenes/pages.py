@@ -48,9 +48,7 @@ class Pages:
         depth: (N,) int32 edges from the root, of the nodes that the present chunks lead to; 0 of others.
     """
 
-    def __init__(
-        self, file: RadFile, name: str, nodes_of: Callable[[Splats, LodTree, FileCoding], Nodes], threads: int
-    ) -> None:
+    def __init__(self, file: RadFile, name: str, nodes_of: NodesOf, threads: int) -> None:
         self.file, self._name, self._nodes_of, self._threads = file, name, nodes_of, threads
         self.count = file.header.count
         self.present = np.zeros(len(file.header.chunks), np.bool_)

@@ -28,8 +28,8 @@ MOST_BITS, LONG, ENDS = 15, 0xFFFF, 32
 #: Largest alphabet, with a cache of 2048 colours.
 LARGEST = VALUES + LENGTHS + 2048
 
-#: What a kernel answers: done, more input or more room is needed, the codes are corrupt, or the data end early.
-DONE, INPUT, ROOM, CORRUPT, SHORT = 0, 1, 2, 3, 4
+#: What a kernel answers: done, more input or more room is needed, or the codes are corrupt.
+DONE, INPUT, ROOM, CORRUPT = 0, 1, 2, 3
 
 #: The order in which the lengths of the codes of lengths are stored.
 ORDER = np.array([17, 18, 0, 1, 2, 3, 4, 5, 16, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15], np.int64)
