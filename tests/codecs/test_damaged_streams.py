@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import io
+import itertools
+import json
 from collections.abc import Callable, Iterable
 from typing import Any, BinaryIO
 
 import numpy as np
 import pytest
+from PIL import Image
 
+from fixtures import by_hand_sog
 from sparklod_cli.model import streams
 from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.support.errors import FormatError, HasTreeError
-from tests.codecs.test_damaged import FILES, WORDS, content, files_of, format_of, header, insides
+from tests.codecs.test_damaged import FILES, WORDS, content, files_of, format_of, header, insides, members
 
 TRIES = 40
 
@@ -88,3 +92,23 @@ def test_a_stream_of_damaged_bytes_fails_as_the_decoder_does(name: str, monkeypa
     found = [compare(name, data) for data in damaged(name, rng)]
     assert found[0] == ("tree" if "tree" in name else "splats")
     assert name.endswith(".splat") or any(text not in ("tree", "splats", "unknown") for text in found)
+
+
+@pytest.mark.parametrize("name", [name for name in FILES if name.endswith(".sog")])
+def test_of_two_faults_a_stream_of_sog_finds_the_one_that_the_decoder_does(name: str) -> None:
+    """Images are read in an order of their own; a label beyond the palette is found in an image that is whole."""
+    files = members(name)
+    images = [part for part in files if part != "meta.json"]
+    labels = json.loads(files["meta.json"])["shN"]["files"][1]
+    with Image.open(io.BytesIO(files[labels])) as image:
+        beyond = np.full((image.height, image.width, 4), 255, np.uint8)
+    faults = [{part: b"GIF89a" + bytes(99)} for part in images]
+    faults += [{part: files[part][: len(files[part]) // 2]} for part in images]
+    faults += [{labels: by_hand_sog.webp(beyond)}]
+    texts = {
+        compare(name, by_hand_sog.zipped(files | first | second))
+        for first, second in itertools.combinations(faults, 2)
+        if first.keys() != second.keys()
+    }
+    assert len(texts) > len(images)
+    assert compare(name, by_hand_sog.zipped(files | faults[-1])).startswith("FormatError: an SH label")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import BinaryIO
 
@@ -75,12 +75,12 @@ class Step:
 
     Attributes:
         texture, index: of the image.
-        fill: called with rows of a scene and their pixels.
+        fill: called with rows of a scene and their pixels; returns what is wrong with their values, or None.
     """
 
     texture: str
     index: int
-    fill: Callable[[Splats, Pixels], None]
+    fill: Callable[[Splats, Pixels], str | None]
 
 
 #: Gives the pixels of a step that belong to some rows; called with the number of the step.
@@ -109,28 +109,36 @@ def _content(
     steps = _steps(meta, version, palette)
     center_tables = _center_tables(meta)
 
+    def in_order() -> list[Step]:
+        """The steps in the order in which they are taken, so that both ways of reading find the same fault first.
+
+        The largest first, so that no thread is left alone with it; but the labels of SH need the palette.
+        """
+        return sorted(steps, key=lambda step: (step.texture == "shN", -files.bytes_of(step.texture, step.index)))
+
     def fill_all(out: Splats, start: int, threads: int, progress: Progress) -> None:
         def work(step: Step) -> None:
-            for part, pixels in files.pixels(step.texture, step.index, count):
-                step.fill(rows_in(out, part), pixels)
+            # The values are judged when the image has been read to its end, as in a stream.
+            pieces = files.pixels(step.texture, step.index, count)
+            _refuse([step.fill(rows_in(out, part), pixels) for part, pixels in pieces])
 
-        # The largest first, so that no thread is left alone with it; but the labels of SH need the palette, which
-        # whoever needs it first decodes.
-        ordered = sorted(steps, key=lambda step: (step.texture == "shN", -files.bytes_of(step.texture, step.index)))
         tasks: list[Callable[[], object]] = [] if palette is None else [palette.values]
-        tasks += [functools.partial(work, step) for step in ordered]
+        tasks += [functools.partial(work, step) for step in in_order()]
         for number, _ in enumerate(ordered_map(lambda task: task(), tasks, threads)):
             progress("reading", (number + 1) * count, len(tasks) * count, "texel")
         for_blocks(lambda part: _finish(center_tables, rows_in(out, part)), count, threads, lambda done: None)
 
     def fill_some(out: Splats, start: int, threads: int, progress: Progress) -> None:
         assert unpacked is not None
-        pixels_of = unpacked(files, steps, count)
+        if palette is not None:
+            palette.values()
+        ordered = in_order()
+        pixels_of = unpacked(files, ordered, count)
 
         def work(part: slice) -> None:
             rows = rows_in(out, part)
-            for number, step in enumerate(steps):
-                step.fill(rows, pixels_of(number, slice(start + part.start, start + part.stop)))
+            for number, step in enumerate(ordered):
+                _refuse([step.fill(rows, pixels_of(number, slice(start + part.start, start + part.stop)))])
             _finish(center_tables, rows)
 
         for_blocks(work, len(out), threads, lambda done: None)
@@ -195,12 +203,17 @@ def _fill_quats(splats: Splats, pixels: Pixels) -> None:
     texels.fill_quats(pixels, codings.quat_components(), splats.quat_xyzw)
 
 
-def _fill_sh(palette: Palette, splats: Splats, pixels: Pixels) -> None:
+def _fill_sh(palette: Palette, splats: Splats, pixels: Pixels) -> str | None:
     values = palette.values()
     rows = values.reshape(len(values), -1)
     largest = texels.gather_rows(pixels, rows, splats.sh.reshape(len(splats), -1))
-    if largest >= len(rows):
-        raise FormatError(f"SH label {largest} is beyond the {len(rows):,} entries of its palette")
+    return f"an SH label is beyond the {len(rows):,} entries of its palette" if largest >= len(rows) else None
+
+
+def _refuse(problems: Iterable[str | None]) -> None:
+    """Raises the first problem."""
+    for problem in filter(None, problems):
+        raise FormatError(problem)
 
 
 def _tables(meta: Meta, name: str, version: int, channels: int) -> FloatArray:

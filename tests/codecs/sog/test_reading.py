@@ -125,7 +125,7 @@ def test_sh_are_looked_up_by_label_row_and_coefficient() -> None:
     np.testing.assert_array_equal(sh[:, :, 0], [[0, 1, 2], [252, 253, 254], [0, 1, 2], [8, 9, 10]])
     np.testing.assert_array_equal(sh[:, :, 1], [[0] * 3, [0] * 3, [9] * 3, [0] * 3])
     np.testing.assert_array_equal(sh[:, :, 2], np.full((4, 3), 7))
-    with pytest.raises(FormatError, match="SH label 64 is beyond the 64 entries of its palette"):
+    with pytest.raises(FormatError, match="an SH label is beyond the 64 entries of its palette"):
         decode(with_meta(json.loads(files["meta.json"]) | {"shN": shn | {"count": 64}}, files))
 
 
