@@ -160,17 +160,21 @@ class Kernel:
         """Compiles the kernel, and writes the machine code to a file if it can be linked, as it is in this process."""
         from . import jit_numba
 
-        called, code = jit_numba.compiler_of(self).compile(arguments)
-        if path is None or code is None:
-            return called
-        try:
-            linked = jit_link.link(code, self.py_func)
-        except Exception as error:
-            if out_of_memory(error):
-                raise
-            return called
-        jit_cache.write(path, code.pieces(), report_trouble)
-        return linked
+        compiler = jit_numba.compiler_of(self)
+        if jit_link.is_tested():
+            try:
+                code = compiler.machine_code(arguments)
+                linked = None if code is None else jit_link.link(code, self.py_func)
+            except Exception as error:
+                if out_of_memory(error):
+                    raise
+            else:
+                if path is not None and code is not None:
+                    jit_cache.write(path, code.pieces(), report_trouble)
+                if linked is not None:
+                    return linked
+        called: Callable[..., Any] = compiler.compile(arguments)
+        return called
 
 
 def kernel(

@@ -18,8 +18,11 @@ from .kernel_sources import digest_of, sources_of
 #: Suffix of the files with machine code, which `jit_link` loads without numba.
 CODE = ".code"
 
-#: Suffix of the files with what numba needs to compile the callers of a kernel as well.
+#: Suffix of the files that numba loads, where machine code is not linked.
 SUFFIX = ".kernel"
+
+#: Suffix of the files with what numba needs of a kernel to compile its callers.
+INNER = ".inner"
 
 #: Bytes of the checksum at the start of a file. 16 make an accidental match impossible in practice.
 CHECKSUM = 16

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import pickle
 import sys
 import threading
@@ -23,6 +24,7 @@ from numba.np.ufunc import parallel
 from . import jit, jit_cache, jit_threads
 from .errors import out_of_memory
 from .jit_cache import Trouble, start_of, stem_of
+from .jit_lean import lean
 from .jit_link import MachineCode
 
 _lock = threading.RLock()
@@ -37,28 +39,61 @@ class Compiler:
         trouble: called with a one-line message if the cache cannot be used.
 
     Attributes:
-        dispatcher: numba's, which compiles the kernel for the types of its arguments.
+        inner: numba's dispatcher for calls by other kernels; nothing of what it compiles can be called from Python.
     """
 
     def __init__(self, kernel: jit.Kernel, folder: Path | None, trouble: Trouble) -> None:
-        options = kernel.options
+        self._function, self._options, self._folder, self._trouble = kernel.py_func, kernel.options, folder, trouble
+        self.inner = self._dispatcher(jit_cache.INNER, no_cpython_wrapper=True)
+
+    @functools.cached_property
+    def dispatcher(self) -> Any:
+        """numba's dispatcher for calls from Python; compiles the kernel for the types of its arguments."""
+        dispatcher = self._dispatcher(jit_cache.SUFFIX)
+        dispatcher.add_overload = functools.partial(_add_overload, dispatcher)
+        return dispatcher
+
+    def compile(self, arguments: Sequence[Any]) -> Callable[..., Any]:
+        """What to call with arguments of these types, by numba alone."""
+        called: Callable[..., Any] = self.dispatcher.compile(tuple(map(numba.typeof, arguments)))
+        return called
+
+    def machine_code(self, arguments: Sequence[Any]) -> MachineCode | None:
+        """The machine code for arguments of these types; None if `jit_link` cannot link it, as found now or earlier.
+
+        Raises:
+            Exception: anything that numba raises.
+        """
+        signature = tuple(map(numba.typeof, arguments))
+        if self._folder is not None and self.dispatcher._cache.path(signature).is_file():
+            return None
+        dispatcher = self._dispatcher()
+        with lean():
+            dispatcher.compile(signature)
+            return _machine_code(dispatcher.overloads[signature])
+
+    def _dispatcher(self, suffix: str = "", **more: bool) -> Any:
+        """One of numba's dispatchers, which caches what it compiles in files with a suffix, or nowhere."""
+        options = self._options
         decorate: Any = numba.njit(
             error_model="numpy",
             parallel=options.parallel,
             nogil=options.nogil,
             inline="always" if options.inline else "never",
             fastmath={"contract"} if options.contract else False,
+            **more,
         )
-        self.dispatcher = decorate(_for_numba(kernel.py_func))
-        self._cache = None if folder is None else KernelCache(kernel.py_func, folder, trouble)
-        if self._cache is not None:
-            self.dispatcher._cache = self._cache
+        dispatcher = decorate(_for_numba(self._function))
+        if suffix and self._folder is not None:
+            dispatcher._cache = KernelCache(self._function, self._folder, suffix, self._trouble)
+        return dispatcher
 
-    def compile(self, arguments: Sequence[Any]) -> tuple[Callable[..., Any], MachineCode | None]:
-        """What to call with arguments of these types, and the machine code if other processes can link it."""
-        signature = tuple(map(numba.typeof, arguments))
-        called: Callable[..., Any] = self.dispatcher.compile(signature)
-        return called, None if self._cache is None else self._cache.machine_code(signature)
+
+def _add_overload(dispatcher: Any, compiled: Any) -> None:
+    """Adds what was compiled, and gives the kernels in it their environments, since they may have been compiled lean."""
+    type(dispatcher).add_overload(dispatcher, compiled)
+    for environment in compiled._find_referenced_environments():
+        compiled.library.codegen.set_env(environment.env_name, environment)
 
 
 def compiler_of(kernel: jit.Kernel) -> Compiler:
@@ -121,7 +156,7 @@ def _known(value: Any) -> Any:
         return numba.prange
     if value is jit.prefetch:
         return _prefetch
-    return compiler_of(value).dispatcher if isinstance(value, jit.Kernel) else value
+    return compiler_of(value).inner if isinstance(value, jit.Kernel) else value
 
 
 class KernelCache(caching._Cache):
@@ -137,11 +172,12 @@ class KernelCache(caching._Cache):
     Args:
         function: the Python function.
         folder: folder of the files.
+        suffix: of the files.
         trouble: called with a one-line message if the cache cannot be used.
     """
 
-    def __init__(self, function: Callable[..., Any], folder: Path, trouble: Trouble) -> None:
-        self._function, self._folder, self._trouble = function, folder, trouble
+    def __init__(self, function: Callable[..., Any], folder: Path, suffix: str, trouble: Trouble) -> None:
+        self._function, self._folder, self._suffix, self._trouble = function, folder, suffix, trouble
         self._enabled = True
 
     @property
@@ -155,13 +191,13 @@ class KernelCache(caching._Cache):
         self._enabled = False
 
     def flush(self) -> None:
-        for path in self._folder.glob(f"{stem_of(self._function)}-*{jit_cache.SUFFIX}"):
+        for path in self._folder.glob(f"{stem_of(self._function)}-*{self._suffix}"):
             path.unlink(missing_ok=True)
 
     def load_overload(self, signature: Any, target_context: Any) -> Any:
         """Loads the compiled function; returns None if it has to be compiled."""
         target_context.refresh()
-        path = self._path(signature)
+        path = self.path(signature)
         try:
             content = jit_cache.read(path) if self._enabled else None
             if content is None:
@@ -177,48 +213,29 @@ class KernelCache(caching._Cache):
     def save_overload(self, signature: Any, compiled: Any) -> None:
         """Writes a compiled function to the cache, if it can be cached."""
         if self._enabled and not compiled.lifted and not compiled.library.has_dynamic_globals:
-            jit_cache.write(self._path(signature), [dumps(compiled._reduce())], self._trouble)
+            jit_cache.write(self.path(signature), [dumps(compiled._reduce())], self._trouble)
 
-    def machine_code(self, signature: Any) -> MachineCode | None:
-        """The machine code in the cache; None if there is none that can be linked without numba."""
-        try:
-            content = jit_cache.read(self._path(signature))
-            return None if content is None else _machine_code(*pickle.loads(content))
-        except Exception as error:
-            if out_of_memory(error):
-                raise
-            return None  # another process has just damaged it, or this numba stores something else
-
-    def _path(self, signature: Any) -> Path:
-        name = f"{start_of(self._function)}-{jit_cache.digest(str(signature))}{jit_cache.SUFFIX}"
-        return self._folder / name
+    def path(self, signature: Any) -> Path:
+        """The file for a signature."""
+        return self._folder / f"{start_of(self._function)}-{jit_cache.digest(str(signature))}{self._suffix}"
 
 
-def _machine_code(
-    library: Any,
-    function: Any,
-    environment: Any,
-    _signature: Any,
-    objectmode: bool,
-    lifted: Any,
-    _annotation: Any,
-    reloads: Sequence[Callable[[], None]],
-    referenced: Sequence[Any],
-) -> MachineCode | None:
-    """The machine code in what numba stores of a compiled function; None if it takes more than `jit_link` gives."""
-    _, kind, data = library
+def _machine_code(compiled: Any) -> MachineCode | None:
+    """The machine code of a function that was compiled lean; None if it takes more than `jit_link` gives."""
+    environment, description, library = compiled.environment, compiled.fndesc, compiled.library
+    referenced = compiled._find_referenced_environments()
     environments = [environment, *(other for other in referenced if other.env_name != environment.env_name)]
     constants = [value for each in environments for value in each.consts]
     known = all(isinstance(value, np.dtype) and value.fields is None and value.isnative for value in constants)
-    starts_threads = [reload.__name__ == "_reload_parfors" for reload in reloads or ()]
-    if kind != "object" or objectmode or lifted or not known or not all(starts_threads):
+    starts_threads = [reload.__name__ == "_reload_parfors" for reload in compiled.reload_init or ()]
+    if library.has_dynamic_globals or compiled.objectmode or compiled.lifted or not known or not all(starts_threads):
         return None
     return MachineCode(
-        name=function.qualname.rpartition(".")[2],
-        wrapper=function.llvm_cpython_wrapper_name,
+        name=description.qualname.rpartition(".")[2],
+        wrapper=description.llvm_cpython_wrapper_name,
         environments=tuple((each.env_name, tuple(value.str for value in each.consts)) for each in environments),
         parallel=bool(starts_threads),
-        code=data[0],
+        code=library.machine_code(),
     )
 
 

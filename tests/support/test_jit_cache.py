@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from sparklod_cli.support import atomic, jit, jit_link
-from sparklod_cli.support.jit_cache import CODE, SUFFIX, pattern_of
+from sparklod_cli.support.jit_cache import CODE, INNER, SUFFIX, is_whole, pattern_of
 from tests.conftest import ROOT
 
 DAMAGE: dict[str, Callable[[bytes], bytes]] = {
@@ -26,8 +26,8 @@ DAMAGE: dict[str, Callable[[bytes], bytes]] = {
     "another file": lambda content: b"\x80\x04N.",
 }
 
-#: What a compiled kernel leaves in the cache.
-SUFFIXES = [CODE, SUFFIX] if jit_link.is_tested() else [SUFFIX]
+#: What a compiled kernel that calls no other leaves in the cache.
+SUFFIXES = [CODE] if jit_link.is_tested() else [SUFFIX]
 
 
 def twice(x: float) -> float:
@@ -134,11 +134,38 @@ def test_damaged_files_are_told_of_and_compiled_again(cache: Cache, damage: Call
 def test_damaged_machine_code_is_told_of_and_replaced(cache: Cache, damage: Callable[[bytes], bytes]) -> None:
     cache.compiles()
     (path,) = cache.files(CODE)
-    content = path.read_bytes()
-    path.write_bytes(damage(content))
-    assert not cache.compiles()  # numba loads what it has stored
+    path.write_bytes(damage(path.read_bytes()))
+    assert cache.compiles()
     assert len(cache.told) == 1
-    assert path.read_bytes() == content
+    assert is_whole(path.read_bytes())
+    assert not cache.compiles()
+
+
+@pytest.mark.parametrize("damage", [None, *DAMAGE.values()], ids=["none", *DAMAGE])
+def test_a_caller_is_compiled_with_what_is_stored_of_the_kernels_in_it(
+    cache: Cache, damage: Callable[[bytes], bytes] | None
+) -> None:
+    def fourfold() -> float:
+        inner = jit.kernel()(twice)
+
+        def outer(x: float) -> float:
+            result: float = inner(inner(x))
+            return result
+
+        found: float = jit.kernel()(outer)(2.0)
+        return found
+
+    assert fourfold() == 8
+    (path,) = cache.files(INNER)
+    content = path.read_bytes()
+    if damage is not None:
+        path.write_bytes(damage(content))
+    for machine_code in cache.files(CODE):
+        machine_code.unlink()
+    assert fourfold() == 8
+    assert len(cache.told) == (damage is not None)
+    assert is_whole(path.read_bytes())
+    assert (path.read_bytes() == content) == (damage is None)
 
 
 def test_a_folder_that_takes_no_file_is_told_of_and_does_no_harm(cache: Cache, monkeypatch: pytest.MonkeyPatch) -> None:

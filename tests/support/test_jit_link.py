@@ -195,7 +195,7 @@ def test_machine_code_that_takes_what_is_not_there_is_left_to_numba(
     with pytest.raises(RuntimeError, match="Failed to materialize symbols"):
         jit_link.link(jit_link.MachineCode.from_bytes(jit_cache.read(path) or b""), thrice)
     assert jit.kernel()(thrice)(2.0) == 6
-    assert jit_cache.read(path) == content
+    jit_link.link(jit_link.MachineCode.from_bytes(jit_cache.read(path) or b""), thrice)  # it was compiled again
     assert capfd.readouterr() == ("", "")
 
 
@@ -203,10 +203,9 @@ def test_machine_code_that_takes_what_is_not_there_is_left_to_numba(
 def test_a_whole_file_with_something_else_in_it_does_no_harm(folder: Path, content: bytes) -> None:
     jit.kernel()(thrice)(2.0)
     (path,) = folder.glob(f"*{CODE}")
-    before = path.read_bytes()
     jit_cache.write(path, [content], print)
     assert jit.kernel()(thrice)(2.0) == 6
-    assert path.read_bytes() == before
+    jit_link.link(jit_link.MachineCode.from_bytes(jit_cache.read(path) or b""), thrice)
 
 
 def test_results_are_those_of_numbas_own_call() -> None:
