@@ -117,7 +117,7 @@ def _failed(error: BaseException, verbosity: Verbosity) -> int:
     return 1
 
 
-def _one_thread_of_blas() -> None:
+def one_thread_of_blas() -> None:
     """Has numpy's library of linear algebra start no threads: each spins for some 60 ms when numpy is loaded.
 
     What it gets are small matrices, and blocks of large ones on threads of our own.
@@ -128,7 +128,7 @@ def _one_thread_of_blas() -> None:
 
 def main() -> NoReturn:
     """Entry point of the script; cleans up on a polite kill as on Ctrl-C."""
-    _one_thread_of_blas()
+    one_thread_of_blas()
     try:
         stdout.reserve()
         interrupts.handle()
