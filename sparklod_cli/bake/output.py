@@ -11,13 +11,11 @@ from ..codecs import clamps
 from ..codecs.clamps import Range
 from ..codecs.encoder import CLAMPED, Encoder, Get, Kept, Stored, results, windows_of
 from ..codecs.formats import WRITABLE, Format
-from ..codecs.gpu import dump
 from ..codecs.options import WriteOptions
-from ..codecs.rad import options as rad_options
 from ..codecs.rad.layout import OPTIONS
 from ..codecs.rad.names import SUFFIX as RAD
 from ..codecs.statistics import Statistics
-from ..io import SceneSink, Sink, detail_sink, scene_sink, sink
+from ..io import SceneSink, Sink, scene_sink, sink
 from ..model.nodes import CHUNK_NODES
 from ..model.scene import Scene
 from ..model.splats import Splats, same_rows
@@ -25,7 +23,6 @@ from ..model.streams import NodeStream
 from ..support.addresses import Place
 from ..support.progress import Progress
 from .clock import Clock
-from .detail_output import DetailOutput
 from .settings import BakeSettings
 from .whole_output import WholeOutput
 from .written import WrittenTree
@@ -45,8 +42,13 @@ class Output(Protocol):
     def needed(self) -> frozenset[str]:
         """The statistics of all nodes by which it is written, see `codecs.statistics`."""
 
-    def check(self, scene: Scene) -> None:
-        """Raises `FormatError` where a tree of these splats cannot be written."""
+    def check(self, splats: Splats, threads: int) -> Statistics | None:
+        """Raises `FormatError` where a tree of these splats cannot be written; statistics of them that `write` takes.
+
+        Args:
+            splats: the leaves of the tree.
+            threads: to count on.
+        """
 
     def check_statistics(self, found: Statistics) -> None:
         """As `check`, of statistics of these splats; and where it cannot be written without all nodes in memory."""
@@ -65,7 +67,13 @@ class Output(Protocol):
         """
 
     def write(
-        self, scene: Scene, environment: Splats | None, clock: Clock, threads: int, progress: Progress
+        self,
+        scene: Scene,
+        environment: Splats | None,
+        clock: Clock,
+        threads: int,
+        progress: Progress,
+        counted: Statistics | None = None,
     ) -> WrittenTree:
         """Writes a tree.
 
@@ -74,6 +82,7 @@ class Output(Protocol):
             environment: splats beside it that are always drawn, which only a Streamed SOG can hold; None without.
             clock: told of the stages.
             threads, progress: as for `bake`.
+            counted: statistics of its leaves, of `check`; None to count these, too.
         """
 
     def encoder(self, nodes: NodeStream, found: Statistics, threads: int, progress: Progress) -> Encoder:
@@ -99,6 +108,9 @@ def output_of(target: Place, settings: BakeSettings, *, overwrite: bool) -> Outp
         OutputError: see `io.scene_sink` and `io.detail_sink`.
     """
     if settings.detail is not None:
+        from ..io import detail_sink  # what most bakes do without
+        from .detail_output import DetailOutput
+
         return DetailOutput(settings.detail, settings.options, detail_sink(target, overwrite=overwrite))
     if settings.encoding is not None:
         return _Arrays(settings.encoding, settings.raw, sink(target, overwrite=overwrite))
@@ -124,9 +136,17 @@ class _Arrays(WholeOutput):
     made = "the arrays of --encoding are packed"
 
     def write(
-        self, scene: Scene, environment: Splats | None, clock: Clock, threads: int, progress: Progress
+        self,
+        scene: Scene,
+        environment: Splats | None,
+        clock: Clock,
+        threads: int,
+        progress: Progress,
+        counted: Statistics | None = None,
     ) -> WrittenTree:
         """Writes them."""
+        from ..codecs.gpu import dump
+
         arrays = dump.pack(scene, self.encoding, threads)
         size = self.sink(dump.encode_raw(arrays) if self.raw else dump.encode_npz(arrays))
         shapes = {name: words.shape for name, words in arrays.items()}
@@ -168,19 +188,31 @@ class _File:
         """The same with these codes."""
         return dataclasses.replace(self, options=stored.like(self.options), stored=stored, before=before)
 
-    def check(self, scene: Scene) -> None:
+    def check(self, splats: Splats, threads: int) -> Statistics | None:
         """The codec knows."""
-        self.form.codec().settled(scene, self.options)
+        found = Statistics.of_leaves(splats, self.needed, threads=threads)
+        self.check_statistics(found)
+        return found
 
     def check_statistics(self, found: Statistics) -> None:
         """The codec knows."""
         self.form.codec().settled(found, self.options)
 
     def write(
-        self, scene: Scene, environment: Splats | None, clock: Clock, threads: int, progress: Progress
+        self,
+        scene: Scene,
+        environment: Splats | None,
+        clock: Clock,
+        threads: int,
+        progress: Progress,
+        counted: Statistics | None = None,
     ) -> WrittenTree:
         """Writes it."""
-        options: WriteOptions = self.form.codec().settled(scene, self.options)
+        if counted is None:
+            found = Statistics.of_scene(scene, self.needed, threads=threads)
+        else:
+            found = Statistics.of_tree(scene, counted, self.needed, threads=threads)
+        options: WriteOptions = self.form.codec().settled(found, self.options)
         if self.stored is None or self.before is None:
             size = self.sink(scene, options, threads=threads, progress=progress)
         else:
@@ -211,7 +243,11 @@ class _File:
 
     def _held(self, options: WriteOptions, sh_degree: int) -> Sequence[Range]:
         """The values that are not clamped."""
-        return rad_options.held(options, sh_degree) if self.in_chunks else clamps.SPZ
+        if not self.in_chunks:
+            return clamps.SPZ
+        from ..codecs.rad.options import held
+
+        return held(options, sh_degree)
 
     def _written(
         self, options: WriteOptions, size: int, count: int, sh_degree: int, beyond: clamps.Clamps
