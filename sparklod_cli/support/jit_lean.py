@@ -18,7 +18,6 @@ from numba import _dynfunc
 from numba.core import codegen, cpu, ir, targetconfig
 from numba.core.compiler_lock import global_compiler_lock
 
-
 #: What is in the names of libraries that wrap the optimised body of a parallel loop, twice.
 _WRAPPERS = ("_GufuncWrapper", "parallelgufuncwrapper")
 
@@ -31,7 +30,7 @@ class _Library(codegen.JITCodeLibrary):  # type: ignore[misc]
 
     def _optimize_functions(self, ll_module: Any) -> None:
         """Optimises the functions of a module one by one, but not those that it merely declares."""
-        if not hasattr(codegen, "create_pass_builder"):  # a numba before 0.63, which does not take long for this
+        if not hasattr(codegen, "create_pass_builder"):  # an older numba, which does not take long for this
             super()._optimize_functions(ll_module)
             return
         ll_module.data_layout = self._codegen._data_layout
@@ -94,7 +93,7 @@ def _rec_list_vars(instruction: Any, value: Any) -> list[Any]:
     if isinstance(value, ir.Var):
         return [value]
     if isinstance(value, ir.Inst):
-        return value.list_vars()  # type: ignore[no-any-return]
+        return value.list_vars()
     if not isinstance(value, (list, tuple, dict)):
         return []
     found: list[Any] = []

@@ -90,7 +90,7 @@ class Compiler:
 
 
 def _add_overload(dispatcher: Any, compiled: Any) -> None:
-    """Adds what was compiled, and gives the kernels in it their environments, since they may have been compiled lean."""
+    """Adds what was compiled, and gives the kernels in it, which may have been compiled lean, their environments."""
     type(dispatcher).add_overload(dispatcher, compiled)
     for environment in compiled._find_referenced_environments():
         compiled.library.codegen.set_env(environment.env_name, environment)
