@@ -1,7 +1,8 @@
 """The worker process in which cases run; `fuzz.child` starts it, and starts another when it dies.
 
-It says that it is ready, reads requests from one pipe and writes answers to another, a JSON object a line. Python's fault handler writes its
-traces to a log: of a crash, and of SIGUSR1, which `fuzz.child` sends to a worker that hangs.
+It says that it is ready, and then reads requests from one pipe and writes answers to another, a JSON object a line.
+Python's fault handler writes its traces to a log: of a crash, and of SIGUSR1, which `fuzz.child` sends to a worker that
+hangs.
 """
 
 from __future__ import annotations

@@ -173,7 +173,7 @@ def test_cameras_that_are_none_fail_before_any_work(
     assert sorted(path.name for path in scene.parent.iterdir()) == ["cameras.csv", "scene.ply"]
 
 
-#: A fitting that says "ready", and then waits until it is told to stop; or says that it heard that, and does not listen.
+#: A fitting that says "ready", waits until it is told to stop, says that it heard that, and stops or goes on.
 WAITING = """
 import sys, time
 from sparklod_cli import cli

@@ -93,7 +93,11 @@ def trees() -> dict[str, bytes]:
 
 @pytest.mark.parametrize("mode", MODES)
 def test_every_option_of_traverse_is_used_or_refused(
-    mode: str, trees: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    mode: str,
+    trees: dict[str, bytes],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(
