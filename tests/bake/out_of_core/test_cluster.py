@@ -166,16 +166,18 @@ def test_a_worker_without_sparklod_is_told_what_to_do(engine: ClusterEngine, job
 def _hide(module: str) -> None:
     import sys
 
-    sys.modules["hidden"] = sys.modules.pop(module)
+    sys.modules["hidden"] = sys.modules.pop(module, None)  # type: ignore[assignment]
     sys.modules[module] = None  # type: ignore[assignment]
 
 
 def _show(module: str) -> None:
-    """Also where it is not hidden, on a worker that came since."""
+    """Also on a worker that came since, where it is not hidden."""
     import sys
 
     if "hidden" in sys.modules:
-        sys.modules[module] = sys.modules.pop("hidden")
+        del sys.modules[module]
+        if (found := sys.modules.pop("hidden")) is not None:
+            sys.modules[module] = found
 
 
 def test_a_block_that_does_not_fit_into_memory_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
