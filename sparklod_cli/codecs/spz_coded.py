@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -14,6 +14,9 @@ from ..model.splats import COLUMNS, FloatArray, Splats
 from .kernels.spz_codes import fill_extremes, fill_sizes, look_up
 from .quantize import Bytes
 from .spz_layout import LINKS, Layout, column_of
+
+#: By column of `Splats`, what is called with all of its codes, (n, bytes) at a time, as they are read.
+Watch = Mapping[str, Callable[[Bytes], None]]
 
 #: Columns of `Splats` whose numbers are a byte each.
 BYTES = ("opacity", "rgb", "scale")
