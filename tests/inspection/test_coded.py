@@ -114,7 +114,7 @@ def test_codes_of_columns_that_nobody_wants_are_not_kept() -> None:
 @pytest.mark.parametrize("threads", [1, 3])
 def test_codes_can_be_watched_without_being_kept(threads: int, tmp_path: Path) -> None:
     path = tmp_path / "any.spz"
-    path.write_bytes(random_file(3, flags=LOD, count=70_000, links=1))
+    path.write_bytes(random_file(3, flags=LOD, count=100_000, links=1))
     seen: list[np.ndarray] = []
     coded, whole = read_coded(path, columns=(), watch={"rgb": seen.append}, threads=threads), read_coded(path)
     assert coded is not None
