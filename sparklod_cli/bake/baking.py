@@ -11,6 +11,7 @@ import numpy as np
 
 from ..io import read_rgba, read_stored
 from ..lod.builders import BUILDERS
+from ..lod.check import select
 from ..model.lod_tree import LodTree
 from ..model.scene import Scene
 from ..model.splats import Splats
@@ -224,7 +225,9 @@ def _built(
 ) -> _Made:
     """A tree of the splats of the input."""
     scene = scenes.pop()
-    kept, dropped = settings.selection.apply(_recolored(scene.splats, settings.rgba).with_max_sh(settings.max_sh))
+    colored = _recolored(scene.splats, settings.rgba).with_max_sh(settings.max_sh)
+    kept, dropped = select(settings.selection, colored, threads)
+    del colored
     kept, far = divided(kept, settings)
     kept = transformed(kept, settings.transform)
     environment = None if far is None else transformed(far, settings.transform)
