@@ -58,7 +58,7 @@ def select(selection: Selection, splats: Splats, threads: int) -> tuple[Splats, 
     """`Selection.apply`, which takes longer where nothing is to be dropped."""
     if len(splats) and replace(selection, drop_invalid=False) == Selection() and all_drawable(splats, threads):
         return splats, {}
-    return selection.apply(splats)
+    return selection.apply(splats, threads=threads)
 
 
 def check(splats: Splats) -> Bounds:
