@@ -18,6 +18,9 @@ from .support.printable import printable
 #: Characters that are quoted of an error that nobody foresaw.
 QUOTED = 200
 
+#: Variables by which a person chooses the threads of numpy's OpenBLAS; the first one is for nothing else.
+BLAS_THREADS = ("OPENBLAS_NUM_THREADS", "GOTO_NUM_THREADS", "OMP_NUM_THREADS")
+
 #: The commands, and what `sparklod --help` says of them.
 COMMANDS = {
     "build-lod": "Bake splat files into Level-of-Detail files.",
@@ -114,8 +117,18 @@ def _failed(error: BaseException, verbosity: Verbosity) -> int:
     return 1
 
 
+def one_thread_of_blas() -> None:
+    """Has numpy's library of linear algebra start no threads: each spins for some 60 ms when numpy is loaded.
+
+    What it gets are small matrices, and blocks of large ones on threads of our own.
+    """
+    if not any(map(os.environ.get, BLAS_THREADS)):
+        os.environ[BLAS_THREADS[0]] = "1"
+
+
 def main() -> NoReturn:
     """Entry point of the script; cleans up on a polite kill as on Ctrl-C."""
+    one_thread_of_blas()
     try:
         stdout.reserve()
         interrupts.handle()

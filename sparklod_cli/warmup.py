@@ -67,9 +67,16 @@ JOBS = {
         (
             *("tree_links.find_cycles", "tree_links.find_depths", "tree_links.find_parents"),
             *("tree_links.add_weighted", "tree_links.fill_weights", "tree_links.sum_by_depth"),
+            *("tree_links.count_limits", "tree_links.gather_large", "tree_links.mark_small"),
+            *("spz_codes.count_bytes", "spz_codes.count_ends", "spz_codes.count_squares", "spz_codes.count_halves"),
+            *("spz_codes.fill_extremes", "spz_codes.fill_sizes", "spz_codes.look_up"),
             *("digits.count_digits", "digits.sh_lengths"),
         ),
-        ("inspect shiny.spz --check --stats --json",),
+        (
+            "inspect shiny.spz --check --stats --json",
+            "inspect shiny.ply --check --stats --json",
+            "inspect small.spz --check --json",
+        ),
     ),
     "quality": Job(
         (
@@ -244,4 +251,8 @@ def _write_inputs(folder: Path) -> None:
     write_whole(folder / "scene.ply", ply.encode(Scene(leaves)), overwrite=True)
     write_whole(folder / "tree.spz", spz.encode(tree), overwrite=True)
     sh = rng.uniform(-0.5, 0.5, (count + 1, 3, 3)).astype(np.float32)
-    write_whole(folder / "shiny.spz", spz.encode(replace(tree, splats=replace(root, sh=sh))), overwrite=True)
+    shiny = replace(root, sh=sh)
+    write_whole(folder / "shiny.spz", spz.encode(replace(tree, splats=shiny)), overwrite=True)
+    small = replace(root, scale=np.concatenate([root.scale[:1] / 100, root.scale[1:]]))
+    write_whole(folder / "small.spz", spz.encode(replace(tree, splats=small)), overwrite=True)
+    write_whole(folder / "shiny.ply", ply.encode(Scene(shiny)), overwrite=True)

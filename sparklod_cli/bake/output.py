@@ -11,13 +11,11 @@ from ..codecs import clamps
 from ..codecs.clamps import Range
 from ..codecs.encoder import CLAMPED, Encoder, Get, Kept, Stored, results, windows_of
 from ..codecs.formats import WRITABLE, Format
-from ..codecs.gpu import dump
 from ..codecs.options import WriteOptions
-from ..codecs.rad import options as rad_options
 from ..codecs.rad.layout import OPTIONS
 from ..codecs.rad.names import SUFFIX as RAD
 from ..codecs.statistics import Statistics
-from ..io import SceneSink, Sink, detail_sink, scene_sink, sink
+from ..io import SceneSink, Sink, scene_sink, sink
 from ..model.nodes import CHUNK_NODES
 from ..model.scene import Scene
 from ..model.splats import Splats, same_rows
@@ -25,7 +23,6 @@ from ..model.streams import NodeStream
 from ..support.addresses import Place
 from ..support.progress import Progress
 from .clock import Clock
-from .detail_output import DetailOutput
 from .settings import BakeSettings
 from .whole_output import WholeOutput
 from .written import WrittenTree
@@ -99,6 +96,9 @@ def output_of(target: Place, settings: BakeSettings, *, overwrite: bool) -> Outp
         OutputError: see `io.scene_sink` and `io.detail_sink`.
     """
     if settings.detail is not None:
+        from ..io import detail_sink  # what most bakes do without
+        from .detail_output import DetailOutput
+
         return DetailOutput(settings.detail, settings.options, detail_sink(target, overwrite=overwrite))
     if settings.encoding is not None:
         return _Arrays(settings.encoding, settings.raw, sink(target, overwrite=overwrite))
@@ -127,6 +127,8 @@ class _Arrays(WholeOutput):
         self, scene: Scene, environment: Splats | None, clock: Clock, threads: int, progress: Progress
     ) -> WrittenTree:
         """Writes them."""
+        from ..codecs.gpu import dump
+
         arrays = dump.pack(scene, self.encoding, threads)
         size = self.sink(dump.encode_raw(arrays) if self.raw else dump.encode_npz(arrays))
         shapes = {name: words.shape for name, words in arrays.items()}
@@ -211,7 +213,11 @@ class _File:
 
     def _held(self, options: WriteOptions, sh_degree: int) -> Sequence[Range]:
         """The values that are not clamped."""
-        return rad_options.held(options, sh_degree) if self.in_chunks else clamps.SPZ
+        if not self.in_chunks:
+            return clamps.SPZ
+        from ..codecs.rad.options import held
+
+        return held(options, sh_degree)
 
     def _written(
         self, options: WriteOptions, size: int, count: int, sh_degree: int, beyond: clamps.Clamps

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import shutil
 import tempfile
 import uuid
@@ -23,7 +24,7 @@ from .out_of_core.contracts import Engine
 from .out_of_core.manifest import at_work, scratch_folder
 from .out_of_core.store import FileStore, store_of
 from .output import Output
-from .recipe import Recipe, recipe_of
+from .recipe import Recipe, files_named_in, recipe_of
 from .resources import Resources
 from .settings import BakeSettings
 from .sources import Merged, Source, absolute_source, opened_source, placement_of, places_of
@@ -95,7 +96,10 @@ def bake_scaled(
     if size is None:
         return None
     memory = estimate.default_memory() if resources.memory is None else resources.memory
-    recipe = recipe_of(places_of(source), settings, **placement_of(source))
+    # It reads samples of all inputs, and most bakes in memory need none.
+    recipe = functools.lru_cache(1)(lambda: recipe_of(places_of(source), settings, **placement_of(source)))
+    if files_named_in(settings):
+        recipe()  # so that one that is missing is told of at once
     folder = scratch_folder(target, recipe, resources.scratch_dir)
     if engine is not None:
         folder = absolute(folder)  # other processes work in folders of their own
@@ -108,7 +112,7 @@ def bake_scaled(
         why = None
     if why is None:
         if left:  # refused, or removed
-            with _work(store, recipe, 0, resources, overwrite, say):
+            with _work(store, recipe(), 0, resources, overwrite, say):
                 pass
         return None
     from .out_of_core.engine import LocalEngine  # what most bakes do without takes long to load
@@ -126,7 +130,7 @@ def bake_scaled(
         f" {block_splats:,}, scratch of about {format_size(needed)} in {folder}"
     )
     with (
-        _work(store, recipe, block_splats, resources, overwrite, say) as block_splats,
+        _work(store, recipe(), block_splats, resources, overwrite, say) as block_splats,
         _opened(source, folder, threads, engine) as stream,
     ):
         baked = bake_out_of_core(

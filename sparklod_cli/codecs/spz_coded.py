@@ -6,10 +6,17 @@ import functools
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 
+import numpy as np
+
+from ..model.gaussian import spark_size
 from ..model.lod_tree import LodTree
-from ..model.splats import COLUMNS, Splats
+from ..model.splats import COLUMNS, FloatArray, Splats
+from .kernels.spz_codes import fill_extremes, fill_sizes, look_up
 from .quantize import Bytes
 from .spz_layout import LINKS, Layout, column_of
+
+#: Columns of `Splats` whose numbers are a byte each.
+BYTES = ("opacity", "rgb", "scale")
 
 
 def sound(layout: Layout) -> bool:
@@ -56,10 +63,42 @@ class CodedSpz:
         splats = Splats.zeros(len(range(*part.indices(self.count))), self.sh_degree)
         for stream in self.layout.streams():
             if stream.column in columns:
-                out = column_of(splats, None, stream)
-                out[...] = stream.decode(self.codes[stream.name][part]).reshape(out.shape)
+                out, codes = column_of(splats, None, stream), self.codes[stream.name][part]
+                if stream.column in BYTES:
+                    look_up(codes, self.table(stream.column), out.reshape(codes.shape))
+                else:
+                    out[...] = stream.decode(codes).reshape(out.shape)
         tree = self.tree
         return splats, None if tree is None else LodTree(tree.child_count[part], tree.child_start[part])
+
+    def table(self, column: str) -> FloatArray:
+        """(256,) what each byte stands for in a column of `BYTES`."""
+        return self._tables[column]
+
+    @functools.cached_property
+    def _tables(self) -> dict[str, FloatArray]:
+        every = np.arange(256, dtype=np.uint8)
+        return {each.column: each.decode(every) for each in self.layout.streams() if each.column in BYTES}
+
+    @functools.cached_property
+    def _factors(self) -> FloatArray:
+        """(256,) feature size over mean scale, of each code of an opacity."""
+        splats = Splats.zeros(256, 0)
+        splats.scale[...], splats.opacity[...] = 1, self.table("opacity")
+        return spark_size(splats)
+
+    def fill_sizes(self, part: slice, out: FloatArray) -> None:
+        """The feature sizes of some splats, as `gaussian.spark_size` computes them."""
+        fill_sizes(self.codes["scales"][part], self.codes["alphas"][part], self.table("scale"), self._factors, out)
+
+    def extremes(self, part: slice) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Of some splats of a sound file: (n,) opacities, largest scales, and largest absolute coordinates."""
+        positions, scales, alphas = (self.codes[name][part] for name in ("positions", "scales", "alphas"))
+        found = np.empty((3, len(scales)), np.float32)
+        tables = self.table("opacity"), self.table("scale")
+        fill_extremes(alphas, scales, positions, *tables, np.float32(2.0**-self.layout.fractional_bits), found)
+        opacity, largest, furthest = found
+        return opacity, largest, furthest
 
     @functools.cached_property
     def tree(self) -> LodTree | None:

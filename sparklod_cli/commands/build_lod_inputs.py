@@ -46,9 +46,11 @@ class Inputs:
         Raises:
             InstancesFileError: it cannot be read.
         """
+        if self.scene is None:
+            return []
         from ..scenes.instances_file import read_instances
 
-        return [] if self.scene is None else read_instances(self.scene)
+        return read_instances(self.scene)
 
     def jobs(
         self, instances: Sequence[Instance], outputs: Outputs, say: Callable[[str], None]

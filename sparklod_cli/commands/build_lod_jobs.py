@@ -34,14 +34,14 @@ def job_of(
     ctx: click.Context, outputs: Outputs, general: General, console: Console, engine: ClusterEngine | None
 ) -> tuple[Make, Callable[..., None]]:
     """What makes outputs of inputs, and what reports one; the point where numpy is loaded."""
-    from ..api.bake_jobs import bake, bake_side_by_side, bake_unless_there, extract_leaves
+    from ..api import bake_jobs
 
     shared: dict[str, Any] = {"overwrite": outputs.overwrite, "progress": console.progress}
     if outputs.unlod:
         if WRITABLE[outputs.suffix].name == "SOG":
             console.announce_compiling("palette")
         how: dict[str, Any] = {"suffix": outputs.suffix, "options": write_options(ctx), "threads": general.threads}
-        return _one_by_one(functools.partial(extract_leaves, **how, **shared)), report_extracted
+        return _one_by_one(functools.partial(bake_jobs.extract_leaves, **how, **shared)), report_extracted
     settings = bake_settings(
         ctx,
         suffix=outputs.suffix,
@@ -50,7 +50,8 @@ def job_of(
         converts=outputs.format_is_asked_for,
     )
     console.announce_compiling(settings.method, *_jobs_of(outputs, settings))
-    make, resources = bake_unless_there if ctx.params["skip_existing"] else bake, resources_of(ctx)
+    make = bake_jobs.bake_unless_there if ctx.params["skip_existing"] else bake_jobs.bake
+    resources = resources_of(ctx)
     if engine is not None:
         resources = dataclasses.replace(resources, memory=engine.memory)
     here = functools.partial(
@@ -60,7 +61,7 @@ def job_of(
     if engine is None:
         return alone, report_baked
     beside: Make = functools.partial(
-        bake_side_by_side,
+        bake_jobs.bake_side_by_side,
         make=make,
         settings=settings,
         engine=engine,

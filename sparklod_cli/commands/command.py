@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Callable, Sequence
 from importlib import import_module
 from typing import Any, TypeVar
@@ -129,6 +128,8 @@ class Group(click.Group):
 
 def near_command(name: str, names: Sequence[str]) -> str | None:
     """The command that somebody meant by another name, if that can be told."""
+    import difflib  # which takes a millisecond, and is needed after a mistake only
+
     plain = name.lower().replace("_", "-")
     if plain in names or plain in ALIASES:
         return plain if plain in names else ALIASES[plain]

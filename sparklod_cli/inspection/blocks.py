@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -47,12 +47,19 @@ class Block:
         splats: n of them; columns that were not asked for may be 0.
         tree: (n,) of them where they are nodes of a tree, with children as the whole tree numbers them.
         sound: no splat can be invalid, whatever its codes are.
+        coded: the codes of a sound file, see `Blocks`.
     """
 
     start: int
     splats: Splats
     tree: LodTree | None
     sound: bool = False
+    coded: CodedSpz | None = None
+
+    @property
+    def part(self) -> slice:
+        """Of all splats."""
+        return slice(self.start, self.start + len(self.splats))
 
     @functools.cached_property
     def invalid(self) -> dict[str, Mask]:
@@ -83,6 +90,7 @@ class Blocks:
         tree: of all splats, where it is in memory.
         sound: no splat can be invalid, so that whoever looks for those needs no more columns.
         antialiased, format, notes, header, chunk_bytes: as in `Scene`.
+        coded: the codes of a sound file, which tell more in less time than what they are decoded to.
     """
 
     count: int
@@ -98,6 +106,7 @@ class Blocks:
     notes: tuple[str, ...] = ()
     header: Mapping[str, int] = field(default_factory=dict)
     chunk_bytes: tuple[int, ...] | None = None
+    coded: CodedSpz | None = None
 
     @classmethod
     def of(cls, scene: Scene) -> Blocks:
@@ -115,12 +124,15 @@ class Blocks:
     @classmethod
     def of_codes(cls, coded: CodedSpz) -> Blocks:
         """Those of an SPZ file, whose codes are decoded whenever they are read."""
+        known = coded if coded.sound and coded.count else None
 
         def at(start: int, columns: Collection[str]) -> Block:
-            return Block(start, *coded.decode(slice(start, start + CHUNK_NODES), columns), coded.sound)
+            rows = coded.decode(slice(start, start + CHUNK_NODES), columns)
+            return Block(start, *rows, coded.sound, known)
 
         about = coded.antialiased, coded.format, coded.notes, coded.header
-        return cls._in_memory(coded.count, coded.sh_degree, at, CHUNK_NODES, coded.tree, coded.sound, *about)
+        found = cls._in_memory(coded.count, coded.sh_degree, at, CHUNK_NODES, coded.tree, coded.sound, *about)
+        return replace(found, coded=known)
 
     @classmethod
     def _in_memory(
@@ -181,6 +193,13 @@ class Tally:
 
     count: int = 0
     first: int = -1
+
+    @classmethod
+    def of(cls, mask: Mask, start: int) -> Tally:
+        """Those of a block that begins at `start`."""
+        found = cls()
+        found.add(mask, start)
+        return found
 
     def add(self, mask: Mask, start: int) -> None:
         """Counts those of a block that begins at `start`."""

@@ -18,7 +18,7 @@ from ..support.printable import printable
 from ..support.progress import Progress, silent
 from ..support.untrusted import QUOTED
 from ..tables.columns import Row
-from . import arrays, chunks, rad, streamed_sog, tree, value_checks, values
+from . import arrays, chunks, code_values, rad, streamed_sog, tree, tree_findings, value_checks, values
 from .blocks import Block, Blocks
 from .findings import Finding
 
@@ -26,7 +26,7 @@ from .findings import Finding
 SCHEMA_VERSION = 1
 
 #: Columns that the facts of a tree are computed from.
-TREE_COLUMNS = tree.USED
+TREE_COLUMNS = tree_findings.USED
 
 
 #: Fields for which the headers of a RAD file, or of the files of a Streamed SOG, are enough.
@@ -250,21 +250,27 @@ def _of_blocks(
     if isinstance(surveyed, rad.Survey) and surveyed.facts is not None:
         ends = rad.ends_of(surveyed.facts)
     columns = tree.Columns.of(blocks) if blocks.is_tree and blocks.count else None
+    coded = blocks.coded
     statistics = values.Statistics(blocks.sh_degree, all_quantities=settings.all_quantities)
     checks = value_checks.ValueChecks(ends, is_tree=blocks.is_tree)
     rows = chunks.Rows(blocks)
     wanted: list[tuple[_Passed, Collection[str]]] = [
-        *([] if columns is None else [(columns, tree.USED)]),
-        *([(statistics, values.USED if blocks.sound else COLUMNS)] if settings.values else []),
-        *([(checks, value_checks.USED if blocks.sound else COLUMNS)] if settings.check else []),
+        *([] if columns is None else [(columns, TREE_COLUMNS if coded is None else ())]),
+        *([(statistics, values.USED if blocks.sound else COLUMNS)] if settings.values and coded is None else []),
+        *([(checks, () if coded else value_checks.USED if blocks.sound else COLUMNS)] if settings.check else []),
         *([(rows, chunks.USED)] if settings.chunks else []),
     ]
     used = {name for _, names in wanted for name in names}
     for parts in blocks.map(lambda block: [each.part_of(block) for each, _ in wanted], used, threads):
         for (each, _), part in zip(wanted, parts, strict=True):
             each.merge(part)
-    if settings.values:
+    told = None
+    if settings.values and coded is not None:
+        sizes = None if columns is None else columns.size
+        told = code_values.examine(coded, sizes, all_quantities=settings.all_quantities, threads=threads)
+    elif settings.values:
         statistics.finish(blocks, threads=threads)
+        told = statistics.facts()
     facts = None
     in_order = rows.rows(columns) if settings.chunks else None
     if columns is not None:
@@ -291,7 +297,7 @@ def _of_blocks(
         compression_ratio=_compression_ratio(size, blocks.count, blocks.sh_degree),
         notes=list(blocks.notes),
         tree=facts,
-        values=statistics.facts() if settings.values else None,
+        values=told,
         chunks=in_order,
         findings=findings if settings.check else None,
         **_facts_of(surveyed),

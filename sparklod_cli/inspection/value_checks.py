@@ -71,7 +71,7 @@ def check(scene: Scene, ends: Ends | None = None) -> list[Finding]:
 
 @dataclass
 class ValueChecks:
-    """Looks for faults in splats that pass once, block by block, with all columns, or those `USED` of sound ones.
+    """Looks for faults in splats that pass once, block by block: with all columns, `USED` of sound ones, or codes.
 
     Attributes:
         ends: of the codes of their file.
@@ -117,14 +117,16 @@ class ValueChecks:
         self.checked += int(np.count_nonzero(some))
         for kind, mask in block.invalid.items():
             self._add(kind, mask, block)
+        if block.coded is None:
+            opacity, most, furthest = splats.opacity, largest(splats.scale), largest(np.abs(splats.center))
+        else:
+            opacity, most, furthest = block.coded.extremes(block.part)
         if not self.is_tree:
-            self._add("opaque", valid & (splats.opacity > 1), block)
+            self._add("opaque", valid & (opacity > 1), block)
         # Merged splats of thin leaves far apart may be fainter than any code, or larger.
-        most = largest(splats.scale)
-        invisible = some & ((splats.opacity == 0) | (most == 0))
+        invisible = some & ((opacity == 0) | (most == 0))
         self.invisible += int(np.count_nonzero(invisible))
         self._add("invisible", valid & invisible, block)
-        furthest = largest(np.abs(splats.center))
         self._add("center", valid & (furthest >= self.ends.center), block)
         low, high = self.ends.scale
         if high < math.inf:  # a smallest scale that was clamped is not visible

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -17,7 +17,7 @@ from ..model.splats import COLUMNS, FloatArray, Splats
 from ..support.parallel import ordered_map
 from ..tables.histograms import Histogram, histogram
 from .blocks import Block, Blocks, largest, smallest
-from .percentiles import Percentiles
+from .percentiles import Known, Percentiles
 
 #: The quantities of a splat by name, as functions of N splats to (N,) numbers. Splats with SH have `SH_QUANTITIES` too.
 QUANTITIES: dict[str, Callable[[Splats], FloatArray]] = {
@@ -58,6 +58,8 @@ COUNTED = ("good", "non_finite", "negative_scale", "zero_opacity", "zero_scale",
 MAIN = ("scale", "opacity", "anisotropy")
 #: Percentiles of a quantity, by name.
 PERCENTILES = {"p1": 1, "p25": 25, "p50": 50, "p75": 75, "p99": 99}
+#: The same, the least and the largest number.
+LEVELS = (0, *PERCENTILES.values(), 100)
 
 
 @dataclass(frozen=True)
@@ -95,6 +97,12 @@ class ValueFacts:
 def names_of(splats: Splats) -> list[str]:
     """The names of the quantities of these splats: those of SH by their degree."""
     return [*QUANTITIES, *SH_QUANTITIES[: splats.sh_degree]]
+
+
+def needed(sh_degree: int, *, all_quantities: bool) -> list[str]:
+    """The names of the quantities whose percentiles a report needs: those of the box first."""
+    names = [*QUANTITIES, *SH_QUANTITIES[:sh_degree]] if all_quantities else MAIN
+    return list(dict.fromkeys((*AXES, *names)))
 
 
 def quantity(splats: Splats, name: str) -> FloatArray:
@@ -161,8 +169,8 @@ class Statistics:
     def __init__(self, sh_degree: int, *, all_quantities: bool = False) -> None:
         none = Splats.empty(0, sh_degree)
         self._numbers = {
-            name: Percentiles((0, *PERCENTILES.values(), 100), quantity(none, name).dtype)
-            for name in dict.fromkeys((*AXES, *(names_of(none) if all_quantities else MAIN)))
+            name: Percentiles(LEVELS, quantity(none, name).dtype)
+            for name in needed(sh_degree, all_quantities=all_quantities)
         }
         self._shown = [name for name in self._numbers if all_quantities or name in MAIN]
         self._low, self._high = np.full(3, np.inf, np.float32), np.full(3, -np.inf, np.float32)
@@ -221,18 +229,35 @@ class Statistics:
 
     def facts(self) -> ValueFacts:
         """What was found."""
-        box = box_98 = None
-        counts = dict(self._counts)
-        if counts.pop("good"):
-            box = Box(_numbers(self._low), _numbers(self._high))
-            places = [list(PERCENTILES.values()).index(level) + 1 for level in (1, 99)]
-            low, high = np.stack([self._numbers[axis].values()[places] for axis in AXES], axis=1)
-            box_98 = Box(_numbers(low), _numbers(high))
-        quantities = {name: _summary(self._numbers[name]) for name in self._shown}
-        return ValueFacts(box=box, box_98=box_98, quantities=quantities, **counts)
+        return facts_of(self._counts, self._low, self._high, self._numbers, self._shown)
 
 
-def _summary(numbers: Percentiles) -> dict[str, float | None]:
+def facts_of(
+    counts: Mapping[str, int],
+    low: FloatArray,
+    high: FloatArray,
+    numbers: Mapping[str, Percentiles | Known],
+    shown: Iterable[str],
+) -> ValueFacts:
+    """What is reported of splats.
+
+    Args:
+        counts: of `COUNTED`.
+        low, high: (3,) box of the centres of valid splats.
+        numbers: of `LEVELS`, of all quantities that are shown and of `AXES`.
+        shown: quantities.
+    """
+    box = box_98 = None
+    if counts["good"]:
+        box = Box(_numbers(low), _numbers(high))
+        places = [LEVELS.index(level) for level in (1, 99)]
+        inner_low, inner_high = np.stack([numbers[axis].values()[places] for axis in AXES], axis=1)
+        box_98 = Box(_numbers(inner_low), _numbers(inner_high))
+    told = {name: counts[name] for name in COUNTED if name != "good"}
+    return ValueFacts(box=box, box_98=box_98, quantities={name: _summary(numbers[name]) for name in shown}, **told)
+
+
+def _summary(numbers: Percentiles | Known) -> dict[str, float | None]:
     if not numbers.count:
         return dict.fromkeys(("min", *PERCENTILES, "max", "mean"))
     levels: dict[str, float | None] = dict(zip(("min", *PERCENTILES, "max"), _numbers(numbers.values()), strict=True))

@@ -8,10 +8,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from ..codecs.formats import HEAD, sniff
-from ..codecs.rad import header as rad_header
-from ..codecs.sog.files import MAX_META, names_beside
 from ..codecs.sog.names import META
-from ..codecs.streamed_sog.manifest import MAX_MANIFEST, parse
 from ..codecs.streamed_sog.names import MANIFEST
 from ..support.addresses import Place
 from ..support.errors import FormatError, UnreadableError
@@ -50,10 +47,16 @@ def _named_in(path: Path) -> list[Path]:
     """The files that a splat file refers to: images of an unpacked SOG, chunks of a RAD, all those of Streamed SOG."""
     with path.open("rb") as file:
         head = file.read(HEAD)
+        form = sniff(head, "")
+        if form is not None and not form.companions:
+            return []
+        from ..codecs.rad import header as rad_header  # what most jobs do without, as what follows
+        from ..codecs.streamed_sog.manifest import MAX_MANIFEST, parse
+
         file.seek(0)
         if head.startswith(rad_header.MAGIC):
             return _beside(path, rad_header.read_header(file).filenames)
-        if (form := sniff(head, "")) is not None and form.folders:
+        if form is not None and form.folders:
             metas = _beside(path, parse(file.read(MAX_MANIFEST + 1)).names(), folders=True)
             return [*metas, *itertools.chain(*map(_images_of, metas))]
     return _images_of(path)
@@ -61,6 +64,8 @@ def _named_in(path: Path) -> list[Path]:
 
 def _images_of(path: Path) -> list[Path]:
     """The images that the meta.json of an unpacked SOG names."""
+    from ..codecs.sog.files import MAX_META, names_beside
+
     if not path.is_file() or path.stat().st_size > MAX_META:
         return []
     data = path.read_bytes()

@@ -7,13 +7,11 @@ import functools
 import os
 from collections.abc import Collection, Iterator
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 from ..codecs.encoder import Stored
 from ..codecs.formats import FORMATS, HEAD, Format, sniff
-from ..codecs.gpu import dump
 from ..codecs.gpu.table import NPZ, RAW_SUFFIXES
-from ..codecs.spz_coded import CodedSpz
 from ..model.detail import DetailScene
 from ..model.scene import Scene
 from ..model.splats import COLUMNS
@@ -23,6 +21,10 @@ from ..support.progress import Progress, silent
 from ..support.stdin import DASH, spooled
 from .beside import in_folder, open_beside
 from .names import reason_of
+
+if TYPE_CHECKING:
+    from ..codecs.gpu import dump
+    from ..codecs.spz_coded import CodedSpz
 
 #: How a .npz begins, which is a zip.
 ZIP = b"PK\x03\x04"
@@ -167,6 +169,8 @@ def read_arrays(path: Path) -> dump.Arrays | None:
     Raises:
         FormatError: an array is damaged, or of no plain numbers.
     """
+    from ..codecs.gpu import dump
+
     try:
         if path != DASH and not path.is_file():
             return None

@@ -21,7 +21,7 @@ from ..support.progress import Progress, silent
 from .check import check, check_setting
 from .voxel_grid import VoxelGrid
 from .voxel_growth import Arrivals, grow
-from .voxel_rows import joining, leaf_rows, sorted_leaves
+from .voxel_rows import fill_rows, joining, sorted_leaves
 from .voxel_tree import VoxelTree
 
 
@@ -50,7 +50,7 @@ def build(splats: Splats, base: float = DEFAULT_BASE, *, progress: Progress = si
     with threads_for(n) as threads:
         grid = VoxelGrid.of(bounds, base)
         index, joins = sorted_leaves(splats.center, splats.scale, grid, threads)
-        arrivals = Arrivals(n, joining(index, joins, lambda some: leaf_rows(some, splats, grid.space)))
+        arrivals = Arrivals(n, joining(index, joins, lambda some, rows: fill_rows(some, splats, grid.space, rows)))
         tree = VoxelTree(n, n, grid.space)
         ((_, root),) = grow(tree, grid, arrivals, None, progress)
         final = tree.finish(root, index, splats)

@@ -18,7 +18,7 @@ from ..support.progress import Progress
 from .kernels.sort import Nodes, sort_by_cell
 from .margins import Margins
 from .voxel_grid import VoxelGrid
-from .voxel_tree import Rows, VoxelTree
+from .voxel_tree import Joining, Rows, VoxelTree
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,13 +27,13 @@ class Arrivals:
 
     Attributes:
         splats: number of splats that join at the level of their size.
-        joining: rows of those splats by level, each along the curve.
+        joining: those splats by level, each along the curve.
         waiting: rows of other nodes by the level that they wait for; all nodes in a cell of the level below come from
             one stage, in their order.
     """
 
     splats: int
-    joining: dict[int, Rows]
+    joining: dict[int, Joining]
     waiting: dict[int, Rows] = field(default_factory=dict)
 
 
@@ -65,10 +65,9 @@ def grow(
             if margins.are_closed:
                 break
         if level in arrivals.joining:
-            rows = arrivals.joining.pop(level)
-            joined += len(rows)
-            active = tree.join(active, rows)
-            del rows
+            new = arrivals.joining.pop(level)
+            joined += len(new)
+            active = tree.join(active, new)
             progress("building", joined, arrivals.splats, "splat")
         if margins is not None:
             active, outside = margins.split(active, tree.nodes)
@@ -79,7 +78,8 @@ def grow(
                 active = tree.merge_cells(level, *_by_cell(tree, grid, level, active), grid.largest_trace(level))
         level += 1
     left.append((level, tree.take(active)))
-    return left + list(arrivals.joining.items()) + list(arrivals.waiting.items())
+    unjoined = [(level, splats.rows()) for level, splats in arrivals.joining.items()]
+    return left + unjoined + list(arrivals.waiting.items())
 
 
 def _by_cell(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,7 +11,7 @@ from .kernels.node_rows import Space, fill_leaf_rows
 from .kernels.pair_cost import WIDTH
 from .kernels.sort import Nodes, sort_by_key
 from .voxel_grid import VoxelGrid
-from .voxel_tree import Offsets, Rows
+from .voxel_tree import FillRows, Joining, Offsets, Rows
 
 
 def sorted_leaves(
@@ -37,18 +35,18 @@ def sorted_leaves(
     return sort_by_key(keys, order, bits, threads)[1], ends
 
 
-def joining(index: Nodes, ends: Offsets, of: Callable[[Nodes], FloatArray]) -> dict[int, Rows]:
-    """Rows of splats by level.
+def joining(index: Nodes, ends: Offsets, fill: FillRows) -> dict[int, Joining]:
+    """The splats of each level that has some.
 
     Args:
-        index: (n,) the splat of each row; rows are numbered in this order.
+        index: (n,) the splat of each node; nodes are numbered in this order.
         ends: where each level ends.
-        of: returns the node rows of splats.
+        fill: fills the node rows of splats.
     """
     found, begin = {}, 0
     for level, end in enumerate(ends.tolist()):
         if end > begin:
-            found[level] = numbered(of(index[begin:end]), begin)
+            found[level] = Joining(index[begin:end], begin, fill)
         begin = end
     return found
 
@@ -61,10 +59,15 @@ def numbered(nodes: FloatArray, number: int) -> Rows:
 
 def leaf_rows(index: Nodes, splats: Splats, space: Space) -> FloatArray:
     """(n, WIDTH) node rows of some splats."""
-    rows, size = np.empty((len(index), WIDTH), np.float32), np.empty(len(index), np.float32)
-    columns = SplatColumns(splats.center, splats.scale, splats.quat_xyzw, splats.opacity)
-    fill_leaf_rows(index, columns, splats.rgb, space, rows, size)
+    rows = np.empty((len(index), WIDTH), np.float32)
+    fill_rows(index, splats, space, rows)
     return rows
+
+
+def fill_rows(index: Nodes, splats: Splats, space: Space, rows: FloatArray) -> None:
+    """Fills the node rows of some splats."""
+    columns = SplatColumns(splats.center, splats.scale, splats.quat_xyzw, splats.opacity)
+    fill_leaf_rows(index, columns, splats.rgb, space, rows, np.empty(len(index), np.float32))
 
 
 def by_level(levels: NDArray[np.int32]) -> list[tuple[int, Nodes]]:

@@ -32,6 +32,9 @@ MOVED = 1 << 14
 
 Offsets = NDArray[np.int64]
 
+#: Fills the node rows of splats, of which it gets the indices and the (n, WIDTH) rows.
+FillRows = Callable[[Nodes, FloatArray], None]
+
 
 @dataclass(frozen=True, eq=False)
 class Rows:
@@ -72,10 +75,41 @@ class Rows:
             column = getattr(self, name)
             column.resize((size, *column.shape[1:]), refcheck=False)
 
-    def put(self, start: int, rows: Rows) -> None:
-        """Overwrites rows from `start` on."""
-        part = slice(start, start + len(rows))
-        self.node[part], self.number[part], self.count[part] = rows.node, rows.number, rows.count
+    def put(self, into: Rows, start: int) -> None:
+        """Writes these rows over others, from `start` on."""
+        part = slice(start, start + len(self))
+        into.node[part], into.number[part], into.count[part] = self.node, self.number, self.count
+
+
+@dataclass(frozen=True, eq=False)
+class Joining:
+    """Splats that join at a level, whose rows are not made before.
+
+    Attributes:
+        index: (n,) uint32 the splat of each node.
+        number: of the first node; the others follow.
+        fill: fills the node rows of splats.
+    """
+
+    index: Nodes
+    number: int
+    fill: FillRows
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+    def put(self, into: Rows, start: int) -> None:
+        """Writes their rows over others, from `start` on."""
+        part = slice(start, start + len(self))
+        self.fill(self.index, into.node[part])
+        into.number[part] = np.arange(self.number, self.number + len(self), dtype=np.uint32)
+        into.count[part] = 0
+
+    def rows(self) -> Rows:
+        """Their rows."""
+        rows = Rows.empty(len(self))
+        self.put(rows, 0)
+        return rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,9 +150,10 @@ class VoxelTree:
             keys: returns the keys of a batch, by the level and the rows of the nodes made; None if nobody wants them.
         """
         self.leaves, self.batches, self.total, self._space, self._keys = leaves, list[Batch](), 0, space, keys
-        self._rows, self._used = Rows.empty(0), 0
-        # Twice the nodes are the most that there will be; memory that is not written to is not taken.
+        # Twice the nodes are the most that there will be; memory that is not written to is not taken. So much room is
+        # enough for the rows, too: half of them for what the others are merged into.
         size = 2 * given
+        self._rows, self._used, self._awaited = Rows.empty(size), 0, given
         self._center, self._scale = np.empty((size, 3), np.float32), np.empty((size, 3), np.float32)
         self._quat, self._opacity = np.empty((size, 4), np.float32), np.empty(size, np.float32)
         self._weight, self._number = np.empty(size, np.float64), np.empty(size, np.uint32)
@@ -133,10 +168,11 @@ class VoxelTree:
         """Copies of some of them."""
         return self._rows.take(nodes)
 
-    def join(self, active: Nodes, rows: Rows) -> Nodes:
+    def join(self, active: Nodes, rows: Rows | Joining) -> Nodes:
         """Adds nodes; returns where the active ones and they are. Others may be forgotten."""
         active = self.tidy(active, len(rows))
-        self._rows.put(self._used, rows)
+        rows.put(self._rows, self._used)
+        self._awaited -= len(rows)
         added = np.arange(self._used, self._used + len(rows), dtype=np.uint32)
         self._used += len(rows)
         return np.concatenate([active, added])
@@ -146,26 +182,22 @@ class VoxelTree:
         need, size = len(active) + 2 * more, len(self._rows)
         if self._used + need <= size and self._used <= 2 * len(active) + more:
             return active
-        if len(active) + need <= size:
-            active = self._forget(active)
-            if size > 2 * (self._used + need):
-                self._rows.shrink(self._used + need)
-            return active
-        kept = Rows.empty(2 * (len(active) + need))
-        for name in Rows.__dataclass_fields__:
-            np.take(getattr(self._rows, name), active, axis=0, out=getattr(kept, name)[: len(active)], mode="clip")
-        self._rows, self._used = kept, len(active)
-        return np.arange(len(active), dtype=np.uint32)
+        active = self._forget(active)
+        enough = 2 * (len(active) + self._awaited)
+        if size > 2 * enough:
+            self._rows.shrink(enough)
+        return active
 
     def _forget(self, active: Nodes) -> Nodes:
-        """Moves the active nodes together, where there is no memory for two copies; returns where they are."""
+        """Moves the active nodes together, in place; returns where they are."""
         kept = np.zeros(self._used, np.bool_)
         kept[active] = True
         order = np.flatnonzero(kept).astype(np.uint32)
         place = np.empty(self._used, np.uint32)
         place[order] = np.arange(len(order), dtype=np.uint32)
         for part in blocks_of(len(order), MOVED):
-            self._rows.put(part.start, self._rows.take(order[part]))  # from there or from further behind
+            if order[part][-1] >= part.stop:  # else they are there
+                self._rows.take(order[part]).put(self._rows, part.start)
         self._used = len(order)
         return place[active]
 

@@ -11,7 +11,6 @@ import functools
 import io
 import posixpath
 import re
-import tempfile
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -135,6 +134,8 @@ class Address:
 
         It is made as a temporary file on this machine first, so that nothing is sent of what fails halfway.
         """
+        import tempfile  # as every command loads this module
+
         with tempfile.NamedTemporaryFile(prefix="sparklod-") as file:
             size = sum(map(file.write, pieces))
             file.flush()

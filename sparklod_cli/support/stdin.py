@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import functools
-import shutil
 import sys
-import tempfile
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -37,6 +35,9 @@ def spooled() -> BinaryIO:
 
 @functools.lru_cache(maxsize=1)
 def _copy_of(stream: Any) -> BinaryIO:
+    import shutil  # which take milliseconds, and every command loads this module
+    import tempfile
+
     file: BinaryIO = tempfile.TemporaryFile(prefix="sparklod-")  # noqa: SIM115
     shutil.copyfileobj(stream.buffer, file, 1 << 20)
     return file

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import math
 import re
-from fractions import Fraction
 
 #: Decimal prefixes, in either case: a lower-case m cannot sensibly mean a thousandth of a bit.
 PREFIXES = {"": 1, "k": 10**3, "m": 10**6, "g": 10**9}
 
 NUMBER = r"(?P<number>(?:[0-9]{1,30}(?:\.[0-9]{0,30})?|\.[0-9]{1,30})(?:[eE][+-]?[0-9]{1,2})?)"
-COUNT = re.compile(rf"{NUMBER}\s*(?P<prefix>[kKmMgG]?)")
-SIZE = re.compile(rf"{NUMBER}\s*(?:(?P<prefix>[kKmMgG]?)(?P<binary>i?)(?:B|(?i:bytes?))?)")
-LATENCY = re.compile(rf"{NUMBER}\s*(?P<unit>ms|s)")
-BANDWIDTH = re.compile(rf"{NUMBER}\s*(?P<prefix>[kKmMgG]?)(?P<unit>(?i:bits?|bytes?)|b|B)(?:/s|ps)?")
+COUNT = rf"{NUMBER}\s*(?P<prefix>[kKmMgG]?)"
+SIZE = rf"{NUMBER}\s*(?:(?P<prefix>[kKmMgG]?)(?P<binary>i?)(?:B|(?i:bytes?))?)"
+LATENCY = rf"{NUMBER}\s*(?P<unit>ms|s)"
+BANDWIDTH = rf"{NUMBER}\s*(?P<prefix>[kKmMgG]?)(?P<unit>(?i:bits?|bytes?)|b|B)(?:/s|ps)?"
 
 
 def count_of(count: int, noun: str, plural: str | None = None) -> str:
@@ -37,7 +36,7 @@ def parse_bandwidth(text: str) -> float:
     Raises:
         ValueError: the text is not a bandwidth above 0.
     """
-    match = BANDWIDTH.fullmatch(text.strip())
+    match = re.fullmatch(BANDWIDTH, text.strip())
     if match is None:
         raise ValueError(
             f"{text!r} is not a bandwidth: a number and a unit, such as 20Mbit (bits/s) or 2.5MB/s (bytes/s)"
@@ -57,7 +56,7 @@ def parse_latency(text: str) -> float:
     Raises:
         ValueError: the text is not a latency.
     """
-    match = LATENCY.fullmatch(text.strip())
+    match = re.fullmatch(LATENCY, text.strip())
     if match is None:
         raise ValueError(f"{text!r} is not a latency: a number, 0 or more, and a unit, such as 60ms or 0.1s")
     value = float(match["number"])
@@ -70,7 +69,9 @@ def parse_count(text: str) -> int:
     Raises:
         ValueError: the text is not a count.
     """
-    match = COUNT.fullmatch(text.strip())
+    from fractions import Fraction  # which takes milliseconds, and every command loads this module
+
+    match = re.fullmatch(COUNT, text.strip())
     value = Fraction(match["number"]) * PREFIXES[match["prefix"].lower()] if match else Fraction(-1, 2)
     if value.denominator != 1:
         raise ValueError(f"{text!r} is not a count: a whole number, such as 500000, 500k or 1.5M")
@@ -83,7 +84,9 @@ def parse_size(text: str) -> int:
     Raises:
         ValueError: the text is not a size.
     """
-    match = SIZE.fullmatch(text.strip())
+    from fractions import Fraction
+
+    match = re.fullmatch(SIZE, text.strip())
     value = Fraction(-1, 2)
     if match is not None and (match["prefix"] or not match["binary"]):
         power = PREFIXES[match["prefix"].lower()]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import io
 import json
 import math
@@ -28,6 +27,8 @@ FORMULAS = ("=", "+", "-", "@", "\t", "\r", "\n")
 
 def near(name: str, known: Iterable[str], *, cutoff: float = 0.6) -> str:
     """The end of an error about an unknown name: ", did you mean ...?"; empty if no known name is similar."""
+    import difflib  # which takes a millisecond, and is needed after a mistake only
+
     found = difflib.get_close_matches(name, list(known), n=3, cutoff=cutoff)
     return f", did you mean {' or '.join(found)}?" if found else ""
 

@@ -53,7 +53,8 @@ def test_many_files_are_not_open_at_a_time(tmp_path: Path) -> None:
 BASELINE = """
 import re, sys
 from sparklod_cli.support import interrupts
-from sparklod_cli.cli import run
+from sparklod_cli.cli import one_thread_of_blas, run
+one_thread_of_blas()
 interrupts.handle()  # starts a thread, whose stack and heap count
 code = run(sys.argv[1:])
 text = open("/proc/self/status").read()

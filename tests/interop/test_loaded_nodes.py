@@ -26,9 +26,12 @@ from sparklod_cli.model.splats import FloatArray
 from sparklod_cli.scenes.loaded_scene import nodes_of
 from sparklod_cli.scenes.reading import read_scenes
 from tests.conftest import FIXTURES, real_scene
+from tests.fittings import StandIn
+from tests.fittings import stand_in as stand_in
 from tests.interop.spark import NODE, Spark
+from tests.interop.test_paged_traversal import Paged
 from tests.interop.test_rad import chunks_of
-from tests.interop.test_traversal import BUDGETS, FOV_Y, FOVEATIONS, LIMITS, LOD_SCALES, SPARKS_CONES, cameras
+from tests.interop.test_traversal import BUDGETS, FOV_Y, FOVEATIONS, LIMITS, LOD_SCALES, SPARKS_CONES, Tree, cameras
 from tests.interop.ties import Words
 from tests.references.dynamic_cuts import dynamic_limit
 from tests.scenes import random_splats
@@ -94,6 +97,28 @@ def check_cuts(spark: Spark, path: Path, precision: str, views: int) -> None:
         np.testing.assert_array_equal(ours.indices()[0], np.sort(theirs.indices[0]))
 
 
+def check_paged_cuts(spark: Spark, path: Path, tmp_path: Path, precision: str, frames: int) -> None:
+    """Asserts that cuts of a file of which chunks are missing are those of Spark, which loads the chunks itself."""
+    scenes = read_scenes([Instance(path, "tree")], precision=precision, threads=2)
+    chunk, loaded = tmp_path / "chunk.radc", []
+    for data, _, _ in chunks_of(path):
+        chunk.write_bytes(data)
+        loaded.append(spark.load_words(PAGES[precision], chunk)["lodTree"])
+    tree = Tree.of(np.concatenate(loaded))
+    paged = Paged(spark, [tree], pages=len(loaded) + 1)
+    paged.forest = scenes.forest
+    rng = np.random.default_rng(frames)
+    reasons = set()
+    for number, camera in enumerate(cameras(tree.nodes, frames, seed=len(loaded))):
+        resident = rng.random(len(loaded)) < rng.choice([0.4, 0.7])
+        resident[0] = True
+        paged.keep(resident, rng)
+        instance = TreeInstance(0, np.eye(4), LOD_SCALES[number % 5], FOVEATIONS[number % len(FOVEATIONS)])
+        for budget in (1_000, 20_000, 150_000):
+            reasons.add(paged.check([instance], camera, budget, LIMITS[number % len(LIMITS)]).reason)
+    assert "missing" in reasons
+
+
 def check_dynamic_cuts(spark: Spark, path: Path, precision: str, views: int) -> None:
     """Asserts that a dynamic cut of Spark is the cut of all nodes above the pixel scale at which it ends."""
     scenes = read_scenes([Instance(path, "tree")], precision=precision, threads=2)
@@ -153,6 +178,32 @@ def test_files_and_their_cuts_are_those_of_spark(
         assert check_pages(spark, path, tmp_path) == -(-len(read_scene(path)) // CHUNK_NODES)
 
 
+@pytest.mark.parametrize("precision", PAGES)
+@pytest.mark.parametrize("name", ["playbot-125k.ply", "meadow.sog"])
+def test_cuts_of_files_with_missing_chunks_are_those_of_spark(
+    spark: Spark, folder: Path, tmp_path: Path, name: str, precision: str
+) -> None:
+    check_paged_cuts(spark, baked(folder, name, "quick", ".rad"), tmp_path, precision, frames=12)
+
+
+@pytest.mark.parametrize("suffix", [".spz", ".rad"])
+def test_refined_trees_and_their_cuts_are_those_of_spark(
+    spark: Spark, tmp_path: Path, stand_in: StandIn, suffix: str
+) -> None:
+    """Refined as they stand in their file, so that scales come from no code before they are written again."""
+    made, refined = tmp_path / f"made{suffix}", tmp_path / f"refined{suffix}"
+    source = FIXTURES / "demo.ply"
+    assert run(["build-lod", str(source), "--method", "quality", "--quiet", "-o", str(made)]) == 0
+    assert run(["build-lod", str(made), "--refine", "--quiet", "-o", str(refined)]) == 0
+    assert len(stand_in.calls) == 1
+    assert refined.read_bytes() != made.read_bytes()
+    check_whole(spark, refined)
+    for precision in LAYOUTS:
+        check_cuts(spark, refined, precision, views=8)
+    if suffix == ".rad":
+        assert check_pages(spark, refined, tmp_path) == 1
+
+
 @pytest.mark.parametrize("precision", LAYOUTS)
 @pytest.mark.parametrize("suffix", [".spz", ".rad"])
 def test_dynamic_cuts_are_those_of_spark(spark: Spark, folder: Path, suffix: str, precision: str) -> None:
@@ -165,6 +216,8 @@ def test_a_file_of_sparks_native_program_and_its_cuts_are_those_of_spark(spark: 
     for precision in LAYOUTS:
         check_cuts(spark, path, precision, views=8)
     assert check_pages(spark, path, tmp_path) == 3
+    for precision in PAGES:
+        check_paged_cuts(spark, path, tmp_path, precision, frames=8)
 
 
 def test_chunk_files_of_sparks_native_program_are_those_of_spark(spark: Spark, tmp_path: Path) -> None:

@@ -42,16 +42,16 @@ HOPELESS = (FormatError, InvalidSplatsError)
 Forget = Callable[[Store, list[str]], None]
 
 
-def scratch_folder(target: Place, recipe: Recipe, parent: Place | None) -> Place:
+def scratch_folder(target: Place, recipe: Callable[[], Recipe], parent: Place | None) -> Place:
     """The scratch folder of a bake: beside its output, or in a folder for those of several bakes.
 
     Args:
         target: the output. That of standard output (-) is among the system's temporary files.
-        recipe: of the output.
+        recipe: makes that of the output, where it is needed.
         parent: the folder for several; None for that of the output.
     """
     if target == DASH:
-        return (parent or Path(tempfile.gettempdir())) / f"standard-output-{recipe.digest[:8]}{SUFFIX}"
+        return (parent or Path(tempfile.gettempdir())) / f"standard-output-{recipe().digest[:8]}{SUFFIX}"
     if parent is None:
         return target.parent / f"{_shortened(target.name)}{SUFFIX}"
     name = os.path.realpath(target) if isinstance(target, Path) else target.url

@@ -204,30 +204,35 @@ def merge_span(nodes, is_first, rows, largest, begin, end, made, owner, row):
     size = end - begin
     lanes = np.empty((WIDTH, size + PADDING), np.float32)
     a, b = np.ones(WIDTH * GROUP, np.float32), np.ones(WIDTH * GROUP, np.float32)
-    cell, place, kept = np.empty(size, np.int32), np.empty(size, np.int32), np.empty(size, np.int64)
-    first, second = np.empty(size // 2, np.int64), np.empty(size // 2, np.int64)
-    cost, best, at = np.empty(size, np.float32), np.empty(size, np.float32), np.empty(size, np.int32)
-    slot, joined, members = np.arange(size), np.arange(size), np.ones(size, np.int64)
+    cell, place, at = np.empty(size, np.int32), np.empty(size, np.int32), np.empty(size, np.int32)
+    cost, best = np.empty(size, np.float32), np.empty(size, np.float32)
+    # Lists are filled without branches, which nobody can predict: what is not to stay is written, and then overwritten.
+    # So they have room for one more. Indices are unsigned, as numba asks of signed ones whether they are negative.
+    first, second = np.empty(size + 1, np.uint64), np.empty(size + 1, np.uint64)
+    kept, done, ends = np.empty(size + 1, np.uint64), np.empty(size + 1, np.uint64), np.empty(size + 1, np.uint64)
+    slot, joined, members = np.empty(size, np.uint64), np.empty(size, np.uint64), np.ones(size, np.int64)
+    is_dead = np.empty(size, np.uint8)
     number = np.int32(-1)
     for i in range(size):
         number += np.int32(is_first[begin + i])
-        cell[i] = number
+        cell[i], slot[i], joined[i] = number, i, i
+        node = nodes[begin + i]
         for column in range(WIDTH):
-            lanes[column, i] = rows[nodes[begin + i], column]
-    merges = np.empty(number + 1, np.int32)  # of each cell, in a round
+            lanes[column, i] = rows[node, column]
+    merges = np.empty(number + 1, np.uint8)  # whether a cell has merges in a round
     count, families = size, begin // 2
     for turn in range(ROUNDS):
+        run, before = np.int32(0), np.int32(-1)
         for i in range(count):
-            place[i] = place[i - 1] + 1 if i > 0 and cell[i] == cell[i - 1] else 0
-            merges[cell[i]] = 0
+            run = np.int32(run + 1) if cell[i] == before else np.int32(0)
+            before = cell[i]
+            place[i] = run
         find_partners_in_cells(lanes, count, cell, place, largest, cost, best, at)
-        pairs = 0
+        pairs = np.int64(0)
         for i in range(count):
-            j = i + at[i] - place[i]
-            if at[i] > place[i] and at[j] == place[i]:
-                first[pairs], second[pairs] = i, j
-                pairs += 1
-                merges[cell[i]] += 1
+            j = max(i + at[i] - place[i], 0)
+            first[pairs], second[pairs] = i, j
+            pairs += (at[i] > place[i]) & (at[j] == place[i])
         for start in range(0, pairs, GROUP):
             some = min(GROUP, pairs - start)
             for column in range(WIDTH):
@@ -238,37 +243,41 @@ def merge_span(nodes, is_first, rows, largest, begin, end, made, owner, row):
             for column in range(WIDTH):
                 for k in range(some):
                     lanes[column, first[start + k]] = a[column * GROUP + k]
-        for i in range(count):
-            kept[i] = i
+        merges[:] = 0
+        is_dead[:count] = 0
         for pair in range(pairs):
             i, j = first[pair], second[pair]
             joined[slot[j]] = slot[i]
             members[slot[i]] += members[slot[j]]
-            kept[j] = -1
-        left = 0
+            is_dead[j] = 1
+            merges[np.uint64(cell[i])] = 1
+        left = finished = np.int64(0)
+        goes_on = np.uint8(turn < ROUNDS - 1)
         for i in range(count):
-            if kept[i] < 0:
-                continue
-            if merges[cell[i]] > 0 and turn < ROUNDS - 1:
-                cell[left], slot[left], kept[left] = cell[i], slot[i], i
-                left += 1
-                continue
-            # Without a merge, its cell would not change in another round.
+            lives, again = np.uint8(1) - is_dead[i], merges[np.uint64(cell[i])] & goes_on
+            own = slot[i]
+            kept[left], done[finished], ends[finished] = i, i, own
+            cell[left], slot[left] = cell[i], own
+            left += lives & again
+            finished += lives & (np.uint8(1) - again)
+        # Those that are done: without a merge, their cells would not change in another round.
+        for k in range(finished):
+            i, own = done[k], ends[k]
             trace = lanes[COVARIANCE, i] + lanes[COVARIANCE + 1, i] + lanes[COVARIANCE + 2, i]
-            many = members[slot[i]]
+            many = members[own]
             if many >= LEAST_CHILDREN or (many > 1 and trace <= PATIENCE * largest):
                 finish_row(lanes, i, rows[made + families])
-                row[begin + slot[i]] = made + families
+                row[begin + np.int64(own)] = made + families
                 families += 1
             else:
-                members[slot[i]] = 0
+                members[own] = 0
         for column in range(WIDTH):
             for i in range(left):
                 lanes[column, i] = lanes[column, kept[i]]
         count = left
     for i in range(size):
         joined[i] = joined[joined[i]]  # final, as it comes before
-        owner[begin + i] = begin + (joined[i] if members[joined[i]] > 0 else i)
+        owner[begin + i] = begin + (np.int64(joined[i]) if members[joined[i]] > 0 else i)
 
 
 @kernel(parallel=True)

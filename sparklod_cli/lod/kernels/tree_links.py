@@ -11,11 +11,14 @@ from .geometry import ellipsoid_area
 #: can number up to the square of the nodes. Chosen.
 MAX_LINKS = 4
 
+#: Upper bits of limits, as float32, by which nodes are counted.
+LIMIT_BITS = 16
+
 #: Least surface area of a child, so that children whose areas are not float64 numbers above 0 count equally. Chosen.
 LEAST_AREA = 1e-300
 
 
-@kernel()
+@kernel(nogil=True)
 def find_depths(child_count, child_start, size):
     """Depths of the nodes that are reachable from the root.
 
@@ -71,7 +74,7 @@ def find_depths(child_count, child_start, size):
     return depth, limit
 
 
-@kernel()
+@kernel(nogil=True)
 def find_parents(child_count, child_start):
     """Parents of all nodes.
 
@@ -147,7 +150,7 @@ def add_weighted(parent, size, weight, sums, weights):
             sums[parent[node]] += weight[node] * size[node]
 
 
-@kernel()
+@kernel(nogil=True)
 def find_cycles(parent, depth):
     """Nodes on a cycle or below one: parents lead from them neither to the root nor to a node without a parent.
 
@@ -175,7 +178,7 @@ def find_cycles(parent, depth):
     return state == cycle
 
 
-@kernel()
+@kernel(nogil=True)
 def sum_by_depth(depth, child_count, size):
     """Numbers of nodes and sums of their sizes by depth; nodes of depth -1 are left out of both.
 
@@ -201,3 +204,67 @@ def sum_by_depth(depth, child_count, size):
             leaves[depth[node]] += child_count[node] == 0
             logs[depth[node]] += np.log(size[node])
     return nodes, leaves, logs, children
+
+
+@kernel(nogil=True)
+def count_limits(child_count, child_start, limit, chunk_bits, counts):
+    """Counts inner nodes by their limits.
+
+    Args:
+        child_count, child_start: (N,) of any unsigned type.
+        limit: (N,) float32, 0 or more.
+        chunk_bits: a chunk has 2 ** chunk_bits nodes.
+        counts: (1 << LIMIT_BITS,) int64, to which nodes with limits above 0 are added, by the upper bits of these.
+
+    Returns:
+        number of inner nodes, whatever their limit, whose children lie in more than one chunk.
+    """
+    bits = limit.view(np.uint32)
+    split = 0
+    for node in range(len(child_count)):
+        if child_count[node] > 0:
+            first = np.int64(child_start[node])
+            split += first >> chunk_bits != (first + np.int64(child_count[node]) - 1) >> chunk_bits
+            if limit[node] > 0:
+                counts[bits[node] >> np.uint32(32 - LIMIT_BITS)] += 1
+    return split
+
+
+@kernel(nogil=True)
+def gather_large(child_count, limit, least, nodes):
+    """Fills `nodes` (int64) with the inner nodes whose limits are above 0 and `least` or more, ascending."""
+    found = 0
+    for node in range(len(child_count)):
+        if child_count[node] > 0 and limit[node] > 0 and limit[node] >= least:
+            nodes[found] = node
+            found += 1
+
+
+@kernel(nogil=True)
+def mark_small(child_count, child_start, size, ratio, marks):
+    """Marks nodes whose size is less than `ratio` times that of one of their children, of finite size.
+
+    Args:
+        child_count, child_start: (N,) of any unsigned type.
+        size: (N,) float32.
+        ratio: float64.
+        marks: (N,) bool, zeros, filled.
+
+    Returns:
+        number of marked nodes.
+    """
+    count, marked, steps = len(child_count), 0, 0
+    for node in range(count):
+        start = np.int64(child_start[node])
+        end = min(count, start + np.int64(child_count[node]))
+        steps += max(0, end - start)
+        if steps > MAX_LINKS * count:
+            marks[node] = start < end  # links of a broken tree may be too many to be followed
+        most = np.float32(0)
+        for child in range(start, start if marks[node] else end):
+            if most < size[child] < np.inf:
+                most = size[child]
+        if np.float64(size[node]) < ratio * np.float64(most):
+            marks[node] = True
+        marked += marks[node]
+    return marked

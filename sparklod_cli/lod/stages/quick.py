@@ -67,7 +67,7 @@ def advance(
     del pending
     with threads_for(len(given["level"])) as threads:
         pick, joins, arrivals, leaves = _arrivals(given, plan, threads)
-        del given["rows"]  # the arrivals have them; frees the memory if the caller has no reference
+        del given["rows"]  # the arrivals have them
         tree = VoxelTree(len(pick), leaves, plan.space, partial(_keys, plan))
         margins = Margins(plan, region.low, region.high) if region else None
         left = grow(tree, plan, arrivals, margins, progress)
@@ -128,7 +128,12 @@ def _arrivals(given: Mapping[str, NDArray[Any]], grid: VoxelGrid, threads: int) 
     number = np.empty(len(old), np.uint32)  # among the survivors, of each in the order of the stages
     number[np.searchsorted(place, old)] = np.arange(len(old), dtype=np.uint32)
     waiting = {level: survivors.take(number[at]) for level, at in by_level(given["level"][place])}
-    arrivals = Arrivals(len(new), joining(new, joins, lambda some: given["rows"][some]), waiting)
+    rows: FloatArray = given["rows"]
+
+    def fill(some: Nodes, out: FloatArray) -> None:
+        np.take(rows, some, axis=0, out=out, mode="clip")
+
+    arrivals = Arrivals(len(new), joining(new, joins, fill), waiting)
     return np.concatenate([new, old]), joins, arrivals, len(new) + merged
 
 

@@ -212,10 +212,10 @@ def test_a_folder_that_cannot_be_made_is_an_error(tmp_path: Path) -> None:
 
 def test_scratch_folders_have_names_of_their_own(tmp_path: Path) -> None:
     target = tmp_path / "web" / "a.spz"
-    assert scratch_folder(target, A, None) == tmp_path / "web" / f"a.spz{SUFFIX}"
+    assert scratch_folder(target, lambda: A, None) == tmp_path / "web" / f"a.spz{SUFFIX}"
     parent = tmp_path / "fast"
-    names = {scratch_folder(tmp_path / folder / "a.spz", A, parent) for folder in ("web", "www")}
+    names = {scratch_folder(tmp_path / folder / "a.spz", lambda: A, parent) for folder in ("web", "www")}
     assert len(names) == 2
     assert {name.parent for name in names} == {parent}
-    assert scratch_folder(DASH, A, parent).parent == parent
-    assert scratch_folder(DASH, A, None) == scratch_folder(DASH, A, None)
+    assert scratch_folder(DASH, lambda: A, parent).parent == parent
+    assert scratch_folder(DASH, lambda: A, None) == scratch_folder(DASH, lambda: A, None)

@@ -28,7 +28,7 @@ def test_no_name_ends_an_annotation_or_begins_a_command(
     shutil.copy(BROKEN, path)
     monkeypatch.setitem(CODES, "tree.orphan", CODES["tree.orphan"])
     monkeypatch.setattr(
-        "sparklod_cli.inspection.tree._link_findings",
+        "sparklod_cli.inspection.tree.link_findings",
         lambda *_: [Finding("tree.orphan", "100% of it\r\nis: lost, all")],
     )
     monkeypatch.chdir(tmp_path)

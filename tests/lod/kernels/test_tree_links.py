@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from random import Random
 
 import numpy as np
 import pytest
@@ -12,11 +13,15 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from sparklod_cli.lod.kernels.tree_links import (
+    LIMIT_BITS,
     MAX_LINKS,
     add_child_sizes,
+    count_limits,
     find_cycles,
     find_depths,
     find_parents,
+    gather_large,
+    mark_small,
     sum_by_depth,
 )
 from sparklod_cli.model.gaussian import spark_size
@@ -185,3 +190,38 @@ def test_the_kernels_give_the_same_without_compilation() -> None:
         check=False,
     )
     assert done.returncode == 0, done.stdout
+
+
+@given(ANY, st.integers(0, 3))
+def test_inner_nodes_are_counted_and_gathered_by_their_limits(links: Links, chunk_bits: int) -> None:
+    count, start, size = arrays(links)
+    _, limit = find_depths(count, start, size)
+    counts = np.zeros(1 << LIMIT_BITS, np.int64)
+    split = count_limits(count, start, limit, chunk_bits, counts)
+    chunks = [{child >> chunk_bits for child in (first, first + many - 1)} for many, first in links if many]
+    assert split == sum(len(each) > 1 for each in chunks)
+    inner = [node for node in range(len(links)) if count[node] and limit[node] > 0]
+    buckets = [int(limit[node].view(np.uint32)) >> (32 - LIMIT_BITS) for node in inner]
+    assert np.array_equal(counts, np.bincount(buckets, minlength=len(counts)))
+    for least in limit:
+        expected = [node for node in inner if limit[node] >= least]
+        nodes = np.empty(len(expected), np.int64)
+        gather_large(count, limit, least, nodes)
+        assert nodes.tolist() == expected
+
+
+@given(ANY, st.sampled_from([1 / 3, 1.0, 2.0]), st.randoms(use_true_random=False))
+def test_nodes_much_smaller_than_a_child_are_marked(links: Links, ratio: float, random: Random) -> None:
+    """All of them, and if links are too many to be followed, perhaps others."""
+    count, start, size = arrays(links)
+    size[random.randrange(len(size))] = random.choice([np.nan, np.inf, -1, 0])
+    marks = np.zeros(len(links), np.bool_)
+    marked = mark_small(count, start, size, ratio, marks)
+    children = [
+        [float(size[child]) for child in each if 0 < size[child] < np.inf] for each in tree_links.links_of(count, start)
+    ]
+    expected = np.array([own < ratio * max(each, default=0.0) for own, each in zip(size, children, strict=True)])
+    assert marked == marks.sum()
+    assert marks[expected].all()
+    if followed(links) <= MAX_LINKS * len(links):
+        assert np.array_equal(marks, expected)
