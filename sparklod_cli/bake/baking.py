@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..codecs.statistics import Statistics
 from ..io import read_rgba, read_stored
 from ..lod.builders import BUILDERS
 from ..model.lod_tree import LodTree
@@ -77,6 +78,7 @@ class _Made:
         output: where it goes.
         environment: splats that are no part of the tree.
         is_ordered: its nodes are in the order of a file of the same format already.
+        counted: statistics of its leaves, see `Output.check`; None where there are none.
     """
 
     built: list[tuple[Splats, LodTree]]
@@ -85,6 +87,7 @@ class _Made:
     output: Output
     environment: Splats | None = None
     is_ordered: bool = False
+    counted: Statistics | None = None
 
 
 def bake(
@@ -166,7 +169,8 @@ def bake(
                 nodes, tree = taken(built, order, child_start)
             clock.end("arrange")
         environment = made.environment if environment is None else environment
-        written = made.output.write(Scene(nodes, tree, antialiased), environment, clock, threads, progress)
+        counted = made.counted if fitting is None else None
+        written = made.output.write(Scene(nodes, tree, antialiased), environment, clock, threads, progress, counted)
     return Baked(
         **vars(written),
         format=form,
@@ -224,16 +228,17 @@ def _built(
 ) -> _Made:
     """A tree of the splats of the input."""
     scene = scenes.pop()
-    kept, dropped = settings.selection.apply(_recolored(scene.splats, settings.rgba).with_max_sh(settings.max_sh))
+    read = _recolored(scene.splats, settings.rgba).with_max_sh(settings.max_sh)
+    kept, dropped = settings.selection.apply(read, threads=threads)
     kept, far = divided(kept, settings)
     kept = transformed(kept, settings.transform)
     environment = None if far is None else transformed(far, settings.transform)
     clock.end("read")
-    output.check(Scene(kept))  # before building, so that what does not fit is said at once
+    counted = output.check(kept, threads)  # before building, so that what does not fit is said at once
     leaves = len(kept)
     # The builder frees its input as it goes, if nobody else holds it: a third of the peak.
     handed_over = [kept]
-    del scene, kept, far
+    del scene, read, kept, far
     with on_threads(threads):
         built = [settings.builder()(handed_over.pop(), progress=progress)]
         if BUILDERS[settings.method].in_bands and not output.in_chunks:
@@ -241,7 +246,7 @@ def _built(
 
             built = [banded(built)]
     clock.end("build")
-    return _Made(built, leaves, dropped, output, environment)
+    return _Made(built, leaves, dropped, output, environment, counted=counted)
 
 
 def _recolored(splats: Splats, rgba: Path | None) -> Splats:

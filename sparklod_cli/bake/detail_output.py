@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 from ..codecs.options import WriteOptions
+from ..codecs.statistics import Statistics
 from ..codecs.streamed_sog.names import ENVIRONMENT, folders_of
 from ..io import SinkTogether
 from ..io.together import Files
@@ -69,7 +70,13 @@ class DetailOutput(WholeOutput):
     made = "detail levels are made"
 
     def write(
-        self, scene: Scene, environment: Splats | None, clock: Clock, threads: int, progress: Progress
+        self,
+        scene: Scene,
+        environment: Splats | None,
+        clock: Clock,
+        threads: int,
+        progress: Progress,
+        counted: Statistics | None = None,
     ) -> WrittenTree:
         """Makes its levels and writes them."""
         from ..codecs.streamed_sog.codec import encode_files

@@ -42,8 +42,13 @@ class Output(Protocol):
     def needed(self) -> frozenset[str]:
         """The statistics of all nodes by which it is written, see `codecs.statistics`."""
 
-    def check(self, scene: Scene) -> None:
-        """Raises `FormatError` where a tree of these splats cannot be written."""
+    def check(self, splats: Splats, threads: int) -> Statistics | None:
+        """Raises `FormatError` where a tree of these splats cannot be written; statistics of them that `write` takes.
+
+        Args:
+            splats: the leaves of the tree.
+            threads: to count on.
+        """
 
     def check_statistics(self, found: Statistics) -> None:
         """As `check`, of statistics of these splats; and where it cannot be written without all nodes in memory."""
@@ -62,7 +67,13 @@ class Output(Protocol):
         """
 
     def write(
-        self, scene: Scene, environment: Splats | None, clock: Clock, threads: int, progress: Progress
+        self,
+        scene: Scene,
+        environment: Splats | None,
+        clock: Clock,
+        threads: int,
+        progress: Progress,
+        counted: Statistics | None = None,
     ) -> WrittenTree:
         """Writes a tree.
 
@@ -71,6 +82,7 @@ class Output(Protocol):
             environment: splats beside it that are always drawn, which only a Streamed SOG can hold; None without.
             clock: told of the stages.
             threads, progress: as for `bake`.
+            counted: statistics of its leaves, of `check`; None to count these, too.
         """
 
     def encoder(self, nodes: NodeStream, found: Statistics, threads: int, progress: Progress) -> Encoder:
@@ -124,7 +136,13 @@ class _Arrays(WholeOutput):
     made = "the arrays of --encoding are packed"
 
     def write(
-        self, scene: Scene, environment: Splats | None, clock: Clock, threads: int, progress: Progress
+        self,
+        scene: Scene,
+        environment: Splats | None,
+        clock: Clock,
+        threads: int,
+        progress: Progress,
+        counted: Statistics | None = None,
     ) -> WrittenTree:
         """Writes them."""
         from ..codecs.gpu import dump
@@ -170,19 +188,31 @@ class _File:
         """The same with these codes."""
         return dataclasses.replace(self, options=stored.like(self.options), stored=stored, before=before)
 
-    def check(self, scene: Scene) -> None:
+    def check(self, splats: Splats, threads: int) -> Statistics | None:
         """The codec knows."""
-        self.form.codec().settled(scene, self.options)
+        found = Statistics.of_leaves(splats, self.needed, threads=threads)
+        self.check_statistics(found)
+        return found
 
     def check_statistics(self, found: Statistics) -> None:
         """The codec knows."""
         self.form.codec().settled(found, self.options)
 
     def write(
-        self, scene: Scene, environment: Splats | None, clock: Clock, threads: int, progress: Progress
+        self,
+        scene: Scene,
+        environment: Splats | None,
+        clock: Clock,
+        threads: int,
+        progress: Progress,
+        counted: Statistics | None = None,
     ) -> WrittenTree:
         """Writes it."""
-        options: WriteOptions = self.form.codec().settled(scene, self.options)
+        if counted is None:
+            found = Statistics.of_scene(scene, self.needed, threads=threads)
+        else:
+            found = Statistics.of_tree(scene, counted, self.needed, threads=threads)
+        options: WriteOptions = self.form.codec().settled(found, self.options)
         if self.stored is None or self.before is None:
             size = self.sink(scene, options, threads=threads, progress=progress)
         else:

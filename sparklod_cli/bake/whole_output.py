@@ -6,7 +6,6 @@ from typing import NoReturn, TypeVar
 
 from ..codecs.encoder import Encoder, Get, Stored
 from ..codecs.statistics import Statistics
-from ..model.scene import Scene
 from ..model.splats import Splats
 from ..model.streams import NodeStream
 from ..support.errors import FormatError
@@ -40,7 +39,7 @@ class WholeOutput:
         """None: nothing is settled by statistics."""
         return frozenset()
 
-    def check(self, scene: Scene) -> None:
+    def check(self, splats: Splats, threads: int) -> None:
         """It holds anything."""
 
     def check_statistics(self, found: Statistics) -> None:

@@ -32,8 +32,12 @@ def faces(scale: FloatArray, blur: float) -> NDArray[np.float64]:
         scale: (N, 3) standard deviations, world units.
         blur: added to each, as a pixel does: what is far thinner than that covers no less for it.
     """
-    x, y, z = np.sqrt(np.square(scale.T.astype(np.float64)) + blur * blur)
-    return x * y + x * z + y * z
+    planes = np.array(scale.T, np.float64, order="C")
+    planes *= planes
+    planes += blur * blur
+    x, y, z = np.sqrt(planes, out=planes)
+    found: NDArray[np.float64] = x * y + x * z + y * z
+    return found
 
 
 def kept(opacity: FloatArray, scale: FloatArray, rounded: FloatArray, blur: float) -> FloatArray:
@@ -52,11 +56,11 @@ def kept(opacity: FloatArray, scale: FloatArray, rounded: FloatArray, blur: floa
     area = faces(rounded, blur)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.where(area > 0, np.clip(faces(scale, blur) / area, LEAST_GROWTH, MOST_GROWTH), 1)
-    faint = opacity <= 1
     wide = opacity.astype(np.float64)
-    most = np.maximum(wide, 1)
+    grown = np.minimum(wide * ratio, 1)
+    merged = np.flatnonzero(~(opacity <= 1))  # usually few
+    most = wide[merged]
     covered = np.log(most) + _EULER + (1 - _EULER) / most  # H(A), within 1.5 %
     slope = most / (most + 0.5)  # of H(A) by ln(A), within 4 %
-    merged = np.maximum(most * np.exp(covered * (ratio - 1) / slope), _ABOVE_1)
-    grown = np.where(faint, np.minimum(wide * ratio, 1), merged)
+    grown[merged] = np.maximum(most * np.exp(covered * (ratio[merged] - 1) / slope), _ABOVE_1)
     return np.where(ratio == 1, opacity, grown).astype(np.float32)

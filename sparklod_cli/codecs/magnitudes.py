@@ -15,8 +15,8 @@ from ..model.splats import FloatArray
 _SHIFT = 16
 _BINS = 1 << 15
 
-#: Rows that are counted at a time.
-_ROWS = 1 << 18
+#: Values that are counted at a time: they and their bins stay in the processor's cache.
+_VALUES = 1 << 17
 
 
 def _of_bins(bins: NDArray[np.uint32]) -> NDArray[np.float64]:
@@ -47,8 +47,9 @@ class Magnitudes:
     def of(cls, values: FloatArray) -> Magnitudes:
         """Counts all values of (N, ...) float32."""
         counts, lowest, highest = np.zeros(2 * _BINS, np.int64), 0.0, 0.0
-        for start in range(0, len(values), _ROWS):
-            flat = np.ascontiguousarray(values[start : start + _ROWS], np.float32).reshape(-1)
+        rows = max(1, _VALUES * len(values) // max(values.size, 1))
+        for start in range(0, len(values), rows):
+            flat = np.ascontiguousarray(values[start : start + rows], np.float32).reshape(-1)
             lowest, highest = min(lowest, float(flat.min(initial=0))), max(highest, float(flat.max(initial=0)))
             counts += np.bincount(flat.view(np.uint32) >> np.uint32(_SHIFT), minlength=2 * _BINS)
         return cls(counts[:_BINS], counts[_BINS:], lowest, highest)

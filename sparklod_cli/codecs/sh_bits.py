@@ -21,8 +21,8 @@ ALL_BITS = 8
 #: it, SH alone cost what 58 dB and more are, see docs/decisions/2026-11-22-rounding.md.
 LARGEST_ERROR = 0.009
 
-#: Splats that are counted at a time.
-_ROWS = 1 << 16
+#: Splats that are counted at a time: they and their codes stay in the processor's cache.
+_ROWS = 1 << 13
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -21,7 +22,7 @@ from .compression import Run
 from .encoder import CLAMPED, Encoded, Get, rows_of, windows_of
 from .options import WriteOptions
 from .spz_layout import ANTIALIASED, HEADER, LOD, MAGIC, Layout, column_of
-from .spz_values import to_code
+from .spz_values import opacities, sh_codes
 
 #: How streams are deflated; the others have repetitions of all kinds.
 WAYS = {
@@ -65,9 +66,12 @@ class SpzEncoder:
         for part in blocks_of(len(splats)):
             some, links = rows_of(splats, tree, part)
             is_leaf = None if links is None else links.is_leaf
-            some = to_code(some, is_leaf, bits, sh_bits, covering=self.options.covering)
+            some = dataclasses.replace(some, opacity=opacities(some, bits, covering=self.options.covering))
             for stream in streams:
-                values = np.ascontiguousarray(stream.encode(column_of(some, links, stream)))
+                if stream.name == "sh":
+                    values = sh_codes(some.sh, is_leaf, sh_bits)
+                else:
+                    values = np.ascontiguousarray(stream.encode(column_of(some, links, stream)))
                 codes[stream.name][part] = values.view(np.uint8).reshape(-1, stream.size)
         return codes | ({CLAMPED: clamps.tally(splats, self.ranges)} if self.ranges else {})
 

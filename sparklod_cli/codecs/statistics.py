@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from ..model.scene import Scene
 from ..model.sh import COEFFICIENTS
 from ..model.splats import FloatArray, Splats
+from ..support.parallel import blocks_of, ordered_map
 from .binades import Binades
 from .magnitudes import Magnitudes
 from .sh_bits import ShBytes
@@ -24,6 +25,9 @@ from .sh_bits import ShBytes
 #: What can be counted: the largest coordinate, the largest scale of each leaf, how many times as long as wide it is,
 #: the SH bytes of leaves, and the magnitudes of columns.
 ALL = frozenset(("reach", "leaf_scale", "leaf_length", "leaf_sh", "rgb", "scale", "sh"))
+
+#: Splats that a thread counts at a time. Counts take some 2 MB.
+_BLOCK = 1 << 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,9 +84,44 @@ class Statistics:
         return cls(len(splats), splats.sh_degree, leaf is not None, reach, leaf_scale, magnitudes, leaf_sh, leaf_length)
 
     @classmethod
-    def of_scene(cls, scene: Scene, needed: Collection[str] = ALL) -> Statistics:
+    def of_scene(cls, scene: Scene, needed: Collection[str] = ALL, *, threads: int = 1) -> Statistics:
         """Counts the splats of a scene."""
-        return cls.of(scene.splats, None if scene.tree is None else scene.tree.is_leaf, needed)
+        return cls._of_blocks(scene.splats, None if scene.tree is None else scene.tree.is_leaf, needed, threads)
+
+    @classmethod
+    def of_leaves(cls, splats: Splats, needed: Collection[str] = ALL, *, threads: int = 1) -> Statistics:
+        """Counts splats that will be the leaves of a tree, for `of_tree`."""
+        return cls._of_blocks(splats, np.ones(len(splats), np.bool_), needed, threads)
+
+    @classmethod
+    def of_tree(
+        cls, scene: Scene, leaves: Statistics, needed: Collection[str] = ALL, *, threads: int = 1
+    ) -> Statistics:
+        """As `of_scene`, of a tree whose leaves have been counted.
+
+        Args:
+            scene: the tree.
+            leaves: of `of_leaves`, asked for the same.
+            needed: what to count, of `ALL`.
+            threads: to count on.
+        """
+        assert scene.tree is not None
+        inner = scene.splats.take(np.flatnonzero(scene.tree.child_count))
+        return cls.merged([leaves, cls._of_blocks(inner, np.zeros(len(inner), np.bool_), needed, threads)])
+
+    @classmethod
+    def _of_blocks(
+        cls, splats: Splats, leaf: NDArray[np.bool_] | None, needed: Collection[str], threads: int
+    ) -> Statistics:
+        """As `of`, block by block."""
+
+        def count(part: slice) -> Statistics:
+            return cls.of(splats.take(part), None if leaf is None else leaf[part], needed)
+
+        found: Statistics | None = None
+        for some in ordered_map(count, blocks_of(len(splats), _BLOCK), threads):
+            found = some if found is None else cls.merged([found, some])
+        return cls.of(splats, leaf, needed) if found is None else found
 
     @classmethod
     def merged(cls, parts: Sequence[Statistics]) -> Statistics:

@@ -10,7 +10,11 @@ from numpy.typing import NDArray
 from ..model.splats import Splats, describe_invalid
 from ..support.errors import InvalidSplatsError
 from ..support.jit import threads_for
+from ..support.parallel import blocks_of, ordered_map
 from .kernels.geometry import find_bounds
+
+#: Splats that a thread looks at at a time.
+BLOCK = 1 << 15
 
 
 @dataclass(frozen=True)
@@ -42,12 +46,18 @@ def check(splats: Splats) -> Bounds:
     """
     if len(splats) == 0:
         raise InvalidSplatsError("no splat is left to build a tree of")
-    if invalid := splats.invalid():
-        raise InvalidSplatsError(f"{describe_invalid(invalid)}: see Selection.apply")
     with threads_for(len(splats)) as threads:
+        if _has_invalid(splats, threads):
+            raise InvalidSplatsError(f"{describe_invalid(splats.invalid())}: see Selection.apply")
         low, high, smallest, largest = find_bounds(splats.center, splats.scale, threads)
     check_visible(smallest, float(splats.opacity.min()))
     return Bounds(low, high, smallest, largest)
+
+
+def _has_invalid(splats: Splats, threads: int) -> bool:
+    """Whether any is invalid; blocks of them stay in the processor's cache."""
+    parts = blocks_of(len(splats), BLOCK)
+    return any(ordered_map(lambda part: bool(splats.take(part).invalid()), parts, threads))
 
 
 def check_visible(smallest: float, faintest: float = 1.0) -> None:

@@ -202,6 +202,7 @@ def _sequence(families: Families, filled: int, total: int, progress: Progress) -
         sets = [part for part in parts if part[2] > CHUNK_NODES]
         progress("arranging", filled + own - sum(nodes for _, _, nodes, _ in sets), total, "node")
     bits = (length - 1).bit_length()
+    set_of[:] = -1  # numbers of sets are none of chunks
     sort_within_chunks(np.unique(ends), families.parent, families.rank, bits, sequence, set_of, root)
     return sequence
 

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..support.errors import InvalidSplatsError
+from ..support.parallel import blocks_of, ordered_map
 from .splats import INVALID, Splats, describe_counts
 
 Vector = tuple[float, float, float]
@@ -19,6 +20,9 @@ REASONS = INVALID | {
     "low_opacity": "below --min-opacity",
     "cropped": "cropped",
 }
+
+#: Splats that a thread examines at a time: they and what is made of them stay in the processor's cache.
+EXAMINED = 1 << 15
 
 
 @dataclass(frozen=True)
@@ -66,13 +70,17 @@ class Selection:
     max_box: Vector | None = None
     within: tuple[Vector, float] | None = None
 
-    def apply(self, splats: Splats) -> tuple[Splats, dict[str, int]]:
+    def apply(self, splats: Splats, *, threads: int = 1) -> tuple[Splats, dict[str, int]]:
         """The splats that are kept, in their order, and the number dropped for each of `REASONS` that occurred.
 
         Raises:
             InvalidSplatsError: there are no splats, some are invalid without `drop_invalid`, or none is left.
         """
-        keep, tally = self.examine(splats)
+        keep, tally = np.ones(len(splats), np.bool_), Tally()
+        parts = blocks_of(len(splats), EXAMINED)
+        found = ordered_map(lambda part: self.examine(splats.take(part)), parts, threads)
+        for part, (kept, some) in zip(parts, found, strict=True):
+            keep[part], tally = kept, tally.then(some)
         self.check(tally)
         return (splats if keep.all() else splats.take(keep)), tally.dropped
 
@@ -84,7 +92,7 @@ class Selection:
         invalid = splats.invalid()
         keeps = {kind: ~mask for kind, mask in invalid.items()} | {
             "zero_opacity": splats.opacity > 0,
-            "zero_scale": splats.scale.max(axis=1, initial=0) > 0,
+            "zero_scale": np.maximum.reduce(splats.scale.T, initial=0) > 0,
             "low_opacity": splats.opacity >= self.min_opacity,
             "cropped": self._inside(splats.center),
         }

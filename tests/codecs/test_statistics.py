@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from types import ModuleType
+
 import numpy as np
 import pytest
 
-from sparklod_cli.codecs import spz
+from sparklod_cli.codecs import spz, statistics
 from sparklod_cli.codecs.options import DEFAULTS, RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import codec as rad
 from sparklod_cli.codecs.statistics import ALL, Statistics
@@ -47,6 +49,22 @@ def test_pieces_in_any_order_settle_as_the_whole(codec, sh_degree: int) -> None:
         rng.shuffle(parts)  # type: ignore[arg-type]
         found = Statistics.merged([Statistics.merged(parts[:3]), *parts[3:]])
         assert codec.settled(found, DEFAULTS) == codec.settled(scene, DEFAULTS)
+
+
+@pytest.mark.parametrize("codec", [spz, rad])
+def test_a_tree_whose_leaves_were_counted_settles_as_the_whole(
+    codec: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(statistics, "_BLOCK", 64)
+    scene, needed = tree_of(2_000, 3), codec.needed(DEFAULTS)
+    scene.splats.center[0], scene.splats.scale[0] = 3_000, 80  # the root
+    assert scene.tree is not None
+    leaves = Statistics.of_leaves(scene.splats.take(scene.tree.is_leaf), needed, threads=2)
+    found = Statistics.of_tree(scene, leaves, needed, threads=2)
+    assert (found.count, found.tree) == (len(scene), True)
+    settled = codec.settled(found, DEFAULTS)
+    assert settled == codec.settled(Statistics.of(scene.splats, scene.tree.is_leaf, needed), DEFAULTS)
+    assert settled != codec.settled(leaves, DEFAULTS)
 
 
 def test_an_array_holds_all_of_them() -> None:

@@ -153,6 +153,22 @@ def test_the_number_of_threads_changes_nothing(built: tuple[Splats, LodTree]) ->
     check_threads(lambda: arrange(*built))
 
 
+def test_chunks_are_not_taken_for_sets(built: tuple[Splats, LodTree], monkeypatch: pytest.MonkeyPatch) -> None:
+    """A thread may ask for the chunk of a parent before another has told it: the number of a set may not stand there.
+
+    Both are small numbers from 0 on, so that the order would depend, rarely, on which thread is first.
+    """
+    sort, asked = chunk_order.sort_within_chunks, []
+
+    def sort_within_chunks(*arguments: np.ndarray) -> None:
+        asked.append(int(arguments[5].max()))
+        sort(*arguments)
+
+    monkeypatch.setattr(chunk_order, "sort_within_chunks", sort_within_chunks)
+    arrange(*built)
+    assert asked == [-1]
+
+
 def test_the_first_chunk_is_a_coarse_picture_of_the_whole(built: tuple[Splats, LodTree]) -> None:
     """It refines the largest nodes: none outside is larger than all but the last inside."""
     splats, tree = arrange(*built)

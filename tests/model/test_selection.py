@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from sparklod_cli.model import selection
 from sparklod_cli.model.selection import Selection, describe
 from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.support.errors import InvalidSplatsError
@@ -79,3 +80,15 @@ def test_nothing_left_is_an_error_that_says_why() -> None:
 def test_a_selection_of_all_copies_nothing() -> None:
     splats = random_splats(5)
     assert Selection().apply(splats)[0] is splats
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_blocks_are_examined_as_the_whole(threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    splats = with_value(with_value(random_splats(100, seed=3), "center", 71, np.nan), "opacity", 12, 0)
+    keep, tally = Selection(drop_invalid=True).examine(splats)
+    monkeypatch.setattr(selection, "EXAMINED", 16)
+    kept, dropped = Selection(drop_invalid=True).apply(splats, threads=threads)
+    assert dropped == tally.dropped == {"non_finite": 1, "zero_opacity": 1}
+    assert np.array_equal(kept.center, splats.center[keep])
+    with pytest.raises(InvalidSplatsError, match="splat 71"):
+        Selection().apply(splats, threads=threads)

@@ -17,6 +17,7 @@ from ...model.scene import Scene
 from ...model.sh import COEFFICIENTS
 from ...model.splats import COLUMNS, FloatArray, Splats
 from ...model.streams import NodeStream
+from ...support.parallel import blocks_of
 from ...support.progress import Progress, silent
 from .. import clamps, coverage, octahedral
 from ..clamps import Range
@@ -24,7 +25,7 @@ from ..encoder import CLAMPED, Encoded, Get, windows_of
 from ..options import WriteOptions
 from ..splat_encoding import SplatEncoding
 from .comment import comment_of
-from .encodings import CODINGS
+from .encodings import BLOCK, CODINGS
 from .header import pack_chunk_header, pack_header, padding
 from .layout import BY_NAME, PROPERTIES, RANGES, SIZES, Row
 from .names import SUFFIX, chunk_name
@@ -168,7 +169,8 @@ class RadEncoder:
         """(n, numbers) values of a property, as its encoding takes them."""
         if row.degree:
             source = splats.sh if self.palette is None else self.palette.codes
-            return source[:, COEFFICIENTS[row.degree - 1] : COEFFICIENTS[row.degree]].reshape(len(source), -1)
+            flat = source.reshape(len(source), 3 * source.shape[1])
+            return flat[:, 3 * COEFFICIENTS[row.degree - 1] : 3 * COEFFICIENTS[row.degree]]
         if row.column == "labels":
             assert labels is not None
             return labels[:, None]
@@ -186,9 +188,13 @@ class RadEncoder:
         if not self.options.covering:
             return splats.opacity
         ends = code_range(BY_NAME["scales"], self._codes)
-        rounded = CODINGS[self.options.rad.scales].rounded(splats.scale, *ends)
         bits = self.options.rad.center_bits
-        return coverage.kept(splats.opacity, splats.scale, rounded, 0.0 if bits is None else 2.0**-bits)
+        blur, kept = 0.0 if bits is None else 2.0**-bits, np.empty_like(splats.opacity)
+        for part in blocks_of(len(splats), BLOCK):
+            scale = splats.scale[part]
+            rounded = CODINGS[self.options.rad.scales].rounded(scale, *ends)
+            kept[part] = coverage.kept(splats.opacity[part], scale, rounded, blur)
+        return kept
 
     def _deflated(self, codes: NDArray[Any], encoding: str) -> bytes:
         """A raw deflate stream.

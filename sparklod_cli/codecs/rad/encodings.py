@@ -13,12 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...model.splats import FloatArray
+from ...support.parallel import blocks_of
 from .. import octahedral, splat_encoding
 from ..octahedral import STEPS_8_8_8
 from ..quantize import Bytes
 
 #: Largest finite float16. Larger values are clamped to it: rounded they would be infinite.
 LARGEST_F16 = np.float32(65504)
+
+#: Splats that are coded at a time: they and what is computed of them stay in the processor's cache.
+BLOCK = 1 << 13
 
 #: Every code of a byte.
 _ALL = np.arange(256, dtype=np.uint8)
@@ -87,12 +91,18 @@ def _by_table(
 ) -> Coding:
     """A byte a number; the table has the values of all 256."""
 
+    def encode_planes(values: FloatArray, low: float, high: float) -> NDArray[Any]:
+        planes = np.empty((values.shape[1], len(values)), np.uint8)
+        for part in blocks_of(len(values), BLOCK):
+            planes[:, part] = encode(np.ascontiguousarray(values[part].T), low, high)
+        return planes
+
     def decode(codes: Bytes, count: int, numbers: int, low: float, high: float) -> NDArray[Any]:
         with np.errstate(over="ignore", invalid="ignore"):  # a stranger's range may be any
             values = table(low, high)
         return values[codes.reshape(numbers, count).T]
 
-    return Coding(lambda values, low, high: encode(np.ascontiguousarray(values.T), low, high).astype(np.uint8), decode)
+    return Coding(encode_planes, decode)
 
 
 def _encode_signed(values: FloatArray, low: float, high: float) -> NDArray[Any]:
@@ -119,7 +129,9 @@ def _decode_log_f16(codes: Bytes, count: int, numbers: int, low: float, high: fl
 
 def _encode_octahedral(quat_xyzw: NDArray[Any], low: float, high: float) -> NDArray[Any]:
     codes = np.empty((len(quat_xyzw), 3), np.uint8)
-    codes[:, 0], codes[:, 1], codes[:, 2] = octahedral.encode_axis_angle(quat_xyzw, STEPS_8_8_8)
+    for part in blocks_of(len(quat_xyzw), BLOCK):
+        for number, found in enumerate(octahedral.encode_axis_angle(quat_xyzw[part], STEPS_8_8_8)):
+            codes[part, number] = found
     return codes
 
 

@@ -25,7 +25,8 @@ def sort_within_chunks(bounds, parent, rank, axis_bits, sequence, chunk_of, dept
         rank: (F, 3) int32, place of the parent's centre among all, along each axis.
         axis_bits: bits of the greatest rank.
         sequence: (F,) int32 families, parents first; reordered.
-        chunk_of, depth: (F,) int32, working memory.
+        chunk_of: (F,) int32 of no chunk's number; filled. Another thread may not have reached the parent's chunk yet.
+        depth: (F,) int32, working memory.
     """
     up, down = np.uint64(max(AXIS_BITS - axis_bits, 0)), np.uint64(max(axis_bits - AXIS_BITS, 0))
     for chunk in prange(len(bounds) - 1):
