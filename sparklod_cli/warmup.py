@@ -46,7 +46,13 @@ class Job:
 JOBS = {
     "quick": Job(
         (
-            *("geometry.find_bounds", "group.level_keys", "cell_pairs.merge_in_cells", "cell_pairs.split_families"),
+            *(
+                "drawable.count_doubtful",
+                "geometry.find_bounds",
+                "group.level_keys",
+                "cell_pairs.merge_in_cells",
+                "cell_pairs.split_families",
+            ),
             *("final_order.fill_leaves", "final_order.merge_colors"),
             *("node_rows.fill_leaf_rows", "node_rows.fill_merged_splats", "sort.cell_words", "sort.sort_pass"),
         ),
@@ -80,7 +86,13 @@ JOBS = {
     ),
     "quality": Job(
         (
-            *("geometry.find_bounds", "final_order.fill_leaves", "final_order.merge_colors", "sort.sort_pass"),
+            *(
+                "drawable.count_doubtful",
+                "geometry.find_bounds",
+                "final_order.fill_leaves",
+                "final_order.merge_colors",
+                "sort.sort_pass",
+            ),
             *("node_rows.fill_leaf_rows", "node_rows.fill_merged_splats", "node_rows.morton_keys"),
             "curve_sort.sort_along_curve",
             *("pair_cost.find_partners", "pair_cost.match_pairs", "pair_merge.merge_pairs", "prune.drop_nodes"),
