@@ -115,6 +115,7 @@ def build_lod(
     """
     from ..bake import BakeSettings
     from ..lod.band_order import banded
+    from ..lod.check import select
     from ..model.selection import Selection
     from .refining import asked_for, refined_tree
 
@@ -128,7 +129,7 @@ def build_lod(
     fitting = asked_for(refine)
     build = BakeSettings(method=method, base=base, growth=growth).builder()
     with on_threads(threads), telling(progress) as told, memory_errors_translated():
-        kept, _ = (selection or Selection()).apply(scene.splats.with_max_sh(max_sh))
+        kept, _ = select(selection or Selection(), scene.splats.with_max_sh(max_sh), thread_count(threads))
         # A builder frees its input as it goes where nobody else holds it.
         built = build(kept, progress=told)
         made = Tree(*(banded([built]) if BUILDERS[method].in_bands else built), scene.antialiased)

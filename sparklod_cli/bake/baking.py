@@ -12,6 +12,7 @@ import numpy as np
 from ..codecs.statistics import Statistics
 from ..io import read_rgba, read_stored
 from ..lod.builders import BUILDERS
+from ..lod.check import select
 from ..model.lod_tree import LodTree
 from ..model.scene import Scene
 from ..model.splats import Splats
@@ -229,7 +230,7 @@ def _built(
     """A tree of the splats of the input."""
     scene = scenes.pop()
     read = _recolored(scene.splats, settings.rgba).with_max_sh(settings.max_sh)
-    kept, dropped = settings.selection.apply(read, threads=threads)
+    kept, dropped = select(settings.selection, read, threads)
     kept, far = divided(kept, settings)
     kept = transformed(kept, settings.transform)
     environment = None if far is None else transformed(far, settings.transform)

@@ -1,20 +1,22 @@
-"""Checks the input and the setting of a builder."""
+"""Selects and checks the input of a builder, and checks its setting."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..model.splats import Splats, describe_invalid
+from ..model.selection import Selection
+from ..model.splats import COLUMNS, UNIT_TOLERANCE, Splats, describe_invalid
 from ..support.errors import InvalidSplatsError
 from ..support.jit import threads_for
 from ..support.parallel import blocks_of, ordered_map
+from .kernels.drawable import count_doubtful
 from .kernels.geometry import find_bounds
 
-#: Splats that a thread looks at at a time.
-BLOCK = 1 << 15
+#: Splats that are looked at together. Chosen: fewer than in any scene for which several threads pay.
+EXAMINED = 1 << 15
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,27 @@ def check_setting(name: str, value: float, least: float, most: float) -> None:
         raise ValueError(f"{name} {value} is not within {least} to {most}")
 
 
+def all_drawable(splats: Splats, threads: int) -> bool:
+    """Whether splats are valid and visible beyond doubt; where not, `Splats.invalid` and `Selection` tell.
+
+    Rounding differs from theirs, so a rotation has to be nearer to a unit one.
+    """
+    tolerance = np.float32(UNIT_TOLERANCE / 2)
+
+    def is_drawable(part: slice) -> bool:
+        columns = (getattr(splats, name)[part].reshape(-1) for name in COLUMNS)
+        return int(count_doubtful(*columns, tolerance)) == 0
+
+    return all(list(ordered_map(is_drawable, blocks_of(len(splats), EXAMINED), threads)))
+
+
+def select(selection: Selection, splats: Splats, threads: int) -> tuple[Splats, dict[str, int]]:
+    """`Selection.apply`, which takes longer where nothing is to be dropped."""
+    if len(splats) and replace(selection, drop_invalid=False) == Selection() and all_drawable(splats, threads):
+        return splats, {}
+    return selection.apply(splats, threads=threads)
+
+
 def check(splats: Splats) -> Bounds:
     """Checks that a tree can be built of splats, and returns their bounds.
 
@@ -47,17 +70,11 @@ def check(splats: Splats) -> Bounds:
     if len(splats) == 0:
         raise InvalidSplatsError("no splat is left to build a tree of")
     with threads_for(len(splats)) as threads:
-        if _has_invalid(splats, threads):
-            raise InvalidSplatsError(f"{describe_invalid(splats.invalid())}: see Selection.apply")
+        if not all_drawable(splats, threads) and (invalid := splats.invalid()):
+            raise InvalidSplatsError(f"{describe_invalid(invalid)}: see Selection.apply")
         low, high, smallest, largest = find_bounds(splats.center, splats.scale, threads)
     check_visible(smallest, float(splats.opacity.min()))
     return Bounds(low, high, smallest, largest)
-
-
-def _has_invalid(splats: Splats, threads: int) -> bool:
-    """Whether any is invalid; blocks of them stay in the processor's cache."""
-    parts = blocks_of(len(splats), BLOCK)
-    return any(ordered_map(lambda part: bool(splats.take(part).invalid()), parts, threads))
 
 
 def check_visible(smallest: float, faintest: float = 1.0) -> None:

@@ -1,0 +1,67 @@
+"""What builders take: the fast test of their input agrees with the definition of a valid and visible splat."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sparklod_cli.lod import check
+from sparklod_cli.lod.check import all_drawable, select
+from sparklod_cli.model.selection import Selection
+from sparklod_cli.model.splats import COLUMNS
+from sparklod_cli.support.errors import InvalidSplatsError
+from tests.lod.trees import hard_cases
+from tests.scenes import random_splats
+
+#: Numbers that some column must not have.
+FAULTS = {
+    **{f"{name} {value}": (name, value) for name in COLUMNS for value in (np.nan, np.inf, -np.inf)},
+    "negative scale": ("scale", -1e-30),
+    "negative opacity": ("opacity", -1e-30),
+    "no opacity": ("opacity", 0.0),
+    "rotation": ("quat_xyzw", 1.1),
+}
+
+
+@pytest.mark.parametrize("name", hard_cases())
+def test_splats_that_can_be_drawn_are_known_as_such(name: str) -> None:
+    splats = hard_cases()[name]
+    assert all_drawable(splats, 1)
+    assert select(Selection(), splats, 1) == (splats, {})
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize("place", [0, 35])
+def test_one_fault_is_found(fault: str, place: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(check, "EXAMINED", 32)
+    splats = random_splats(40, sh_degree=1)
+    name, value = FAULTS[fault]
+    getattr(splats, name)[place] = value
+    assert not all_drawable(splats, 2)
+
+
+def test_a_splat_without_extent_is_dropped_and_counted() -> None:
+    splats = random_splats(9)
+    splats.scale[4] = 0
+    kept, dropped = select(Selection(), splats, 1)
+    assert len(kept) == 8
+    assert dropped == {"zero_scale": 1}
+
+
+def test_a_selection_with_a_limit_is_applied() -> None:
+    splats = random_splats(50)
+    faintest = float(np.median(splats.opacity))
+    kept, dropped = select(Selection(min_opacity=faintest), splats, 1)
+    assert sum(dropped.values()) == 50 - len(kept) > 0
+
+
+def test_no_splats_are_an_error() -> None:
+    with pytest.raises(InvalidSplatsError, match="no splats"):
+        select(Selection(), random_splats(0), 1)
+
+
+def test_a_rotation_near_the_tolerance_is_left_to_the_definition() -> None:
+    splats = random_splats(9)
+    splats.quat_xyzw[3] *= np.float32(np.sqrt(1 + 0.8e-3))
+    assert not all_drawable(splats, 1)
+    assert len(select(Selection(), splats, 1)[0]) == 9
