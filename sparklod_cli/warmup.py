@@ -73,7 +73,7 @@ JOBS = {
         (
             *("tree_links.find_cycles", "tree_links.find_depths", "tree_links.find_parents"),
             *("tree_links.add_weighted", "tree_links.fill_weights", "tree_links.sum_by_depth"),
-            *("tree_links.count_limits", "tree_links.gather_large", "tree_links.mark_small"),
+            *("tree_links.count_limits", "tree_links.mark_small"),
             *("spz_codes.count_bytes", "spz_codes.count_ends", "spz_codes.count_squares", "spz_codes.count_halves"),
             *("spz_codes.fill_extremes", "spz_codes.fill_sizes", "spz_codes.look_up"),
             *("digits.count_digits", "digits.sh_lengths"),
@@ -112,7 +112,7 @@ JOBS = {
         (
             *("bands.count_fragments", "bands.draw_discs", "continuous.blend", "continuous.find_limits"),
             *("continuous.order_inner", "cut_parts.take_step"),
-            *("project.project", "raster.draw_tiles", "raster.sort_into_tiles"),
+            *("project.project", "raster.draw_tiles", "tiles.sort_into_tiles"),
         ),
         (
             "render tree.spz --size 64x64 -o cut.png",
@@ -125,7 +125,7 @@ JOBS = {
         (
             *("adam.step", "backward.first_rows", "backward.weigh_tiles", "cut_parts.take_step", "difference.by_image"),
             *("difference.squared_differences", "project.project"),
-            *("project_gradients.carry_back", "raster.draw_tiles", "raster.sort_into_tiles", "shade.add_sh"),
+            *("project_gradients.carry_back", "raster.draw_tiles", "tiles.sort_into_tiles", "shade.add_sh"),
             *("shade.sh_gradients", "tree_links.add_child_sizes", "tree_links.find_parents", "view.gather"),
             "view.mark_seen",
         ),
