@@ -26,6 +26,9 @@ LIMIT = 10.0
 #: Seconds that a case may take if it may have to compile kernels: the first of a process, and one that is repeated.
 PATIENCE = 300.0
 
+#: Seconds that the worker is given to start, and that the fault handler is given to write where a case hangs.
+STARTS, TELLS = 300.0, 10.0
+
 
 class Child:
     """A worker process that runs cases; it is started by the first request, and again after it died.
@@ -70,9 +73,7 @@ class Child:
             name = signal.Signals(-code).name if code < 0 else f"exit code {code}"
             finding = Finding("crash", f"the process died: {name}", f"{name} in {_place(log)}", log)
         else:
-            process.send_signal(signal.SIGUSR1)
-            time.sleep(0.5)
-            log = self._log_text()
+            log = self._trace(process)
             finding = Finding("hang", f"longer than {wait:g} s", _place(log), log)
         self.stop()
         return {"finding": finding.plain(), "outcome": "", "seconds": time.perf_counter() - started, "what": ""}
@@ -112,6 +113,21 @@ class Child:
         for descriptor in inherited:
             os.close(descriptor)
         self._requests, self._results = os.fdopen(requests[1], "w"), os.fdopen(answers[0])
+
+        if select.select([self._results], [], [], STARTS)[0]:
+            self._results.readline()  # that it is ready, or nothing if it died, which the first request will find
+
+    def _trace(self, process: subprocess.Popen[bytes]) -> str:
+        """What the fault handler of a worker that hangs writes, once it has written all of it."""
+        process.send_signal(signal.SIGUSR1)
+        before, ends = "", time.monotonic() + TELLS
+        while time.monotonic() < ends:
+            time.sleep(0.25)
+            log = self._log_text()
+            if log and log == before:
+                break
+            before = log
+        return before
 
     def _log_text(self) -> str:
         return self._log.read_text(errors="replace")[-20_000:]

@@ -1,7 +1,8 @@
 """The worker process in which cases run; `fuzz.child` starts it, and starts another when it dies.
 
-It reads requests from one pipe and writes answers to another, a JSON object a line. Python's fault handler writes its
-traces to a log: of a crash, and of SIGUSR1, which `fuzz.child` sends to a worker that hangs.
+It says that it is ready, and then reads requests from one pipe and writes answers to another, a JSON object a line.
+Python's fault handler writes its traces to a log: of a crash, and of SIGUSR1, which `fuzz.child` sends to a worker that
+hangs.
 """
 
 from __future__ import annotations
@@ -23,6 +24,9 @@ from typing import Any
 #: Bytes of address space that the process may add to those it has after its first case, so that no case uses up the
 #: machine's memory.
 ADDRESS_SPACE = 4 << 30
+
+#: The line that the worker writes before it reads requests: Python, numpy and sparklod are loaded.
+READY = "ready"
 
 #: Packages that cases cannot import: they take seconds to load and call into graphics drivers.
 BLOCKED = ("pyvista", "open3d")
@@ -51,6 +55,8 @@ def main() -> None:
     watch = WriteWatch([temporary, given.scratch / "matplotlib", Path("/dev"), Path("/proc"), *caches])
     limited = False
     with os.fdopen(given.requests) as requests, os.fdopen(given.results, "w") as results:
+        results.write(f"{READY}\n")
+        results.flush()
         for line in requests:
             answer = attempt(json.loads(line), given.scratch, watch)
             results.write(json.dumps(answer) + "\n")

@@ -112,7 +112,7 @@ JOBS = {
         (
             *("bands.count_fragments", "bands.draw_discs", "continuous.blend", "continuous.find_limits"),
             *("continuous.order_inner", "cut_parts.take_step"),
-            *("project.project", "raster.draw_tiles", "raster.sort_into_tiles"),
+            *("project.project", "raster.draw_tiles", "tiles.sort_into_tiles"),
         ),
         (
             "render tree.spz --size 64x64 -o cut.png",
@@ -125,7 +125,7 @@ JOBS = {
         (
             *("adam.step", "backward.first_rows", "backward.weigh_tiles", "cut_parts.take_step", "difference.by_image"),
             *("difference.squared_differences", "project.project"),
-            *("project_gradients.carry_back", "raster.draw_tiles", "raster.sort_into_tiles", "shade.add_sh"),
+            *("project_gradients.carry_back", "raster.draw_tiles", "tiles.sort_into_tiles", "shade.add_sh"),
             *("shade.sh_gradients", "tree_links.add_child_sizes", "tree_links.find_parents", "view.gather"),
             "view.mark_seen",
         ),

@@ -8,11 +8,14 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 
 # Machines differ by a factor of a hundred in speed, and the first example of a kernel compiles it. The fuzzers try many
-# more examples than a run of the tests.
-settings.register_profile("sparklod", deadline=None, max_examples=40)
+# more examples than a run of the tests, which tries the same ones every time: what passes here passes elsewhere.
+# `--hypothesis-profile=explore` tries others.
+TIMELESS = {"deadline": None, "suppress_health_check": [HealthCheck.too_slow]}
+settings.register_profile("sparklod", max_examples=40, derandomize=True, **TIMELESS)
+settings.register_profile("explore", max_examples=40, **TIMELESS)
 settings.load_profile("sparklod")
 
 ROOT = Path(__file__).resolve().parents[1]

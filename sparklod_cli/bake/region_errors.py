@@ -17,7 +17,8 @@ from ..cameras.pose import rotation_of
 from ..model.detail import DetailScene
 from ..model.gaussian import lod_opacity
 from ..model.sh import degree_of
-from ..render.kernels.project import TILE, Limits, ShadedColumns
+from ..render.kernels.ellipse import Limits
+from ..render.kernels.project import TILE, ShadedColumns
 from ..render.kernels.region_errors import compare_levels
 from ..render.kernels.shade import add_sh
 from ..render.settings import BLUR, CLIP, MAX_STD_DEV, MIN_ALPHA, STD_DEV_PER_D

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from ..model.gaussian import spark_size
 from ..model.lod_tree import LodTree
+from ..model.nodes import CHUNK_NODES
 from ..model.splats import COLUMNS, FloatArray, Splats
 from .kernels.spz_codes import fill_extremes, fill_sizes, look_up
 from .quantize import Bytes
 from .spz_layout import LINKS, Layout, column_of
+
+#: By column of `Splats`, what is called with all of its codes, (n, bytes) at a time, as they are read.
+Watch = Mapping[str, Callable[[Bytes], None]]
 
 #: Columns of `Splats` whose numbers are a byte each.
 BYTES = ("opacity", "rgb", "scale")
@@ -58,9 +62,12 @@ class CodedSpz:
 
         Args:
             part: which splats; may end behind the last.
-            columns: of `Splats`; the others are 0.
+            columns: of `Splats`; the others are 0, and cannot be written to.
         """
-        splats = Splats.zeros(len(range(*part.indices(self.count))), self.sh_degree)
+        count = len(range(*part.indices(self.count)))
+        zeros = self._zeros if count <= len(self._zeros) else Splats.zeros(count, self.sh_degree)
+        rows = {name: getattr(zeros, name)[:count] for name in COLUMNS}
+        splats = Splats(**{name: np.empty_like(row) if name in columns else row for name, row in rows.items()})
         for stream in self.layout.streams():
             if stream.column in columns:
                 out, codes = column_of(splats, None, stream), self.codes[stream.name][part]
@@ -79,6 +86,14 @@ class CodedSpz:
     def _tables(self) -> dict[str, FloatArray]:
         every = np.arange(256, dtype=np.uint8)
         return {each.column: each.decode(every) for each in self.layout.streams() if each.column in BYTES}
+
+    @functools.cached_property
+    def _zeros(self) -> Splats:
+        """Zeros that all blocks share."""
+        splats = Splats.zeros(min(self.count, CHUNK_NODES), self.sh_degree)
+        for name in COLUMNS:
+            getattr(splats, name).flags.writeable = False
+        return splats
 
     @functools.cached_property
     def _factors(self) -> FloatArray:

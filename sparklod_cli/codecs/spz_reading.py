@@ -24,7 +24,7 @@ from . import compression, quantize
 from .content import HAS_TREE, Content, Scratch
 from .inflate import GZIP_MAGIC, Inflate
 from .sound import with_sound_tree
-from .spz_coded import CodedSpz, sound
+from .spz_coded import CodedSpz, Watch, sound
 from .spz_layout import ANTIALIASED, EXTENSIONS, HEADER, LOD, MAGIC, Layout, Stream, StreamRows, column_of
 from .stream import Positioned, Read, rows_between, rows_of, size_of
 
@@ -136,12 +136,18 @@ def read_codes(file: BinaryIO) -> tuple[Layout, dict[str, quantize.Bytes]]:
 
 
 def read_coded(
-    file: BinaryIO, *, columns: Collection[str] = COLUMNS, threads: int = 1, progress: Progress = silent
+    file: BinaryIO,
+    *,
+    columns: Collection[str] = COLUMNS,
+    watch: Watch | None = None,
+    threads: int = 1,
+    progress: Progress = silent,
 ) -> CodedSpz:
     """The codes of a file for inspection, see `examine`.
 
     Those of the given columns of `Splats`, and of the tree; of a file that may hold invalid splats, those of all.
     """
+    watch = watch or {}
     layout, rows, header = _opened(file, threads)
     columns = columns if sound(layout) else COLUMNS
     streams = [each for each in layout.streams() if each.column in {*columns, "child_count", "child_start"}]
@@ -150,6 +156,8 @@ def read_coded(
     for each, part, some in rows:
         if each.name in codes:
             codes[each.name][part] = some
+        if each.column in watch:
+            watch[each.column](some)
         done += some.size
         progress("reading", done, layout.total, "B")
     facts, degree = _facts(layout) | header, min(layout.sh_degree, MAX_SH_DEGREE)

@@ -22,6 +22,7 @@ from ..codecs.spz_coded import CodedSpz
 from ..model.nodes import CHUNK_NODES
 from ..model.sh import COEFFICIENTS
 from ..model.splats import FloatArray, Splats
+from ..support.defaults import MAX_SH_DEGREE
 from ..support.parallel import blocks_of, ordered_map
 from .percentiles import Known, Percentiles, ranks_of
 from .values import AXES, LEVELS, MAIN, SH_QUANTITIES, ValueFacts, facts_of, needed, quantity
@@ -37,17 +38,58 @@ SH_STEPS, MOST_SQUARED = 128, 128**2
 Found = dict[str, Known | Percentiles]
 
 
-def examine(coded: CodedSpz, size: FloatArray | None, *, all_quantities: bool, threads: int) -> ValueFacts:
+class Watched:
+    """Counts codes while they are read, so that they need not be kept.
+
+    Args:
+        all_quantities: of all quantities, not only those of `MAIN`.
+
+    Attributes:
+        opacities: (1, 256) number of each code.
+        watch: what is called with the codes of a file.
+    """
+
+    def __init__(self, *, all_quantities: bool) -> None:
+        self.all_quantities = all_quantities
+        self.opacities, self._colors = np.zeros((1, 256), np.int64), np.zeros((3, 256), np.int64)
+        self._squares: dict[int, NDArray[np.int64]] = {}  # by degree, counted from 0
+        self.watch: dict[str, Callable[[Bytes], None]] = {"opacity": lambda codes: count_bytes(codes, self.opacities)}
+        if all_quantities:
+            self.watch |= {"rgb": lambda codes: count_bytes(codes, self._colors), "sh": self._add_sh}
+
+    def _add_sh(self, codes: Bytes) -> None:
+        for degree in range(MAX_SH_DEGREE):
+            first, last = 3 * COEFFICIENTS[degree], 3 * COEFFICIENTS[degree + 1]
+            if last <= codes.shape[1]:
+                counts = self._squares.setdefault(degree, np.zeros(0, np.int64))
+                if not len(counts):
+                    counts = self._squares[degree] = np.zeros((last - first) * MOST_SQUARED + 1, np.int64)
+                count_squares(codes, first, last, counts)
+
+    def found(self, coded: CodedSpz) -> Found:
+        """The quantities of opacities, colours and SH, after the last codes."""
+        found = _of_bytes(coded, "opacity", self.opacities)
+        if self.all_quantities:
+            found |= _of_bytes(coded, "rgb", self._colors)
+        for degree, counts in self._squares.items():
+            # The root mean square of the coefficients of a degree, of their whole numbers of steps.
+            squares, numbers = np.flatnonzero(counts), (len(counts) - 1) // MOST_SQUARED
+            values = np.sqrt(squares / SH_STEPS**2 / numbers)
+            found[SH_QUANTITIES[degree]] = Known.of_counts(LEVELS, values, counts[squares])
+        return found
+
+
+def examine(coded: CodedSpz, size: FloatArray | None, watched: Watched, *, threads: int) -> ValueFacts:
     """Statistics of the splats of a sound file, as `values.Statistics` has them; means may differ in their last bits.
 
     Args:
         coded: of at least one splat.
         size: (N,) float32 feature sizes, if they are known.
-        all_quantities: all quantities, not only those of `MAIN`.
+        watched: has seen all codes.
         threads: to work on.
     """
+    all_quantities, opacities = watched.all_quantities, watched.opacities
     names = needed(coded.sh_degree, all_quantities=all_quantities)
-    opacities = _count_bytes(coded.codes["alphas"])
     scales = _count_ends(coded.codes["scales"])
     shown = [name for name in names if all_quantities or name in MAIN]
     # Those that take longest first.
@@ -55,11 +97,9 @@ def examine(coded: CodedSpz, size: FloatArray | None, *, all_quantities: bool, t
     if all_quantities:
         work = [
             lambda: {"size": _of_numbers(_sizes(coded) if size is None else size)},
-            *(functools.partial(_of_sh, coded, degree) for degree in reversed(range(coded.sh_degree))),
             *work,
-            lambda: _of_bytes(coded, "rgb", _count_bytes(coded.codes["colors"])),
         ]
-    numbers: Found = _of_bytes(coded, "opacity", opacities) | _of_scales(coded, scales, names)
+    numbers: Found = watched.found(coded) | _of_scales(coded, scales, names)
     for found in ordered_map(lambda each: each(), work, threads):
         numbers |= found
     low, high = (np.array([numbers[axis].values()[end] for axis in AXES]) for end in (0, -1))
@@ -98,12 +138,6 @@ def _palette(count: int, **columns: FloatArray) -> Splats:
     return splats
 
 
-def _count_bytes(codes: Bytes) -> NDArray[np.int64]:
-    counts = np.zeros((codes.shape[1], 256), np.int64)
-    count_bytes(codes, counts)
-    return counts
-
-
 def _count_ends(codes: Bytes) -> NDArray[np.int64]:
     counts = np.zeros((256, 256), np.int64)
     count_ends(codes, counts)
@@ -130,16 +164,6 @@ def _of_scales(coded: CodedSpz, counts: NDArray[np.int64], names: list[str]) -> 
         for name in OF_SCALES
         if name in names
     }
-
-
-def _of_sh(coded: CodedSpz, degree: int) -> Found:
-    """The root mean square of the coefficients of a degree, counted from 0: of their whole numbers of steps."""
-    first, last = 3 * COEFFICIENTS[degree], 3 * COEFFICIENTS[degree + 1]
-    counts = np.zeros((last - first) * MOST_SQUARED + 1, np.int64)
-    count_squares(coded.codes["sh"], first, last, counts)
-    squares = np.flatnonzero(counts)
-    values = np.sqrt(squares / SH_STEPS**2 / (last - first))
-    return {SH_QUANTITIES[degree]: Known.of_counts(LEVELS, values, counts[squares])}
 
 
 def _of_axis(coded: CodedSpz, axis: int) -> Found:

@@ -178,9 +178,11 @@ def inspect(
                 blocks = Blocks.of_file(file, threads=threads, progress=progress)
                 return _of_blocks(path, blocks, size, settings, surveyed, threads), None
         if settings.at_once is not True:
-            coded = read_coded(path, columns=_columns_of(settings), threads=threads, progress=progress)
+            kept, watched = _columns_of(settings), code_values.Watched(all_quantities=settings.all_quantities)
+            watch = watched.watch if settings.values else None
+            coded = read_coded(path, columns=kept, watch=watch, threads=threads, progress=progress)
             if coded is not None:
-                return _of_blocks(path, Blocks.of_codes(coded), size, settings, surveyed, threads), None
+                return _of_blocks(path, Blocks.of_codes(coded), size, settings, surveyed, threads, watched), None
         scene = examine_scene(path, columns=columns, threads=threads, progress=progress)
     except FormatError as error:
         found = surveyed.findings if surveyed is not None and settings.check else []
@@ -190,13 +192,12 @@ def inspect(
 
 
 def _columns_of(settings: ReportSettings) -> set[str]:
-    """Columns of `Splats` that a report on sound splats needs."""
+    """Columns of `Splats` whose codes a report on sound splats keeps."""
     return {
         *TREE_COLUMNS,
         *(value_checks.USED if settings.check else ()),
         *(chunks.USED if settings.chunks else ()),
         *(values.USED if settings.values else ()),
-        *(("rgb", "sh") if settings.values and settings.all_quantities else ()),
     }
 
 
@@ -239,6 +240,7 @@ def _of_blocks(
     settings: ReportSettings,
     surveyed: Surveyed | None,
     threads: int,
+    watched: code_values.Watched | None = None,
 ) -> Report:
     """The report on a file that can be read, block by block."""
     size = blocks.header.get("bytes", size)
@@ -265,9 +267,9 @@ def _of_blocks(
         for (each, _), part in zip(wanted, parts, strict=True):
             each.merge(part)
     told = None
-    if settings.values and coded is not None:
+    if settings.values and coded is not None and watched is not None:
         sizes = None if columns is None else columns.size
-        told = code_values.examine(coded, sizes, all_quantities=settings.all_quantities, threads=threads)
+        told = code_values.examine(coded, sizes, watched, threads=threads)
     elif settings.values:
         statistics.finish(blocks, threads=threads)
         told = statistics.facts()

@@ -168,14 +168,25 @@ def order_findings(parent: NDArray[np.int32], limit: FloatArray, threads: int) -
         limit: (N,) of `find_depths`.
         threads: to work on.
     """
-    children = np.flatnonzero(parent >= 0)
-    if len(children) < MIN_NODES:
+    held = parent >= 0
+    count = int(np.count_nonzero(held))
+    if count < MIN_NODES:
         return []
-    parts = np.array_split(children, PARTS)
-    limits = np.array(list(ordered_map(lambda part: np.median(limit[parent[part]]), parts, threads)))
+    # In a good tree all nodes but the first, which need not be listed.
+    children = range(1, len(parent)) if count == len(parent) - 1 and not held[0] else np.flatnonzero(held)
+    del held
+    ends = [count // PARTS * end + min(count % PARTS, end) for end in range(PARTS + 1)]
+
+    def median(part: int) -> np.float32:
+        some = children[ends[part] : ends[part + 1]]
+        above = parent[some.start : some.stop] if isinstance(some, range) else parent[some]
+        found: np.float32 = np.median(limit[above])
+        return found
+
+    limits = np.array(list(ordered_map(median, range(PARTS), threads)))
     rises = np.flatnonzero(limits[1:] > MAX_RISE * np.minimum.accumulate(limits)[:-1])
     if not rises.size:
         return []
-    at = int(parts[rises[0] + 1][0])
+    at = int(children[ends[rises[0] + 1]])
     what = f"nodes from {at:,} on are refined before some of the nodes before them"
     return [Finding("tree.coarse-first", what, at, len(parent) - at)]

@@ -73,7 +73,8 @@ def _images_of(path: Path) -> list[Path]:
 
 
 def _beside(path: Path, names: Iterable[str], *, folders: bool = False) -> list[Path]:
-    return [path.parent / name for name in names if not leads_away(name, folders=folders)]
+    each = dict.fromkeys(names)  # a manifest of strangers may name one file half a million times
+    return [path.parent / name for name in each if not leads_away(name, folders=folders)]
 
 
 def in_folder(folder: Place) -> Place:

@@ -24,7 +24,7 @@ from .names import reason_of
 
 if TYPE_CHECKING:
     from ..codecs.gpu import dump
-    from ..codecs.spz_coded import CodedSpz
+    from ..codecs.spz_coded import CodedSpz, Watch
 
 #: How a .npz begins, which is a zip.
 ZIP = b"PK\x03\x04"
@@ -104,12 +104,18 @@ def examine_scene(
 
 
 def read_coded(
-    path: Place, *, columns: Collection[str] = COLUMNS, threads: int = 1, progress: Progress = silent
+    path: Place,
+    *,
+    columns: Collection[str] = COLUMNS,
+    watch: Watch | None = None,
+    threads: int = 1,
+    progress: Progress = silent,
 ) -> CodedSpz | None:
     """The codes of an SPZ file, for a report on it; None where a file is of another format.
 
     Args:
         path, columns, threads, progress: as for `examine_scene`.
+        watch: sees the codes of some columns, which need not be kept.
 
     Raises:
         FormatError: as `examine_scene`.
@@ -117,7 +123,9 @@ def read_coded(
     with opened(path) as (file, form, _):
         if form.name != "SPZ":
             return None
-        coded: CodedSpz = form.codec().read_coded(file, columns=columns, threads=threads, progress=progress)
+        coded: CodedSpz = form.codec().read_coded(
+            file, columns=columns, watch=watch, threads=threads, progress=progress
+        )
     return coded
 
 

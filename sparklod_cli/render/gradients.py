@@ -26,7 +26,7 @@ class SplatGradients:
         center: (N, 3) per world unit.
         log_scale: (N, 3) per unit of ln(scale).
         turn: (N, 3) per radian of a rotation vector in the splat's own axes: q becomes q * exp(turn / 2).
-        lod_opacity: (N,) per unit of D; 0 above `project.MAX_D`.
+        lod_opacity: (N,) per unit of D; 0 above `ellipse.MAX_D`.
         rgb: (N, 3) per unit of colour; where a colour is 0, of raising it.
     """
 

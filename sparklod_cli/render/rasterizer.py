@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..cameras.camera import Camera
 from ..cameras.pose import FLIP
 from ..support.jit import threads_in_use
-from .kernels import project, raster
+from .kernels import ellipse, project, raster, tiles
 from .settings import BLUR, CLIP, MAX_STD_DEV, MIN_ALPHA, STD_DEV_PER_D, RasterSettings
 from .shading import ShadedSplats
 
@@ -21,6 +21,9 @@ _kept = threading.local()
 
 #: Bytes that processors fetch from memory at once.
 CACHE_LINE = 64
+
+#: Most pixels along a side of a picture: int16 holds the numbers of its tiles.
+MAX_SIDE = project.TILE * np.iinfo(np.int16).max
 
 #: Pieces a thread to sort splats into tiles in.
 CHUNKS = 2
@@ -32,12 +35,12 @@ class Projected:
 
     Attributes:
         screen: (N, `project.COLUMNS`) float32, filled for splats that are drawn.
-        boxes: (N, 4) int32 first and last tile across and down that each overlaps; empty for splats that are not drawn.
+        boxes: (N, 4) int16 first and last tile across and down that each overlaps; empty for splats that are not drawn.
         keys: (M,) uint64 from near to far, see `kernels.project.project`.
     """
 
     screen: NDArray[np.float32]
-    boxes: NDArray[np.int32]
+    boxes: NDArray[np.int16]
     keys: NDArray[np.uint64]
 
 
@@ -67,21 +70,28 @@ def draw(splats: ShadedSplats, camera: Camera, settings: RasterSettings) -> Imag
 def draw_projected(seen: Projected, camera: Camera, settings: RasterSettings) -> tuple[Image, Tiles]:
     """The picture of splats on the screen, and its tiles."""
     across, down = tiles_across(camera)
-    start, order = raster.sort_into_tiles(seen.keys, seen.boxes, across, down, CHUNKS * threads_in_use())
-    tiles = Tiles(start, order, np.empty(across * down, np.int64))
+    start, order = tiles.sort_into_tiles(seen.keys, seen.boxes, across, down, CHUNKS * threads_in_use())
+    drawn = Tiles(start, order, np.empty(across * down, np.int64))
     image = np.empty((camera.height, camera.width, 4), np.float32)
     is_design = settings.profile == "shifted"
-    raster.draw_tiles(seen.screen, start, order, across, is_design, np.float32(MIN_ALPHA), image, tiles.stop)
-    return image, tiles
+    raster.draw_tiles(seen.screen, start, order, across, is_design, np.float32(MIN_ALPHA), image, drawn.stop)
+    return image, drawn
 
 
 def tiles_across(camera: Camera) -> tuple[int, int]:
-    """Numbers of tiles across and down the picture of a camera."""
+    """Numbers of tiles across and down the picture of a camera.
+
+    Raises:
+        ValueError: the picture is larger than `MAX_SIDE`.
+    """
+    if max(camera.width, camera.height) > MAX_SIDE:
+        raise ValueError(f"a picture of {camera.width} x {camera.height} pixels; at most {MAX_SIDE:,} along a side")
     return -(-camera.width // project.TILE), -(-camera.height // project.TILE)
 
 
 def project_splats(splats: ShadedSplats, camera: Camera, settings: RasterSettings) -> Projected:
     """The splats on the screen; `screen` and `boxes` are buffers, which the next call overwrites."""
+    tiles_across(camera)
     screen, boxes, keys = _buffers(len(splats))
     project.project(*arguments(splats, camera, settings), settings.sort == "radial", screen, keys, boxes)
     return Projected(screen, boxes, np.sort(keys[keys != project.NOT_DRAWN]))
@@ -89,19 +99,19 @@ def project_splats(splats: ShadedSplats, camera: Camera, settings: RasterSetting
 
 def arguments(
     splats: ShadedSplats, camera: Camera, settings: RasterSettings
-) -> tuple[project.ShadedColumns, NDArray[np.float32], project.Lens, project.Limits]:
+) -> tuple[project.ShadedColumns, NDArray[np.float32], ellipse.Lens, ellipse.Limits]:
     """What the kernels take for splats, a camera and settings: `splats`, `world_to_camera`, `lens` and `limits`."""
     columns = project.ShadedColumns(splats.center, splats.scale, splats.quat_xyzw, splats.lod_opacity, splats.rgb)
-    lens = project.Lens(*map(np.float32, (*camera.focal, *camera.principal, camera.width, camera.height)))
+    lens = ellipse.Lens(*map(np.float32, (*camera.focal, *camera.principal, camera.width, camera.height)))
     near, far, radius = settings.near, settings.far, settings.max_radius
-    limits = project.Limits(*map(np.float32, (near, far, CLIP, BLUR, MIN_ALPHA, MAX_STD_DEV, STD_DEV_PER_D, radius)))
+    limits = ellipse.Limits(*map(np.float32, (near, far, CLIP, BLUR, MIN_ALPHA, MAX_STD_DEV, STD_DEV_PER_D, radius)))
     return columns, world_to_camera(camera), lens, limits
 
 
-def _buffers(count: int) -> tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.uint64]]:
+def _buffers(count: int) -> tuple[NDArray[np.float32], NDArray[np.int16], NDArray[np.uint64]]:
     """Working memory for projected splats, reused by each thread, because the first access to new memory is slow."""
     if len(getattr(_kept, "keys", ())) < count:
-        _kept.screen, _kept.boxes = _aligned(count), np.empty((count, 4), np.int32)
+        _kept.screen, _kept.boxes = _aligned(count), np.empty((count, 4), np.int16)
         _kept.keys = np.empty(count, np.uint64)
     return _kept.screen[:count], _kept.boxes[:count], _kept.keys[:count]
 

@@ -8,7 +8,6 @@ import re
 import struct
 import subprocess
 import sys
-import time
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -165,21 +164,24 @@ BOMBS: dict[str, bytes] = {
 }
 
 LIMITED = """
-import re, resource, sys
+import re, resource, sys, time
 from pathlib import Path
 resource.setrlimit(resource.RLIMIT_AS, (4 << 30, 4 << 30))
 from sparklod_cli.cli import run
 code = run(["build-lod", *sys.argv[1:], "--threads", "2"])
 status = Path("/proc/self/status")  # what a child is told of itself by `getrusage` counts its parent's memory, too
 taken = re.search(r"VmHWM:\\s*(\\d+)", status.read_text())[1] if status.exists() else None
-print(taken or resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+print(taken or resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.process_time())
 sys.exit(code)
 """
 
 
 @dataclass(frozen=True)
 class Run:
-    """What came of all bombs at once, for numba takes longer to load than they take to be refused."""
+    """What came of all bombs at once, for numba takes longer to load than they take to be refused.
+
+    Seconds are those of a processor, which does not take longer where other processes want it, too.
+    """
 
     directory: Path
     code: int
@@ -198,10 +200,9 @@ def all_bombs(tmp_path_factory: pytest.TempPathFactory) -> Run:
     sources = [directory / f"{name}.bin" for name in BOMBS]
     for source, content in zip(sources, BOMBS.values(), strict=True):
         source.write_bytes(content)
-    start = time.perf_counter()
-    done = subprocess.run([sys.executable, "-c", LIMITED, *sources], capture_output=True, text=True, timeout=120)
-    seconds = time.perf_counter() - start
-    return Run(directory, done.returncode, done.stderr.splitlines(), int(done.stdout or -1), seconds)
+    done = subprocess.run([sys.executable, "-c", LIMITED, *sources], capture_output=True, text=True, timeout=500)
+    kilobytes, seconds = done.stdout.split() or (-1, -1)
+    return Run(directory, done.returncode, done.stderr.splitlines(), int(kilobytes), float(seconds))
 
 
 @pytest.mark.parametrize("name", BOMBS)
@@ -214,5 +215,5 @@ def test_all_bombs_are_refused_in_little_memory_and_time(all_bombs: Run) -> None
     assert all_bombs.code == 1
     assert len(all_bombs.lines) == len(BOMBS), all_bombs.lines
     assert 0 < all_bombs.kilobytes < 600_000  # numba takes most of it
-    assert all_bombs.seconds < 60
+    assert 0 < all_bombs.seconds < 60
     assert {path.name for path in all_bombs.directory.iterdir()} == {f"{name}.bin" for name in BOMBS}

@@ -17,10 +17,12 @@ from sparklod_cli.model.splats import COLUMNS
 
 COUNT = 5_000
 CODES = np.random.default_rng(3).integers(0, 256, (COUNT, 9), np.uint8)
+CODES.flags.writeable = False  # as codes are that are read
 #: Coordinates of the same bytes.
 WHOLE = (
     CODES[:, 0::3].astype(np.int64) + (CODES[:, 1::3].astype(np.int64) << 8) + (CODES[:, 2::3].astype(np.int64) << 16)
 )
+POSITIONS = CODES.copy()
 WHOLE = np.where(WHOLE >= 1 << 23, WHOLE - (1 << 24), WHOLE)
 
 
@@ -61,8 +63,8 @@ def test_squares_are_counted_by_their_sum(first: int, last: int) -> None:
 
 
 def test_the_largest_sum_of_squares_has_a_place() -> None:
-    counts = np.zeros(128**2 * 9 + 1, np.int64)
-    spz_codes.count_squares(np.zeros((2, 9), np.uint8), 0, 9, counts)
+    counts, zeros = np.zeros(128**2 * 9 + 1, np.int64), np.frombuffer(bytes(18), np.uint8).reshape(2, 9)
+    spz_codes.count_squares(zeros, 0, 9, counts)
     assert counts[-1] == 2
 
 
@@ -70,12 +72,12 @@ def test_the_largest_sum_of_squares_has_a_place() -> None:
 def test_halves_of_coordinates_are_counted(axis: int) -> None:
     keys, half = WHOLE[:, axis] + (1 << 23), 1 << 12
     upper = np.zeros((1, half), np.int64)
-    assert spz_codes.count_halves(CODES, axis, 12, np.zeros(half, np.int16), upper) == WHOLE[:, axis].sum()
+    assert spz_codes.count_halves(POSITIONS, axis, 12, np.zeros(half, np.int16), upper) == WHOLE[:, axis].sum()
     assert np.array_equal(upper[0], np.bincount(keys >> 12, minlength=half))
     wanted = np.unique(keys >> 12)[[3, 100]]
     rows, lower = np.full(half, -1, np.int16), np.zeros((2, half), np.int64)
     rows[wanted] = 0, 1
-    spz_codes.count_halves(CODES, axis, 0, rows, lower)
+    spz_codes.count_halves(POSITIONS, axis, 0, rows, lower)
     for row, prefix in zip(lower, wanted, strict=True):
         assert np.array_equal(row, np.bincount(keys[keys >> 12 == prefix] & (half - 1), minlength=half))
 

@@ -109,3 +109,16 @@ def test_codes_of_columns_that_nobody_wants_are_not_kept() -> None:
     assert coded is not None
     assert set(coded.codes) == {"scales", "child_counts", "child_starts"}
     assert read_coded(FIXTURES / "sh0.ply") is None
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_codes_can_be_watched_without_being_kept(threads: int, tmp_path: Path) -> None:
+    path = tmp_path / "any.spz"
+    path.write_bytes(random_file(3, flags=LOD, count=100_000, links=1))
+    seen: list[np.ndarray] = []
+    coded, whole = read_coded(path, columns=(), watch={"rgb": seen.append}, threads=threads), read_coded(path)
+    assert coded is not None
+    assert whole is not None
+    assert set(coded.codes) == {"child_counts", "child_starts"}
+    assert len(seen) > 1
+    assert np.array_equal(np.concatenate(seen), whole.codes["colors"])

@@ -208,16 +208,17 @@ def may_be_null(way: tuple[Any, ...]) -> bool:
 
 def test_a_wrong_type_is_noticed(full: Report) -> None:
     examples: dict[type | None, Any] = {str: "1", int: 1, float: 0.5, list: [], dict: {}, bool: True, None: None}
-    for number, way in enumerate(places(full)):
+    for number, way in enumerate([*places(full)]):
         right = type(holder(full, way)[way[-1]])
         for kind, other in list(examples.items())[number % 2 :: 2]:
             if kind is right or (kind is int and right is float):
                 continue
             if right is type(None) and kind in (int, float):  # a range that this property does not have
                 continue
-            changed = copy.deepcopy(full)
-            holder(changed, way)[way[-1]] = other
-            assert bool(faults(changed)) != (other is None and may_be_null(way)), (way, other)
+            value = holder(full, way)[way[-1]]
+            holder(full, way)[way[-1]] = other
+            assert VALIDATOR.is_valid(full) == (other is None and may_be_null(way)), (way, other)
+            holder(full, way)[way[-1]] = value
 
 
 def test_a_missing_field_is_noticed(full: Report) -> None:
@@ -227,7 +228,7 @@ def test_a_missing_field_is_noticed(full: Report) -> None:
         optional = isinstance(way[-1], int) and way[-2] not in ("min", "max")
         optional |= len(way) > 1 and way[-2] in ("header", "children", "properties")
         optional |= len(way) > 1 and way[-2] == "quantities" and way[-1] not in values.MAIN
-        assert bool(faults(changed)) != optional, way
+        assert VALIDATOR.is_valid(changed) == optional, way
 
 
 def test_an_unknown_field_is_noticed(full: Report) -> None:

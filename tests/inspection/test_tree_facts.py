@@ -211,6 +211,16 @@ def test_a_rise_of_size_in_a_large_tree_is_a_finding(nodes: int, rise: float) ->
         assert findings == []
 
 
+def test_a_rise_is_found_although_a_node_has_no_parent() -> None:
+    sizes = np.ones(3000)
+    sizes[:3] = 100, 10, 20 * tree_findings.MAX_RISE
+    links = [(2, 1), (1498, 3), (1498, 1501), *[(0, 0)] * 2997]
+    _, findings = examine(sized(sizes.tolist()), tree_of(links))
+    assert codes(findings) == {"tree.orphan", "tree.coarse-first"}
+    (found,) = (each for each in findings if each.code == "tree.coarse-first")
+    assert found.index == pytest.approx(1500, abs=3000 / tree_findings.PARTS)
+
+
 @pytest.mark.parametrize("seed", range(30))
 def test_small_good_trees_give_no_finding(seed: int) -> None:
     for base in (1.1, 1.5, 2.0):

@@ -7,7 +7,7 @@ import pytest
 
 from sparklod_cli.lod.kernels import merge, profile
 from sparklod_cli.model import gaussian
-from sparklod_cli.render.kernels import project
+from sparklod_cli.render.kernels import ellipse, project
 from tests.scenes import random_splats
 
 QUATS = random_splats(50, seed=4).quat_xyzw
@@ -27,7 +27,7 @@ def test_a_rotation_matrix_turns_vectors_as_its_quaternion_does() -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "kernel"), [(np.float32, project.rotation_matrix), (np.float64, merge.rotation_matrix)]
+    ("kind", "kernel"), [(np.float32, ellipse.rotation_matrix), (np.float64, merge.rotation_matrix)]
 )
 def test_kernels_have_the_rotation_matrix_of_numpy_bit_for_bit(kind: type, kernel) -> None:  # type: ignore[no-untyped-def]
     quats = QUATS.astype(kind)

@@ -1,4 +1,4 @@
-"""The shaders, in GLSL 4.2: kernels/project.py, kernels/falloff.py and kernels/raster.py, step by step, for OpenGL.
+"""The shaders, in GLSL 4.2: kernels/ellipse.py, kernels/falloff.py and kernels/raster.py, step by step, for OpenGL.
 
 `precise` keeps compilers from reordering what they could: what is left of the covariances of thin splats are small
 differences of large numbers, which come out visibly different when rounded in another order.
@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..kernels.ellipse import LEAST_COVARIANCE, MAX_D, MAX_VARIANCE
 from ..kernels.falloff import HALF_LOG2E, LEAST_EXPONENT, LEAST_REST
-from ..kernels.project import LEAST_COVARIANCE, MAX_D, MAX_VARIANCE
 from ..settings import BLUR, CLIP, MAX_STD_DEV, MIN_ALPHA, STD_DEV_PER_D
 
 

@@ -44,7 +44,7 @@ class Drawn(NamedTuple):
     """A picture's splats and tiles.
 
     Attributes:
-        screen, boxes: (N, COLUMNS) float32 and (N, 4) int32 of `project`.
+        screen, boxes: (N, COLUMNS) float32 and (N, 4) int16 of `project`.
         start, splats, stop: of `draw_tiles`.
         across: number of tiles in a row of them.
     """

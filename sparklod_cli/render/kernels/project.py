@@ -8,11 +8,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...model import gaussian
-from ...support.fast_math import log2
 from ...support.jit import kernel, prange
-from .falloff import HALF_LOG2E
+from .ellipse import ellipse, on_screen, shortened
 
-f32, f64 = np.float32, np.float64
+f32 = np.float32
 
 #: Columns of a splat on the screen, float32, 64 bytes:
 #: X, Y: its centre, in pixels from the upper left corner.
@@ -29,11 +28,19 @@ X, Y, ALONG, SHEAR, ACROSS, LOG, LEAST, OPACITY = range(8)
 POWER, RED, GREEN, BLUE, HALF_WIDTH, HALF_HEIGHT, SLOPE, TALL = range(8, 16)
 COLUMNS = 16
 
+#: Splats that are projected together: their fields, 9 KB, stay in the first-level cache. Chosen.
+GROUP = 64
+
+#: Fields of a splat while it is projected, besides its columns: what it is made of, and those of `OnScreen`, float32.
+CENTER, SCALE, QUAT = 16, 19, 22
+SEEN, XX, XY, YY, DET, DEVIATIONS, LONGEST, DEPTH, SQUARE = range(26, 35)
+FIELDS = 35
+
 #: Side of a tile of the picture, pixels.
 TILE = 16
 
-#: Largest D, as in Spark's encodings, and largest colour value, that of the float16 that Spark keeps colours in.
-MAX_D, MAX_COLOR = f32(5), f32(65504)
+#: Largest colour value, that of the float16 that Spark keeps colours in.
+MAX_COLOR = f32(65504)
 
 #: The key of a splat that is not drawn; it is sorted behind all others.
 NOT_DRAWN = np.uint64(0xFFFFFFFFFFFFFFFF)
@@ -44,14 +51,6 @@ NOT_SEEN = f32(-1)
 #: The largest index in a key, whose lower half it is.
 MAX_INDEX = 0xFFFFFFFF
 
-#: Largest variance on the screen, pixels squared, so that float32 holds determinants. Chosen, far beyond any picture.
-MAX_VARIANCE = f32(1e18)
-
-#: Least covariance on the screen, pixels squared, from which the direction of the longer axis is computed; below it the
-#: axes are those of the screen. Spark's shader has the same.
-LEAST_COVARIANCE = f32(1e-3)
-
-rotation_matrix = kernel(inline=True)(gaussian.rotation_matrix)
 linear_opacity_above_1 = kernel(inline=True)(gaussian.linear_opacity_above_1)
 
 
@@ -69,82 +68,23 @@ class ShadedColumns(NamedTuple):
     rgb: Any
 
 
-class Lens(NamedTuple):
-    """A camera's picture; pixels, float32.
-
-    Attributes:
-        focal_x, focal_y: focal lengths. principal_x, principal_y: principal point. width, height: of the picture.
-    """
-
-    focal_x: Any
-    focal_y: Any
-    principal_x: Any
-    principal_y: Any
-    width: Any
-    height: Any
-
-
-class Limits(NamedTuple):
-    """Limits on what is drawn, float32; see `RasterSettings` and the constants in its module.
-
-    Attributes:
-        near, far: range of depths, world units.
-        clip: largest distance of a centre from the picture's, in half pictures.
-        blur: variance added to a splat's on the screen, pixels squared.
-        min_alpha: least alpha.
-        std_devs: radius of a splat, in standard deviations. std_devs_per_d: added to it per unit of D above 1.
-        max_radius: pixels.
-    """
-
-    near: Any
-    far: Any
-    clip: Any
-    blur: Any
-    min_alpha: Any
-    std_devs: Any
-    std_devs_per_d: Any
-    max_radius: Any
+@kernel(inline=True)
+def power_of(d):
+    """POWER of a splat of D."""
+    return linear_opacity_above_1(d, f32(1), f32(np.e)) if d > 1 else f32(1)
 
 
 @kernel(inline=True)
-def in_camera(m, x, y, z):
-    """A point in the axes of a camera: right, down and forward; `m` is its (3, 4) world to camera."""
-    return (
-        m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3],
-        m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3],
-        m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3],
-    )
+def shown_color(value):
+    """A colour value as it is drawn; NaN is 0."""
+    return min(value, MAX_COLOR) if value > 0 else f32(0)
 
 
 @kernel(inline=True)
-def jacobian(lens, inverse, dx, dy):
-    """Pixels per unit of a camera's axes at a point: x by right, y by down, x and y by forward.
-
-    Args:
-        lens: `Lens`.
-        inverse: 1 / depth of the point.
-        dx, dy: from the principal point to the point, pixels.
-    """
-    return lens.focal_x * inverse, lens.focal_y * inverse, -dx * inverse, -dy * inverse
-
-
-@kernel(inline=True)
-def per_world_unit(m, row, sideways, forward):
-    """Pixels per unit of the world's axes, of pixels per unit of axis `row` of a camera and of its forward axis."""
-    return (
-        sideways * m[row, 0] + forward * m[2, 0],
-        sideways * m[row, 1] + forward * m[2, 1],
-        sideways * m[row, 2] + forward * m[2, 2],
-    )
-
-
-@kernel(inline=True)
-def turned(t, r):
-    """Three pixels per world unit t along the axes of a splat of rotation r, 9 elements row by row."""
-    return (
-        t[0] * r[0] + t[1] * r[3] + t[2] * r[6],
-        t[0] * r[1] + t[1] * r[4] + t[2] * r[7],
-        t[0] * r[2] + t[1] * r[5] + t[2] * r[8],
+def is_in_picture(x, y, half_width, half_height, lens):
+    """Whether a box overlaps the picture, or has a side that is not a number."""
+    return not (
+        (x + half_width < 0) | (x - half_width > lens.width) | (y + half_height < 0) | (y - half_height > lens.height)
     )
 
 
@@ -155,104 +95,34 @@ def project_splat(splats, i, world_to_camera, lens, limits, radial, row):
     Args:
         splats: `ShadedColumns`.
         i: which of them.
-        world_to_camera: (3, 4) float32; the camera looks along z, with y down.
-        lens: `Lens`.
-        limits: `Limits`.
+        world_to_camera, lens, limits: of `on_screen`.
         radial: splats are sorted by distance from the camera, not by depth.
         row: (COLUMNS,) float32, filled if the splat is drawn.
 
     Returns:
         float32 distance to sort by, world units; NOT_SEEN if the splat is not drawn.
     """
-    center, scale, quat, lod_opacity, rgb = splats
-    m = world_to_camera
-    d = min(lod_opacity[i], MAX_D)
-    x, y, z = center[i, 0], center[i, 1], center[i, 2]
-    u, v, w = in_camera(m, x, y, z)
-    if not (w > limits.near and w < limits.far and d >= limits.min_alpha):
+    center, scale, quat, rgb = splats.center[i], splats.scale[i], splats.quat_xyzw[i], splats.rgb[i]
+    place, size = (center[0], center[1], center[2]), (scale[0], scale[1], scale[2])
+    turn = quat[0], quat[1], quat[2], quat[3]
+    s = on_screen(place, size, turn, splats.lod_opacity[i], world_to_camera, lens, limits)
+    a, b, c, det = s.a, s.b, s.c, s.det
+    if not s.is_seen:
         return NOT_SEEN
-    # In float64 up to the covariance: a direction in float32 is off by hundredths of a pixel at the ends of a needle.
-    exact_u, exact_v, exact_w = in_camera(m, f64(x), f64(y), f64(z))
-    inverse = f64(1) / exact_w
-    dx, dy = lens.focal_x * exact_u * inverse, lens.focal_y * exact_v * inverse
-    half_width, half_height = f32(0.5) * lens.width, f32(0.5) * lens.height
-    if abs(lens.principal_x + dx - half_width) > limits.clip * half_width or (
-        abs(lens.principal_y + dy - half_height) > limits.clip * half_height
-    ):
-        return NOT_SEEN
-    # T: Jacobian of the projection, times the rotation into the camera. With the splat's rotation R and scales S,
-    # the covariance on the screen is (T R S) (T R S)^T; p and q are the rows of T R S.
-    jx, jy, kx, ky = jacobian(lens, inverse, dx, dy)
-    across, down = per_world_unit(m, 0, jx, kx), per_world_unit(m, 1, jy, ky)
-    rotation = rotation_matrix(f64(quat[i, 0]), f64(quat[i, 1]), f64(quat[i, 2]), f64(quat[i, 3]), f64(1))
-    sx, sy, sz = scale[i, 0], scale[i, 1], scale[i, 2]
-    px, py, pz = turned(across, rotation)
-    qx, qy, qz = turned(down, rotation)
-    p0, p1, p2 = px * sx, py * sy, pz * sz
-    q0, q1, q2 = qx * sx, qy * sy, qz * sz
-    xx, xy, yy = p0 * p0 + p1 * p1 + p2 * p2, p0 * q0 + p1 * q1 + p2 * q2, q0 * q0 + q1 * q1 + q2 * q2
-    # Determinants before and after the blur as sums of terms >= 0: for needles, a * c - b * b would cancel.
-    minor, other, third = p0 * q1 - p1 * q0, p0 * q2 - p2 * q0, p1 * q2 - p2 * q1
-    area = minor * minor + other * other + third * third
-    before, a, b, c = f32(area), f32(xx + limits.blur), f32(xy), f32(yy + limits.blur)
-    det = f32(area + limits.blur * (xx + yy) + limits.blur * limits.blur)
-    if not (det > 0 and a < MAX_VARIANCE and c < MAX_VARIANCE):
-        return NOT_SEEN
-    one = f32(1)
-    deviations = limits.std_devs + limits.std_devs_per_d * max(d - one, f32(0))
-    d *= np.sqrt(before / det)
-    if not d >= limits.min_alpha:
-        return NOT_SEEN
-    mean = f32(0.5) * (a + c)
-    spread = np.sqrt(max(mean * mean - det, f32(0)))
-    longest = deviations * np.sqrt(mean + spread)
-    if longest > limits.max_radius:  # each axis is shortened by itself
-        is_turned = abs(b) > LEAST_COVARIANCE
-        ax, ay = (b, mean + spread - a) if is_turned else ((one, f32(0)) if a >= c else (f32(0), one))
-        norm = one / np.sqrt(ax * ax + ay * ay)
-        ax, ay = ax * norm, ay * norm
-        # The smaller eigenvalue is determinant / larger one: mean - spread cancels for thin splats.
-        first = (limits.max_radius / deviations) ** f32(2)
-        second = min(first, det / (mean + spread))
-        a, b, c = (
-            first * ax * ax + second * ay * ay,
-            (first - second) * ax * ay,
-            first * ay * ay + second * ax * ax,
-        )
-        det = first * second
+    if s.longest > limits.max_radius:
+        a, b, c, det = shortened(a, b, c, det, s.deviations, limits.max_radius)
         if not det > 0:
             return NOT_SEEN
-    end = deviations * deviations
-    log = f32(0)
-    if d <= one:
-        log = log2(f32(d))
-        # Where alpha is least: a faint splat ends there.
-        end = min(end, (log - log2(limits.min_alpha)) / HALF_LOG2E)
-    end = max(end, f32(0))
-    row[X] = lens.principal_x + dx
-    row[Y] = lens.principal_y + dy
-    row[ALONG] = np.sqrt(HALF_LOG2E * c / det)
-    row[SHEAR] = b / c
-    row[ACROSS] = HALF_LOG2E / c
-    row[LOG] = log
-    row[LEAST] = log - HALF_LOG2E * end
-    row[OPACITY] = d
-    row[POWER] = linear_opacity_above_1(d, one, f32(np.e)) if d > one else one
-    for channel in range(3):
-        value = rgb[i, channel]
-        row[RED + channel] = min(value, MAX_COLOR) if value > 0 else f32(0)
-    row[HALF_WIDTH] = np.sqrt(end * a)
-    row[HALF_HEIGHT] = np.sqrt(end * c)
-    row[SLOPE] = b / a
-    row[TALL] = np.sqrt(end * det / a)
-    if (
-        row[X] + row[HALF_WIDTH] < 0
-        or row[X] - row[HALF_WIDTH] > lens.width
-        or row[Y] + row[HALF_HEIGHT] < 0
-        or row[Y] - row[HALF_HEIGHT] > lens.height
-    ):
+    along, shear, across, log, least, half_width, half_height, slope, tall = ellipse(
+        a, b, c, det, s.d, s.deviations, limits.min_alpha
+    )
+    row[X], row[Y], row[ALONG], row[SHEAR], row[ACROSS], row[LOG] = s.x, s.y, along, shear, across, log
+    row[LEAST], row[OPACITY], row[POWER] = least, s.d, power_of(s.d)
+    row[RED], row[GREEN], row[BLUE] = shown_color(rgb[0]), shown_color(rgb[1]), shown_color(rgb[2])
+    row[HALF_WIDTH], row[HALF_HEIGHT], row[SLOPE], row[TALL] = half_width, half_height, slope, tall
+    if not is_in_picture(s.x, s.y, half_width, half_height, lens):
         return NOT_SEEN
-    return np.sqrt(u * u + v * v + w * w) if radial else w
+    return np.sqrt(s.square) if radial else s.depth
 
 
 @kernel(inline=True)
@@ -280,21 +150,80 @@ def index_of(key):
 
 @kernel(parallel=True)
 def project(splats, world_to_camera, lens, limits, radial, screen, keys, boxes):
-    """Splats on the screen; see `project_splat`.
+    """Splats on the screen; see `project_splat`, of which this is the same for many splats at once.
 
     Args:
         splats, world_to_camera, lens, limits, radial: of `project_splat`.
         screen: (N, COLUMNS) float32, filled for splats that are drawn.
         keys: (N,) uint64, filled with distance and index, so that they sort from near to far, and among equal
             distances the last splat is in front, as in Spark; NOT_DRAWN for splats that are not drawn.
-        boxes: (N, 4) int32, filled with the `tiles_of` splats that are drawn, and for others with an empty box.
+        boxes: (N, 4) int16, filled with the `tiles_of` splats that are drawn, and for others with an empty box.
     """
+    n = len(splats.center)
+    for group in prange((n + GROUP - 1) // GROUP):
+        fields = np.empty((FIELDS, GROUP), np.float32)
+        start = GROUP * group
+        project_group(splats, start, min(GROUP, n - start), world_to_camera, lens, limits, fields)
+        finish_group(splats, start, min(GROUP, n - start), lens, radial, fields, screen, keys, boxes)
+
+
+@kernel(inline=True)
+def project_group(splats, start, count, world_to_camera, lens, limits, fields):
+    """Fills the fields of `count` splats from `start` on, but POWER and colours.
+
+    Loops over fields, not over splats: LLVM vectorizes those without branches.
+    """
+    for k in range(count):
+        i = start + k
+        for axis in range(3):
+            fields[CENTER + axis, k] = splats.center[i, axis]
+            fields[SCALE + axis, k] = splats.scale[i, axis]
+        for axis in range(4):
+            fields[QUAT + axis, k] = splats.quat_xyzw[i, axis]
+        fields[OPACITY, k] = splats.lod_opacity[i]
+    for k in range(count):
+        center = fields[CENTER, k], fields[CENTER + 1, k], fields[CENTER + 2, k]
+        scale = fields[SCALE, k], fields[SCALE + 1, k], fields[SCALE + 2, k]
+        quat = fields[QUAT, k], fields[QUAT + 1, k], fields[QUAT + 2, k], fields[QUAT + 3, k]
+        s = on_screen(center, scale, quat, fields[OPACITY, k], world_to_camera, lens, limits)
+        fields[SEEN, k], fields[X, k], fields[Y, k] = f32(1) if s.is_seen else f32(0), s.x, s.y
+        fields[XX, k], fields[XY, k], fields[YY, k], fields[DET, k] = s.a, s.b, s.c, s.det
+        fields[OPACITY, k], fields[DEVIATIONS, k], fields[LONGEST, k] = s.d, s.deviations, s.longest
+        fields[DEPTH, k], fields[SQUARE, k] = s.depth, s.square
+    for k in range(count):
+        if fields[SEEN, k] > 0 and fields[LONGEST, k] > limits.max_radius:
+            a, b, c, det = fields[XX, k], fields[XY, k], fields[YY, k], fields[DET, k]
+            a, b, c, det = shortened(a, b, c, det, fields[DEVIATIONS, k], limits.max_radius)
+            fields[XX, k], fields[XY, k], fields[YY, k], fields[DET, k] = a, b, c, det
+    for k in range(count):
+        a, b, c, det = fields[XX, k], fields[XY, k], fields[YY, k], fields[DET, k]
+        along, shear, across, log, least, half_width, half_height, slope, tall = ellipse(
+            a, b, c, det, fields[OPACITY, k], fields[DEVIATIONS, k], limits.min_alpha
+        )
+        is_inside = is_in_picture(fields[X, k], fields[Y, k], half_width, half_height, lens)
+        fields[SEEN, k] = f32(1) if (fields[SEEN, k] > 0) & (det > 0) & is_inside else f32(0)
+        fields[ALONG, k], fields[SHEAR, k], fields[ACROSS, k] = along, shear, across
+        fields[LOG, k], fields[LEAST, k] = log, least
+        fields[HALF_WIDTH, k], fields[HALF_HEIGHT, k] = half_width, half_height
+        fields[SLOPE, k], fields[TALL, k] = slope, tall
+
+
+@kernel(inline=True)
+def finish_group(splats, start, count, lens, radial, fields, screen, keys, boxes):
+    """Fills `screen`, `keys` and `boxes` of `project` of the fields of `count` splats from `start` on."""
     across, down = -(-np.int64(lens.width) // TILE), -(-np.int64(lens.height) // TILE)
-    for i in prange(len(splats.center)):
-        depth = project_splat(splats, i, world_to_camera, lens, limits, radial, screen[i])
-        if depth >= 0:
+    for k in range(count):
+        i = start + k
+        if fields[SEEN, k] > 0:
+            fields[POWER, k] = power_of(fields[OPACITY, k])
+            for channel in range(3):
+                fields[RED + channel, k] = shown_color(splats.rgb[i, channel])
+            row = screen[i]
+            for column in range(COLUMNS):
+                row[column] = fields[column, k]
+            depth = np.sqrt(fields[SQUARE, k]) if radial else fields[DEPTH, k]
             keys[i] = (np.uint64(np.float32(depth).view(np.uint32)) << np.uint64(32)) | np.uint64(MAX_INDEX - i)
-            boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3] = tiles_of(screen[i], across, down)
+            boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3] = tiles_of(row, across, down)
         else:
             keys[i] = NOT_DRAWN
             boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3] = 0, -1, 0, -1

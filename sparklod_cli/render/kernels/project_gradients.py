@@ -12,19 +12,14 @@ import numpy as np
 
 from ...support.jit import kernel, prange
 from .backward import BY_RED, BY_SHAPE, BY_X, BY_XX, BY_XY, BY_Y, BY_YY, SUMS
+from .ellipse import MAX_D, in_camera, jacobian, per_world_unit, rotation_matrix, turned
 from .falloff import HALF_LOG2E
 from .project import (
     ACROSS,
     ALONG,
     MAX_COLOR,
-    MAX_D,
     OPACITY,
     SHEAR,
-    in_camera,
-    jacobian,
-    per_world_unit,
-    rotation_matrix,
-    turned,
 )
 
 f64 = np.float64

@@ -1,10 +1,10 @@
-"""Sorts splats into tiles and draws the tiles."""
+"""Draws the tiles of a picture."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from ...support.jit import kernel, prange
+from ...support.jit import kernel, prange, prefetch
 from .falloff import merged, plain, shifted
 from .project import (
     ACROSS,
@@ -25,7 +25,6 @@ from .project import (
     TILE,
     X,
     Y,
-    index_of,
 )
 
 f32 = np.float32
@@ -48,105 +47,101 @@ LEAST_SQUARE = f32(1e-6)
 #: has to be guessed stands between them. Measured: docs/decisions/2026-11-22-render-speed.md.
 BATCH = 16
 
+#: Rows of LANES pixels that a batch may have to be blended into, and one column that is written beyond the last.
+ROWS = (BATCH * BLOCKS + 1) * TILE
 
-@kernel(parallel=True)
-def sort_into_tiles(keys, boxes, across, down, blocks):
-    """Lists the splats of each tile, in their order.
-
-    Args:
-        keys: (M,) uint64 of `project`, sorted, without NOT_DRAWN.
-        boxes: (N, 4) int32 of it.
-        across, down: numbers of tiles.
-        blocks: ranges of splats to process in parallel; the result does not depend on it.
-
-    Returns:
-        start: (tiles + 1,) int64, where the splats of each tile begin.
-        splats: (total,) int32 splats, from near to far.
-    """
-    tiles = across * down
-    count = np.zeros((blocks, tiles), np.int32)
-    n = len(keys)
-    for block in prange(blocks):
-        for k in range(n * block // blocks, n * (block + 1) // blocks):
-            box = boxes[index_of(keys[k])]
-            for y in range(box[2], box[3] + 1):
-                for x in range(box[0], box[1] + 1):
-                    count[block, y * across + x] += 1
-    start = np.empty(tiles + 1, np.int64)
-    at = np.empty((blocks, tiles), np.int64)
-    total = 0
-    for tile in range(tiles):
-        start[tile] = total
-        for block in range(blocks):
-            at[block, tile] = total
-            total += count[block, tile]
-    start[tiles] = total
-    splats = np.empty(total, np.int32)
-    for block in prange(blocks):
-        for k in range(n * block // blocks, n * (block + 1) // blocks):
-            i = index_of(keys[k])
-            box = boxes[i]
-            for y in range(box[2], box[3] + 1):
-                for x in range(box[0], box[1] + 1):
-                    tile = y * across + x
-                    splats[at[block, tile]] = i
-                    at[block, tile] += 1
-    return start, splats
+#: What is listed of a row of pixels, see `list_rows`: which of a tile's rows it is, and which of the batch's splats is
+#: blended into it; and of the exponent t of that splat's falloff, MIDDLE and MOST: i pixels right of the row's first,
+#: t = MOST - (ALONG i - MIDDLE)^2.
+PLACE, SPLAT = range(2)
+MIDDLE, MOST = range(2)
 
 
 @kernel(inline=True)
-def blend(pixels, i, alpha, is_drawn, red, green, blue):
+def blend(lanes, i, alpha, is_drawn, red, green, blue):
     """Blends a splat behind what a pixel has so far; branch-free, so that LLVM vectorizes over the pixels of a row.
 
     Colours are clamped to 1 after they are multiplied by alpha, as in an 8-bit picture.
     """
     alpha = alpha if is_drawn else f32(0)
-    through = pixels[0, i]
-    pixels[1, i] += through * min(alpha * red, f32(1))
-    pixels[2, i] += through * min(alpha * green, f32(1))
-    pixels[3, i] += through * min(alpha * blue, f32(1))
-    pixels[0, i] = through - through * alpha
+    through = lanes[0, i]
+    lanes[1, i] += through * min(alpha * red, f32(1))
+    lanes[2, i] += through * min(alpha * green, f32(1))
+    lanes[3, i] += through * min(alpha * blue, f32(1))
+    lanes[0, i] = through - through * alpha
 
 
 @kernel(inline=True)
-def blend_column(pixels, row, x, first, last, design, least):
-    """Blends a splat into a column of blocks.
+def list_rows(splats, k, lines, rows, terms, end):
+    """Lists the rows of pixels in which a splat may be drawn; branch-free, as their number cannot be foreseen.
 
     Args:
-        pixels: (TILE, 4, LANES) float32: transmittance, red, green and blue.
-        row: the splat, after `measure`.
-        x: its centre from the middle of the column's first pixel, pixels.
-        first, last: rows of pixels, the last excluded.
+        splats: (COLUMNS, BATCH) float32 splats of a batch, after `measure`.
+        k: which of them.
+        lines: (BLOCKS, 2) int32 of `measure`.
+        rows: (2, ROWS) uint32, PLACE and SPLAT, filled from `end` on, and up to TILE columns beyond the last row.
+        terms: (2, ROWS) float32, MIDDLE and MOST, filled likewise.
+        end: where the list ends.
+
+    Returns:
+        where it ends now.
+    """
+    x, y, along, shear = splats[X, k], splats[Y, k], splats[ALONG, k], splats[SHEAR, k]
+    across, log = splats[ACROSS, k], splats[LOG, k]
+    for block in range(BLOCKS):
+        first, last = lines[block, 0], lines[block, 1]
+        left = x - f32(LANES * block)
+        for i in range(TILE):
+            line, to = np.int32(first + i), np.uint64(end + i)
+            dy = f32(line) - y
+            rows[PLACE, to] = np.uint32(line + TILE * block)
+            rows[SPLAT, to] = np.uint32(k)
+            terms[MIDDLE, to] = along * (left + shear * dy)
+            terms[MOST, to] = log - across * dy * dy
+        end += max(0, last - first)
+    return end
+
+
+@kernel(inline=True)
+def listed(splats, rows, terms, j):
+    """Of row j of a list: SPLAT, MIDDLE and MOST, and that splat's ALONG, LEAST, RED, GREEN and BLUE."""
+    k = rows[SPLAT, j]
+    shape = terms[MIDDLE, j], terms[MOST, j], splats[ALONG, k], splats[LEAST, k]
+    return k, *shape, splats[RED, k], splats[GREEN, k], splats[BLUE, k]
+
+
+@kernel(inline=True)
+def blend_rows(pixels, splats, rows, terms, first, last, design, least):
+    """Blends splats into the rows of a list; they are all merged ones, or all others.
+
+    Args:
+        pixels: (BLOCKS * TILE, 4, LANES) float32: transmittance, red, green and blue.
+        splats, rows, terms: of `list_rows`.
+        first, last: which rows of the list, the last excluded; at least one.
         design: merged splats have the falloff `shifted`, that of Spark's LoD design.
         least: float32, least alpha that is drawn.
     """
-    y, along, shear, across, log, end = row[Y], row[ALONG], row[SHEAR], row[ACROSS], row[LOG], row[LEAST]
-    d, power = row[OPACITY], row[POWER]
-    red, green, blue = row[RED], row[GREEN], row[BLUE]
-    if d <= 1:
-        for line in range(first, last):
-            dy = f32(line) - y
-            middle, most = along * (x + shear * dy), log - across * dy * dy
-            lanes = pixels[line]
+    if splats[OPACITY, rows[SPLAT, first]] <= 1:
+        for j in range(first, last):
+            k, middle, most, along, end, red, green, blue = listed(splats, rows, terms, j)
+            lanes = pixels[rows[PLACE, j]]
             for i in range(LANES):
                 away = along * f32(i) - middle
                 t = most - away * away
                 blend(lanes, i, plain(t), t >= end, red, green, blue)
     elif design:
-        for line in range(first, last):
-            dy = f32(line) - y
-            middle, most = along * (x + shear * dy), log - across * dy * dy
-            lanes = pixels[line]
+        for j in range(first, last):
+            k, middle, most, along, end, red, green, blue = listed(splats, rows, terms, j)
+            lanes, d = pixels[rows[PLACE, j]], splats[OPACITY, k]
             for i in range(LANES):
                 away = along * f32(i) - middle
                 t = most - away * away
                 alpha = shifted(t, d)
                 blend(lanes, i, alpha, (t >= end) & (alpha >= least), red, green, blue)
     else:
-        for line in range(first, last):
-            dy = f32(line) - y
-            middle, most = along * (x + shear * dy), log - across * dy * dy
-            lanes = pixels[line]
+        for j in range(first, last):
+            k, middle, most, along, end, red, green, blue = listed(splats, rows, terms, j)
+            lanes, power = pixels[rows[PLACE, j]], splats[POWER, k]
             for i in range(LANES):
                 away = along * f32(i) - middle
                 t = most - away * away
@@ -155,14 +150,20 @@ def blend_column(pixels, row, x, first, last, design, least):
 
 
 @kernel(inline=True)
-def is_opaque(pixels):
-    """Whether no pixel of a tile has a transmittance of OPAQUE or more."""
-    most = np.zeros(LANES, np.float32)
-    for block in range(BLOCKS):
-        for line in range(TILE):
-            for i in range(LANES):
-                most[i] = max(most[i], pixels[block, line, 0, i])
-    return most.max() < OPAQUE
+def blend_batch(pixels, splats, count, lines, rows, terms, design, least):
+    """Blends a batch of `count` splats, after `measure`, from near to far; for the arguments see `blend_rows`.
+
+    Rows of several splats are blended in one loop, as loops over those of each would end where no processor foresees.
+    """
+    k = 0
+    while k < count:
+        is_merged = splats[OPACITY, k] > 1
+        end = 0
+        while k < count and (splats[OPACITY, k] > 1) == is_merged:
+            end = list_rows(splats, k, lines[k], rows, terms, end)
+            k += 1
+        if end > 0:
+            blend_rows(pixels, splats, rows, terms, 0, end, design, least)
 
 
 @kernel(inline=True)
@@ -198,33 +199,35 @@ def draw_tile(screen, start, splats, tile, across, design, least, image):
     """Blends the splats of a tile, from near to far, see `draw_tiles`; returns where in `splats` it stopped."""
     height, width = image.shape[:2]
     left, top = tile % across * TILE, tile // across * TILE
-    rows, columns = min(TILE, height - top), min(TILE, width - left)
-    pixels = np.zeros((BLOCKS, TILE, 4, LANES), np.float32)
-    fetched, lines = np.empty((BATCH, COLUMNS), np.float32), np.empty((BATCH, BLOCKS, 2), np.int32)
+    down, right = min(TILE, height - top), min(TILE, width - left)
+    pixels = np.zeros((BLOCKS * TILE, 4, LANES), np.float32)
+    fetched, lines = np.empty((COLUMNS, BATCH), np.float32), np.empty((BATCH, BLOCKS, 2), np.int32)
+    rows, terms = np.empty((2, ROWS), np.uint32), np.empty((2, ROWS), np.float32)
     for block in range(BLOCKS):
-        for line in range(rows):
+        for line in range(down):
             for i in range(LANES):
-                pixels[block, line, 0, i] = f32(1) if LANES * block + i < columns else f32(0)
-    stop = start[tile + 1]
+                pixels[TILE * block + line, 0, i] = f32(1) if LANES * block + i < right else f32(0)
+    floats, stop = screen.reshape(-1), start[tile + 1]
+    clear = 0  # all pixels before it are opaque, and stay so
     for entry in range(start[tile], start[tile + 1], BATCH):
         count = min(BATCH, start[tile + 1] - entry)
+        for k in range(entry + BATCH, min(entry + 2 * BATCH, start[tile + 1])):
+            prefetch(floats, np.int64(splats[k]) * COLUMNS)
         for k in range(count):
-            found = screen[splats[entry + k]]
+            found = np.uint64(splats[entry + k]) * np.uint64(COLUMNS)
             for column in range(COLUMNS):
-                fetched[k, column] = found[column]
+                fetched[column, k] = floats[found + np.uint64(column)]
         for k in range(count):
-            measure(fetched[k], left, top, rows, columns, lines[k])
-        for k in range(count):
-            row = fetched[k]
-            for block in range(BLOCKS):
-                first, last = lines[k, block, 0], lines[k, block, 1]
-                blend_column(pixels[block], row, row[X] - f32(LANES * block), first, last, design, least)
-        if is_opaque(pixels):
+            measure(fetched[:, k], left, top, down, right, lines[k])
+        blend_batch(pixels, fetched, count, lines, rows, terms, design, least)
+        while clear < BLOCKS * TILE * LANES and pixels[clear // LANES, 0, clear % LANES] < OPAQUE:
+            clear += 1
+        if clear == BLOCKS * TILE * LANES:
             stop = min(entry + BATCH, stop)
             break
-    for line in range(rows):
-        for i in range(columns):
-            lanes = pixels[i // LANES, line]
+    for line in range(down):
+        for i in range(right):
+            lanes = pixels[TILE * (i // LANES) + line]
             image[top + line, left + i, 0] = lanes[1, i % LANES]
             image[top + line, left + i, 1] = lanes[2, i % LANES]
             image[top + line, left + i, 2] = lanes[3, i % LANES]
@@ -238,7 +241,7 @@ def draw_tiles(screen, start, splats, across, design, least, image, stop):
 
     Args:
         screen: (N, COLUMNS) of `project`.
-        start, splats: of `sort_into_tiles`.
+        start, splats: of `tiles.sort_into_tiles`.
         across: number of tiles in a row of them.
         design: merged splats have the falloff `shifted`, that of Spark's LoD design.
         least: float32, least alpha that is drawn.

@@ -10,7 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...support.jit import kernel, prange
-from .project import COLUMNS, TILE, Lens, ShadedColumns, project_splat, tiles_of
+from .ellipse import Lens
+from .project import COLUMNS, TILE, ShadedColumns, project_splat, tiles_of
 from .raster import LANES, draw_tile
 
 f32 = np.float32

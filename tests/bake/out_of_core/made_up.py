@@ -62,11 +62,11 @@ def fill_disk(job: Job, name: str, **_: Any) -> None:
 
 
 def devour(job: Job, name: str, **_: Any) -> None:
-    """Takes memory until somebody ends it."""
+    """Takes memory until somebody ends it, so slowly that a busy machine has enough until then."""
     held = []
     while True:
-        held.append(np.ones(5_000_000))
-        time.sleep(0.02)
+        held.append(np.ones(1_000_000))
+        time.sleep(0.01)
 
 
 def tree_of(count: int, *, seconds: float = 0.0) -> list[Task]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import pickle
-import time
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -113,11 +113,11 @@ def test_a_result_that_is_lost_with_its_worker_is_waited_for(engine: ClusterEngi
         pool.submit("twice", 0, cluster_worker.run_call, made_up.twice, (21,), 1)
         future = pool._futures["twice"]
         future.result(timeout=60)
-        loop = engine._connection.client.loop
+        loop, lost = engine._connection.client.loop, threading.Event()
         loop.add_callback(future._state.lose)  # as when the scheduler hears that the worker is gone
+        loop.add_callback(lost.set)
+        assert lost.wait(60) and future.status == "lost"
         loop.add_callback(loop.call_later, 0.5, future._state.finish)
-        while future.status != "lost":
-            time.sleep(0.01)
         assert pool.next() == ("twice", 42, None)
 
 
@@ -166,14 +166,18 @@ def test_a_worker_without_sparklod_is_told_what_to_do(engine: ClusterEngine, job
 def _hide(module: str) -> None:
     import sys
 
-    sys.modules["hidden"] = sys.modules.pop(module)
+    sys.modules["hidden"] = sys.modules.pop(module, None)  # type: ignore[assignment]
     sys.modules[module] = None  # type: ignore[assignment]
 
 
 def _show(module: str) -> None:
+    """Also on a worker that came since, where it is not hidden."""
     import sys
 
-    sys.modules[module] = sys.modules.pop("hidden")
+    if "hidden" in sys.modules:
+        del sys.modules[module]
+        if (found := sys.modules.pop("hidden")) is not None:
+            sys.modules[module] = found
 
 
 def test_a_block_that_does_not_fit_into_memory_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +24,8 @@ from .made_up import Job, tree_of
 
 
 @pytest.fixture
-def scheduler(monkeypatch: pytest.MonkeyPatch) -> Any:
+def scheduler() -> Any:
     """A scheduler with a worker, in this process."""
-    monkeypatch.setattr(module, "PATIENCE", 0.5)
     with module._quiet():
         yield from _scheduler()
 
@@ -55,14 +55,24 @@ def test_a_scheduler_that_runs_is_used_and_left_alone(scheduler: Any, tmp_path: 
 def test_a_scheduler_that_goes_away_keeps_what_is_done(scheduler: Any, tmp_path: Path) -> None:
     job, tasks = Job(FolderStore(tmp_path)), tree_of(64, seconds=0.05)
     with cluster(ClusterSettings(scheduler=scheduler.scheduler_address)) as engine:
-        threading.Timer(0.5, lambda: scheduler.loop.add_callback(scheduler.scheduler.close)).start()
+
+        def close() -> None:
+            while not job.store.has(tasks[0].name):
+                time.sleep(0.01)
+            scheduler.loop.add_callback(scheduler.scheduler.close)
+
+        threading.Thread(target=close, daemon=True).start()
         with pytest.raises(SparklodError, match=r"scheduler of the cluster does not answer any more.*add --resume"):
             engine.run("building", tasks, job, silent)
     assert job.store.has(tasks[0].name) and not job.store.has(tasks[-1].name)
 
 
-def test_a_cluster_without_workers_is_refused(scheduler: Any) -> None:
+def test_a_cluster_without_workers_is_refused(scheduler: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    wait = distributed.Client.wait_for_workers
+    monkeypatch.setattr(distributed.Client, "wait_for_workers", lambda client, count, timeout: wait(client, count, 0.2))
     scheduler.scale(0)
+    while scheduler.scheduler.workers:
+        time.sleep(0.01)
     with (
         pytest.raises(SparklodError, match=r"has no workers; start some with dask worker tcp://"),
         cluster(ClusterSettings(scheduler=scheduler.scheduler_address)),

@@ -173,7 +173,7 @@ def test_cameras_that_are_none_fail_before_any_work(
     assert sorted(path.name for path in scene.parent.iterdir()) == ["cameras.csv", "scene.ply"]
 
 
-#: A fitting that says "ready", and then waits until it is told to stop, or does not listen.
+#: A fitting that says "ready", waits until it is told to stop, says that it heard that, and stops or goes on.
 WAITING = """
 import sys, time
 from sparklod_cli import cli
@@ -183,7 +183,10 @@ from tests.fittings import StandIn
 class Waiting(StandIn):
     def __call__(self, nodes, tree, settings, *, interrupted, **how):
         print("ready", flush=True)
-        while not ({heeds} and interrupted()):
+        while not interrupted():
+            time.sleep(0.01)
+        print("heard", flush=True)
+        while not {heeds}:
             time.sleep(0.01)
         self.is_complete = False
         return super().__call__(nodes, tree, settings, **how)
@@ -213,10 +216,7 @@ def interrupted(
     assert process.stdout.readline() == "ready\n"
     for number in signals[:-1]:
         process.send_signal(number)
-        try:
-            process.wait(0.3)
-        except subprocess.TimeoutExpired:
-            continue
+        assert process.stdout.readline() == "heard\n"
     process.send_signal(signals[-1])
     _, err = process.communicate(timeout=60)
     return process.returncode, err.lstrip()

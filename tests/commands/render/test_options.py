@@ -175,7 +175,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert run(["build-lod", str(folder / "away.ply"), "-o", str(folder / "tree.spz"), "-q"]) == 0
     for tree, file in zip(MORE, ("other.ply", "plain.ply"), strict=True):
         assert run(["build-lod", str(folder / file), "-o", str(folder / tree), "-q"]) == 0
-    write_streamed(folder / "web", row_of_regions(8, 4))
+    write_streamed(folder / "web", row_of_regions(8, 4), together=4)
     there = {"file": "tree.spz", "translation": [-AWAY, 0, 0]}
     (folder / "back.json").write_text(json.dumps({"instances": [there]}))
     twice = [there, there | {"translation": [1 - AWAY, 0, 0]}]

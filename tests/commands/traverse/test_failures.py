@@ -166,9 +166,9 @@ def is_writing(process: int, folder: Path) -> bool:
 
 def test_sigterm_leaves_nothing_behind(tmp_path: Path) -> None:
     """As Ctrl-C, which whoever runs tests in the background may have turned off."""
-    settings = ("--orbit", "30000", "--budget", "50k", "--threads", "2", "-q", "-o", str(tmp_path / "out.csv"))
-    command = [sys.executable, "-m", "sparklod_cli", "traverse", str(TOWN), *settings]
-    process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE)
+    settings = ("--distance", "5", "--center", "0,0,0", "--budget", "50k", "--threads", "2", "-q")
+    command = [sys.executable, "-m", "sparklod_cli", "traverse", str(TOWN), "--orbit", "10000", *settings]
+    process = subprocess.Popen([*command, "-o", str(tmp_path / "out.csv")], cwd=ROOT, stderr=subprocess.PIPE)
     for _ in range(600):
         if is_writing(process.pid, tmp_path):
             break

@@ -9,15 +9,21 @@ from typing import Any
 import pytest
 
 from sparklod_cli.cli import run
+from sparklod_cli.codecs import spz
 from sparklod_cli.commands.traverse import traverse as command
 from sparklod_cli.figures import traversal_chart
+from sparklod_cli.lod import quick
+from sparklod_cli.model.scene import Scene
 from tests.commands.render.test_options import GIVEN as OF_RENDER
 from tests.conftest import FIXTURES
 from tests.lod.details import row_of_regions
+from tests.scenes import random_splats
 from tests.streamed import write_streamed
 
-TOWN = FIXTURES / "traverse" / "town.spz"
 CAMERAS = FIXTURES / "cameras"
+
+#: Trees of a few thousand nodes; each is a chunk.
+TREES = ("tree.spz", "second.spz", "third.spz")
 
 #: Options that only this command has, or that take something else here.
 OWN: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
@@ -58,8 +64,8 @@ MODES: dict[str, tuple[str, ...]] = {
     "a camera path": ("--camera-path", str(CAMERAS / "inria.json")),
     "keyframes": ("--keyframes", "0.5,-0.5,0.5:3,0,3 -0.5,-0.5,0.5:3,0,-3", "--every", "20"),
     "Streamed SOG": ("--keyframes", "0,0,7:0,0,20 0,0,1:0,0,20", "--every", "10", "--budget", "200"),
-    "a summary": ("--orbit", "3", "--distance", "6", "--json"),
-    "a summary and a table": ("--orbit", "3", "--distance", "6", "--json", "-o", "out.csv"),
+    "a summary": ("--orbit", "3", "--distance", "2", "--json"),
+    "a summary and a table": ("--orbit", "3", "--distance", "2", "--json", "-o", "out.csv"),
 }
 
 #: Options that ask for what is so already: nothing is behind cameras that see all.
@@ -79,24 +85,34 @@ def tidy(text: str, *, table: bool) -> Any:
     return [line[:-1] if timed and number else line for number, line in enumerate(lines)]
 
 
+@pytest.fixture(scope="module")
+def trees() -> dict[str, bytes]:
+    scenes = [Scene(*quick.build(random_splats(4000, seed=seed, extent=1.5))) for seed in range(len(TREES))]
+    return {name: b"".join(spz.encode(scene)) for name, scene in zip(TREES, scenes, strict=True)}
+
+
 @pytest.mark.parametrize("mode", MODES)
 def test_every_option_of_traverse_is_used_or_refused(
-    mode: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    mode: str,
+    trees: dict[str, bytes],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(
         traversal_chart, "plot", lambda *arguments: traversal_chart.Plot(b"a plot", None)
     )  # takes seconds, and has its tests
-    (tmp_path / "town.spz").write_bytes(TOWN.read_bytes())
-    write_streamed(tmp_path / "web", row_of_regions(8, 4))
-    (tmp_path / "scene.json").write_text(json.dumps({"instances": [{"file": "town.spz", "scale": 3}]}))
+    for name, data in trees.items():
+        (tmp_path / name).write_bytes(data)
+    write_streamed(tmp_path / "web", row_of_regions(8, 4), together=4)
+    (tmp_path / "scene.json").write_text(json.dumps({"instances": [{"file": "tree.spz", "scale": 3}]}))
     inputs = {path.name for path in tmp_path.iterdir()}
     known: dict[tuple[str, ...], Any] = {}
 
     def came(*arguments: str) -> Any:
         if arguments not in known:
-            file = "web" if mode == "Streamed SOG" else "town.spz"
-            files = () if "--scene" in arguments else (file,)
+            files = () if "--scene" in arguments else ("web",) if mode == "Streamed SOG" else TREES
             code = run(["traverse", *files, *MODES[mode], *arguments])
             out, err = capsys.readouterr()
             written = {}
