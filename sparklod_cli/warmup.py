@@ -73,7 +73,7 @@ JOBS = {
         (
             *("tree_links.find_cycles", "tree_links.find_depths", "tree_links.find_parents"),
             *("tree_links.add_weighted", "tree_links.fill_weights", "tree_links.sum_by_depth"),
-            *("tree_links.count_limits", "tree_links.gather_large", "tree_links.mark_small"),
+            *("tree_links.count_limits", "tree_links.mark_small"),
             *("spz_codes.count_bytes", "spz_codes.count_ends", "spz_codes.count_squares", "spz_codes.count_halves"),
             *("spz_codes.fill_extremes", "spz_codes.fill_sizes", "spz_codes.look_up"),
             *("digits.count_digits", "digits.sh_lengths"),

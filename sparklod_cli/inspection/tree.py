@@ -17,7 +17,6 @@ from ..lod.kernels.tree_links import (
     count_limits,
     find_depths,
     find_parents,
-    gather_large,
     sum_by_depth,
 )
 from ..model.gaussian import spark_size
@@ -28,7 +27,7 @@ from ..model.splats import FloatArray, Splats
 from ..support.parallel import ordered_map
 from .blocks import Block, Blocks, Tally
 from .findings import Finding
-from .tree_findings import USED, link_findings, order_findings, size_findings, told
+from .tree_findings import USED, link_findings, order_findings, parts_of, size_findings, told
 
 #: Most depths that a report lists, from the root on. Good trees have some twenty; a chain could have one a node.
 MAX_DEPTHS = 1000
@@ -226,8 +225,8 @@ def _coarse_cut(tree: LodTree, limit: FloatArray) -> tuple[NDArray[np.int64], in
     split = count_limits(tree.child_count, tree.child_start, limit, CHUNK_BITS, counts)
     above = np.cumsum(counts[::-1])[::-1]  # nodes of this limit or more
     bucket = max(0, int(np.count_nonzero(above > CHUNK_NODES)) - 1)
-    inner = np.empty(int(above[bucket]), np.int64)
-    gather_large(tree.child_count, limit, np.array(bucket << (32 - LIMIT_BITS), np.uint32).view(np.float32)[()], inner)
+    least = float(np.array(bucket << (32 - LIMIT_BITS), np.uint32).view(np.float32)[()])
+    inner = np.concatenate([part.start + _large(tree, limit, least, part) for part in parts_of(tree)])
     if len(inner) > CHUNK_NODES:
         limits = limit[inner]
         inner = inner[limits >= -np.partition(-limits, CHUNK_NODES)[CHUNK_NODES]]
@@ -240,3 +239,9 @@ def _coarse_cut(tree: LodTree, limit: FloatArray) -> tuple[NDArray[np.int64], in
     children = np.repeat(start - (np.cumsum(count) - count), count) + np.arange(count.sum())
     nodes = np.concatenate([np.zeros(1, np.int64), children])
     return np.setdiff1d(nodes[nodes < len(tree)], refined), split
+
+
+def _large(tree: LodTree, limit: FloatArray, least: float, part: slice) -> NDArray[np.intp]:
+    """The places in a part of the inner nodes whose limits are above 0 and `least` or more."""
+    some = limit[part]
+    return np.flatnonzero((tree.child_count[part] > 0) & (some > 0) & (some >= least))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -15,6 +16,7 @@ import pytest
 
 from sparklod_cli.support import atomic, jit, jit_link
 from sparklod_cli.support.jit_cache import CODE, SUFFIX, pattern_of
+from sparklod_cli.warmup import JOBS
 from tests.conftest import ROOT
 
 DAMAGE: dict[str, Callable[[bytes], bytes]] = {
@@ -166,7 +168,15 @@ def test_a_full_disk_leaves_no_part_of_a_file(cache: Cache, monkeypatch: pytest.
     assert cache.files() == []
 
 
-def test_a_bake_heals_a_cache_in_which_every_file_is_damaged(tmp_path: Path) -> None:
+def test_a_command_heals_a_cache_in_which_every_file_is_damaged(tmp_path: Path) -> None:
+    assert jit.CACHE_FOLDER is not None
+    copy = tmp_path / "cache" / jit.CACHE_FOLDER.name
+    copy.mkdir(parents=True)
+    for name in JOBS["inspect"].kernels:
+        (source,) = jit.PACKAGE.glob(f"*/kernels/{name.partition('.')[0]}.py")
+        for suffix in SUFFIXES:
+            for path in jit.CACHE_FOLDER.glob(pattern_of(name, source, suffix)):
+                shutil.copy(path, copy)
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
     scene = ROOT / "fixtures" / "sh1-ascii.ply"
     tree = str(tmp_path / "tree.spz")
@@ -174,15 +184,15 @@ def test_a_bake_heals_a_cache_in_which_every_file_is_damaged(tmp_path: Path) -> 
     # inspect compiles the least
     command = [sys.executable, "-m", "sparklod_cli", "inspect", tree, "--check"]
     how: dict[str, Any] = {"cwd": ROOT, "env": environment, "capture_output": True, "text": True, "check": True}
-    first = subprocess.run(command, **how)
-    files = sorted(path for path in (tmp_path / "cache").rglob("*") if path.is_file())
+    assert "ompil" not in subprocess.run(command, **how).stderr
+    files = sorted(copy.iterdir())
     assert len(files) >= 4 * len(SUFFIXES)
     for number, path in enumerate(files):
         path.write_bytes([*DAMAGE.values()][number % len(DAMAGE)](path.read_bytes()))
     healed = subprocess.run(command, **how)
     assert healed.stderr.count("is damaged;") == 1  # for all of them
-    compiled = [re.search(r"compiled \d+ kernels", each.stderr) for each in (first, healed)]
-    assert compiled[0] and compiled[1] and compiled[0][0] == compiled[1][0]
+    compiled = re.search(r"compiled (\d+) kernels", healed.stderr)
+    assert compiled and int(compiled[1]) >= 4
     again = subprocess.run(command, **how)
     assert "damaged" not in again.stderr
     assert "ompil" not in again.stderr

@@ -26,6 +26,10 @@ LANES = 14
 #: Nodes in a block: its columns, 30 KB, stay in the first-level cache. Results do not depend on it.
 BLOCK = 512
 
+#: The number of pairs whose costs are computed at once is a multiple of this, which vectors divide: the rest of a loop
+#: takes as long for each pair as a vector. What is computed beyond the pairs is not used. Chosen.
+SIDE_BY_SIDE = 16
+
 #: Cost of a squared colour difference of 1 (channels are 0..1), in nats of shape. Between 3 and 10 it matters little
 #: (docs/decisions/2026-11-21-fidelity.md).
 COLOR_COST = f32(4)
@@ -64,7 +68,8 @@ def pair_costs(lanes, first, step, count, largest, cost):
     With coverages w as weights, and covariances P, it is ((w_i + w_j) ln|P_ij| - w_i ln|P_i| - w_j ln|P_j|) / 2
     (Runnalls 2007), plus COLOR_COST times Ward's variance of the colours. Branch-free, and columns are contiguous, so
     that LLVM vectorizes over pairs; with a slice of `lanes` instead of `first` it does not, and takes four times as
-    long.
+    long. Indices are unsigned: of signed ones it cannot tell that none counts from the end, and it gathers the second
+    nodes one by one.
 
     Args:
         lanes: (LANES, at least first + count + step) float32 columns of node rows, C-contiguous.
@@ -74,32 +79,24 @@ def pair_costs(lanes, first, step, count, largest, cost):
         largest: float32, units squared; a pair is never merged if its covariance has a larger trace.
         cost: (at least count,) float32, filled.
     """
-    x, y, z = lanes[0, first:], lanes[1, first:], lanes[2, first:]
-    xx, yy, zz = lanes[3, first:], lanes[4, first:], lanes[5, first:]
-    xy, xz, yz = lanes[6, first:], lanes[7, first:], lanes[8, first:]
-    red, green, blue, logs, weight = (
-        lanes[9, first:],
-        lanes[10, first:],
-        lanes[11, first:],
-        lanes[12, first:],
-        lanes[13, first:],
-    )
+    start, distance = np.uint64(first), np.uint64(step)
     for i in range(count):
-        j = i + step
-        wi, wj = weight[i], weight[j]
+        p = start + np.uint64(i)
+        q = p + distance
+        wi, wj = lanes[13, p], lanes[13, q]
         inverse = f32(1) / (wi + wj)
         a, b = wi * inverse, wj * inverse
         ab = a * b
-        dx, dy, dz = x[j] - x[i], y[j] - y[i], z[j] - z[i]
-        mxx = a * xx[i] + b * xx[j] + ab * dx * dx
-        myy = a * yy[i] + b * yy[j] + ab * dy * dy
-        mzz = a * zz[i] + b * zz[j] + ab * dz * dz
-        mxy = a * xy[i] + b * xy[j] + ab * dx * dy
-        mxz = a * xz[i] + b * xz[j] + ab * dx * dz
-        myz = a * yz[i] + b * yz[j] + ab * dy * dz
+        dx, dy, dz = lanes[0, q] - lanes[0, p], lanes[1, q] - lanes[1, p], lanes[2, q] - lanes[2, p]
+        mxx = a * lanes[3, p] + b * lanes[3, q] + ab * dx * dx
+        myy = a * lanes[4, p] + b * lanes[4, q] + ab * dy * dy
+        mzz = a * lanes[5, p] + b * lanes[5, q] + ab * dz * dz
+        mxy = a * lanes[6, p] + b * lanes[6, q] + ab * dx * dy
+        mxz = a * lanes[7, p] + b * lanes[7, q] + ab * dx * dz
+        myz = a * lanes[8, p] + b * lanes[8, q] + ab * dy * dz
         joint = log_det(mxx, myy, mzz, mxy, mxz, myz)
-        dr, dg, db = red[j] - red[i], green[j] - green[i], blue[j] - blue[i]
-        shape = f32(0.5) * (wi * (joint - logs[i]) + wj * (joint - logs[j]))
+        dr, dg, db = lanes[9, q] - lanes[9, p], lanes[10, q] - lanes[10, p], lanes[11, q] - lanes[11, p]
+        shape = f32(0.5) * (wi * (joint - lanes[12, p]) + wj * (joint - lanes[12, q]))
         total = shape + COLOR_COST * (wi * b) * (dr * dr + dg * dg + db * db)
         cost[i] = total if mxx + myy + mzz <= largest else NEVER
 
@@ -123,8 +120,8 @@ def find_partners(rows, nodes, window, largest):
     for block in prange((n + BLOCK - 1) // BLOCK):
         begin, end = block * BLOCK, min(n, block * BLOCK + BLOCK)
         low, high = max(0, begin - window), min(n, end + window)
-        lanes = np.empty((LANES, BLOCK + 2 * window), np.float32)
-        cost = np.empty(BLOCK + window, np.float32)
+        lanes = np.empty((LANES, BLOCK + 2 * window + SIDE_BY_SIDE), np.float32)
+        cost = np.empty(BLOCK + window + SIDE_BY_SIDE, np.float32)
         best, at = np.full(BLOCK + 2 * window, NEVER, np.float32), np.full(BLOCK + 2 * window, -1, np.int32)
         for i in range(low, high):
             for column in range(LANES):
@@ -135,7 +132,7 @@ def find_partners(rows, nodes, window, largest):
             count = min(end - low, high - low - step) - first
             if count <= 0:
                 continue
-            pair_costs(lanes, first, step, count, largest, cost)
+            pair_costs(lanes, first, step, -(-count // SIDE_BY_SIDE) * SIDE_BY_SIDE, largest, cost)
             keep_cheaper(cost, count, best[first:], at[first:], low + first, low + first + step)
             keep_cheaper(cost, count, best[first + step :], at[first + step :], low + first + step, low + first)
         for i in range(begin, end):
@@ -182,18 +179,15 @@ def match_pairs(nodes, partner, cost, limit, made):
     mutual = 0
     for i in range(n):
         j = partner[i]
-        mutual += j > i and partner[j] == i and cost[i] <= limit
-    pairs, rest = np.empty((mutual, 2), np.uint32), np.empty(n - mutual, np.uint32)
+        mutual += (j > i) & (partner[j] == i) & (cost[i] <= limit)
+    # One more than there are: each step writes where the next pair will be, as branches would be mispredicted.
+    pairs, rest = np.empty((mutual + 1, 2), np.uint32), np.empty(n - mutual + 1, np.uint32)
     found = left = 0
     for i in range(n):
         j = partner[i]
-        if j >= 0 and partner[j] == i and cost[i] <= limit:
-            if j < i:
-                continue
-            pairs[found, 0], pairs[found, 1] = nodes[i], nodes[j]
-            rest[left] = made + found
-            found += 1
-        else:
-            rest[left] = nodes[i]
-        left += 1
-    return pairs, rest
+        merges = (j >= 0) & (partner[j] == i) & (cost[i] <= limit)
+        pairs[found, 0], pairs[found, 1] = nodes[i], nodes[j]
+        rest[left] = made + found if merges else nodes[i]
+        found += merges & (j > i)
+        left += not (merges & (j < i))
+    return pairs[:mutual], rest[: n - mutual]

@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from ...model.lod_tree import MAX_CHILDREN
-from ...support.jit import kernel
+from ...support.jit import kernel, prange
 
 #: Size steps per octave, and octaves: all of float32's, 2^-128 to 2^128. Steps chosen.
 STEPS, OCTAVES = 4, 256
@@ -54,6 +54,7 @@ NO_RANK = np.int32(-(1 << 31))
 
 #: Bits of a float32 usefulness by which nodes are ordered: sign, exponent and 7 bits of fraction. Chosen.
 KEY_BITS = 16
+LAST_KEY = (1 << KEY_BITS) - 1
 
 
 @kernel()
@@ -62,8 +63,8 @@ def size_step(size):
     return min(max(int(STEPS * (math.log2(size) + OCTAVES / 2)), 0), STEPS * OCTAVES - 1)
 
 
-@kernel()
-def fill_usefulness_terms(children, leaves, drawn_leaves, top, log_size, lost, weight):
+@kernel(parallel=True)
+def fill_usefulness_terms(children, leaves, drawn_leaves, top, log_size, lost, weight, blocks):
     """Fills the terms of `usefulness`.
 
     Args:
@@ -75,36 +76,51 @@ def fill_usefulness_terms(children, leaves, drawn_leaves, top, log_size, lost, w
             above which the traversal does not refine the node.
         lost: (top + 1 - leaves,) float32, `picture_error`, replaced by the error cost of merged nodes, in splats.
         weight: (top + 1 - leaves,) float32, filled for merged nodes with their rarity weight.
+        blocks: ranges of nodes to process in parallel; the result does not depend on it.
 
     Returns:
         (top + 1,) uint32 parents; the root's is itself.
     """
-    total = leaves + len(children)
+    total, steps = leaves + len(children), STEPS * OCTAVES
+    for block in prange(blocks):
+        for node in range(total * block // blocks, total * (block + 1) // blocks):
+            log_size[node] = math.log(max(log_size[node], LEAST_SIZE))
+    if top == total:
+        log_size[top] = ABOVE_ALL
     parent = np.empty(top + 1, np.uint32)
     parent[:] = top
-    log_size[top] = ABOVE_ALL if top == total else math.log(max(log_size[top], LEAST_SIZE))
-    count, inner, sums = np.zeros(STEPS * OCTAVES), np.zeros(STEPS * OCTAVES), np.zeros(STEPS * OCTAVES)
-    for node in range(total - 1, -1, -1):
-        if node < top:
-            own = np.float32(math.log(max(log_size[node], LEAST_SIZE)))
-            log_size[node] = min(own, log_size[parent[node]])
-        step = size_step(math.exp(log_size[node]))
-        count[step] += 1
-        if node >= leaves:
-            parent[children[node - leaves, 0]] = parent[children[node - leaves, 1]] = node
-            inner[step] += 1
-            sums[step] += lost[node - leaves]
-    drawn, rare = 0.0, np.empty(STEPS * OCTAVES)
-    for step in range(STEPS * OCTAVES - 1, -1, -1):
+    for node in range(total - 1, leaves - 1, -1):
+        log_size[node] = min(log_size[node], log_size[parent[node]])
+        parent[children[node - leaves, 0]] = parent[children[node - leaves, 1]] = node
+    counts, step_of = np.zeros((blocks, 2, steps), np.int64), np.empty(total - leaves, np.uint16)
+    for block in prange(blocks):
+        for node in range(total * block // blocks, total * (block + 1) // blocks):
+            if node < leaves:
+                log_size[node] = min(log_size[node], log_size[parent[node]])
+            step = size_step(math.exp(log_size[node]))
+            counts[block, 0, step] += 1
+            if node >= leaves:
+                counts[block, 1, step] += 1
+                step_of[node - leaves] = step
+    count, inner, sums = np.zeros(steps), np.zeros(steps), np.zeros(steps)
+    for block in range(blocks):
+        for step in range(steps):
+            count[step] += counts[block, 0, step]
+            inner[step] += counts[block, 1, step]
+    for slot in range(total - leaves - 1, -1, -1):  # one after the other, so that threads do not change the rounding
+        sums[step_of[slot]] += lost[slot]
+    drawn, rare = 0.0, np.empty(steps)
+    for step in range(steps - 1, -1, -1):
         drawn += count[step]  # roughly the splats of a cut with this threshold
         rare[step] = min(1.0, drawn / (FEW * drawn_leaves))
         count[step] = max(min(drawn, float(drawn_leaves)), 1.0) ** -RARITY
-    for node in range(leaves, total):
-        step = size_step(math.exp(log_size[node]))
-        weight[node - leaves] = count[step]
-        mean = sums[step] / inner[step]
-        error = lost[node - leaves]
-        lost[node - leaves] = ERROR_COST * rare[step] * math.sqrt(error / mean) if mean > 0 else 0.0
+    for block in prange(blocks):
+        slots = total - leaves
+        for slot in range(slots * block // blocks, slots * (block + 1) // blocks):
+            step = step_of[slot]
+            weight[slot] = count[step]
+            mean = sums[step] / inner[step]
+            lost[slot] = ERROR_COST * rare[step] * math.sqrt(lost[slot] / mean) if mean > 0 else 0.0
     return parent
 
 
@@ -116,29 +132,41 @@ def usefulness_key(useful):
     return (ordered + 0x80000000) >> (32 - KEY_BITS)
 
 
-@kernel()
-def drop_nodes(leaves, most, parent, log_size, lost, weight, saved):
+@kernel(parallel=True)
+def drop_nodes(leaves, most, parent, log_size, lost, weight, saved, blocks):
     """Drops the least useful merged nodes until `most` are left, or none can be dropped.
 
     Args:
         leaves: number of leaves; they come first, and have no place in arrays of merged nodes.
         most: number of merged nodes to keep, at least 1, the root.
-        parent: (T,) uint32, updated: the nearest ancestor that is kept.
+        parent: (T,) uint32, updated for what is kept: the nearest ancestor that is kept.
         log_size, lost, weight: of `fill_usefulness_terms`; the error cost of a dropped node is added to its parent's.
         saved: (T - leaves,) int32, on entry 1 for each merged node; what is less for the root allows it that many more
             children. Updated: the number of children minus 1 of those that are kept, -1 for dropped nodes.
+        blocks: ranges of nodes to process in parallel; the result does not depend on it.
     """
-    total = len(parent)
-    left = total - leaves
-    count = np.zeros(1 << KEY_BITS, np.int64)
+    left = len(parent) - leaves
+    many = slots = left - 1
+    kept = np.empty(slots, np.uint32)  # the first `many`: merged nodes but the root, less `leaves`, parents first
+    for slot in range(slots):
+        kept[slot] = slots - 1 - slot
+    keys = np.empty(slots, np.uint16)
     turn, children = ROUNDS, MOST_CHILDREN
     while left > most:  # also after ROUNDS, where nodes gained usefulness as their children were dropped
-        count[:] = 0
-        candidates = 0
-        for node in range(total - 1 - leaves):
-            if saved[node] > 0 and saved[parent[node + leaves] - leaves] + saved[node] < children:
-                count[usefulness_key(usefulness(node, leaves, parent, log_size, lost, weight, saved))] += 1
-                candidates += 1
+        counts = np.zeros((blocks, 1 << KEY_BITS), np.int32)
+        for block in prange(blocks):
+            for i in range(many * block // blocks, many * (block + 1) // blocks):
+                node = kept[i]
+                keys[node] = LAST_KEY
+                if can_be_dropped(node, leaves, parent, saved, children):
+                    key = usefulness_key(usefulness(node, leaves, parent, log_size, lost, weight, saved))
+                    keys[node] = key
+                    counts[block, key] += 1
+        count, candidates = np.zeros(1 << KEY_BITS, np.int64), 0
+        for block in range(blocks):
+            for key in range(1 << KEY_BITS):
+                count[key] += counts[block, key]
+                candidates += counts[block, key]
         if candidates == 0:
             if children == MAX_CHILDREN:
                 break
@@ -148,21 +176,42 @@ def drop_nodes(leaves, most, parent, log_size, lost, weight, saved):
         while below + count[threshold] < wanted:
             below += count[threshold]
             threshold += 1
-        for node in range(total - 1 - leaves):
+        for i in range(many - 1, -1, -1):
+            node = kept[i]
+            if keys[node] > threshold:
+                continue
             if left <= most:
                 break
-            above = parent[node + leaves] - leaves
-            if saved[node] < 1 or saved[above] + saved[node] >= children:
+            if not can_be_dropped(node, leaves, parent, saved, children):
                 continue
             if usefulness_key(usefulness(node, leaves, parent, log_size, lost, weight, saved)) <= threshold:
+                above = parent[node + leaves] - leaves
                 saved[above] += saved[node]
                 lost[above] += lost[node]
                 saved[node] = -1
                 left -= 1
-        for node in range(total - 2, -1, -1):
-            if saved[parent[node] - leaves] < 0:
-                parent[node] = parent[parent[node]]
+                if above < slots:
+                    keys[above] = 0  # its usefulness has changed, and is computed again when its turn comes
+        after = 0
+        for i in range(many):
+            node = kept[i]
+            above = parent[node + leaves]
+            if saved[above - leaves] == -1:
+                parent[node + leaves] = parent[above]
+            kept[after] = node
+            after += saved[node] != -1
+        many = after
         turn = max(turn - 1, 1)
+    for block in prange(blocks):
+        for leaf in range(leaves * block // blocks, leaves * (block + 1) // blocks):
+            while saved[parent[leaf] - leaves] == -1:  # once for each round at most
+                parent[leaf] = parent[parent[leaf]]
+
+
+@kernel(inline=True)
+def can_be_dropped(node, leaves, parent, saved, children):
+    """Whether merged node `leaves + node` is kept as yet, and its parent has room for its children."""
+    return saved[node] > 0 and saved[parent[node + leaves] - leaves] + saved[node] < children
 
 
 @kernel(inline=True)

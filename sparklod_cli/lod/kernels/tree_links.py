@@ -231,16 +231,6 @@ def count_limits(child_count, child_start, limit, chunk_bits, counts):
 
 
 @kernel(nogil=True)
-def gather_large(child_count, limit, least, nodes):
-    """Fills `nodes` (int64) with the inner nodes whose limits are above 0 and `least` or more, ascending."""
-    found = 0
-    for node in range(len(child_count)):
-        if child_count[node] > 0 and limit[node] > 0 and limit[node] >= least:
-            nodes[found] = node
-            found += 1
-
-
-@kernel(nogil=True)
 def mark_small(child_count, child_start, size, ratio, marks):
     """Marks nodes whose size is less than `ratio` times that of one of their children, of finite size.
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ...model.splats import FloatArray
 from ...support.jit import threads_for
+from ...support.parallel import blocks_of
 from ...support.progress import Progress
 from ..kernels import pair_cost, pair_merge
 from ..kernels.sort import Nodes
@@ -56,7 +57,8 @@ class BinaryTree:
     has one row to spare, the next merge takes that of its first node, and N rows are enough for all 2N - 1 nodes.
 
     Attributes:
-        rows: (N, WIDTH) float32 node rows, see `kernels/pair_cost.py`; leaf k has row k until it is merged.
+        rows: (N, WIDTH) float32 node rows, see `kernels/pair_cost.py`; leaf k has row k until it is merged. The array
+            owns its memory, and no other refers to it.
         weight: (N,) float32 weights of the leaves, which outlast their rows.
         row: (N,) uint32 row of each merged node.
         spare: (N,) uint32 row that is to spare in the tree of each merged node without a parent.
@@ -98,6 +100,22 @@ class BinaryTree:
         merged = nodes >= self.leaves
         found[merged] = self.row[nodes[merged] - np.uint32(self.leaves)]
         return found
+
+    def keep_rows(self, slots: Nodes) -> None:
+        """Drops all rows but those of some merged nodes, which are numbered from the first.
+
+        In place: those that are kept would be a large part of the memory that a build takes.
+        """
+        rows = self.row[slots]
+        is_kept = np.zeros(len(self.rows), np.bool_)
+        is_kept[rows] = True
+        self.row[slots] = (np.cumsum(is_kept, dtype=np.uint32) - np.uint32(1))[rows]
+        end = 0
+        for part in blocks_of(len(self.rows)):
+            kept = self.rows[part][is_kept[part]]
+            self.rows[end : end + len(kept)] = kept
+            end += len(kept)
+        self.rows.resize((end, pair_cost.WIDTH), refcheck=False)
 
 
 def levels_of(size: FloatArray) -> Levels:

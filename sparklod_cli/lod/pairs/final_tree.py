@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ...model.lod_tree import LodTree
 from ...model.sh import degree_of
 from ...model.splats import COLUMNS, FloatArray, Splats
-from ...support.jit import threads_for
+from ...support.jit import threads_for, threads_in_use
 from ...support.progress import Progress
 from ..kernels import node_rows, pair_cost, prune
 from ..kernels.final_order import fill_leaves, merge_colors
@@ -93,8 +93,7 @@ def in_final_order(
     del rank
     slots = inner - np.uint32(n)
     binary.spare = np.empty(0, np.uint32)
-    binary.rows = rows = binary.rows[binary.row[slots]]  # frees those of what was dropped
-    binary.row[slots] = np.arange(len(inner), dtype=np.uint32)
+    binary.keep_rows(slots)
     total = n + len(inner) + hidden
     progress("ordering", 0, total, "node")
     order = np.empty(total, np.uint32)
@@ -111,11 +110,11 @@ def in_final_order(
     for name in GEOMETRY:
         fill(name)
     places = (getattr(out, name)[hidden:] for name in GEOMETRY)
-    node_rows.fill_merged_splats(order[hidden:], n, binary.row, rows, curve.space, *places)
+    node_rows.fill_merged_splats(order[hidden:], n, binary.row, binary.rows, curve.space, *places)
+    weight = binary.rows[binary.row[slots], pair_cost.WEIGHT]
+    binary.rows = rows = binary.rows[binary.row[slots[:0] if wanted.is_whole else slots]]  # frees what is not returned
     weights = np.empty(binary.used, np.float32)
-    weights[:n], weights[inner] = binary.weight, rows[:, pair_cost.WEIGHT]
-    if wanted.is_whole:  # frees the rows before memory for colours is touched
-        binary.rows = rows = rows[:0].copy()
+    weights[:n], weights[inner] = binary.weight, weight
     for name in COLORS:
         fill(name)
     ends = np.concatenate([np.flatnonzero(np.diff(ranks, prepend=ranks[:1] - 1)), [len(inner)]])
@@ -131,17 +130,17 @@ def _prune(
     binary: BinaryTree, wanted: Wanted, progress: Progress
 ) -> tuple[Nodes, NDArray[np.int32], NDArray[np.int32]]:
     """Parents of all nodes, `saved` of `prune.drop_nodes`, and ranks; frees what only pruning needs."""
-    n, top = binary.leaves, binary.used - wanted.is_whole
+    n, top, blocks = binary.leaves, binary.used - wanted.is_whole, threads_in_use()
     progress("pruning", 0, binary.used, "node")
     log_size, lost, weight = binary.size[: top + 1], binary.error[: top + 1 - n], np.empty(top + 1 - n, np.float32)
     children = binary.children[: binary.used - n]
-    parent = prune.fill_usefulness_terms(children, n, wanted.splats, top, log_size, lost, weight)
+    parent = prune.fill_usefulness_terms(children, n, wanted.splats, top, log_size, lost, weight, blocks)
     binary.children = children = np.empty((0, 2), np.uint32)
     saved = np.ones(top + 1 - n, np.int32)
     if not wanted.is_whole:
         saved[-1] = np.count_nonzero(parent[:-1] == top) - 1 - prune.ROOM
     # A root that is only to be is one node more.
-    prune.drop_nodes(n, wanted.most + (not wanted.is_whole), parent, log_size, lost, weight, saved)
+    prune.drop_nodes(n, wanted.most + (not wanted.is_whole), parent, log_size, lost, weight, saved, blocks)
     if not wanted.is_whole:
         saved[-1] += prune.ROOM
     highest = log_size[top] if wanted.highest is None else np.float32(wanted.highest)

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sparklod_cli.lod.kernels import pair_merge, pair_overlap, profile
-from sparklod_cli.lod.kernels.pair_cost import CENTER, COLOR, COVARIANCE, COVERED, DENSITY, LOG_DET, WEIGHT
+from sparklod_cli.lod.kernels.pair_cost import CENTER, COLOR, COVARIANCE, COVERED, DENSITY, LOG_DET, WEIGHT, WIDTH
 from sparklod_cli.lod.pairs.binary import BinaryTree
 from sparklod_cli.model.gaussian import lod_opacity
 from tests.references import gaussians
@@ -225,3 +225,8 @@ def test_merged_nodes_have_the_rows_that_leaves_no_longer_need(count: int, seed:
     assert len(np.unique(tree.rows_of(inner))) == count - 1
     for node in inner:
         assert np.array_equal(tree.rows[tree.rows_of(np.array([node], np.uint32))[0]], expected[node])
+    kept = rng.permutation(count - 1)[: int(rng.integers(1, count))].astype(np.uint32)
+    tree.keep_rows(kept)
+    assert tree.rows.shape == (len(kept), WIDTH)
+    for slot in kept:
+        assert np.array_equal(tree.rows[tree.row[slot]], expected[count + slot])

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from sparklod_cli.lod.kernels import prune
 from sparklod_cli.model.lod_tree import LodTree
+from tests.references import pruning
 
 #: Of a place in the order that nobody has taken.
 UNUSED = np.uint32(0xFFFFFFFF)
@@ -18,10 +19,10 @@ UNUSED = np.uint32(0xFFFFFFFF)
 class Binary:
     """A random binary tree as it has grown: leaves first, then nodes after their children."""
 
-    def __init__(self, leaves: int, seed: int, equal: bool) -> None:
+    def __init__(self, leaves: int, seed: int, equal: bool, blocks: int = 1) -> None:
         rng = np.random.default_rng(seed)
         total = 2 * leaves - 1
-        self.leaves = leaves
+        self.leaves, self.blocks = leaves, blocks
         self.children = np.zeros((leaves - 1, 2), np.uint32)
         self.size = np.ones(total, np.float32)
         self.error = np.zeros(leaves - 1, np.float32)
@@ -38,11 +39,11 @@ class Binary:
         self.log_size, self.lost, self.weight = self.size.copy(), self.error.copy(), np.empty(leaves - 1, np.float32)
         self.saved = np.ones(leaves - 1, np.int32)
         terms = self.log_size, self.lost, self.weight
-        self.parent = prune.fill_usefulness_terms(self.children, leaves, leaves, total - 1, *terms)
+        self.parent = prune.fill_usefulness_terms(self.children, leaves, leaves, total - 1, *terms, blocks)
 
     def drop(self, most: int) -> np.ndarray:
         """Drops; returns which are kept, leaves among them."""
-        prune.drop_nodes(self.leaves, most, self.parent, self.log_size, self.lost, self.weight, self.saved)
+        prune.drop_nodes(self.leaves, most, self.parent, self.log_size, self.lost, self.weight, self.saved, self.blocks)
         return np.flatnonzero(self.is_kept)
 
     @property
@@ -68,7 +69,7 @@ class Binary:
         return order, tree, inner, places
 
 
-BINARIES = st.builds(Binary, st.integers(2, 150), st.integers(0, 2**32 - 1), st.booleans())
+BINARIES = st.builds(Binary, st.integers(2, 150), st.integers(0, 2**32 - 1), st.booleans(), st.integers(1, 5))
 
 
 @given(BINARIES)
@@ -113,9 +114,32 @@ def test_the_most_useful_nodes_are_kept() -> None:
         lost = np.array([0.1, 0.1, 1], np.float32)
         lost[worse] = 0.4
         weight, saved = np.empty(3, np.float32), np.ones(3, np.int32)
-        parent = prune.fill_usefulness_terms(children, 4, 4, 6, log_size, lost, weight)
-        prune.drop_nodes(4, 2, parent, log_size, lost, weight, saved)
+        parent = prune.fill_usefulness_terms(children, 4, 4, 6, log_size, lost, weight, 2)
+        prune.drop_nodes(4, 2, parent, log_size, lost, weight, saved, 2)
         assert saved.tolist() == ([-1, 1, 2] if worse == 0 else [1, -1, 2])
+
+
+@given(st.integers(2, 150), st.integers(0, 2**32 - 1), st.booleans(), st.integers(2, 9), st.floats(0, 1))
+def test_the_number_of_blocks_changes_nothing(leaves: int, seed: int, equal: bool, blocks: int, share: float) -> None:
+    one, many = (Binary(leaves, seed, equal, count) for count in (1, blocks))
+    for name in ("log_size", "lost", "weight", "parent"):
+        assert np.array_equal(getattr(one, name), getattr(many, name))
+    most = max(1, int(share * (leaves - 1)))
+    kept = one.drop(most)
+    assert np.array_equal(kept, many.drop(most))
+    assert np.array_equal(one.saved, many.saved) and np.array_equal(one.lost, many.lost)
+    assert np.array_equal(one.parent[kept], many.parent[kept])
+
+
+@given(BINARIES, st.integers(0, 150))
+def test_it_drops_as_a_plain_loop_does(binary: Binary, most: int) -> None:
+    """Which looks at every node in every round, and keeps no list."""
+    most = max(most, 1)
+    parent, lost, saved = binary.parent.copy(), binary.lost.copy(), binary.saved.copy()
+    pruning.drop_nodes(binary.leaves, most, parent, binary.log_size, lost, binary.weight, saved)
+    kept = binary.drop(most)
+    assert np.array_equal(saved, binary.saved) and np.array_equal(lost, binary.lost)
+    assert np.array_equal(parent[kept], binary.parent[kept])
 
 
 @given(BINARIES, st.floats(0, 1))
@@ -150,12 +174,12 @@ def test_of_nodes_that_get_their_parents_later_as_many_are_dropped(binary: Binar
     children = binary.children[:made]
     log_size, lost = np.append(binary.size[:total], np.float32(0)), np.ones(made + 1, np.float32)
     weight = np.empty(made + 1, np.float32)
-    parent = prune.fill_usefulness_terms(children, binary.leaves, binary.leaves, total, log_size, lost, weight)
+    parent = prune.fill_usefulness_terms(children, binary.leaves, binary.leaves, total, log_size, lost, weight, 2)
     loose = np.setdiff1d(np.arange(total), children)
     assert np.array_equal(np.flatnonzero(parent[:-1] == total), loose)
     saved = np.ones(made + 1, np.int32)
     saved[-1] = len(loose) - 1 - prune.ROOM
-    prune.drop_nodes(binary.leaves, most + 1, parent, log_size, lost, weight, saved)
+    prune.drop_nodes(binary.leaves, most + 1, parent, log_size, lost, weight, saved, 2)
     assert np.count_nonzero(saved[:-1] >= 0) == min(most, made)
     kept = np.concatenate([np.ones(binary.leaves, bool), saved[:-1] >= 0])
     assert saved[-1] + prune.ROOM + 1 == np.count_nonzero((parent[:-1] == total) & kept)

@@ -20,7 +20,6 @@ from sparklod_cli.lod.kernels.tree_links import (
     find_cycles,
     find_depths,
     find_parents,
-    gather_large,
     mark_small,
     sum_by_depth,
 )
@@ -193,7 +192,7 @@ def test_the_kernels_give_the_same_without_compilation() -> None:
 
 
 @given(ANY, st.integers(0, 3))
-def test_inner_nodes_are_counted_and_gathered_by_their_limits(links: Links, chunk_bits: int) -> None:
+def test_inner_nodes_are_counted_by_their_limits(links: Links, chunk_bits: int) -> None:
     count, start, size = arrays(links)
     _, limit = find_depths(count, start, size)
     counts = np.zeros(1 << LIMIT_BITS, np.int64)
@@ -203,11 +202,6 @@ def test_inner_nodes_are_counted_and_gathered_by_their_limits(links: Links, chun
     inner = [node for node in range(len(links)) if count[node] and limit[node] > 0]
     buckets = [int(limit[node].view(np.uint32)) >> (32 - LIMIT_BITS) for node in inner]
     assert np.array_equal(counts, np.bincount(buckets, minlength=len(counts)))
-    for least in limit:
-        expected = [node for node in inner if limit[node] >= least]
-        nodes = np.empty(len(expected), np.int64)
-        gather_large(count, limit, least, nodes)
-        assert nodes.tolist() == expected
 
 
 @given(ANY, st.sampled_from([1 / 3, 1.0, 2.0]), st.randoms(use_true_random=False))
