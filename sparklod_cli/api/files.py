@@ -127,11 +127,11 @@ def build_lod(
     within("growth", growth, MIN_GROWTH, MAX_GROWTH)
     whole_within("max_sh", max_sh, 0, MAX_SH_DEGREE)
     fitting = asked_for(refine)
-    build = BakeSettings(method=method, base=base, growth=growth).builder()
+    build, setting = BakeSettings(method=method, base=base, growth=growth).builder()
     with on_threads(threads), telling(progress) as told, memory_errors_translated():
         kept, _ = select(selection or Selection(), scene.splats.with_max_sh(max_sh), thread_count(threads))
         # A builder frees its input as it goes where nobody else holds it.
-        built = build(kept, progress=told)
+        built = build(kept, setting, progress=told)
         made = Tree(*(banded([built]) if BUILDERS[method].in_bands else built), scene.antialiased)
         return made if fitting is None else refined_tree(made, fitting, thread_count(threads), told, None)[0]
 

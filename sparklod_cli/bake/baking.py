@@ -241,7 +241,8 @@ def _built(
     handed_over = [kept]
     del scene, read, kept, far
     with on_threads(threads):
-        built = [settings.builder()(handed_over.pop(), progress=progress)]
+        build, setting = settings.builder()
+        built = [build(handed_over.pop(), setting, progress=progress)]
         if BUILDERS[settings.method].in_bands and not output.in_chunks:
             from ..lod.band_order import banded
 

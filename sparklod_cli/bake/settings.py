@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -67,7 +66,10 @@ class BakeSettings:
     converts: bool = False
     unused: tuple[str, ...] = ()
 
-    def builder(self) -> Callable[..., tuple[Splats, LodTree]]:
-        """What makes `(nodes, tree)` of splats; takes `progress`, too."""
+    def builder(self) -> tuple[Callable[..., tuple[Splats, LodTree]], float]:
+        """What makes `(nodes, tree)` of splats and its setting; takes `progress`, too.
+
+        Not a `functools.partial`, which would hold the splats until it returns, when the builder wants to free them.
+        """
         row = BUILDERS[self.method]
-        return functools.partial(row.load().build, **{row.setting: getattr(self, row.setting)})
+        return row.load().build, getattr(self, row.setting)
