@@ -11,9 +11,10 @@ What `__all__` names is the public interface, described in docs/python.md. Nothi
 from __future__ import annotations
 
 import sys
-from importlib import import_module
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
+
+from .support.lazy import loader_of
 
 if TYPE_CHECKING:
     from .api.cameras import orbit, read_cameras
@@ -167,13 +168,7 @@ __all__ = [
     "write",
 ]
 
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(import_module(f".{_HOMES[name]}", __name__), name)
-    globals()[name] = value
-    return value
+__getattr__ = loader_of(__name__, _MODULES)
 
 
 def __dir__() -> list[str]:

@@ -36,5 +36,4 @@ _NAMES = {
     "extract_leaves": ("Extracted", "extract_leaves"),
 }
 
-if not TYPE_CHECKING:
-    __getattr__ = loader_of(__name__, _NAMES)
+__getattr__ = loader_of(__name__, _NAMES)

@@ -20,7 +20,6 @@ _NAMES = {
     "bake.sources": ("Merged", "Source"),
 }
 
-if not TYPE_CHECKING:
-    __getattr__ = loader_of(__name__, _NAMES)
+__getattr__ = loader_of(__name__, _NAMES)
 
 __all__ = ["BakeSettings", "Baked", "Merged", "Resources", "Source", "bake", "bake_unless_there"]

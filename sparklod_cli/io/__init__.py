@@ -51,8 +51,7 @@ _NAMES = {
     "io.writing": ("Sink", "check_writable", "sink", "write_stdout", "write_whole"),
 }
 
-if not TYPE_CHECKING:
-    __getattr__ = loader_of(__name__, _NAMES)
+__getattr__ = loader_of(__name__, _NAMES)
 
 __all__ = [
     "MAX_TEXT",

@@ -7,16 +7,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..model.selection import Selection
+from ..model.selection import EXAMINED, Selection
 from ..model.splats import COLUMNS, UNIT_TOLERANCE, Splats, describe_invalid
 from ..support.errors import InvalidSplatsError
 from ..support.jit import threads_for
 from ..support.parallel import blocks_of, ordered_map
 from .kernels.drawable import count_doubtful
 from .kernels.geometry import find_bounds
-
-#: Splats that are looked at together. Chosen: fewer than in any scene for which several threads pay.
-EXAMINED = 1 << 15
 
 
 @dataclass(frozen=True)
