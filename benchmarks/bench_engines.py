@@ -24,12 +24,7 @@ from tests.interop.pictures import cameras_around
 
 HEADINGS = ("scene", "engine", "first frame", "last frame", "levels asked for", "files", "MB", "PSNR", "seconds")
 
-#: For Babylon.js: opacity makes up for the blur, as ours does, and level 0 reaches as far as the scene.
-BABYLON_ALIKE = {
-    "  import { Engine }": "  import { GaussianSplattingMaterial } from "
-    "'@babylonjs/core/Materials/GaussianSplatting/gaussianSplattingMaterial.js';\n  import { Engine }",
-    "  const engine": "  GaussianSplattingMaterial.Compensation = true;\n  const engine",
-}
+#: For Babylon.js: level 0 reaches as far as the scene.
 FARTHER = {"lodBaseDistance: 20": "lodBaseDistance: 1000"}
 
 
@@ -59,7 +54,7 @@ def main() -> None:
             splats = read_scene(file).splats
             camera = cameras_around(splats.center, *map(int, arguments.size.split("x")))[arguments.view]
             ours = our_picture(splats, camera)
-            changes: Mapping[str, str] = BABYLON_ALIKE | (FARTHER if file.suffix == ".json" else {})
+            changes: Mapping[str, str] = FARTHER if file.suffix == ".json" else {}
             for engine in ("PlayCanvas", "Babylon.js"):
                 start = time.perf_counter()
                 if engine == "PlayCanvas":

@@ -20,6 +20,7 @@ from fidelity_views import CAMERAS, MOVING, OF_PATHS, SIZE, Figures, FullDetail,
 from fine_structure import fine_structure
 from glossy_knot import glossy_knot
 from performance.machine import machine
+from photo_cloud import loose_cloud, photo_cloud
 from scenes import write_ply
 
 import sparklod_cli as sparklod
@@ -28,7 +29,12 @@ import sparklod_cli as sparklod
 REAL_SCENES = ("biker.ply", "playbot.sog", "playbot-125k.ply", "meadow.sog")
 
 #: Scenes that we make.
-MADE = {"fine-structure": fine_structure, "glossy-knot": glossy_knot}
+MADE = {
+    "fine-structure": fine_structure,
+    "glossy-knot": glossy_knot,
+    "photo-cloud": photo_cloud,
+    "loose-cloud": loose_cloud,
+}
 
 BUDGETS = "2%,5%,10%,25%,50%"
 

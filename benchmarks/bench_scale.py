@@ -102,7 +102,7 @@ def bake(scene: Path, folder: Path, method: str, way: str, limit: int, hours: fl
     options = ["build-lod", str(scene), "-o", str(output), "--method", method, "--overwrite", "--json"]
     options += [f"--{name}={value}" for name, value in settings.items()]
     if way != "memory":
-        options += ["--memory", str(limit), "--scratch-dir", str(scratch)]
+        options += ["--memory", f"{limit}B", "--scratch-dir", str(scratch)]
     command = [sys.executable, str(HERE / "scale_child.py"), str(0 if way == "memory" else limit), *options]
     start = time.perf_counter()
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as child:

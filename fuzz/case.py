@@ -20,7 +20,18 @@ Rng = np.random.Generator
 SEED = 1
 
 #: Names of the targets; each is a module in `fuzz/targets/`.
-TARGETS = ("decoders", "trees", "builds", "cameras", "instances", "expectations", "assertions", "rgba", "options")
+TARGETS = (
+    "decoders",
+    "trees",
+    "builds",
+    "outputs",
+    "cameras",
+    "instances",
+    "expectations",
+    "assertions",
+    "rgba",
+    "options",
+)
 
 
 class LawError(Exception):

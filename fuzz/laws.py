@@ -98,6 +98,15 @@ def check_report(path: Path) -> None:
             raise LawError(f"of a finding, {text}", f"{fault}, of {finding.code}")
 
 
+def check_passes(path: Path) -> None:
+    """Checks that a file which we wrote breaks no promise that our own check knows."""
+    found, _ = report.inspect(path, report.ReportSettings(check=True), threads=2)
+    errors = [each for each in found.findings or [] if each.severity == "error"]
+    if errors:
+        lines = "\n".join(finding_line(str(path.name), each, "text") for each in errors)
+        raise LawError(f"our own check rejects what we wrote: {lines}", f"own check: {errors[0].code}")
+
+
 def check_output(path: Path) -> None:
     """Checks that a file which a command wrote is a whole file of the kind that its suffix names."""
     data = path.read_bytes()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -25,22 +26,27 @@ LOG_SCALES = (-100.0, -40.0, -20.0, -10.0, -4.0, -4.0, -4.0, 0.0, 5.0, 10.0, 40.
 SPREADS = (0.0, 0.5, 0.5, 3.0, 20.0)
 
 
-def extreme(rng: Rng) -> Columns:
-    """Makes columns for `by_hand.ply_columns` of 1 to 200 splats with extreme values."""
+def extreme(rng: Rng, extents: Sequence[float] = EXTENTS) -> Columns:
+    """Makes columns for `by_hand.ply_columns` of 1 to 200 splats with extreme values.
+
+    Args:
+        rng: the case's random generator.
+        extents: spreads of the centres to choose from, in world units.
+    """
     count = int(pick(rng, (1, 2, 3, 5, 17, 60, 200)))
     sh = int(pick(rng, (0, 0, 3, 8, 15)))
-    center: NDArray[np.float64] = rng.normal(size=(count, 3)) * pick(rng, EXTENTS)
+    center: NDArray[np.float64] = rng.normal(size=(count, 3)) * pick(rng, extents)
     layout = int(rng.integers(7))
     if layout == 0:
-        center[:, int(rng.integers(3))] = pick(rng, EXTENTS)
+        center[:, int(rng.integers(3))] = pick(rng, extents)
     elif layout == 1:
         center[:] = center[0]
     elif layout == 2:
-        center[:] = rng.integers(-1, 2, (count, 3)) * pick(rng, EXTENTS)
+        center[:] = rng.integers(-1, 2, (count, 3)) * pick(rng, extents)
     elif layout == 3:
         center[: count // 2] *= 1e-6
     values = {
-        "center": np.clip(center, -8388607, 8388607),
+        "center": np.clip(center, -max(extents), max(extents)),
         "log_scale": pick(rng, LOG_SCALES) + pick(rng, SPREADS) * rng.normal(size=(count, 3)),
         "quat_wxyz": rng.normal(size=(count, 4)) * pick(rng, (1.0, 1.0, 1e-30, 1e30)),
         "logit": pick(rng, (0.0, 3.0, -10.0, 100.0, -80.0)) + pick(rng, SPREADS) * rng.normal(size=count),

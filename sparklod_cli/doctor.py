@@ -17,17 +17,17 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from . import __version__
 from .support import machine
+from .support.optional import DISTRIBUTION, install_hint, pip_install
 from .support.parallel import processors
+from .support.python_process import program_command
 from .support.requirements import required_by
 
 #: ok: works. note: something optional is missing, or could be better. problem: baking does not work.
 State = Literal["ok", "note", "problem"]
-
-DISTRIBUTION = "sparklod"
 
 #: Extras for display who work on sparklod, which nobody else need install.
 INTERNAL_EXTRAS = ("dev", "docs", "test")
@@ -112,13 +112,11 @@ def _versions() -> Iterator[Check]:
 def _packages() -> Iterator[Check]:
     try:
         for one in required_by(DISTRIBUTION):
-            advice = f"pip install --upgrade '{one.name}>={one.least}'" if one.missing else ""
+            advice = pip_install("--upgrade", f"{one.name}>={one.least}") if one.missing else ""
             yield Check(one.name, "problem" if one.missing else "ok", one.found, advice)
     except metadata.PackageNotFoundError:
-        yield Check("packages", "note", "sparklod itself is not installed, so nothing tells what it requires", _INSTALL)
-
-
-_INSTALL = "pip install sparklod"
+        value = "sparklod itself is not installed, so nothing tells what it requires"
+        yield Check("packages", "note", value, install_hint())
 
 
 def _extras() -> Iterator[Check]:
@@ -130,7 +128,7 @@ def _extras() -> Iterator[Check]:
         packages = list(required_by(DISTRIBUTION, extra))
         missing = any(package.missing for package in packages)
         purpose = f"   # {PURPOSES[extra]}" if extra in PURPOSES else ""
-        advice = f"pip install --upgrade 'sparklod[{extra}]'{purpose}" if missing else ""
+        advice = f"{install_hint(extra)}{purpose}" if missing else ""
         yield Check(
             f"extra {extra}",
             "note" if missing else "ok",
@@ -148,11 +146,11 @@ def _print_kernels() -> None:
     from .bake import bake  # noqa: F401
     from .support import jit
 
-    jit.require_compiler()
+    jit.load_compiler()
     about = {
         "folder": None if jit.CACHE_FOLDER is None else str(jit.CACHE_FOLDER.resolve()),
-        "wanted": len({name for job in warmup.JOBS.values() for name in job.kernels}),
-        "missing": len(warmup.missing(warmup.JOBS)),
+        "wanted": len(warmup.units()),
+        "missing": len(warmup.missing()),
         "layer": jit.threading_layer(),
         "threads": jit.threads_in_use(),
     }
@@ -160,11 +158,11 @@ def _print_kernels() -> None:
 
 
 def _kernels() -> Iterator[Check]:
-    code, out, err = _run([sys.executable, "-c", KERNELS])
+    code, out, err = _run(program_command(KERNELS))
     try:
         about = json.loads(out.splitlines()[-1])
     except (IndexError, ValueError):
-        advice = "pip install --force-reinstall sparklod   # in a new virtual environment, if that does not help"
+        advice = f"{install_hint('', '--force-reinstall')}   # in a new virtual environment, if that does not help"
         yield Check("kernels", "problem", f"what bakes does not load: {_last_line(err, code)}", advice)
         return
     wanted, folder = about["wanted"], about["folder"]
@@ -182,10 +180,13 @@ def _kernels() -> Iterator[Check]:
             advice = f"delete the other kernels-* in {Path(folder).parent}, unless those versions are still used"
             yield Check("old caches", "note", value, advice)
     layer = about["layer"]
-    advice = "install OpenMP (on Debian and Ubuntu: apt install libgomp1), or pip install tbb"
-    slow = layer == "workqueue"  # numba's own, which ends a process that calls kernels from two threads at once
+    advice = (
+        f"install OpenMP (on Debian and Ubuntu: apt install libgomp1), or {pip_install('tbb')}:"
+        " kernels of several threads then run at once"
+    )
+    slow = layer == "workqueue"  # numba's own, which runs one parallel kernel at a time
     value = f"{about['threads']}, run by {layer}"
-    yield Check("threads", "note" if slow else "ok", value, f"{advice}: programs with threads need it" if slow else "")
+    yield Check("threads", "note" if slow else "ok", value, advice if slow else "")
 
 
 def _processors() -> Iterator[Check]:
@@ -214,7 +215,7 @@ def _memory() -> Iterator[Check]:
 
 def _opengl() -> Iterator[Check]:
     if not _is_installed("moderngl"):
-        yield Check("OpenGL", "note", "not tried without moderngl", "pip install 'sparklod[render]'")
+        yield Check("OpenGL", "note", "not tried without moderngl", install_hint("render"))
         return
     from .render.gl.context import PACKAGES, probe
 
@@ -230,15 +231,15 @@ def _opengl() -> Iterator[Check]:
 
 def _open3d() -> Iterator[Check]:
     if not _is_installed("open3d"):
-        yield Check("Open3D", "note", "not tried, since it is not installed", "pip install 'sparklod[render]'")
+        yield Check("Open3D", "note", "not tried, since it is not installed", install_hint("render"))
         return
     try:
         from .render.open3d.child import PACKAGES
-        from .render.open3d.process import COMMAND
+        from .render.open3d.process import command
     except ImportError as error:  # numpy
-        yield Check("Open3D", "note", f"not tried ({error})", _INSTALL)
+        yield Check("Open3D", "note", f"not tried ({error})", install_hint())
         return
-    code, out, err = _run(COMMAND)  # it draws a splat before it looks for requests, of which there are none
+    code, out, err = _run(command())  # it draws a splat before it looks for requests, of which there are none
     try:
         reason = json.loads(out.splitlines()[0]).get("error", "")
     except (IndexError, ValueError):
@@ -249,7 +250,7 @@ def _open3d() -> Iterator[Check]:
 
 def _ffmpeg() -> Iterator[Check]:
     if _is_installed("imageio-ffmpeg"):
-        code, out, err = _run([sys.executable, "-c", FFMPEG])
+        code, out, err = _run(program_command(FFMPEG))
         value = _last_line(err, code) if code else out.strip()
         advice = "install ffmpeg, or set IMAGEIO_FFMPEG_EXE to it   # .mp4 animations take it" if code else ""
         yield Check("ffmpeg", "note" if code else "ok", value, advice)
@@ -281,11 +282,9 @@ def _is_installed(package: str) -> bool:
 
 
 def _run(command: list[str]) -> tuple[int, str, str]:
-    """Exit code, output and errors of a program that has nothing to read, and finds the modules that this one finds."""
-    here = [str(Path(__file__).parents[1]), *(path or str(Path.cwd()) for path in sys.path)]
-    how: dict[str, Any] = {"env": {**os.environ, "PYTHONPATH": os.pathsep.join(here)}, "timeout": PATIENCE}
+    """Return the exit code, output and errors of a program that has nothing to read."""
     try:
-        done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, check=False, **how)
+        done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, check=False, timeout=PATIENCE)
     except subprocess.TimeoutExpired:
         return 1, "", f"no answer within {PATIENCE} seconds"
     except OSError as error:

@@ -8,8 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .codecs import clamps
 from .codecs.formats import WRITABLE
 from .codecs.options import WriteOptions
+from .codecs.sound import check_scene
 from .codecs.spz_options import like
 from .io import read_scene, scene_sink
 from .model.scene import Scene
@@ -28,6 +30,10 @@ class Extracted:
         sh_degree: of the splats.
         bytes: of the output.
         seconds: by stage (read, write).
+        output_format: for display.
+        clamped: by the column of `Splats`, the number of splats with a value that the output cannot hold.
+        drops_sh: the output has no SH, and some splats do.
+        up_lost: the axis that points up, which the format cannot note; None where nothing is lost.
     """
 
     format: str
@@ -36,6 +42,10 @@ class Extracted:
     sh_degree: int
     bytes: int
     seconds: dict[str, float]
+    output_format: str
+    clamped: dict[str, int]
+    drops_sh: bool
+    up_lost: str | None = None
 
 
 def leaves_of(scene: Scene) -> Scene:
@@ -49,7 +59,7 @@ def leaves_of(scene: Scene) -> Scene:
     leaves = scene.splats.take(scene.tree.is_leaf)
     # A leaf is an input splat. One whose opacity is above 1 comes from a writer that rounds up.
     leaves = dataclasses.replace(leaves, opacity=np.minimum(leaves.opacity, np.float32(1)))
-    return Scene(leaves, antialiased=scene.antialiased, format=scene.format, header=scene.header)
+    return Scene(leaves, antialiased=scene.antialiased, format=scene.format, header=scene.header, up=scene.up)
 
 
 def extract_leaves(
@@ -75,16 +85,22 @@ def extract_leaves(
 
     Raises:
         FormatError, OutputError: see `io.read_scene` and `io.scene_sink`; the file has no tree.
+        InvalidSplatsError: a leaf is invalid.
         OutOfMemoryError: it does not fit into memory.
     """
     with memory_errors_translated():
-        write = scene_sink(target, WRITABLE[suffix], chunked=options.rad.chunked, overwrite=overwrite)
+        form = WRITABLE[suffix]
+        write = scene_sink(target, form, chunked=options.rad.chunked, overwrite=overwrite)
         start = time.perf_counter()
         scene = read_scene(source, threads=threads, progress=progress)
         leaves = leaves_of(scene)
+        check_scene(leaves, threads)
         read_done = time.perf_counter()
         # As they are: their opacities make up for nothing.
-        chosen = dataclasses.replace(like(scene.header, options), covering=False)
+        codec, chosen = form.codec(), dataclasses.replace(like(scene.header, options), covering=False)
+        chosen = codec.settled(leaves, chosen)
+        beyond = clamps.find(leaves.splats, threads, codec.held(chosen, leaves.splats.sh_degree))
+        drops_sh = any(clamp.column == "sh" and clamp.end == 0 for clamp in beyond.ends)
         size = write(leaves, chosen, threads=threads, progress=progress)
         seconds = {"read": read_done - start, "write": time.perf_counter() - read_done}
     return Extracted(
@@ -94,4 +110,8 @@ def extract_leaves(
         sh_degree=leaves.splats.sh_degree,
         bytes=size,
         seconds={stage: round(value, 4) for stage, value in seconds.items()},
+        output_format=form.name,
+        clamped={column: count for column, count in beyond.splats.items() if column != "sh" or not drops_sh},
+        drops_sh=drops_sh,
+        up_lost=leaves.up if form.bare else None,
     )

@@ -1,270 +1,164 @@
-"""Compiling kernels in advance: which ones each job needs, and how they get into the cache."""
+"""Compiling kernels in advance: all that declare the types that Python calls them with, see `jit.kernel`."""
 
 from __future__ import annotations
 
+import importlib
+import itertools
+import json
 import os
 import subprocess
 import sys
-import tempfile
 import threading
-import time
-from collections.abc import Iterable
-from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-import numpy as np
-
-from .codecs import ply, spz
-from .io import write_whole
-from .model.lod_tree import LodTree
-from .model.scene import Scene
-from .model.splats import Splats
 from .support import jit
 from .support.errors import SparklodError
+from .support.jit_cache import stem_of
+from .support.kernel_sources import PACKAGE
 from .support.progress import Progress, silent
+from .support.python_process import program_command
 
-#: Seconds between two counts of the kernels that are in the cache, for the progress bar.
+#: Seconds between two looks at how far the child processes are, for the progress bar.
 PATIENCE = 0.1
 
+#: Program of a child process.
+_PROGRAM = f"from {__name__} import _compile_requested; _compile_requested()"
 
-@dataclass(frozen=True)
-class Job:
-    """A job that needs kernels.
-
-    Attributes:
-        kernels: the kernels that Python code of the job calls, as `jit.is_cached` names them.
-        commands: command lines that call all of them, on the files of `_write_inputs`.
-    """
-
-    kernels: tuple[str, ...]
-    commands: tuple[str, ...]
+#: Seconds that compiling a kernel takes on a fast machine and on a slow one; docs/performance.md has measurements.
+SECONDS = (1, 3)
 
 
-#: The jobs by name, in the order in which processes that work at the same time compile the fewest kernels twice.
-JOBS = {
-    "quick": Job(
-        (
-            *(
-                "drawable.count_doubtful",
-                "geometry.find_bounds",
-                "group.level_keys",
-                "cell_pairs.merge_in_cells",
-                "cell_pairs.split_families",
-            ),
-            *("final_order.fill_leaves", "final_order.merge_colors"),
-            *("node_rows.fill_leaf_rows", "node_rows.fill_merged_splats", "sort.cell_words", "sort.sort_pass"),
-        ),
-        ("build-lod scene.ply -o quick.spz",),
-    ),
-    "traverse": Job(
-        (
-            *(
-                "cut_parts.take_step",
-                "cut_statistics.measure_cut",
-                "cut_statistics.replace_drawn",
-                "cut_statistics.select",
-            ),
-        ),
-        ("traverse tree.spz --orbit 2 -o frames.csv",),
-    ),
-    "inspect": Job(
-        (
-            *("tree_links.find_cycles", "tree_links.find_depths", "tree_links.find_parents"),
-            *("tree_links.add_weighted", "tree_links.fill_weights", "tree_links.sum_by_depth"),
-            *("tree_links.count_limits", "tree_links.mark_small"),
-            *("spz_codes.count_bytes", "spz_codes.count_ends", "spz_codes.count_squares", "spz_codes.count_halves"),
-            *("spz_codes.fill_extremes", "spz_codes.fill_sizes", "spz_codes.look_up"),
-            *("digits.count_digits", "digits.sh_lengths"),
-        ),
-        (
-            "inspect shiny.spz --check --stats --json",
-            "inspect shiny.ply --check --stats --json",
-            "inspect small.spz --check --json",
-        ),
-    ),
-    "quality": Job(
-        (
-            *(
-                "drawable.count_doubtful",
-                "geometry.find_bounds",
-                "final_order.fill_leaves",
-                "final_order.merge_colors",
-                "sort.sort_pass",
-            ),
-            *("node_rows.fill_leaf_rows", "node_rows.fill_merged_splats", "node_rows.morton_keys"),
-            "curve_sort.sort_along_curve",
-            *("pair_cost.find_partners", "pair_cost.match_pairs", "pair_merge.merge_pairs", "prune.drop_nodes"),
-            *("prune.fill_usefulness_terms", "prune.lay_out_children", "prune.size_ranks"),
-            *("family_links.find_limits", "tree_links.find_parents"),
-        ),
-        ("build-lod scene.ply --method quality -o quality.spz",),
-    ),
-    "rad": Job(
-        (
-            *("chunk_demand.fill_demand", "chunk_inside.sort_within_chunks", "chunk_sets.split_sets", "sort.sort_pass"),
-            *("family_links.find_limits", "tree_links.find_parents"),
-        ),
-        ("build-lod tree.spz --format rad -o tree.rad",),
-    ),
-    "render": Job(
-        (
-            *("bands.count_fragments", "bands.draw_discs", "continuous.blend", "continuous.find_limits"),
-            *("continuous.order_inner", "cut_parts.take_step"),
-            *("project.project", "raster.draw_tiles", "tiles.sort_into_tiles"),
-        ),
-        (
-            "render tree.spz --size 64x64 -o cut.png",
-            "render tree.spz --size 64x64 --continuous -o continuous.png",
-            "render scene.ply --size 64x64 --style billboards -o billboards.png",
-            "render scene.ply --size 64x64 --color-by overdraw -o overdraw.png",
-        ),
-    ),
-    "refine": Job(
-        (
-            *("adam.step", "backward.first_rows", "backward.weigh_tiles", "cut_parts.take_step", "difference.by_image"),
-            *("difference.squared_differences", "project.project"),
-            *("project_gradients.carry_back", "raster.draw_tiles", "tiles.sort_into_tiles", "shade.add_sh"),
-            *("shade.sh_gradients", "tree_links.add_child_sizes", "tree_links.find_parents", "view.gather"),
-            "view.mark_seen",
-        ),
-        ("build-lod shiny.spz --refine 2 -o refined.spz",),
-    ),
-    "palette": Job(
-        (
-            *("chunk_demand.fill_demand", "chunk_inside.sort_within_chunks", "chunk_sets.split_sets", "sort.sort_pass"),
-            *("family_links.find_limits", "tree_links.find_parents", "row_hash.hash_rows", "cells.halve_cells"),
-            *("cells.average_cells", "nearest.find_neighbours", "nearest.choose_codes"),
-        ),
-        ("build-lod shiny.spz --format rad --cluster-sh 4 -o palette.rad",),
-    ),
-    "streamed-sog": Job(
-        (
-            *("region_errors.compare_levels", "row_hash.hash_rows", "shade.add_sh", "tree_links.find_parents"),
-            *(
-                "texels.fill_quats",
-                "texels.gather_rows",
-                "texels.look_up",
-                "texels.look_up_words",
-                "texels.place_bytes",
-            ),
-            *("webp_codes.read_codes", "webp_pixels.read_pixels", "webp_transforms.undo"),
-        ),
-        ("build-lod shiny.spz -o web/lod-meta.json", "inspect web/lod-meta.json --check"),
-    ),
-}
+class Unit(NamedTuple):
+    """A kernel and one of the signatures that it declares, as `jit_types.describe` has it."""
+
+    kernel: jit.Kernel
+    signature: str
+
+    @property
+    def name(self) -> str:
+        """ "module.function", for display."""
+        return stem_of(self.kernel.py_func)
 
 
-class _Children:
-    """Child processes that are stopped together; none starts afterwards."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._started: list[subprocess.Popen[str]] = []
-        self._stopped = False
-
-    def start(self, line: list[str], **how: Any) -> subprocess.Popen[str] | None:
-        """Starts a process; None if all have been stopped."""
-        with self._lock:
-            if self._stopped:
-                return None
-            process: subprocess.Popen[str] = subprocess.Popen(line, **how)
-            self._started.append(process)
-            return process
-
-    def stop(self) -> None:
-        with self._lock:
-            self._stopped = True
-            for process in self._started:
-                process.terminate()
+def units() -> list[Unit]:
+    """Return all that can be compiled in advance, by module."""
+    found = []
+    for path in sorted(PACKAGE.glob("*/kernels/*.py")):
+        name = ".".join([PACKAGE.name, *path.relative_to(PACKAGE).with_suffix("").parts])
+        members = vars(importlib.import_module(name)).values()
+        kernels = [each for each in members if isinstance(each, jit.Kernel) and each.__module__ == name]
+        found += [Unit(kernel, signature) for kernel in kernels for signature in kernel.examples]
+    return found
 
 
-def missing(jobs: Iterable[str]) -> set[str]:
-    """The kernels of some of `JOBS` that are not in the cache."""
-    return {name for job in jobs for name in JOBS[job].kernels if not jit.is_cached(name)}
+def missing() -> list[Unit]:
+    """Return those of `units` that are not in the cache."""
+    return [unit for unit in units() if not unit.kernel.is_cached(unit.signature)]
+
+
+def duration(count: int, processes: int = 1) -> str:
+    """Return how long compiling some kernels takes, for display: "about 20 to 60 s"."""
+    return f"about {' to '.join(f'{max(1, round(count * seconds / processes))}' for seconds in SECONDS)} s"
 
 
 def warm_up(*, processes: int, progress: Progress = silent) -> int:
-    """Compiles all kernels that are missing, and returns their number.
+    """Compile all kernels that are missing, and return their number.
 
     Args:
-        processes: number of processes to compile in; each works on one job at a time.
-        progress: is told how many kernels are in the cache.
+        processes: number of processes to compile in, since numba compiles one kernel at a time in each.
+        progress: is called with the number of compiled kernels.
 
     Raises:
-        SparklodError: no cache can be written, or a job failed.
+        SparklodError: no cache can be written, or a kernel cannot be compiled.
     """
     if jit.CACHE_FOLDER is None:
         raise SparklodError("no cache can be written; set NUMBA_CACHE_DIR to a folder that can be written")
-    wanted = missing(JOBS)
+    wanted = missing()
     if not wanted:
         return 0
-    children = _Children()
-    with tempfile.TemporaryDirectory(prefix="sparklod-") as name, ThreadPoolExecutor(processes) as pool:
-        _write_inputs(Path(name))
-        running = [pool.submit(_do, job, Path(name), children) for job in JOBS if missing([job])]
+    # A module's kernels share code, which one process compiles once.
+    modules = [list(group) for _, group in itertools.groupby(wanted, lambda unit: unit.kernel.__module__)]
+    left, cache = iter(modules), jit.CACHE_FOLDER.parent.resolve()
+    children = [_Child(left, cache) for _ in range(min(processes, len(modules)))]
+    with ThreadPoolExecutor(len(children)) as pool:
+        running = {pool.submit(child.run) for child in children}
         try:
-            while not all(map(Future.done, running)):
-                progress("compiling", len(wanted) - len(missing(JOBS)), len(wanted), "kernel")
-                time.sleep(PATIENCE)
+            while running:
+                done, running = wait(running, PATIENCE)
+                for each in done:
+                    each.result()
+                progress("compiling", sum(child.compiled for child in children), len(wanted), "kernel")
         except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            children.stop()
+            for child in children:
+                child.stop()
             raise
-        for job in running:
-            job.result()
-    left = missing(JOBS)
-    if left:
-        raise SparklodError(f"{len(left)} of {len(wanted)} kernels are still not in the cache in {jit.CACHE_FOLDER}")
+    absent = len(missing())
+    if absent:
+        raise SparklodError(f"{absent} of {len(wanted)} kernels are still not in the cache in {jit.CACHE_FOLDER}")
     return len(wanted)
 
 
-def _do(job: str, folder: Path, children: _Children) -> None:
-    """Runs the commands of a job in child processes, since numba compiles one kernel at a time in each.
+class _Child:
+    """Child process that compiles the kernels of one module after the other.
 
-    Raises:
-        SparklodError: one failed.
+    Args:
+        modules: what is left to compile, by module; children share it.
+        cache: value of NUMBA_CACHE_DIR.
+
+    Attributes:
+        compiled: number of kernels that it has compiled.
     """
-    package = Path(__file__).parent
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(package.parent), os.environ.get("PYTHONPATH", "")])}
-    if jit.CACHE_FOLDER is not None:
-        environment["NUMBA_CACHE_DIR"] = str(jit.CACHE_FOLDER.parent.resolve())
-    quiet: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
-    for command in JOBS[job].commands:
-        line = [sys.executable, "-m", package.name, *command.split(), "--quiet"]
-        process = children.start(line, cwd=folder, env=environment, text=True, **quiet)
-        if process is None:
-            return
-        said = process.communicate()[1].strip()
-        if process.returncode:
-            last = said.rpartition("\n")[2] or f"exit status {process.returncode}"
-            raise SparklodError(f"sparklod {command.partition(' ')[0]} failed while it compiled: {last}")
+
+    def __init__(self, modules: Iterator[list[Unit]], cache: Path) -> None:
+        self._modules, self._cache, self._stopped = modules, cache, threading.Event()
+        self._process: subprocess.Popen[str] | None = None
+        self.compiled = 0
+
+    def run(self) -> None:
+        """Compile until nothing is left.
+
+        Raises:
+            SparklodError: a kernel cannot be compiled.
+        """
+        piped: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+        environment = {**os.environ, "NUMBA_CACHE_DIR": str(self._cache)}
+        with subprocess.Popen(program_command(_PROGRAM), env=environment, text=True, **piped) as process:
+            self._process = process
+            for unit in itertools.chain.from_iterable(self._modules):
+                if self._stopped.is_set():
+                    return
+                self._compile(process, unit)
+
+    def _compile(self, process: subprocess.Popen[str], unit: Unit) -> None:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        assert process.stderr is not None
+        request = json.dumps([unit.kernel.__module__, unit.kernel.py_func.__name__, unit.signature])
+        try:
+            process.stdin.write(f"{request}\n")
+            process.stdin.flush()
+            answered = process.stdout.readline()
+        except OSError:
+            answered = ""
+        if not answered:
+            process.terminate()
+            said = process.stderr.read().strip().rpartition("\n")[2] or f"exit status {process.wait()}"
+            raise SparklodError(f"{unit.name} cannot be compiled: {said}")
+        self.compiled += 1
+
+    def stop(self) -> None:
+        """End the process; another thread may be in `run`."""
+        self._stopped.set()
+        if self._process is not None:
+            self._process.terminate()
 
 
-def _write_inputs(folder: Path) -> None:
-    """Writes a scene of a few splats, and trees of them with and without SH, without a builder, which needs kernels."""
-    rng = np.random.default_rng(0)
-    count = 64
-    leaves = Splats(
-        center=rng.normal(size=(count, 3)).astype(np.float32),
-        scale=np.full((count, 3), 0.1, np.float32),
-        quat_xyzw=np.tile(np.array([0, 0, 0, 1], np.float32), (count, 1)),
-        opacity=np.full(count, 0.9, np.float32),
-        rgb=rng.uniform(size=(count, 3)).astype(np.float32),
-        sh=np.zeros((count, 0, 3), np.float32),
-    )
-    root = Splats.concat([leaves.take(slice(0, 1)), leaves])
-    root.scale[0] = 1
-    children = np.zeros(count + 1, np.uint16)
-    starts = np.zeros(count + 1, np.uint32)
-    children[0], starts[0] = count, 1
-    tree = Scene(root, LodTree(children, starts))
-    write_whole(folder / "scene.ply", ply.encode(Scene(leaves)), overwrite=True)
-    write_whole(folder / "tree.spz", spz.encode(tree), overwrite=True)
-    sh = rng.uniform(-0.5, 0.5, (count + 1, 3, 3)).astype(np.float32)
-    shiny = replace(root, sh=sh)
-    write_whole(folder / "shiny.spz", spz.encode(replace(tree, splats=shiny)), overwrite=True)
-    small = replace(root, scale=np.concatenate([root.scale[:1] / 100, root.scale[1:]]))
-    write_whole(folder / "small.spz", spz.encode(replace(tree, splats=small)), overwrite=True)
-    write_whole(folder / "shiny.ply", ply.encode(Scene(shiny)), overwrite=True)
+def _compile_requested() -> None:
+    """Compile the kernels that are named on standard input, and print a line for each."""
+    for line in sys.stdin:
+        module, name, signature = json.loads(line)
+        getattr(importlib.import_module(module), name).prepare(signature)
+        print(flush=True)

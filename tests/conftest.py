@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -37,10 +40,48 @@ def real_scene(name: str) -> Path:
 def pytest_sessionstart(session: pytest.Session) -> None:
     """Compiles all kernels that no cache has, so that no test meets a notice of it, or waits for one of its own."""
     from sparklod_cli import warmup
+    from sparklod_cli.commands.console import count_of
     from sparklod_cli.support import jit
+    from sparklod_cli.support.parallel import processors
 
-    if not hasattr(session.config, "workerinput") and jit.CACHE_FOLDER is not None:  # once, not in each of xdist's
-        warmup.warm_up(processes=2)
+    _refuse_undeclared_types()
+    is_worker = hasattr(session.config, "workerinput")  # of xdist; the controlling process has compiled them
+    missing = len(warmup.missing()) if jit.CACHE_FOLDER is not None and not is_worker else 0
+    if not missing:
+        return
+    terminal = session.config.pluginmanager.get_plugin("terminalreporter")
+    processes, start = min(processors(), 4), time.perf_counter()
+    expected = warmup.duration(missing, processes)
+    terminal.write_line(f"compiling {count_of(missing, 'kernel')} for this machine, once, {expected} ...", flush=True)
+
+    def report(_stage: str, done: int, total: int, _unit: str) -> None:
+        if terminal.isatty:
+            terminal.rewrite(f"compiled {done} of {total}", erase=True, flush=True)
+
+    compiled = warmup.warm_up(processes=processes, progress=report)
+    seconds = time.perf_counter() - start
+    terminal.rewrite("", erase=terminal.isatty)
+    terminal.write_line(f"compiled {count_of(compiled, 'kernel')} in {seconds:.0f} s", flush=True)
+
+
+def _refuse_undeclared_types() -> None:
+    """Has kernels raise an error where the package calls them with types that they do not declare.
+
+    Such a kernel would be compiled when it is called, whatever a warm-up has compiled. Tests may call them so.
+    """
+    from sparklod_cli.support import jit
+    from sparklod_cli.support.jit_types import describe
+
+    find = jit.Kernel._find
+
+    def checked(kernel: Any, key: Any, arguments: tuple[Any, ...]) -> Any:
+        caller = sys._getframe(2).f_globals["__name__"]
+        if caller.startswith("sparklod_cli.") and kernel.declared(arguments) is None:
+            name, types = kernel.py_func.__name__, describe(arguments)
+            raise AssertionError(f"{caller} calls {name} with types that it does not declare: {types}")
+        return find(kernel, key, arguments)
+
+    jit.Kernel._find = checked  # type: ignore[method-assign]
 
 
 @pytest.fixture(autouse=True)

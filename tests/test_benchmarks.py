@@ -16,7 +16,7 @@ import pytest
 import sparklod_cli as sparklod
 from tests.conftest import ROOT
 
-BENCHMARKS = [*sorted(path.stem for path in (ROOT / "benchmarks").glob("bench_*.py")), "run_all"]
+BENCHMARKS = [*sorted(path.stem for path in (ROOT / "benchmarks").glob("bench_*.py")), "digests", "run_all"]
 
 
 @pytest.mark.parametrize("name", BENCHMARKS)
@@ -48,6 +48,17 @@ def benchmark_module(monkeypatch: pytest.MonkeyPatch) -> Any:
     """Imports a module of the benchmarks by its name."""
     monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
     return importlib.import_module
+
+
+def test_digests_that_differ_are_named(benchmark_module: Any) -> None:
+    digests = benchmark_module("digests")
+    before = {"a.ply: quick": "1", "a.ply: cuts": "2", "a.ply: picture": "3"}
+    after = {"a.ply: quick": "1", "a.ply: cuts": "4", "a.ply: report": "5"}
+    assert digests.differences(before, before) == []
+    assert digests.differences(before, after) == ["changed: a.ply: cuts", "lost: a.ply: picture", "new: a.ply: report"]
+    assert dict(digests.digests_of_report('{"nodes": 3, "seconds": 1}')) == dict(
+        digests.digests_of_report('{"nodes": 3}')
+    )
 
 
 #: By budget, what pictures of a tree come to.

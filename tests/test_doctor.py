@@ -14,6 +14,7 @@ from sparklod_cli import doctor, warmup
 from sparklod_cli.doctor import Check, check_all
 from sparklod_cli.render.gl import context
 from sparklod_cli.support import jit, machine
+from sparklod_cli.support.optional import install_hint, pip_install
 from sparklod_cli.support.requirements import Required
 
 HEALTHY = {"folder": "/nowhere/kernels-1", "wanted": 35, "missing": 0, "layer": "omp", "threads": 4}
@@ -53,8 +54,8 @@ def test_this_installation_has_no_problem(monkeypatch: pytest.MonkeyPatch) -> No
 
 def test_the_kernels_are_those_of_this_cache() -> None:
     (cache, *_) = doctor._kernels()
-    wanted = {name for job in warmup.JOBS.values() for name in job.kernels}
-    assert cache.value.startswith(f"{len(wanted) - len(warmup.missing(warmup.JOBS))} of {len(wanted)} kernels")
+    units, missing = warmup.units(), warmup.missing()
+    assert cache.value.startswith(f"{len(units) - len(missing)} of {len(units)} kernels")
     assert str(jit.CACHE_FOLDER) in cache.value
 
 
@@ -65,7 +66,7 @@ def test_a_package_that_ends_its_process_is_a_problem(tmp_path: Path, monkeypatc
     (check,) = doctor._kernels()
     assert check.state == "problem"
     assert "what bakes does not load" in check.value
-    assert check.advice.startswith("pip install")
+    assert check.advice.startswith(install_hint("", "--force-reinstall"))
 
 
 def test_a_package_that_does_not_import_is_a_problem_with_its_reason(
@@ -81,8 +82,8 @@ def test_missing_and_old_packages_are_problems(monkeypatch: pytest.MonkeyPatch) 
     required = [Required("numpy", "1.26", "1.20"), Required("numba", "0.60", None), Required("click", "8.1", "8.5")]
     monkeypatch.setattr(doctor, "required_by", lambda name: iter(required))
     assert list(doctor._packages()) == [
-        Check("numpy", "problem", "1.20, older than 1.26", "pip install --upgrade 'numpy>=1.26'"),
-        Check("numba", "problem", "is missing", "pip install --upgrade 'numba>=0.60'"),
+        Check("numpy", "problem", "1.20, older than 1.26", pip_install("--upgrade", "numpy>=1.26")),
+        Check("numba", "problem", "is missing", pip_install("--upgrade", "numba>=0.60")),
         Check("click", "ok", "8.5"),
     ]
 
@@ -91,7 +92,7 @@ def test_a_missing_extra_is_a_note_that_names_it(monkeypatch: pytest.MonkeyPatch
     lack(monkeypatch, "pyarrow")
     (check,) = (check for check in doctor._extras() if check.name == "extra parquet")
     assert (check.state, check.value) == ("note", "pyarrow is missing")
-    assert check.advice.startswith("pip install --upgrade 'sparklod[parquet]'")
+    assert check.advice.startswith(install_hint("parquet"))
 
 
 def test_a_sparklod_that_is_not_installed_is_a_note(monkeypatch: pytest.MonkeyPatch) -> None:

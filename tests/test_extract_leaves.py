@@ -68,6 +68,26 @@ def test_splat_is_sorted_by_importance(tree_file: Path, tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_scene(tmp_path / "back.splat").splats.center, expected.center)
 
 
+def test_what_splat_cannot_hold_is_said(tree_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    splats = random_splats(3000, sh_degree=1)
+    splats.rgb[:1000] += 0.5
+    tree_file.write_bytes(b"".join(spz.encode(Scene(*quick.build(splats)))))
+    assert unlod(tree_file, "-o", tmp_path / "back.splat") == 0
+    said = capsys.readouterr().err
+    expected = leaves(tree_file)
+    beyond = (np.clip(expected.rgb, -0.5 / 255, 255.5 / 255) != expected.rgb).any(axis=1)
+    share = f"{100 * np.count_nonzero(beyond) / len(expected):.3g} %"
+    assert 0 < np.count_nonzero(beyond) < len(expected)
+    assert f"SPLAT holds no reflections (SH), and clamps the colours of {share} of the splats" in said
+
+
+def test_nothing_is_said_where_nothing_is_lost(
+    tree_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert unlod(tree_file, "-o", tmp_path / "back.ply") == 0
+    assert len(capsys.readouterr().err.splitlines()) == 1
+
+
 @pytest.mark.parametrize("name", ["back.sog", "web/meta.json"])
 def test_sog_holds_all_leaves(tree_file: Path, tmp_path: Path, name: str) -> None:
     assert unlod(tree_file, "-o", tmp_path / name, "--cluster-sh", 3000) == 0

@@ -73,6 +73,17 @@ def test_a_former_output_is_replaced_and_its_further_chunks_are_removed(tmp_path
     assert not (tmp_path / "env").exists()
 
 
+@pytest.mark.parametrize("unpacked_first", [False, True])
+def test_an_environment_is_replaced_by_one_of_the_other_form(unpacked_first: bool, tmp_path: Path) -> None:
+    unpacked = output("0_0", "env")
+    manifest = unpacked["lod-meta.json"].replace(b"env/meta.json", b"env/env.sog")
+    bundled = output("0_0") | {"env/env.sog": b"PK", "lod-meta.json": manifest}
+    order = [unpacked, bundled] if unpacked_first else [bundled, unpacked]
+    for overwrite, files in enumerate(order):
+        write(tmp_path / "lod-meta.json", files, overwrite=bool(overwrite))
+        assert held(tmp_path) == files
+
+
 @pytest.mark.parametrize("overwrite", [False, True])
 @pytest.mark.parametrize("name", ["0_0/meta.json", "0_0/anything", "0_0", "0_1/x", "env/x"])
 def test_what_is_not_of_a_former_output_is_in_the_way(name: str, overwrite: bool, tmp_path: Path) -> None:

@@ -6,14 +6,15 @@ import os
 import stat
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from sparklod_cli.io import check_writable, write_stdout, write_whole
+from sparklod_cli.io import check_writable, detail_sink, sink_together, write_stdout, write_whole
 from sparklod_cli.support import atomic
-from sparklod_cli.support.errors import OutputError
+from sparklod_cli.support.errors import FormatError, OutputError
 from tests.conftest import FIXTURES, IS_ROOT
 from tests.support.test_atomic import has_unnamed_files
 
@@ -45,6 +46,35 @@ def test_an_existing_file_is_replaced_only_when_asked_for(tmp_path: Path) -> Non
 def failing(error: BaseException) -> Iterator[bytes]:
     yield b"half a"
     raise error
+
+
+@pytest.mark.parametrize("write", [write_whole, sink_together, detail_sink])
+def test_folders_of_an_output_that_fails_are_removed(write: Callable[..., Any], tmp_path: Path) -> None:
+    (tmp_path / "a").mkdir()
+    target = tmp_path / "a" / "b" / "c" / "lod-meta.json"
+
+    def broken() -> Iterator[Any]:
+        yield b"half a" if write is write_whole else (target.name, [b"half a"])
+        raise FormatError("too large for the format")
+
+    with pytest.raises(FormatError, match="too large"):
+        if write is write_whole:
+            write(target, broken(), overwrite=True)
+        else:
+            write(target, overwrite=True)(broken())
+    assert names(tmp_path) == ["a"] and names(tmp_path / "a") == []
+
+
+def test_a_folder_that_vanishes_while_a_file_is_written_is_made_again(tmp_path: Path) -> None:
+    target = tmp_path / "a" / "out.spz"
+
+    def pieces() -> Iterator[bytes]:
+        yield b"x"
+        if has_unnamed_files(tmp_path):
+            target.parent.rmdir()  # as another run does that made it, and failed
+
+    write_whole(target, pieces(), overwrite=False)
+    assert target.read_bytes() == b"x"
 
 
 @pytest.mark.parametrize("error", [RuntimeError("broken"), MemoryError(), KeyboardInterrupt(), SystemExit(3)])

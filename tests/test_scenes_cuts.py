@@ -171,11 +171,13 @@ def test_splats_that_cannot_be_drawn_are_left_out() -> None:
 @pytest.mark.parametrize("size", [(160, 90), (90, 160)])
 @pytest.mark.parametrize("file", [TOWN, PLAIN, FIXTURES / "demo.ply"], ids=lambda path: path.name)
 def test_a_fitted_camera_sees_the_scene(file: Path, size: tuple[int, int]) -> None:
+    """All of it that is dense, and nearly all that there is: of the demo all but its stars."""
     scenes = read_scenes(at(file))
     view = fitted(camera(*size), covered(scenes.balls()))
-    center = scenes.balls().center
+    center = covered(scenes.balls()).center
     local = (center - view.position) @ view.camera_to_world[:3, :3]
     places = np.abs(local[:, :2] / -local[:, 2:]) * view.focal / (np.array(size) / 2)
     inside = (places <= 1).all(axis=1) & (local[:, 2] < 0)
-    assert inside.mean() >= COVERED
+    assert inside.all()
     assert places[inside].max() > 0.7  # and it fills that
+    assert len(center) >= 0.9 * COVERED * len(scenes.balls().center)

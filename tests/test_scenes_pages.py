@@ -216,12 +216,10 @@ def test_links_are_checked_in_chunks_that_are_read(scene: Scene, tmp_path: Path)
     assert scene.tree is not None
     inner = np.flatnonzero(scene.tree.child_count)
     near, far = int(inner[5]), int(inner[inner >= 3 * CHUNK_NODES][-1])
-    leaf = int(np.flatnonzero(scene.tree.is_leaf)[0])
     second, count = int(inner[1]), len(scene.tree)
     for node, start, what in (
         (near, near, f"node {near} comes after one of its children"),
         (near, count, f"node {near} has children past the last node"),
-        (leaf, 7, f"node {leaf} is a leaf with a child_start"),
         (second, int(scene.tree.child_start[inner[0]]) + 1, "shares children with another node"),
         (far, far, None),
     ):

@@ -2,54 +2,146 @@
 
 from __future__ import annotations
 
+import ast
+import importlib
+import itertools
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
 from sparklod_cli import warmup
 from sparklod_cli.cli import run
+from sparklod_cli.codecs.kernels import drawable, spz_codes
+from sparklod_cli.commands.console import Console
+from sparklod_cli.lod.kernels import sort
 from sparklod_cli.support import jit, jit_link
-from tests.conftest import ROOT
+from sparklod_cli.support.jit_cache import stem_of
+from sparklod_cli.warmup import Unit
+from tests.conftest import FIXTURES, ROOT
 
-#: Runs a command line of JSON and prints which kernels Python has called, and whether numba was loaded.
-CALLED = """
+#: Runs command lines of JSON one after the other; prints their exit statuses, and whether numba was loaded to compile.
+RUN = """
 import json, sys
 from sparklod_cli.cli import run
-from sparklod_cli.support.jit import Kernel
-from sparklod_cli.support.jit_cache import stem_of
-code = run(json.loads(sys.argv[1]))
-kernels = {f for name, module in list(sys.modules.items()) if ".kernels." in name for f in vars(module).values()
-           if isinstance(f, Kernel) and f.called}
-print(json.dumps([code, sorted(stem_of(kernel.py_func) for kernel in kernels), "numba" in sys.modules]))
+print(json.dumps([[run(command) for command in json.loads(sys.argv[1])], "numba" in sys.modules]))
 """
 
-
-@pytest.mark.parametrize("job", warmup.JOBS)
-def test_the_table_has_just_the_kernels_that_a_job_calls(job: str, tmp_path: Path) -> None:
-    warmup._write_inputs(tmp_path)
-    called: set[str] = set()
-    for command in warmup.JOBS[job].commands:
-        line = [sys.executable, "-c", CALLED, json.dumps([*command.split(), "--quiet"])]
-        path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
-        done = subprocess.run(
-            line, cwd=tmp_path, capture_output=True, text=True, check=True, env={**os.environ, "PYTHONPATH": path}
-        )
-        code, kernels, needs_numba = json.loads(done.stdout.splitlines()[-1])
-        assert code == 0, done.stderr
-        assert needs_numba == (not jit_link.is_tested())
-        called |= set(kernels)
-    assert called == set(warmup.JOBS[job].kernels)
+PACKAGE = ROOT / "sparklod_cli"
 
 
-def test_a_second_warmup_compiles_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+def kernels_in(path: Path) -> set[jit.Kernel]:
+    """The kernels that a module of the package imports or uses as attributes of modules of kernels."""
+    package = path.relative_to(ROOT).with_suffix("").parts[:-1]
+    found, nodes = set(), list(ast.walk(ast.parse(path.read_text())))
+    attributes = [node for node in nodes if isinstance(node, ast.Attribute)]
+    uses = [(node.value.id, node.attr) for node in attributes if isinstance(node.value, ast.Name)]
+    for node in nodes:
+        if not (isinstance(node, ast.ImportFrom) and node.level and "kernels" in (node.module or "").split(".")):
+            continue
+        module = ".".join([*package[: len(package) + 1 - node.level], str(node.module)])
+        for alias in node.names:
+            name = alias.asname or alias.name
+            if module.endswith(".kernels"):
+                members = vars(importlib.import_module(f"{module}.{alias.name}"))
+                found |= {members.get(attribute) for of, attribute in uses if of == name}
+            else:
+                found.add(getattr(importlib.import_module(module), alias.name))
+    return {each for each in found if isinstance(each, jit.Kernel)}
+
+
+def kernels_of_functions(path: Path) -> set[jit.Kernel]:
+    """The kernels that the plain functions of a module of kernels use."""
+    members = vars(importlib.import_module(".".join(path.relative_to(ROOT).with_suffix("").parts)))
+    functions = [node for node in ast.parse(path.read_text()).body if isinstance(node, ast.FunctionDef)]
+    nodes = itertools.chain.from_iterable(ast.walk(each) for each in functions if not each.decorator_list)
+    found = [members.get(node.id) for node in nodes if isinstance(node, ast.Name)]
+    return {each for each in found if isinstance(each, jit.Kernel)}
+
+
+def test_every_kernel_that_the_package_calls_declares_its_types_and_no_other() -> None:
+    called: set[jit.Kernel] = set()
+    for path in PACKAGE.rglob("*.py"):
+        called |= (kernels_of_functions if path.parent.name == "kernels" else kernels_in)(path)
+    declared = {unit.kernel for unit in warmup.units()}
+    assert sorted(stem_of(kernel.py_func) for kernel in called) == sorted(
+        stem_of(kernel.py_func) for kernel in declared
+    )
+
+
+def test_a_call_with_types_that_are_not_declared_fails_in_tests() -> None:
+    """Thus no run of the tests calls what a warm-up does not compile; see `tests.conftest`."""
+    package: dict[str, Any] = {"__name__": "sparklod_cli.somewhere"}
+    exec("def call(kernel, *arguments): return kernel(*arguments)", package)
+    codes, counts = np.zeros((3, 3), np.uint8), np.zeros((3, 256), np.int64)
+    package["call"](spz_codes.count_bytes, codes, counts)
+    for wrong in (codes.astype(np.int8), codes.T[:2], codes[0]):
+        with pytest.raises(AssertionError, match="types that it does not declare"):
+            package["call"](spz_codes.count_bytes, wrong, counts)
+
+
+def test_commands_that_combine_much_find_all_kernels_compiled(tmp_path: Path) -> None:
+    sog, tree = str(tmp_path / "one.sog"), str(tmp_path / "tree.spz")
+    scene = str(FIXTURES / "sh1-ascii.ply")
+    commands = [
+        ["build-lod", scene, "--memory", "1GB", "-o", tree],
+        ["build-lod", tree, "-o", sog, "--unlod"],
+        ["build-lod", sog, sog, "--merge", "-o", tree, "--overwrite"],
+        ["build-lod", scene, "--refine", "2", "-o", tree, "--overwrite"],
+    ]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
+    line = [sys.executable, "-c", RUN, json.dumps([[*command, "--quiet"] for command in commands])]
+    done = subprocess.run(line, cwd=tmp_path, capture_output=True, text=True, check=True, env=environment)
+    assert json.loads(done.stdout.splitlines()[-1]) == [[0] * len(commands), not jit_link.is_tested()], done.stderr
+
+
+@pytest.fixture
+def few(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Unit]:
+    """Three kernels that compile fast, and an empty cache."""
+    assert jit.CACHE_FOLDER is not None
+    folder = tmp_path / jit.CACHE_FOLDER.name
+    folder.mkdir()
+    monkeypatch.setattr(jit, "CACHE_FOLDER", folder)
+    kernels = [spz_codes.count_bytes, spz_codes.look_up, drawable.count_doubtful]
+    units = [Unit(kernel, signature) for kernel in kernels for signature in kernel.examples]
+    monkeypatch.setattr(warmup, "units", lambda: units)
+    return units
+
+
+@pytest.mark.parametrize("processes", ["1", "2"])
+def test_as_many_kernels_are_compiled_as_are_missing(
+    processes: str, few: list[Unit], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert warmup.missing() == few
+    assert run(["warmup", "--json", "--verbose", "--jobs", processes]) == 0
+    captured = capsys.readouterr()
+    assert json.loads(captured.out)["compiled"] == len(few)
+    assert captured.err.count("must be compiled") == len(few)
+    assert f"compiled {len(few)} kernels in " in captured.err
+    assert warmup.missing() == []
     assert run(["warmup", "--json"]) == 0
     captured = capsys.readouterr()
     assert json.loads(captured.out)["compiled"] == 0
     assert captured.err == f"all kernels are in {jit.CACHE_FOLDER}\n"
+
+
+def test_a_command_that_compiles_says_how_many_kernels_a_warmup_would(
+    few: list[Unit], capsys: pytest.CaptureFixture[str]
+) -> None:
+    kernel = few[0].kernel
+    with Console(quiet=False, verbose=False) as console:
+        console.announce_compiling()
+        jit.Kernel(kernel.py_func, kernel.options, kernel.signatures).prepare(few[0].signature)
+    first, last = capsys.readouterr().err.splitlines()
+    assert first.startswith("Compiling kernels for this machine")
+    assert f"sparklod warmup compiles all {len(few)} in advance" in first
+    assert last.startswith("compiled 1 kernel in ")
 
 
 def test_warmup_without_a_cache_fails(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
@@ -58,15 +150,39 @@ def test_warmup_without_a_cache_fails(monkeypatch: pytest.MonkeyPatch, capsys: p
     assert "set NUMBA_CACHE_DIR" in capsys.readouterr().err
 
 
-def test_a_job_that_fails_says_why(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(jit, "CACHE_FOLDER", tmp_path)
-    monkeypatch.setattr(warmup, "JOBS", {"none": warmup.Job(("no.kernel",), ("inspect no-such-file.spz",))})
-    with pytest.raises(warmup.SparklodError, match=r"sparklod inspect failed while it compiled: .*no-such-file"):
+def test_a_kernel_that_does_not_compile_is_named_with_the_reason(monkeypatch: pytest.MonkeyPatch) -> None:
+    def absent() -> None: ...
+
+    absent.__module__ = sort.__name__
+    monkeypatch.setattr(warmup, "missing", lambda: [Unit(jit.Kernel(absent, sort.sort_pass.options), "()")])
+    with pytest.raises(warmup.SparklodError, match=r"sort\.absent cannot be compiled: AttributeError: .*absent"):
         warmup.warm_up(processes=1)
 
 
-def test_a_job_that_compiles_nothing_is_an_error(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(jit, "CACHE_FOLDER", tmp_path)
-    monkeypatch.setattr(warmup, "JOBS", {"none": warmup.Job(("no.kernel",), ("inspect scene.ply",))})
+def test_kernels_that_do_not_reach_the_cache_are_an_error(few: list[Unit], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(warmup, "missing", lambda: few[:1])
     with pytest.raises(warmup.SparklodError, match="1 of 1 kernels are still not in the cache"):
         warmup.warm_up(processes=1)
+
+
+def test_the_children_import_nothing_from_the_working_directory(
+    few: list[Unit], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "sparklod_cli.py").write_text("raise SystemExit('planted')")
+    monkeypatch.chdir(tmp_path)
+    assert warmup.warm_up(processes=1) == len(few)
+
+
+def test_the_tests_say_that_they_compile(tmp_path: Path) -> None:
+    assert jit.CACHE_FOLDER is not None
+    (signature,) = spz_codes.count_bytes.examples
+    absent = spz_codes.count_bytes._path(signature)
+    ignore = shutil.ignore_patterns("*.inner", absent.name if absent else "spz_codes.count_bytes*")
+    shutil.copytree(jit.CACHE_FOLDER, tmp_path / jit.CACHE_FOLDER.name, ignore=ignore)
+    line = [sys.executable, "-m", "pytest", "tests/support/test_ticks.py", "-q", "-p", "no:cacheprovider"]
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    how: dict[str, Any] = {"cwd": ROOT, "capture_output": True, "text": True, "check": True, "env": environment}
+    said = subprocess.run([*line, "-n1"], **how).stdout
+    assert "compiling 1 kernel for this machine" in said
+    assert "compiled 1 kernel in " in said
+    assert "ompil" not in subprocess.run(line, **how).stdout

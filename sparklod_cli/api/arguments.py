@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import itertools
+import os
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,6 +13,7 @@ import numpy as np
 from ..cameras.camera import Camera
 from ..cameras.path import CameraPath
 from ..model.scene import Scene
+from ..support.errors import OutputError
 
 
 def scene_like(value: Any) -> Scene:
@@ -25,13 +28,18 @@ def scene_like(value: Any) -> Scene:
 
 
 def camera_like(value: Any) -> Camera:
-    """One camera.
+    """One camera, all of whose numbers are finite.
 
     Raises:
         TypeError: it is anything else.
+        ValueError: a number is not finite; names its field.
     """
     if not isinstance(value, Camera):
         raise TypeError(f"a camera is a Camera, not {_kind(value)}; Camera.look_at makes one, read_cameras reads paths")
+    for name in ("camera_to_world", "width", "height", "focal", "principal", "time"):
+        numbers = getattr(value, name)
+        if not np.isfinite(numbers).all():
+            raise ValueError(f"{name} of a camera is {np.asarray(numbers).tolist()}; give finite numbers")
     return value
 
 
@@ -40,9 +48,11 @@ def path_like(cameras: CameraPath | Iterable[Camera]) -> CameraPath:
 
     Raises:
         TypeError: one is no camera.
-        ValueError: there are none, or they are not in the order of their times.
+        ValueError: a number of one is not finite, there are none, or they are not in the order of their times.
     """
     if isinstance(cameras, CameraPath):
+        for each in cameras.cameras:
+            camera_like(each)
         return cameras
     if isinstance(cameras, str):
         camera_like(cameras)
@@ -52,6 +62,17 @@ def path_like(cameras: CameraPath | Iterable[Camera]) -> CameraPath:
     if any(later.time < earlier.time for earlier, later in itertools.pairwise(every)):
         raise ValueError("the cameras are not in the order of their times")
     return CameraPath(every, "cameras", (), tuple(range(len(every))))
+
+
+def file_path(path: Path | str) -> Path:
+    """Return the path of a file that will be written.
+
+    Raises:
+        OutputError: it names a folder.
+    """
+    if os.fspath(path).endswith(("/", os.sep)) or Path(path).is_dir():
+        raise OutputError(f"{path} is a folder; name a file in it")
+    return Path(path)
 
 
 def within(name: str, value: Any, least: float, most: float) -> None:

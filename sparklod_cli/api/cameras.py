@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 from ..cameras.axes import Axes
 from ..cameras.defaults import ELEVATION
 from ..cameras.formats.table import FORMATS
-from ..cameras.frame import MAX_FRAMES, Settings
+from ..cameras.frame import MAX_FRAMES, Settings, direction_of
 from ..cameras.path import CameraPath
 from ..cameras.sources import Orbit, read_path
 from ..cameras.world_transform import similarity
@@ -85,7 +86,7 @@ def orbit(
     center: Point | None = None,
     distance: float | None = None,
     elevation: float = ELEVATION,
-    up: Point = (0.0, -1.0, 0.0),
+    up: Point | None = None,
     fov_y: float = 60.0,
     size: tuple[int, int] = (1280, 720),
 ) -> CameraPath:
@@ -97,7 +98,7 @@ def orbit(
         center: x, y, z that they look at; the middle of the scenes unless given.
         distance: from there, world units; as near as all scenes are in every picture unless given.
         elevation: above the center, degrees.
-        up: x, y, z of what is up; -y in scenes as training leaves them.
+        up: x, y, z of what is up; what the scenes note unless given, or -y, as training leaves scenes.
         fov_y: vertical field of view, degrees.
         size: width and height of the images, pixels.
 
@@ -107,6 +108,7 @@ def orbit(
     """
     if not 1 <= count <= MAX_FRAMES:
         raise CameraPathError(f"count is {count}; give 1 to {MAX_FRAMES:,} cameras")
-    settings = Settings(size=size, fov_y=math.radians(fov_y), up=up)
+    scenes = functools.cache(lambda: scenes_of(viewed, None))
+    settings = Settings(size=size, fov_y=math.radians(fov_y), up=up, up_of_scene=lambda: direction_of(scenes().up))
     source = Orbit(count, center, distance, elevation)
-    return source.cameras(settings, lambda: scenes_of(viewed, None).balls())
+    return source.cameras(settings, lambda: scenes().balls())

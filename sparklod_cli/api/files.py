@@ -21,7 +21,7 @@ from ..support.defaults import (
     MIN_BASE,
     MIN_GROWTH,
 )
-from ..support.errors import FormatError, TreeError, memory_errors_translated
+from ..support.errors import FormatError, InvalidSplatsError, TreeError, memory_errors_translated
 from ..support.threads import on_threads, thread_count
 from .arguments import scene_like, whole_within, within
 from .progress import Told, telling
@@ -71,7 +71,7 @@ def naming(path: Path) -> Iterator[None]:
     """Puts the file before what is wrong with it: Python, unlike a command, says nothing before it."""
     try:
         yield
-    except (FormatError, TreeError) as error:
+    except (FormatError, InvalidSplatsError, TreeError) as error:
         raise type(error)(f"{path}: {error}") from None
 
 
@@ -132,7 +132,8 @@ def build_lod(
         kept, _ = select(selection or Selection(), scene.splats.with_max_sh(max_sh), thread_count(threads))
         # A builder frees its input as it goes where nobody else holds it.
         built = build(kept, setting, progress=told)
-        made = Tree(*(banded([built]) if BUILDERS[method].in_bands else built), scene.antialiased)
+        nodes, links = banded([built]) if BUILDERS[method].in_bands else built
+        made = Tree(nodes, links, scene.antialiased, up=scene.up)
         return made if fitting is None else refined_tree(made, fitting, thread_count(threads), told, None)[0]
 
 
@@ -159,14 +160,18 @@ def pack(scene: Scene, encoding: str, *, threads: int | None = None) -> dict[str
         arrays of uint32 words by their names, N rows each but for a texture.
 
     Raises:
+        InvalidSplatsError, TreeError: a splat is invalid, or the tree is broken.
         ValueError: there is no such encoding, or no tree for it.
     """
     from ..codecs.gpu import dump
     from ..codecs.gpu.table import ENCODINGS
+    from ..codecs.sound import check_scene
 
     if encoding not in ENCODINGS:
         raise ValueError(f"there is no encoding {encoding!r}; give one of {', '.join(ENCODINGS)}")
-    return dump.pack(scene_like(scene), encoding, thread_count(threads))
+    count = thread_count(threads)
+    check_scene(scene_like(scene), count)
+    return dump.pack(scene, encoding, count)
 
 
 def unpack(arrays: Mapping[str, NDArray[np.uint32]], *, threads: int | None = None) -> Scene:

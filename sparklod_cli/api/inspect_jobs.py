@@ -50,12 +50,16 @@ class DrawSettings:
     chunks: TableOutput | None = None
 
     def check(self) -> None:
-        """Raises a `SparklodError` where a file cannot be written, before anything is read."""
+        """Raises a `SparklodError` where a file cannot be written or drawn, before anything is read."""
         if self.chunks is not None:
             self.chunks.check()
         for target in (self.plot, self.html):
             if target is not None:
                 check_writable(target, overwrite=self.overwrite)
+        if self.plot is not None:
+            from ..figures.pyvista_scene import load_pyvista
+
+            load_pyvista()
 
 
 @dataclass(frozen=True)

@@ -203,10 +203,6 @@ def compare_files(
     from ..tables.assertions import check
     from ..tables.comparison import EMPTY, rows_by_budget, summarize
 
-    scenes = files.read(trees_only=True)
-    path = files.path(lambda: scenes)
-    if fit_planes:
-        render = files.with_planes(render, path, lambda: scenes)
     table.check()
     if plot is not None:
         from ..figures.charts import load_matplotlib
@@ -214,6 +210,10 @@ def compare_files(
 
         check_writable(plot, overwrite=overwrite)
         load_matplotlib()
+    scenes = files.read(trees_only=True)
+    path = files.path(lambda: scenes)
+    if fit_planes:
+        render = files.with_planes(render, path, lambda: scenes)
     ready(path, scenes)
     with on_threads(files.threads):
         try:

@@ -79,4 +79,4 @@ def arrange_chunks(tree: Scene, *, threads: int | None = None, progress: Told = 
         from ..lod.chunk_order import arrange
 
         splats, links = arrange(tree.splats, links, progress=told)
-    return Tree(splats, links, tree.antialiased)
+    return Tree(splats, links, tree.antialiased, up=tree.up)

@@ -84,4 +84,4 @@ def refined_tree(
     """A tree whose merged splats are fitted, and what that brought."""
     found, report = refined(tree, settings, threads=threads, progress=progress, say=say or (lambda text: None))
     assert found.tree is not None
-    return Tree(found.splats, found.tree, found.antialiased), report
+    return Tree(found.splats, found.tree, found.antialiased, up=found.up), report

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..tables.table import Table
+from .arguments import file_path
 
 if TYPE_CHECKING:
     import numpy as np
@@ -69,10 +70,11 @@ class Picture:
         """
         from ..io import write_whole
 
-        if Path(path).suffix.lower() != ".png":
+        path = file_path(path)
+        if path.suffix.lower() != ".png":
             raise ValueError(f"{path}: a picture is saved as .png, which the name does not end in")
 
-        write_whole(Path(path), [self.png], overwrite=overwrite)
+        write_whole(path, [self.png], overwrite=overwrite)
 
 
 def show(image: NDArray[np.float32], *, background: tuple[float, float, float] | None = (0.0, 0.0, 0.0)) -> Picture:

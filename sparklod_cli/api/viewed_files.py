@@ -7,6 +7,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from ..cameras.frame import Point, direction_of
 from ..cameras.framing import reach
 from ..model.splats import COLUMNS
 from ..scenes.pages import TRAVERSED
@@ -58,8 +61,17 @@ class ViewedFiles:
         )
 
     def path(self, scenes: Callable[[], Scenes]) -> CameraPath:
-        """The cameras; scenes are asked for only where cameras are chosen for them."""
-        return self.cameras.cameras(self.settings, lambda: scenes().balls())
+        """The cameras; scenes are read only where cameras are chosen for them, or need their up axis."""
+        settings = dataclasses.replace(self.settings, up_of_scene=lambda: self._up_of(scenes()))
+        return self.cameras.cameras(settings, lambda: scenes().balls())
+
+    def _up_of(self, scenes: Scenes) -> Point:
+        """Up axis of the scenes, in the world of the cameras."""
+        up = direction_of(scenes.up)
+        if scenes.up is None or self.settings.world is None:
+            return up
+        x, y, z = (np.asarray(up) @ self.settings.world[:3, :3]).tolist()  # the inverse rotation, of any length
+        return x, y, z
 
     def with_planes(self, render: RenderSettings, path: CameraPath, scenes: Callable[[], Scenes]) -> RenderSettings:
         """Settings whose near and far planes enclose the scenes, where the cameras are chosen for them."""

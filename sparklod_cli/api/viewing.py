@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..cameras.frame import DEFAULT_UP, Settings
+from ..cameras.frame import Settings, direction_of
 from ..cameras.sources import read_path
+from ..model.up_axis import common
 from ..support.errors import memory_errors_translated
 from ..support.progress import Progress, silent
 from ..view.export import check_folder as check_folder
@@ -27,10 +29,10 @@ class ViewSettings:
     Attributes:
         look_at: eye and target of the camera; None for one that sees the whole scene.
         fov: its vertical field of view, degrees; None for 60.
-        up: direction that is up; None for -y.
+        up: direction that is up; None for what the files note, or -y.
         budget: splats; None for Spark's default on the device.
         camera_path: file of cameras that the page plays; None for none.
-        spark_dir: folder whose node_modules has Spark and three.js; None for a CDN.
+        spark_dir: folder whose node_modules has Spark, or PlayCanvas, and three.js; None for a CDN.
     """
 
     look_at: tuple[Point, Point] | None
@@ -71,16 +73,19 @@ def prepare(
     Raises:
         SparklodError: a file or a library is missing or broken, or the camera makes no sense.
     """
-    libraries = from_cdn() if settings.spark_dir is None else from_folder(settings.spark_dir)
     shown = shown_files(paths)
-    up = DEFAULT_UP if settings.up is None else settings.up
+    engine = shown[0].engine
+    libraries = from_cdn(engine) if settings.spark_dir is None else from_folder(settings.spark_dir, engine)
+    # Files are read only after the camera path, unless its cameras need their up axis.
+    extents = functools.cache(lambda: [extent_of(file, threads=threads, progress=progress) for file in shown])
+    cameras = Settings(up=settings.up, up_of_scene=lambda: direction_of(common(extent.up for extent in extents())))
     path = None
-    if settings.camera_path is not None:
-        path = read_path(settings.camera_path, settings=Settings(up=settings.up))
     with memory_errors_translated():
-        extents = [extent_of(file, threads=threads, progress=progress) for file in shown]
-        start = start_of(extents, settings.look_at, up, FOV if settings.fov is None else settings.fov)
+        if settings.camera_path is not None:
+            path = read_path(settings.camera_path, settings=cameras)
+        up = cameras.up_axis
+        start = start_of(extents(), settings.look_at, up, FOV if settings.fov is None else settings.fov)
     look = Look(start, up, settings.budget, path)
-    site = site_of(shown, extents, look, libraries, up=settings.up, served=served)
+    site = site_of(shown, extents(), look, libraries, cameras=cameras, served=served)
     notes = [file.note for file in shown if file.note is not None]
     return Prepared(site, shown, [*libraries.notes(), *notes, *(path.notes if path else ())])

@@ -21,8 +21,8 @@ from ..support.defaults import (
 )
 from ..support.errors import FormatError, InvalidSplatsError, memory_errors_translated
 from ..support.threads import thread_count
-from .arguments import scene_like, whole_within
-from .files import pack
+from .arguments import file_path, scene_like, whole_within
+from .files import naming, pack
 from .progress import Told, telling
 
 if TYPE_CHECKING:
@@ -91,18 +91,20 @@ def write(
 
     Raises:
         FormatError: the format cannot hold the scene, or there is no such format.
-        InvalidSplatsError: the scene has no splats.
+        InvalidSplatsError: the scene has no splats, or invalid ones (`Scene.from_arrays` says which these are).
         OutputError: the file exists, or cannot be written.
+        TreeError: the tree is broken.
         TypeError: an option is of another type.
         ValueError: an option is out of its range, or is of another format.
     """
     from ..bake.detail_output import DetailOutput
     from ..codecs.formats import WRITABLE, ending_of
     from ..codecs.options import RadOptions, SogOptions, WriteOptions
+    from ..codecs.sound import check_scene
     from ..codecs.splat_encoding import SplatEncoding
     from ..lod.detail_settings import DetailSettings
 
-    path, count = Path(path), thread_count(threads)
+    path, count = file_path(path), thread_count(threads)
     form = None if encoding is not None else WRITABLE.get(ending_of(path.name))
     written = None if form is None else form.name
     streamed = encoding is None and path.name == MANIFEST
@@ -136,6 +138,8 @@ def write(
     with telling(progress) as told, memory_errors_translated():
         if encoding is not None:
             return _write_arrays(path, scene, encoding, overwrite=overwrite, threads=count)
+        with naming(path):
+            check_scene(scene, count)
         if streamed:
             options = WriteOptions(sog=sog or SogOptions())
             output = DetailOutput(detail or DetailSettings(), options, detail_sink(path, overwrite=overwrite))
@@ -168,8 +172,12 @@ def _write_levels(
 
 def _write_arrays(path: Path, scene: Scene, encoding: str, *, overwrite: bool, threads: int) -> Written:
     from ..codecs.gpu import dump
-    from ..codecs.gpu.table import RAW_SUFFIXES
+    from ..codecs.gpu.table import NPZ, RAW_SUFFIXES
 
-    arrays = pack(scene, encoding, threads=threads)
+    if path.suffix.lower() not in (NPZ, *RAW_SUFFIXES):
+        known = ", ".join((NPZ, *RAW_SUFFIXES))
+        raise FormatError(f"{path}: arrays are written as {known}, which the name does not end in")
+    with naming(path):
+        arrays = pack(scene, encoding, threads=threads)
     pieces = dump.encode_raw(arrays) if path.suffix.lower() in RAW_SUFFIXES else dump.encode_npz(arrays)
     return Written(path, encoding, write_whole(path, pieces, overwrite=overwrite))

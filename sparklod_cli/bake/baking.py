@@ -6,9 +6,11 @@ import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from ..codecs.sound import check_scene
 from ..codecs.statistics import Statistics
 from ..io import read_rgba, read_stored
 from ..lod.builders import BUILDERS
@@ -28,7 +30,7 @@ from .out_of_core.contracts import Engine
 from .output import Output, output_of
 from .refining import Refined, fit_settings, refined
 from .resources import Resources
-from .scaling import Scaled, bake_scaled
+from .scaling import Scaled, bake_scaled, has_published
 from .settings import BakeSettings
 from .sources import Merged, Source, read_source
 from .written import WrittenTree
@@ -119,8 +121,8 @@ def bake(
         say: told in a line that it goes out of core, what is left after an interruption, and what fitting brought.
 
     Raises:
-        FormatError, InvalidSplatsError, OutputError: see `read_source`, `Selection.apply` and `io.scene_sink`; or the
-            input has a tree, and the settings do not keep it.
+        FormatError, InvalidSplatsError, OutputError: see `read_source`, `Selection.apply`, `sound.check_scene` and
+            `io.scene_sink`; or the input has a tree, and the settings do not keep it.
         ScratchError: the scratch folder is full, in use, or has the results of another bake.
         OutOfMemoryError: it does not fit into memory.
         CameraPathError: the training cameras cannot be read.
@@ -128,6 +130,8 @@ def bake(
     """
     with memory_errors_translated():
         fitting = fit_settings(settings)
+        resources = resources or Resources()
+        overwrite = overwrite or has_published(source, target, settings, resources)  # its own output
         output, clock = output_of(target, settings, overwrite=overwrite), Clock()
         scaled = bake_scaled(
             source,
@@ -137,7 +141,7 @@ def bake(
             overwrite=overwrite,
             threads=threads,
             progress=progress,
-            resources=resources or Resources(),
+            resources=resources,
             engine=engine,
             say=say,
         )
@@ -146,7 +150,8 @@ def bake(
         # A list, so that whoever takes the scene out of it can free it.
         scenes = [read_source(source, threads=threads, progress=progress)]
         form, notes, read = scenes[0].format, scenes[0].notes, len(scenes[0])
-        antialiased, has_tree = scenes[0].antialiased, scenes[0].tree is not None
+        about: dict[str, Any] = {"antialiased": scenes[0].antialiased, "up": settings.up_of(scenes[0].up)}
+        has_tree = scenes[0].tree is not None
         environment = read_environment(settings, threads=threads, progress=progress)
         if has_tree:
             made = _kept(source, scenes, settings, output, clock)
@@ -154,12 +159,12 @@ def bake(
             made = _built(scenes, settings, output, clock, threads, progress)
         (nodes, tree), fitted = made.built.pop(), None
         if fitting is not None:
-            whole, fitted = refined(
-                Scene(nodes, tree, antialiased), fitting, threads=threads, progress=progress, say=say
-            )
+            whole = Scene(nodes, tree, **about)
+            whole, fitted = refined(whole, fitting, threads=threads, progress=progress, say=say)
             nodes = whole.splats
             clock.end("refine")
-        if output.in_chunks and not made.is_ordered:
+        check_scene(Scene(nodes, tree), threads)
+        if made.output.in_chunks and not made.is_ordered:
             with on_threads(threads):
                 from ..lod.chunk_order import chunk_order
                 from ..lod.families import taken
@@ -171,7 +176,7 @@ def bake(
             clock.end("arrange")
         environment = made.environment if environment is None else environment
         counted = made.counted if fitting is None else None
-        written = made.output.write(Scene(nodes, tree, antialiased), environment, clock, threads, progress, counted)
+        written = made.output.write(Scene(nodes, tree, **about), environment, clock, threads, progress, counted)
     return Baked(
         **vars(written),
         format=form,
@@ -215,11 +220,14 @@ def _kept(source: Source, scenes: list[Scene], settings: BakeSettings, output: O
     check_kept(scene, settings)
     assert scene.tree is not None
     leaves, is_ordered = int(np.count_nonzero(scene.tree.is_leaf)), False
-    if settings.refine is not None and has_format_of(scene, settings):
-        assert not isinstance(source, Merged)  # of which no part is a tree
-        output, is_ordered = output.keeping(read_stored(source), scene.splats), True
-    else:
+    if not has_format_of(scene, settings):
         output = output.converting()
+    else:
+        assert not isinstance(source, Merged)  # of which no part is a tree
+        if settings.refine is None:
+            output = output.repacking(source)
+        else:
+            output, is_ordered = output.keeping(read_stored(source), scene.splats), True
     clock.end("read")
     return _Made([(scene.splats, scene.tree)], leaves, {}, output, is_ordered=is_ordered)
 

@@ -50,7 +50,8 @@ def detail_levels(
     clock.end("levels")
     errors = measured(made, threads=threads, progress=progress)
     clock.end("errors")
-    return dataclasses.replace(made, errors=errors, environment=environment, antialiased=scene.antialiased)
+    antialiased, up = scene.antialiased, scene.up
+    return dataclasses.replace(made, errors=errors, environment=environment, antialiased=antialiased, up=up)
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from ..codecs import clamps
 from ..codecs.clamps import Range
 from ..codecs.encoder import CLAMPED, Encoder, Get, Kept, Stored, results, windows_of
 from ..codecs.formats import WRITABLE, Format
-from ..codecs.options import WriteOptions
+from ..codecs.options import DEFAULTS, WriteOptions
 from ..codecs.rad.layout import OPTIONS
 from ..codecs.rad.names import SUFFIX as RAD
 from ..codecs.statistics import Statistics
@@ -23,6 +23,7 @@ from ..model.streams import NodeStream
 from ..support.addresses import Place
 from ..support.progress import Progress
 from .clock import Clock
+from .repacked import Repacked
 from .settings import BakeSettings
 from .whole_output import WholeOutput
 from .written import WrittenTree
@@ -64,6 +65,13 @@ class Output(Protocol):
         Args:
             stored: the codes of the file.
             before: its nodes.
+        """
+
+    def repacking(self, source: Place) -> Output:
+        """The same for the tree of a file of the same format in its other container, where no option tells how.
+
+        Args:
+            source: the file, whose chunks are written as they stand.
         """
 
     def write(
@@ -188,6 +196,11 @@ class _File:
         """The same with these codes."""
         return dataclasses.replace(self, options=stored.like(self.options), stored=stored, before=before)
 
+    def repacking(self, source: Place) -> Output:
+        """The chunks of a RAD file, where options do not ask for others."""
+        plain = dataclasses.replace(self.options, rad=dataclasses.replace(self.options.rad, chunked=False))
+        return Repacked(source, self.sink) if plain == DEFAULTS else self.converting()
+
     def check(self, splats: Splats, threads: int) -> Statistics | None:
         """The codec knows."""
         found = Statistics.of_leaves(splats, self.needed, threads=threads)
@@ -222,7 +235,7 @@ class _File:
                 for result in results(encoder, scene, threads, progress, "encoding"):
                     kept.put(result)
                 size = self.sink.assemble(encoder, kept.get, threads=threads, progress=progress)
-        beyond = clamps.find(scene.splats, threads, self._held(options, scene.splats.sh_degree))
+        beyond = clamps.find(scene.splats, threads, self._held(options, scene.splats.sh_degree), scene.tree)
         clock.end("write")
         return self._written(options, size, len(scene), scene.splats.sh_degree, beyond)
 
@@ -243,11 +256,8 @@ class _File:
 
     def _held(self, options: WriteOptions, sh_degree: int) -> Sequence[Range]:
         """The values that are not clamped."""
-        if not self.in_chunks:
-            return clamps.SPZ
-        from ..codecs.rad.options import held
-
-        return held(options, sh_degree)
+        held: Sequence[Range] = self.form.codec().held(options, sh_degree)
+        return held
 
     def _written(
         self, options: WriteOptions, size: int, count: int, sh_degree: int, beyond: clamps.Clamps

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..codecs.sound import check_valid
 from ..fitting.settings import FitReport, FitSettings
 from ..model.scene import Scene
-from ..model.splats import Splats, describe_invalid
+from ..model.splats import Splats
 from ..support import interrupts
-from ..support.errors import InvalidSplatsError
 from ..support.progress import Progress
 from .settings import BakeSettings
 
@@ -65,9 +65,7 @@ def refined(
     from ..fitting.fit import fit
 
     assert scene.tree is not None
-    invalid = scene.splats.invalid()
-    if invalid:
-        raise InvalidSplatsError(f"a tree with invalid nodes cannot be refined: {describe_invalid(invalid)}")
+    check_valid(scene.splats, threads)
     start = time.perf_counter()
     with interrupts.deferred() as interrupted:
         nodes, report = fit(

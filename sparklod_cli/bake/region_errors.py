@@ -13,7 +13,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cameras.pose import rotation_of
+from ..cameras.pose import FARTHEST, rotation_of
 from ..model.detail import DetailScene
 from ..model.gaussian import lod_opacity
 from ..model.sh import degree_of
@@ -37,6 +37,9 @@ BACK = np.array([[1.0], [1.0], [-1.0]])
 #: Distance of the camera from the middle of a region, and half the width of the picture there, in radii of the region;
 #: those of splat-transform 3.7.
 DISTANCE, HALF_WIDTH = 200.0, 1.05
+
+#: Least radius of a region, as a share of its coordinates and 1: float32 holds what is divided by it. Chosen.
+LEAST_RADIUS = 1e-30
 
 #: Least and largest width of a picture, pixels. Measured against 256 and 512, see the page above.
 LEAST_WIDTH, MOST_WIDTH = 64, 128
@@ -106,9 +109,11 @@ def _turns() -> NDArray[np.float64]:
 def _poses(bounds: NDArray[np.float64], turns: NDArray[np.float64]) -> NDArray[np.float32]:
     """(R, 6, 3, 4) world to camera, in radii of each region, whose middle is DISTANCE in front of the camera."""
     radius = np.linalg.norm(bounds[:, 1] - bounds[:, 0], axis=1) / 2
-    matrices = turns / np.where(radius > 0, radius, 1)[:, None, None, None]
+    least = LEAST_RADIUS * np.maximum(np.abs(bounds).max(axis=(1, 2)), 1)
+    matrices = turns / np.maximum(np.where(radius > 0, radius, 1), least)[:, None, None, None]
     offsets = -np.einsum("rvij,rj->rvi", matrices, bounds.mean(axis=1)) + [0, 0, DISTANCE]
-    return np.concatenate([matrices, offsets[..., None]], axis=3).astype(np.float32)
+    poses = np.concatenate([matrices, offsets[..., None]], axis=3)
+    return np.clip(poses, -FARTHEST, FARTHEST).astype(np.float32)
 
 
 def _basis(turns: NDArray[np.float64], coefficients: int) -> NDArray[np.float32]:

@@ -120,7 +120,7 @@ def bake_scaled(
 
     degree = min(size.sh_degree, settings.max_sh)
     block_splats = resources.block_splats or _block_splats(
-        size.splats, degree, settings.method, memory, in_chunks=output.in_chunks
+        size.splats, degree, settings.method, memory, in_chunks=output.in_chunks, threads=threads
     )
     needed = estimate.scratch_bytes(settings.method, size.splats, degree)
     if isinstance(folder, Path):
@@ -145,6 +145,20 @@ def bake_scaled(
         )
         written, read = store.traffic.written, store.traffic.read
         return Scaled(baked, stream.format, stream.notes, stream.count, degree, written, read)
+
+
+def has_published(source: Source, target: Place, settings: BakeSettings, resources: Resources) -> bool:
+    """Return True if a bake resumes one that was interrupted when its output, or a part of it, may have been in place.
+
+    Args:
+        source, target, settings, resources: as for `bake`.
+    """
+    if not resources.resume:
+        return False
+    from .out_of_core.job import PUBLISHED
+
+    recipe = functools.partial(recipe_of, places_of(source), settings, **placement_of(source))
+    return store_of(scratch_folder(target, recipe, resources.scratch_dir)).has(PUBLISHED)
 
 
 def fits_in_memory(source: Source, settings: BakeSettings, memory: int | None) -> bool:
@@ -204,11 +218,15 @@ def _as_a_whole(settings: BakeSettings) -> str | None:
     return None if settings.detail is None else "detail levels are made of a whole tree"
 
 
-def _block_splats(splats: int, sh_degree: int, method: str, memory: int | None, *, in_chunks: bool) -> int:
+def _block_splats(
+    splats: int, sh_degree: int, method: str, memory: int | None, *, in_chunks: bool, threads: int
+) -> int:
     """The splats of a block; `OutOfMemoryError` where there is too little memory for the least ones."""
-    found = estimate.block_splats_within(memory, method, splats, sh_degree, in_chunks=in_chunks)
+    found = estimate.block_splats_within(memory, method, splats, sh_degree, in_chunks=in_chunks, threads=threads)
     if found is None:
-        least = estimate.out_of_core_bytes(method, splats, sh_degree, estimate.LEAST_BLOCK_SPLATS, in_chunks=in_chunks)
+        least = estimate.out_of_core_bytes(
+            method, splats, sh_degree, estimate.LEAST_BLOCK_SPLATS, in_chunks=in_chunks, threads=threads
+        )
         raise OutOfMemoryError(
             f"{format_size(memory or 0)} of memory is too little even out of core; give --memory"
             f" {format_size(1.02 * least)} or more"

@@ -14,6 +14,7 @@ from ..model.lod_tree import LodTree
 from ..model.selection import Selection
 from ..model.splats import Splats
 from ..model.transforms import Transform
+from ..model.up_axis import rotated
 from ..support.defaults import DEFAULT_BASE, DEFAULT_GROWTH, MAX_SH_DEGREE
 
 #: Suffix of the format that is written unless another one is chosen.
@@ -31,6 +32,8 @@ class BakeSettings:
         max_sh: the highest SH degree that is kept.
         selection: which splats are kept; its coordinates are those of the input.
         transform: turns, scales and moves the splats that are kept.
+        up: axis of the input that points up, one of `up_axis.AXES`, which `transform` may have turned to another; None
+            for the one that the input notes.
         rgba: a file of colours and opacities that replace the splats' own, see `io.read_rgba`.
         suffix: of the format, one of `WRITABLE` that holds trees.
         options: how to write it.
@@ -53,6 +56,7 @@ class BakeSettings:
     max_sh: int = MAX_SH_DEGREE
     selection: Selection = field(default_factory=Selection)
     transform: Transform = field(default_factory=Transform)
+    up: str | None = None
     rgba: Path | None = None
     suffix: str = SPZ
     options: WriteOptions = field(default_factory=WriteOptions)
@@ -65,6 +69,10 @@ class BakeSettings:
     camera_path: Path | None = None
     converts: bool = False
     unused: tuple[str, ...] = ()
+
+    def up_of(self, noted: str | None) -> str | None:
+        """Return the axis of the output that points up, for the axis that the input notes."""
+        return rotated(self.up or noted, self.transform.rotation)
 
     def builder(self) -> tuple[Callable[..., tuple[Splats, LodTree]], float]:
         """What makes `(nodes, tree)` of splats and its setting; takes `progress`, too.

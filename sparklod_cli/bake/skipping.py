@@ -1,7 +1,8 @@
 """Bakes that need not be done again, as their output is there: `--skip-existing`.
 
 A file beside the output, NAME.sparklod.json, has the recipe of the output, with a digest of all that each input held,
-and what tells the output. The dates of files only save reading inputs that nobody has touched since.
+and a digest of each file of the output. Dates only save reading files that nobody has touched since; with `verify`, all
+are read.
 """
 
 from __future__ import annotations
@@ -11,12 +12,14 @@ import json
 from pathlib import Path
 from typing import Any
 
-from ..io import Identity, content_of, files_of, identity_of, sink
-from ..support.addresses import Place, size_of
-from ..support.errors import OutputError
+from ..io import Identity, content_of, files_of, identity_of, sink, stamp_of
+from ..support.addresses import Address, Place, size_of
+from ..support.errors import OutputError, UnreadableError
 from ..support.untrusted import parse_json
 from .baking import Baked, bake
 from .recipe import Recipe, files_named_in, settings_of
+from .resources import Resources
+from .scaling import has_published
 from .settings import BakeSettings
 from .sources import Source, placement_of, places_of
 
@@ -25,12 +28,13 @@ SUFFIX, MAX_BYTES = ".sparklod.json", 1 << 24
 
 
 def bake_unless_there(
-    source: Source, target: Place, settings: BakeSettings, *, overwrite: bool = False, **how: Any
+    source: Source, target: Place, settings: BakeSettings, *, verify: bool = False, overwrite: bool = False, **how: Any
 ) -> Baked | None:
     """Bakes as `bake` does, and notes of what; None where the output of the same recipe is there.
 
     Args:
         source, target, settings, overwrite: as for `bake`; the output is no standard output.
+        verify: read all of the inputs and of the output, also where size and date are those of the last bake.
         how: further arguments of `bake`.
 
     Raises:
@@ -41,9 +45,13 @@ def bake_unless_there(
     former = _former(beside)
     files = [*(file for place in places_of(source) for file in files_of(place)), *files_named_in(settings)]
     seen = [identity_of(file) for file in files]
-    recipe = _recipe(source, settings, files, seen, former)
-    if target.exists() and not target.is_dir():
-        differences = _differences(recipe, target, former)
+    recipe = _recipe(source, settings, files, seen, {} if verify else former)
+    if (
+        target.exists()
+        and not target.is_dir()
+        and not has_published(source, target, settings, how.get("resources") or Resources())
+    ):
+        differences = _differences(recipe, target, former, verify=verify)
         if not differences:
             return None
         if not overwrite:
@@ -53,7 +61,11 @@ def bake_unless_there(
     if baked.refine is not None and not baked.refine.is_complete:
         return baked  # another run would get farther
     inputs = [dataclasses.asdict(each) for each in seen]
-    note = {"recipe": recipe.to_record(), "inputs": inputs, "output": _told(target)}
+    note = {
+        "recipe": recipe.to_record(),
+        "inputs": inputs,
+        "output": {_within(target, file): _record_of(file) for file in files_of(target)},
+    }
     sink(beside, overwrite=True)([json.dumps(note, indent=1).encode() + b"\n"])
     return baked
 
@@ -85,20 +97,35 @@ def _recipe(
     return Recipe(inputs, tuple(each.name for each in seen), settings_of(settings) | placement_of(source))
 
 
-def _differences(recipe: Recipe, target: Place, former: dict[str, Any]) -> list[str]:
+def _differences(recipe: Recipe, target: Place, former: dict[str, Any], *, verify: bool) -> list[str]:
     """Why an output that is there is not that of a recipe; empty where it is."""
     if not former:
         return ["nothing tells of what it was made"]
     found = recipe.differences(former["recipe"])
-    if not found and former["output"] != _told(target):
-        found = ["it was changed since it was baked"]
-    return found
+    if found:
+        return found
+    files, records = {_within(target, file): file for file in files_of(target)}, former["output"]
+    names = sorted({*files, *records})
+    changed = (name for name in names if not _is_same(files.get(name), records.get(name), verify=verify))
+    return [f"{name} was changed since it was baked" for name in changed]
 
 
-def _told(target: Place) -> dict[str, Any]:
-    """What tells an output: a digest of a sample of it, and the size of each file that it names."""
-    files = files_of(target)
-    return {"sample": identity_of(target).sample, "bytes": {_within(target, file): size_of(file) for file in files}}
+def _record_of(file: Place) -> dict[str, str]:
+    """Size and date of a file of an output, and a digest of all of it; at an address, its version."""
+    stamp = stamp_of(file)
+    return {"stamp": stamp, "content": stamp if isinstance(file, Address) else content_of(file)}
+
+
+def _is_same(file: Place | None, record: Any, *, verify: bool) -> bool:
+    """Return True if a file of an output is the one of a record; it is read where size or date differ, or to verify."""
+    if file is None or not isinstance(record, dict):
+        return False
+    try:
+        if not verify and record.get("stamp") == stamp_of(file):
+            return True
+        return bool(record.get("content") == _record_of(file)["content"])
+    except UnreadableError:
+        return False
 
 
 def _within(target: Place, file: Place) -> str:

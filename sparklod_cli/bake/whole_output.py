@@ -8,6 +8,7 @@ from ..codecs.encoder import Encoder, Get, Stored
 from ..codecs.statistics import Statistics
 from ..model.splats import Splats
 from ..model.streams import NodeStream
+from ..support.addresses import Place
 from ..support.errors import FormatError
 from ..support.progress import Progress
 
@@ -31,6 +32,10 @@ class WholeOutput:
         return self
 
     def keeping(self: Whole, stored: Stored, before: Splats) -> Whole:
+        """It has no format that trees are read from."""
+        return self
+
+    def repacking(self: Whole, source: Place) -> Whole:
         """It has no format that trees are read from."""
         return self
 

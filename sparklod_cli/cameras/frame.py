@@ -10,9 +10,13 @@ from typing import overload
 import numpy as np
 from numpy.typing import NDArray
 
+from ..model.up_axis import AXES
 from ..support.errors import TooManyCamerasError
 from .axes import Axes
 from .camera import Camera, Matrix
+
+#: x, y and z in world units, or of a direction.
+Point = tuple[float, float, float]
 
 #: Image size in pixels, vertical field of view in radians and frame rate where neither file nor user gives one.
 DEFAULT_SIZE = (1280, 720)
@@ -32,7 +36,12 @@ MOST_PIXELS = 1e15
 NUMBERED = 1 << 53
 
 #: Up axis of cameras without one: y points down in scenes as training leaves them.
-DEFAULT_UP = (0.0, -1.0, 0.0)
+DEFAULT_UP: Point = (0.0, -1.0, 0.0)
+
+
+def direction_of(up: str | None) -> Point:
+    """x, y, z of the up axis that a scene notes; `DEFAULT_UP` for None."""
+    return DEFAULT_UP if up is None else AXES[up]
 
 
 @dataclass(frozen=True)
@@ -135,6 +144,7 @@ class Settings:
         fps: frames a second; times are then computed from the numbers of the frames.
         every: keep every n-th frame only.
         up: x, y, z of the up axis of cameras that have only an eye and a target.
+        up_of_scene: called for that where neither file nor user says it.
     """
 
     axes: Axes | None = None
@@ -143,7 +153,13 @@ class Settings:
     fov_y: float | None = None
     fps: float | None = None
     every: int = 1
-    up: tuple[float, float, float] | None = None
+    up: Point | None = None
+    up_of_scene: Callable[[], Point] = lambda: DEFAULT_UP
+
+    @property
+    def up_axis(self) -> Point:
+        """x, y, z of the up axis that was chosen, or else that of the scene."""
+        return self.up or self.up_of_scene()
 
 
 def camera_of(pose: Matrix, lens: Lens, time: float, name: str, settings: Settings) -> Camera:

@@ -17,9 +17,14 @@ from .camera import Camera, Matrix
 #: The share of the splats in the ball around the middle whose radius is the size of a scene.
 SHARE = 0.9
 
-#: The share of the splats that must be in view, each with all that it covers: trained scenes have a few that are very
-#: far away, or very large.
+#: The share of the dense splats that must be in view, each with all that it covers: trained scenes have a few that are
+#: very far away, or very large.
 COVERED = 0.999
+
+#: Side of the cells in which splats are dense or sparse, as a share of the size of the scene; splats for each cube of
+#: that size below which cells are larger, as a few splats are not dense anywhere; and the share of what the splats of a
+#: typical cell cover below which a cell is sparse: stray splats, haze and stars, which are not framed.
+CELL, FEW, SPARSE = 1 / 8, 256, 0.05
 
 #: Splats farther from the middle than this multiple of the radius of the ball that most splats are in are backdrop,
 #: such as a sky or stray splats of training, and are not framed.
@@ -65,7 +70,7 @@ def framing(center: NDArray[np.floating]) -> tuple[NDArray[np.float64], float]:
 
 
 def covered(scene: Balls) -> Balls:
-    """The splats that cameras must have in view: 99.9 % of those that are not backdrop.
+    """The splats that cameras must have in view: 99.9 % of those that are neither backdrop nor sparse.
 
     Raises:
         InvalidSplatsError: there are no splats with finite numbers.
@@ -76,12 +81,35 @@ def covered(scene: Balls) -> Balls:
     reach = np.linalg.norm(scene.center - middle, axis=1) + scene.radius
     # The nearest is always kept, however large it is.
     near = reach <= max(OUTSIDE * radius, float(reach.min()))
-    most = float(np.quantile(reach[near], COVERED, method="higher"))
-    kept = scene.take(near & (reach <= most))
+    scene, reach = scene.take(near), reach[near]
+    dense = _is_dense(Balls(scene.center - middle, scene.radius), radius)
+    most = float(np.quantile(reach[dense], COVERED, method="higher"))
+    kept = scene.take(dense & (reach <= most))
     # Nothing is a point: a camera in line with all of them would be in their midst. Nor is anything, far out, smaller
     # than the steps of the numbers there.
     least = max(SPECK * most, STEPS * float(np.abs(kept.center).max())) or radius
     return Balls(kept.center, np.maximum(kept.radius, least))
+
+
+def _is_dense(scene: Balls, size: float) -> NDArray[np.bool_]:
+    """Return the mask (N,) of the splats in cells that are not sparse.
+
+    Args:
+        scene: without backdrop, around the origin.
+        size: of the scene, see `framing`.
+    """
+    side = size * max(CELL, (FEW / len(scene.center)) ** (1 / 3))
+    area = np.clip(scene.radius, SPECK * size, side) ** 2
+    dense = np.zeros(len(area), np.bool_)
+    for shift in (0.0, 0.5):  # of the cells at the border of something, either set may have thin slices
+        _, cell = np.unique(np.floor(scene.center / side + shift).astype(np.int64), axis=0, return_inverse=True)
+        cell = cell.reshape(-1)
+        cover = np.bincount(cell, area)
+        # The typical cell is the one that the middle of all that is covered lies in.
+        order = np.argsort(cover)
+        typical = cover[order[np.searchsorted(np.cumsum(cover[order]), cover.sum() / 2)]]
+        dense |= (cover >= SPARSE * typical)[cell]
+    return dense
 
 
 def middle_of(scene: Balls) -> Matrix:

@@ -19,7 +19,7 @@ from .camera import Matrix
 from .defaults import ELEVATION
 from .formats.source import Files, Parsed
 from .formats.table import NAMES
-from .frame import DEFAULT_FPS, DEFAULT_UP, Frame, Settings, camera_of
+from .frame import DEFAULT_FPS, Frame, Settings, camera_of
 from .path import GENERATED, CameraPath, cameras_of, read
 from .world_transform import similarity
 
@@ -102,7 +102,7 @@ class Orbit(_Aimed):
 
     def cameras(self, settings: Settings, scene: Scene) -> CameraPath:
         """The cameras around the scene."""
-        up, tilt = settings.up or DEFAULT_UP, math.radians(self.elevation)
+        up, tilt = settings.up_axis, math.radians(self.elevation)
         around = functools.partial(generators.orbit, self.count, (0.0, 0.0, 0.0), 1, tilt, up)
         center, distance = self._aim(around, settings, scene)
         return _generated("orbit", generators.orbit(self.count, center, distance, tilt, up), settings)
@@ -126,7 +126,7 @@ class Dolly(_Aimed):
 
     def cameras(self, settings: Settings, scene: Scene) -> CameraPath:
         """The cameras on the way to the scene."""
-        up, tilt = settings.up or DEFAULT_UP, math.radians(self.elevation)
+        up, tilt = settings.up_axis, math.radians(self.elevation)
         count = max(2, round(self.seconds * (settings.fps or DEFAULT_FPS)))
         ahead = functools.partial(generators.dolly, 2, (0.0, 0.0, 0.0), 1, 1, tilt, up)
         center, distance = self._aim(ahead, settings, scene, generators.DOLLY_START)
@@ -169,7 +169,7 @@ class Views:
 
     def cameras(self, settings: Settings, scene: Scene) -> CameraPath:
         """The cameras, all at time 0; the scene is not looked at."""
-        up = settings.up or DEFAULT_UP
+        up = settings.up_axis
         paths = [_generated("look_at", [generators.frame_looking(*view, up)], settings) for view in self.views]
         cameras = [path.cameras[0] for path in paths]
         if self.named:
@@ -197,7 +197,7 @@ class Keyframes:
     def cameras(self, settings: Settings, scene: Scene) -> CameraPath:
         """The cameras on the way; the scene is not looked at."""
         keys = [generators.Key(eye, target) for eye, target in self.views]
-        fps, up = settings.fps or DEFAULT_FPS, settings.up or DEFAULT_UP
+        fps, up = settings.fps or DEFAULT_FPS, settings.up_axis
         return _generated("keyframes", generators.between(keys, fps, up, seconds=self.seconds), settings)
 
 

@@ -16,6 +16,7 @@ from ..support.defaults import DEFAULT_COMPRESSION
 from ..support.errors import ChecksumError, FormatError, PromiseError, TooLongError
 from ..support.parallel import ordered_map
 from ..support.progress import Progress
+from .inflate import COMMENTED_HEAD, PLAIN_HEAD
 
 #: Bytes of a block that one thread deflates, or inflates, by itself, and bytes that are read at a time. That blocks of
 #: this size refer to none before them costs 0.05 to 0.2 % of a file (docs/decisions/2026-11-22-inspect-speed.md).
@@ -66,7 +67,13 @@ class Run(NamedTuple):
 
 
 def gzip_member(
-    pieces: Iterable[Any], runs: Sequence[Run], level: int, threads: int, progress: Progress
+    pieces: Iterable[Any],
+    runs: Sequence[Run],
+    level: int,
+    threads: int,
+    progress: Progress,
+    *,
+    comment: bytes = b"",
 ) -> Iterator[bytes]:
     """One gzip member, piece by piece; the same bytes for any number of threads, and however the data are cut.
 
@@ -79,6 +86,7 @@ def gzip_member(
         level: of compression. Below the default, which means haste, no other is used, and above it no lower one.
         threads: to deflate on.
         progress: told of the bytes.
+        comment: of the header, without a zero byte; empty for none.
     """
     check = 0
     total = sum(run.size for run in runs)
@@ -90,7 +98,9 @@ def gzip_member(
             check, at = zlib_ng.crc32(block, check), at + len(block)
             yield block, at >= total, ways
 
-    yield b"\x1f\x8b\x08\0\0\0\0\0\0\xff"  # no name, no time, no system: the same scene gives the same bytes
+    # No name, no time, no system: the same scene gives the same bytes.
+    head, rest = (COMMENTED_HEAD, comment + b"\0") if comment else (PLAIN_HEAD, b"")
+    yield head + b"\0\0\0\0\0\xff" + rest
     done = 0
     for size, packed in ordered_map(lambda each: _deflated(*each), blocks(), threads):
         yield packed

@@ -38,7 +38,7 @@ class Content:
         count: N splats.
         sh_degree: as they are read.
         fill: reads and decodes them.
-        format, antialiased, notes, header: as in `Scene`.
+        format, antialiased, notes, header, up: as in `Scene`.
     """
 
     count: int
@@ -48,12 +48,13 @@ class Content:
     antialiased: bool = False
     notes: tuple[str, ...] = ()
     header: Mapping[str, int] = field(default_factory=dict)
+    up: str | None = None
 
     def scene(self, threads: int, progress: Progress) -> Scene:
         """All splats."""
         splats = Splats.empty(self.count, self.sh_degree)
         self.fill(splats, 0, threads, progress)
-        return Scene(splats, None, self.antialiased, self.format, self.notes, self.header)
+        return Scene(splats, None, self.antialiased, self.format, self.notes, self.header, up=self.up)
 
     def stream(self, threads: int) -> streams.SceneStream:
         """The splats block by block, each filled by several threads."""
@@ -67,9 +68,8 @@ class Content:
             for first in range(start, stop, streams.BLOCK_SPLATS):
                 yield block(first, min(first + streams.BLOCK_SPLATS, stop))
 
-        return streams.SceneStream(
-            self.count, self.sh_degree, read, self.antialiased, self.format, self.notes, self.header
-        )
+        about = self.antialiased, self.format, self.notes, self.header, self.up
+        return streams.SceneStream(self.count, self.sh_degree, read, *about)
 
 
 def rows_in(splats: Splats, part: slice, start: int = 0) -> Splats:

@@ -20,9 +20,9 @@ class Format:
         name: for display.
         module: in this package; has `decode(file, *, threads, progress) -> Scene`, and for files without a tree
             `stream(file, *, scratch, threads, progress) -> SceneStream`, see `content`.
-        writable: its module also has `encode(scene, options, *, threads, progress) -> Iterator[bytes]`, and
+        writable: its module also has `encode(scene, options, *, threads, progress) -> Iterator[bytes]`;
             `settled(scene, options) -> WriteOptions`, the options with nothing left open, which raises `FormatError`
-            if the scene cannot be written.
+            if the scene cannot be written; and `held(options, sh_degree)`, the `clamps.Range`s that it can hold.
         unbundled: the name of the first of the files as which a scene can also be written, all in one folder; None if
             there is no such way. Its module then has `encode_files(scene, options, *, threads, progress)`, too, which
             yields the name and the bytes of each, this one last.
@@ -39,6 +39,7 @@ class Format:
         detailed: its files have several detail levels. Its module also has `decode_levels`, which takes what `decode`
             takes and gives a `DetailScene`, and `encode_files(scene, options, settings, *, threads, progress)`, which
             gives the names and contents of the files of one.
+        bare: its files hold nothing but splats, so that nothing can be noted in them, see `noted`.
         selective: its module also has `examine(file, *, columns, threads, progress) -> Scene`, which decodes only some
             columns and accepts a broken tree; `beside`, too, where it has companions.
     """
@@ -53,6 +54,7 @@ class Format:
     companions: bool = False
     folders: bool = False
     detailed: bool = False
+    bare: bool = False
     selective: bool = False
 
     @property
@@ -106,7 +108,7 @@ FORMATS = (
         companions=True,
     ),
     Format("KSPLAT", "ksplat", (".ksplat",), rb"\0[\x01-\xff]\0\0"),  # version 0.1 on; as a float it would be denormal
-    Format("SPLAT", "splat", (".splat",), None, writable=True),
+    Format("SPLAT", "splat", (".splat",), None, writable=True, bare=True),
 )
 
 #: The formats that can be written, by how the name of the file ends, see `Format.endings`.

@@ -26,8 +26,11 @@ except ImportError:
 ERRORS: tuple[Any, ...] = (zlib_ng.error, _library.error)  # the stubs take the classes for instances
 
 GZIP_MAGIC = b"\x1f\x8b"
-#: How a member begins whose data follow after ten bytes: of deflate, without a name or other fields.
-_PLAIN_HEAD, _HEAD_SIZE = GZIP_MAGIC + b"\x08\0", 10
+#: How a member of deflate begins that has no fields but the ten bytes of its head, and one with a comment behind these,
+#: which ends with a zero byte (RFC 1952).
+PLAIN_HEAD, COMMENTED_HEAD, _HEAD_SIZE = GZIP_MAGIC + b"\x08\0", GZIP_MAGIC + b"\x08\x10", 10
+#: Bytes up to which a comment is read; sparklod's have some fifty.
+MOST_COMMENT = 1 << 12
 _TRAILER = struct.Struct("<II")  # CRC-32 and number of the bytes, modulo 2 ** 32
 
 #: Bytes before a position that a deflate stream may refer to; bytes of a file that one thread reads at a time, and
@@ -64,10 +67,15 @@ class Inflate:
     Args:
         file: open for reading at the beginning of the member; nobody else may use it until the last read.
         threads: to inflate on, besides the one that reads.
+
+    Attributes:
+        comment: of the head of the member; empty where it has none, or other fields besides.
     """
 
     def __init__(self, file: BinaryIO, threads: int = 1) -> None:
         self._file = file
+        self._start = file.tell()
+        self._head_size, self.comment = self._read_head()
         self._pieces = self._all_pieces(threads)
         self._rest = memoryview(b"")
         self._end: int | None = None
@@ -123,11 +131,24 @@ class Inflate:
         assert self._end is not None, "the member has not been read to its end"
         return self._end
 
+    def _read_head(self) -> tuple[int, bytes]:
+        """Bytes of the head of the member, after which the file is left, and its comment; 0 bytes of any other head."""
+        head = self._file.read(_HEAD_SIZE)
+        if len(head) == _HEAD_SIZE and head.startswith(PLAIN_HEAD):
+            return _HEAD_SIZE, b""
+        if len(head) < _HEAD_SIZE or not head.startswith(COMMENTED_HEAD):
+            return 0, b""
+        comment, end, _ = self._file.read(MOST_COMMENT).partition(b"\0")
+        if not end:
+            return 0, b""
+        size = _HEAD_SIZE + len(comment) + 1
+        self._file.seek(self._start + size)
+        return size, comment
+
     def _all_pieces(self, threads: int) -> Generator[bytes, None, None]:
         """The data in pieces, none of them empty."""
-        start = self._file.tell()
-        head = self._file.read(_HEAD_SIZE)
-        if len(head) < _HEAD_SIZE or not head.startswith(_PLAIN_HEAD):
+        start = self._start + self._head_size
+        if not self._head_size:
             self._file.seek(start)
             yield from self._rest_of(zlib_ng.decompressobj(zlib_ng.MAX_WBITS + 16))  # which checks the checksum, too
             return
@@ -136,8 +157,7 @@ class Inflate:
             # glibc gives the memory of a large object back to the system at once, and each new one then waits for the
             # system to clear its memory, unless one as large has been freed before. That costs a sixth of the time.
             bytes(_MOST_INFLATED)
-            parts = _parts(self._file, start + _HEAD_SIZE)
-            start += _HEAD_SIZE
+            parts = _parts(self._file, start)
             with contextlib.closing(ordered_map(_alone, parts, threads)) as inflated:
                 for size, piece in inflated:
                     if piece is None:

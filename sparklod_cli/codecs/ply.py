@@ -26,7 +26,9 @@ from ..support.parallel import blocks_of
 from ..support.progress import Progress, silent
 from ..support.untrusted import quoted
 from . import quantize
+from .clamps import Range
 from .content import Content, Scratch, rows_in
+from .noted import comment_of, read_comment
 from .options import DEFAULTS, WriteOptions
 from .ply_header import Header, offset_of, read_header
 from .stream import Positioned, Rows, decode_rows, encode_rows, rows_between, size_of
@@ -73,7 +75,9 @@ def _content(file: BinaryIO, scratch: Scratch | None) -> Content:
         some = rows(start, start + len(out))
         decode_rows(some, lambda part, rows: unpack(rows, rows_in(out, part, start)), count, threads, progress)
 
-    return Content(count, min(degree, MAX_SH_DEGREE), fill, "PLY", notes=notes_on_degree(degree), header=facts)
+    noted = read_comment(header.note)
+    notes = notes_on_degree(degree) + noted.problems
+    return Content(count, min(degree, MAX_SH_DEGREE), fill, "PLY", notes=notes, header=facts, up=noted.up)
 
 
 def _unpacking(row_type: np.dtype[Any], coefficients: int) -> Callable[[NDArray[Any], Splats], None]:
@@ -189,6 +193,11 @@ def settled(scene: Scene, options: WriteOptions) -> WriteOptions:
     return options
 
 
+def held(options: WriteOptions, sh_degree: int) -> tuple[Range, ...]:
+    """Return the values that PLY holds without clamping them: all, so there is no range."""
+    return ()
+
+
 def encode(
     scene: Scene, options: WriteOptions = DEFAULTS, *, threads: int = 1, progress: Progress = silent
 ) -> Iterator[bytes]:
@@ -203,7 +212,9 @@ def encode(
     settled(scene, options)
     splats = scene.splats
     row_type = np.dtype([(name, "<f4") for name in _inria_properties(splats.sh.shape[1])])
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(splats)}"]
+    lines = ["ply", "format binary_little_endian 1.0"]
+    lines += [] if scene.up is None else [f"comment {comment_of(up=scene.up)}"]
+    lines += [f"element vertex {len(splats)}"]
     lines += [f"property float {name}" for name in row_type.names or ()]
     yield "".join(f"{line}\n" for line in [*lines, "end_header"]).encode()
     yield from encode_rows(lambda part: _encode(splats, part, row_type), len(splats), threads, progress)

@@ -28,12 +28,14 @@ class Header:
         text: whether the data are ascii.
         byte_order: "<" or ">" of binary data.
         size: bytes of the header.
+        note: the first comment that is a JSON object; empty without one.
     """
 
     elements: dict[str, tuple[PlyElement, int]]
     text: bool
     byte_order: str
     size: int
+    note: bytes = b""
 
     def count(self, name: str) -> int:
         """Rows of an element; 0 if there is none of this name."""
@@ -95,7 +97,7 @@ def read_header(file: BinaryIO) -> Header:
             raise TruncatedError("the PLY header does not end")
     # plyfile gets the header without comments, which may be in any encoding, and with counts of 0: otherwise it would
     # read all the data, and text value by value.
-    lines, counts = [], []
+    lines, counts, note = [], [], b""
     for words in map(bytes.split, text.splitlines()):
         if words[:1] == [b"element"]:
             if len(words) != 3 or not words[2].isdigit():
@@ -104,6 +106,8 @@ def read_header(file: BinaryIO) -> Header:
                 raise PromiseError(f"its header announces a count of {len(words[2]):,} digits")
             counts.append(int(words[2]))
             words[2] = b"0"
+        if words[:1] == [b"comment"] and words[1:] and words[1].startswith(b"{"):
+            note = note or b" ".join(words[1:])
         if words and words[0] not in (b"comment", b"obj_info"):
             lines.append(b" ".join(words))
     try:
@@ -111,7 +115,7 @@ def read_header(file: BinaryIO) -> Header:
     except (PlyParseError, ValueError) as error:
         raise FormatError(f"bad PLY header: {quoted(error)}") from None
     elements = {element.name: (element, count) for element, count in zip(parsed, counts, strict=True)}
-    return Header(elements, parsed.text, parsed.byte_order, len(text))
+    return Header(elements, parsed.text, parsed.byte_order, len(text), note)
 
 
 def offset_of(file: BinaryIO, header: Header, name: str) -> int:

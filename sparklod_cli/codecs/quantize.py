@@ -55,6 +55,9 @@ FAR = np.float32(110)
 #: Largest float32.
 LARGEST = np.finfo(np.float32).max
 
+#: Largest float32 whose exponential is finite in float32: the logarithm of `LARGEST`, rounded down.
+LARGEST_LOG = np.nextafter(np.float32(np.log(np.float64(LARGEST))), np.float32(0))
+
 
 def decode_log(values: FloatArray) -> FloatArray:
     """Natural logarithms to values. Exact up to float32 arithmetic."""
@@ -63,9 +66,9 @@ def decode_log(values: FloatArray) -> FloatArray:
 
 
 def encode_log(values: FloatArray) -> FloatArray:
-    """Values, 0 or more, to natural logarithms, which are finite for 0 too."""
+    """Values, 0 or more, to natural logarithms, which are finite for 0 too; their exponentials are finite."""
     with np.errstate(divide="ignore"):
-        return np.maximum(np.log(values), -FAR)
+        return np.clip(np.log(values), -FAR, LARGEST_LOG)
 
 
 def decode_logit(logit: FloatArray) -> FloatArray:
@@ -124,7 +127,8 @@ def decode_log_scale(codes: Bytes) -> FloatArray:
 
 def encode_unorm8(values: FloatArray) -> Bytes:
     """0..1 to a byte."""
-    return _to_byte(values * 255)
+    with np.errstate(over="ignore"):
+        return _to_byte(values * 255)
 
 
 def decode_unorm8(codes: Bytes) -> FloatArray:
@@ -282,7 +286,7 @@ def between(unit: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
 
 def range_table(low: Any, high: Any, codes: int) -> NDArray[np.float64]:
     """(..., codes) what the codes 0..codes - 1 mean in equal steps from low to high, (...,), in float64."""
-    return np.linspace(low, high, codes, axis=-1)
+    return np.ascontiguousarray(np.linspace(low, high, codes, axis=-1))
 
 
 def _unorm(code: NDArray[np.uint32], low: int, bits: int) -> FloatArray:

@@ -64,10 +64,15 @@ def after(through: str | None, file: Path, scene: Scene, threads: int = 1) -> Sp
         threads: to work on.
 
     Raises:
-        FormatError: SPZ cannot hold the splats; names the file.
+        FormatError: SPZ cannot hold the splats, or some are invalid; names the file.
     """
     if through is None:
         return scene.splats
+    from ..model.splats import describe_invalid
+
+    invalid = scene.splats.invalid()
+    if invalid:  # of a tree: those of plain files are left out
+        raise FormatError(f"{file}: {describe_invalid(invalid)}; no encoding holds such splats")
     try:
         return ROUND_TRIPS[through](scene, threads)
     except FormatError as error:

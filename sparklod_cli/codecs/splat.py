@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -14,6 +14,7 @@ from ..model.streams import SceneStream
 from ..support.errors import FormatError, TruncatedError
 from ..support.progress import Progress, silent
 from . import quantize
+from .clamps import Range
 from .content import Content, Scratch, rows_in
 from .options import DEFAULTS, WriteOptions
 from .stream import Positioned, decode_rows, encode_rows, rows_between, size_of
@@ -28,6 +29,9 @@ ROW = np.dtype(
     ]
 )
 assert ROW.itemsize == 32
+
+#: What is held without being clamped: colours that round to a code, and no SH.
+HELD = (Range("rgb", -0.5 / 255, 255.5 / 255), Range("sh", 0, 0))
 
 
 def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent) -> Scene:
@@ -80,6 +84,11 @@ def settled(scene: Scene, options: WriteOptions) -> WriteOptions:
     if scene.tree is not None:
         raise FormatError("SPLAT holds no Level-of-Detail tree")
     return options
+
+
+def held(options: WriteOptions, sh_degree: int) -> Sequence[Range]:
+    """Return the values that .splat holds without clamping them."""
+    return HELD
 
 
 def encode(

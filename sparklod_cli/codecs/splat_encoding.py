@@ -16,6 +16,10 @@ from .octahedral import Words, to_code
 SCALE_ZERO = np.float32(np.exp(-30))
 
 
+#: Largest end of a range: float32 holds the width of a range from minus this to this.
+LARGEST_END = float(quantize.LARGEST) / 2
+
+
 @dataclass(frozen=True)
 class SplatEncoding:
     """The ranges of the codes: Spark's `splatEncoding`, with its defaults.
@@ -40,8 +44,8 @@ class SplatEncoding:
         for name, value in vars(self).items():
             if name != "lod_opacity" and not isinstance(value, (int, float, np.integer, np.floating)):
                 raise TypeError(f"{name} is {value!r}; give a number")
-            if not abs(value) <= float(quantize.LARGEST):
-                raise ValueError(f"{name} is {value}; give a finite number that float32 can hold")
+            if not abs(value) <= LARGEST_END:
+                raise ValueError(f"{name} is {value}; give a number whose magnitude is at most {LARGEST_END:g}")
         for least, most in (("rgb_min", "rgb_max"), ("ln_scale_min", "ln_scale_max")):
             low, high = getattr(self, least), getattr(self, most)
             if not low < high:
@@ -64,6 +68,7 @@ class SplatEncoding:
 DEFAULT = SplatEncoding()
 
 
+@np.errstate(over="ignore")
 def encode_linear(values: FloatArray, low: float, high: float) -> Words:
     """Numbers to codes, low..high to 0..255; they are clamped to the range."""
     first, width = np.float32(low), np.float32(high) - np.float32(low)

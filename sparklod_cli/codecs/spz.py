@@ -6,12 +6,14 @@ byte.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from ..model.scene import Scene
 from ..model.streams import NodeStream
 from ..support.progress import Progress, silent
+from . import clamps
+from .clamps import Range
 from .encoder import Kept, results
 from .options import DEFAULTS, WriteOptions
 from .spz_encoder import encoder as encoder
@@ -22,6 +24,11 @@ from .spz_reading import examine as examine
 from .spz_reading import read_coded as read_coded
 from .spz_reading import stream as stream
 from .spz_stored import stored as stored
+
+
+def held(options: WriteOptions, sh_degree: int) -> Sequence[Range]:
+    """Return the values that SPZ holds without clamping them."""
+    return clamps.SPZ
 
 
 def encode(

@@ -36,7 +36,7 @@ class CodedSpz:
         layout: of the file.
         codes: (N, bytes) of streams, by name; of a column that was not asked for there are none.
         sh_degree: as it is decoded.
-        antialiased, format, notes, header: as in `Scene`.
+        antialiased, format, notes, header, up: as in `Scene`.
     """
 
     layout: Layout
@@ -46,6 +46,7 @@ class CodedSpz:
     format: str
     notes: tuple[str, ...] = ()
     header: Mapping[str, int] = field(default_factory=dict)
+    up: str | None = None
 
     @property
     def count(self) -> int:

@@ -20,6 +20,7 @@ from . import clamps, compression
 from .clamps import Range
 from .compression import Run
 from .encoder import CLAMPED, Encoded, Get, rows_of, windows_of
+from .noted import comment_of
 from .options import WriteOptions
 from .spz_layout import ANTIALIASED, HEADER, LOD, MAGIC, Layout, column_of
 from .spz_values import opacities, sh_codes
@@ -41,11 +42,13 @@ class SpzEncoder:
         layout: of the file.
         options: with nothing left open.
         ranges: beyond which values are counted; none unless somebody wants to know.
+        up: as in `Scene`.
     """
 
     layout: Layout
     options: WriteOptions
     ranges: tuple[Range, ...] = ()
+    up: str | None = None
 
     @property
     def count(self) -> int:
@@ -73,7 +76,9 @@ class SpzEncoder:
                 else:
                     values = np.ascontiguousarray(stream.encode(column_of(some, links, stream)))
                 codes[stream.name][part] = values.view(np.uint8).reshape(-1, stream.size)
-        return codes | ({CLAMPED: clamps.tally(splats, self.ranges)} if self.ranges else {})
+        return codes | (
+            {CLAMPED: clamps.tally(splats, self.ranges, None if tree is None else tree.is_leaf)} if self.ranges else {}
+        )
 
     def pieces(self, get: Get, *, threads: int, progress: Progress) -> Iterator[bytes]:
         """The header and all streams, as one gzip member."""
@@ -90,7 +95,9 @@ class SpzEncoder:
             Run(stream.size * layout.count, WAYS.get(stream.name, compression.MIXED)) for stream in layout.streams()
         ]
         runs[0] = runs[0]._replace(size=runs[0].size + HEADER.size)
-        yield from compression.gzip_member(data(), runs, self.options.compression_level, threads, progress)
+        comment = "" if self.up is None else comment_of(up=self.up)
+        level = self.options.compression_level
+        yield from compression.gzip_member(data(), runs, level, threads, progress, comment=comment.encode())
 
 
 def encoder(
@@ -120,4 +127,4 @@ def encoder(
         count, sh_degree, tree = len(scene), scene.splats.sh_degree, scene.tree is not None
     flags = (ANTIALIASED if scene.antialiased else 0) | (LOD if tree else 0)
     layout = Layout(options.spz_version, count, sh_degree, options.fractional_bits, flags)
-    return SpzEncoder(layout, options, ranges)
+    return SpzEncoder(layout, options, ranges, scene.up)

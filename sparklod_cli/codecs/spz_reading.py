@@ -23,6 +23,7 @@ from ..support.progress import Progress, silent
 from . import compression, quantize
 from .content import HAS_TREE, Content, Scratch
 from .inflate import GZIP_MAGIC, Inflate
+from .noted import Noted, read_comment
 from .sound import with_sound_tree
 from .spz_coded import CodedSpz, Watch, sound
 from .spz_layout import ANTIALIASED, EXTENSIONS, HEADER, LOD, MAGIC, Layout, Stream, StreamRows, column_of
@@ -58,7 +59,7 @@ def examine(
     Raises:
         FormatError: as `decode`, but not for a broken tree.
     """
-    layout, rows, header = _opened(file, threads)
+    layout, rows, header, noted = _opened(file, threads)
     make = Splats.empty if set(COLUMNS) <= set(columns) else Splats.zeros
     splats = make(layout.count, min(layout.sh_degree, MAX_SH_DEGREE))
     tree = None
@@ -76,8 +77,8 @@ def examine(
     for count in ordered_map(fill, rows, threads):
         done += count
         progress("reading", done, layout.total, "B")
-    antialiased, notes = bool(layout.flags & ANTIALIASED), _notes(layout, header)
-    return Scene(splats, tree, antialiased, _name_of(layout), notes, _facts(layout) | header, coding=CODING)
+    antialiased, notes, facts = bool(layout.flags & ANTIALIASED), _notes(layout, header, noted), _facts(layout) | header
+    return Scene(splats, tree, antialiased, _name_of(layout), notes, facts, coding=CODING, up=noted.up)
 
 
 def stream(file: BinaryIO, *, scratch: Scratch, threads: int = 1, progress: Progress = silent) -> SceneStream:
@@ -87,7 +88,7 @@ def stream(file: BinaryIO, *, scratch: Scratch, threads: int = 1, progress: Prog
         HasTreeError: it has a tree.
         FormatError: as `decode`; what is wrong with the data, at the first block.
     """
-    layout, rows, header = _opened(file, threads)
+    layout, rows, header, noted = _opened(file, threads)
     if layout.flags & LOD:
         raise HasTreeError(HAS_TREE)
     if not layout.count:  # there is nothing to read, but what follows may be wrong
@@ -118,8 +119,8 @@ def stream(file: BinaryIO, *, scratch: Scratch, threads: int = 1, progress: Prog
             pass
 
     degree, antialiased = min(layout.sh_degree, MAX_SH_DEGREE), bool(layout.flags & ANTIALIASED)
-    notes, facts = _notes(layout, header), _facts(layout) | header
-    return Content(layout.count, degree, fill, _name_of(layout), antialiased, notes, facts).stream(threads)
+    notes, facts = _notes(layout, header, noted), _facts(layout) | header
+    return Content(layout.count, degree, fill, _name_of(layout), antialiased, notes, facts, noted.up).stream(threads)
 
 
 def read_codes(file: BinaryIO) -> tuple[Layout, dict[str, quantize.Bytes]]:
@@ -128,7 +129,7 @@ def read_codes(file: BinaryIO) -> tuple[Layout, dict[str, quantize.Bytes]]:
     Raises:
         FormatError: as `decode`.
     """
-    layout, rows, _ = _opened(file, 1)
+    layout, rows, *_ = _opened(file, 1)
     codes = {each.name: np.empty((layout.count, each.size), np.uint8) for each in layout.streams()}
     for each, part, some in rows:
         codes[each.name][part] = some
@@ -148,7 +149,7 @@ def read_coded(
     Those of the given columns of `Splats`, and of the tree; of a file that may hold invalid splats, those of all.
     """
     watch = watch or {}
-    layout, rows, header = _opened(file, threads)
+    layout, rows, header, noted = _opened(file, threads)
     columns = columns if sound(layout) else COLUMNS
     streams = [each for each in layout.streams() if each.column in {*columns, "child_count", "child_start"}]
     codes = {each.name: np.empty((layout.count, each.size), np.uint8) for each in streams}
@@ -161,18 +162,20 @@ def read_coded(
         done += some.size
         progress("reading", done, layout.total, "B")
     facts, degree = _facts(layout) | header, min(layout.sh_degree, MAX_SH_DEGREE)
-    antialiased, notes = bool(layout.flags & ANTIALIASED), _notes(layout, header)
-    return CodedSpz(layout, codes, degree, antialiased, _name_of(layout), notes, facts)
+    antialiased, notes = bool(layout.flags & ANTIALIASED), _notes(layout, header, noted)
+    return CodedSpz(layout, codes, degree, antialiased, _name_of(layout), notes, facts, noted.up)
 
 
-def _opened(file: BinaryIO, threads: int) -> tuple[Layout, Iterator[StreamRows], dict[str, int]]:
-    """The layout of a file, the rows of its streams, and more numbers, the last of which come with the rows."""
+def _opened(file: BinaryIO, threads: int) -> tuple[Layout, Iterator[StreamRows], dict[str, int], Noted]:
+    """The layout of a file, the rows of its streams, more numbers, the last of which come with the rows; its note."""
     size = size_of(file)
     plain = file.read(4) == struct.pack("<I", MAGIC)
     file.seek(0)
     header: dict[str, int] = {}
-    layout, rows = _read_v4(file, size, header) if plain else _read_gzip(file, size, header, threads)
-    return layout, rows, header
+    if plain:
+        return *_read_v4(file, size, header), header, Noted()
+    inflate = Inflate(file, threads)
+    return *_read_gzip(inflate, size, header), header, read_comment(inflate.comment)
 
 
 def _facts(layout: Layout) -> dict[str, int]:
@@ -183,8 +186,8 @@ def _name_of(layout: Layout) -> str:
     return f"SPZ {layout.version}" + " LoD" * bool(layout.flags & LOD)
 
 
-def _notes(layout: Layout, header: dict[str, int]) -> tuple[str, ...]:
-    notes = notes_on_degree(layout.sh_degree)
+def _notes(layout: Layout, header: dict[str, int], noted: Noted) -> tuple[str, ...]:
+    notes = notes_on_degree(layout.sh_degree) + noted.problems
     if header.get("unknown_streams"):
         notes += (f"{header['unknown_streams']} streams of an unknown kind are left out",)
     return notes
@@ -211,8 +214,7 @@ def _rows(layout: Layout, read: Read, stream: Stream) -> Iterator[StreamRows]:
         yield stream, part, codes
 
 
-def _read_gzip(file: BinaryIO, size: int, header: dict[str, int], threads: int) -> tuple[Layout, Iterator[StreamRows]]:
-    inflate = Inflate(file, threads)
+def _read_gzip(inflate: Inflate, size: int, header: dict[str, int]) -> tuple[Layout, Iterator[StreamRows]]:
     head = inflate.read(HEADER.size)
     if len(head) < HEADER.size:
         raise TruncatedError("cut short inside the SPZ header")

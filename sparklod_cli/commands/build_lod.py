@@ -16,7 +16,7 @@ from ..support.printable import MOST, shortened
 from ..support.stdin import DASH, name_of
 from .build_lod_inputs import Inputs, check_inputs, input_options, record_of
 from .build_lod_jobs import job_of
-from .build_lod_outputs import Outputs, check_formats
+from .build_lod_outputs import BY_DATE, VERIFY, Outputs, check_formats
 from .command import COMMON, Command, option
 from .console import say
 from .options.baking import STREAMED_SOG, baking_options, check_method, method_of
@@ -25,7 +25,7 @@ from .options.common import General, common_options, output_option, overwrite_op
 from .options.refining import check_refining
 from .options.resources import HEADING as LARGE
 from .options.resources import OF_BAKES, resources_options
-from .paths import OutputPath, claim_stdout, is_same_place, keep_apart, with_chunks
+from .paths import NAMELESS, Folder, OutputPath, claim_stdout, is_same_place, keep_apart, with_chunks
 from .usage import exclude, options_of
 
 EXAMPLES = """
@@ -54,13 +54,15 @@ Examples:
   sparklod build-lod scene-lod.spz --unlod -o scene.sog # for PlayCanvas
 """
 
+BOTH = "--output cannot be used with --output-dir"
+
 
 @click.command("build-lod", cls=Command, epilog=EXAMPLES, context_settings={"show_default": True})
 @input_options
 @output_option(
-    "Output of a single input; - is standard output.  [default: NAME-lod.spz beside the input;"
-    f" NAME-lod.rad with --format rad, NAME-lod/{MANIFEST} with --format {STREAMED_SOG}, NAME-lod.npz with --encoding,"
-    " NAME-unlod.spz with --unlod, NAME-lod-refined.spz of a NAME-lod.spz with --refine]",
+    "Output of a single input, or a folder for all outputs; - is standard output.  [default: NAME-lod.spz beside the"
+    f" input; NAME-lod.rad with --format rad, NAME-lod/{MANIFEST} with --format {STREAMED_SOG}, NAME-lod.npz with"
+    " --encoding, NAME-unlod.spz with --unlod, NAME-lod-refined.spz of a NAME-lod.spz with --refine]",
     addresses=True,
 )
 @option(
@@ -75,16 +77,20 @@ Examples:
 @option(
     "--skip-existing",
     heading=LARGE,
-    is_flag=True,
+    metavar="[=verify]",
+    type=click.Choice([BY_DATE, VERIFY]),
+    bare=BY_DATE,
     help="Bake nothing whose output is there already, of the same inputs and settings; a small file beside each output,"
-    " NAME.sparklod.json, tells of what it is.",
+    " NAME.sparklod.json, tells of what it is. Files whose size and date are unchanged are not read;"
+    " --skip-existing=verify reads all, and so finds damage that left both as they were.",
 )
 @option(
     "--unlod",
     heading=COMMON,
     is_flag=True,
-    help="Write the original splats of Level-of-Detail files instead, as SPZ or, by the name of FILE, .rad, .ply,"
-    " .sog, DIR/meta.json (an unpacked SOG) or .splat.",
+    help="Write the leaves of Level-of-Detail files instead: the original splats as the file holds them, rounded, with"
+    " opacities that make up for it. As SPZ or, by the name of FILE, .rad, .ply, .sog, DIR/meta.json (an unpacked SOG)"
+    " or .splat, which has no SH.",
 )
 @baking_options
 @resources_options
@@ -102,12 +108,12 @@ def build_lod(ctx: click.Context, /, **_: Any) -> None:
     The axes of the input are kept unless --up or --rotate turns them. Selection goes by the coordinates of the input;
     of merged inputs, by those at which they stand together.
 
-    INPUT, FILE and DIR may be addresses such as s3://bucket/scan.ply (pip install 'sparklod[cloud]').
+    INPUT, FILE and DIR may be addresses such as s3://bucket/scan.ply (extra cloud).
 
     An input that fails does not stop the others; the exit status is 1 if any did. With --workers or --scheduler,
-    several inputs are baked side by side (pip install 'sparklod[cluster]').
+    several inputs are baked side by side (extra cluster).
     """
-    general, given, outputs = options_of(ctx, General), options_of(ctx, Inputs), options_of(ctx, Outputs)
+    general, given, outputs = options_of(ctx, General), options_of(ctx, Inputs), _outputs(ctx)
     check_inputs(ctx, given, outputs)
     instances = given.instances()
     _check(ctx, given, [each.file for each in instances if each.file is not None], outputs, general)
@@ -136,16 +142,28 @@ def build_lod(ctx: click.Context, /, **_: Any) -> None:
         ctx.exit(1)
 
 
+def _outputs(ctx: click.Context) -> Outputs:
+    """Return where outputs go; an --output that names a folder is an --output-dir."""
+    output = ctx.params["output"]
+    if isinstance(output, Folder):
+        if ctx.params["output_dir"] is not None:
+            raise click.UsageError(BOTH)
+        ctx.params.update(output=None, output_dir=output.path)
+    return options_of(ctx, Outputs)
+
+
 def _check(ctx: click.Context, given: Inputs, named: list[Path], outputs: Outputs, general: General) -> None:
     """Raises a `click.UsageError` where options contradict each other, or the names of files."""
     inputs = given.inputs
     if outputs.output is not None:
         if outputs.output_dir is not None:
-            raise click.UsageError("--output cannot be used with --output-dir")
+            raise click.UsageError(BOTH)
         if len(inputs) > 1 and not given.merge:
-            raise click.UsageError(f"--output takes one input, not {len(inputs)}; use --output-dir")
+            raise click.UsageError(
+                f"--output takes one input, not {len(inputs)}; add --merge to bake them as one scene, or name a folder"
+            )
     elif DASH in inputs:
-        raise click.UsageError("standard input has no name to derive one from; give --output")
+        raise click.UsageError(NAMELESS)
     targets = [outputs.output] if outputs.output is not None else [outputs.target(source) for source in inputs]
     if outputs.may_replace_inputs and not given.is_merged:
         targets = [target for source, target in zip(inputs, targets, strict=True) if not is_same_place(source, target)]

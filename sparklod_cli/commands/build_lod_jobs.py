@@ -9,18 +9,16 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..codecs.formats import WRITABLE
-from ..codecs.rad.names import SUFFIX as RAD
 from ..support.addresses import Place
 from ..support.errors import SparklodError
-from .build_lod_outputs import Outputs
+from .build_lod_outputs import VERIFY, Outputs
 from .options.baking import bake_settings, write_options
 from .options.common import General
 from .options.resources import resources_of
 from .reports import report_baked, report_extracted
 
 if TYPE_CHECKING:
-    from ..api.bake_jobs import Baked, BakeSettings, ClusterEngine, Extracted, Source
+    from ..api.bake_jobs import Baked, ClusterEngine, Extracted, Source
     from .console import Console
 
     #: What is known of an output; None where it was there already.
@@ -36,10 +34,9 @@ def job_of(
     """What makes outputs of inputs, and what reports one; the point where numpy is loaded."""
     from ..api import bake_jobs
 
+    console.announce_compiling()
     shared: dict[str, Any] = {"overwrite": outputs.overwrite, "progress": console.progress}
     if outputs.unlod:
-        if WRITABLE[outputs.suffix].name == "SOG":
-            console.announce_compiling("palette")
         how: dict[str, Any] = {"suffix": outputs.suffix, "options": write_options(ctx), "threads": general.threads}
         return _one_by_one(functools.partial(bake_jobs.extract_leaves, **how, **shared)), report_extracted
     settings = bake_settings(
@@ -49,8 +46,9 @@ def job_of(
         streamed_sog=outputs.is_streamed_sog,
         converts=outputs.format_is_asked_for,
     )
-    console.announce_compiling(settings.method, *_jobs_of(outputs, settings))
-    make = bake_jobs.bake_unless_there if ctx.params["skip_existing"] else bake_jobs.bake
+    make: Callable[..., Baked | None] = bake_jobs.bake
+    if outputs.skip_existing is not None:
+        make = functools.partial(bake_jobs.bake_unless_there, verify=outputs.skip_existing == VERIFY)
     resources = resources_of(ctx)
     if engine is not None:
         resources = dataclasses.replace(resources, memory=engine.memory)
@@ -70,16 +68,6 @@ def job_of(
         **shared,
     )
     return lambda pairs: (beside if len(pairs) > 1 else alone)(pairs), report_baked
-
-
-def _jobs_of(outputs: Outputs, settings: BakeSettings) -> list[str]:
-    """The jobs of `warmup.JOBS` after that of the builder."""
-    jobs = ["refine"] if settings.refine is not None else []
-    if outputs.is_streamed_sog:
-        jobs.append("streamed-sog")
-    elif outputs.suffix == RAD:
-        jobs += ["rad"] if settings.options.rad.sh_codes is None else ["rad", "palette"]
-    return jobs
 
 
 def _one_by_one(make: Callable[..., Made]) -> Make:

@@ -25,7 +25,7 @@ from .options.baking import (
 )
 from .options.detail import HEADING as DETAIL
 from .options.detail import OF_DETAIL
-from .paths import stem_of
+from .paths import require_suffix, stem_of
 from .usage import is_given, refuse
 
 #: Suffixes of the formats in which a tree can be written, and what they are called; the first one is the default.
@@ -39,6 +39,10 @@ PLAIN = {ending for form in FORMATS for ending in (*form.suffixes, *form.endings
 WITH_PALETTE = ("RAD", "SOG")
 
 
+#: Values of --skip-existing: read only files whose size or date changed, or all.
+BY_DATE, VERIFY = "date", "verify"
+
+
 @dataclass(frozen=True)
 class Outputs:
     """Where outputs go.
@@ -50,7 +54,7 @@ class Outputs:
         unlod: write the splats of trees.
         inputs: what they are made of.
         refine: steps by which merged splats are fitted; None for not at all.
-        skip_existing: make nothing that is there already.
+        skip_existing: make nothing that is there already: `BY_DATE` or `VERIFY`; None makes all.
         form: of the outputs, a key of `FORMS`; None where nobody chose.
         encoding: of array files.
     """
@@ -61,7 +65,7 @@ class Outputs:
     unlod: bool
     inputs: tuple[Place, ...]
     refine: int | None
-    skip_existing: bool
+    skip_existing: str | None
     form: str | None
     encoding: str | None
 
@@ -163,6 +167,9 @@ def check_formats(ctx: click.Context, outputs: Outputs) -> None:
         refuse(ctx, OF_PALETTES, "is an option of RAD and SOG, not of --encoding")
     if outputs.form is not None and suffix not in ("", outputs.suffix):
         raise click.UsageError(f"--format {outputs.form} writes {outputs.suffix}, not {suffix}")
+    if outputs.output is not None and outputs.form is None:
+        arrays, trees = (NPZ, *RAW_SUFFIXES), (*TREES, MANIFEST)
+        require_suffix("--output", outputs.output, arrays if outputs.encoding else WRITABLE if outputs.unlod else trees)
     if outputs.unlod:
         _check_unlod(ctx, outputs)
     elif outputs.encoding:

@@ -38,11 +38,16 @@ ALIASES = {
 
 
 class Option(click.Option):
-    """An option that stands under a heading of `--help`."""
+    """An option that stands under a heading of `--help`.
 
-    def __init__(self, *arguments: Any, heading: str = GENERAL, **attributes: Any) -> None:
+    Args:
+        heading: of these.
+        bare: its value where it stands alone; another one follows after "=", never as the next argument.
+    """
+
+    def __init__(self, *arguments: Any, heading: str = GENERAL, bare: str | None = None, **attributes: Any) -> None:
         super().__init__(*arguments, **attributes)
-        self.heading = heading
+        self.heading, self.bare = heading, bare
 
 
 def option(*names: str, heading: str, **attributes: Any) -> Callable[[Decorated], Decorated]:
@@ -68,6 +73,12 @@ class Command(click.Command):
     def __init__(self, *arguments: Any, headings: Sequence[str] = (COMMON,), **attributes: Any) -> None:
         super().__init__(*arguments, **attributes)
         self.headings = headings
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        options = [param for param in self.params if isinstance(param, Option) and param.bare is not None]
+        bare = {name: f"{name}={param.bare}" for param in options for name in param.opts}
+        end = args.index("--") if "--" in args else len(args)
+        return super().parse_args(ctx, [*(bare.get(arg, arg) for arg in args[:end]), *args[end:]])
 
     def by_heading(self, ctx: click.Context) -> dict[str, list[click.Parameter]]:
         """The options that `--help` lists, by heading, in the order of both."""

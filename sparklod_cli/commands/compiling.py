@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from .console import count_of
@@ -10,21 +10,17 @@ from .console import count_of
 if TYPE_CHECKING:
     from .console import Console
 
-#: Seconds that compiling a kernel takes on a fast machine and on a slow one; docs/performance.md has measurements.
-SECONDS = (1, 3)
-
 
 class Reporter:
     """Announces the first kernel that is compiled, shows a bar, and prints at the end how long all of them took.
 
     Args:
         console: prints it.
-        jobs: the jobs of `warmup.JOBS` that follow, which tell how many kernels there will be.
     """
 
-    def __init__(self, console: Console, jobs: Sequence[str]) -> None:
-        self._console, self._jobs = console, jobs
-        self._total = self._done = 0
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._begun = self._done = 0
         self._seconds = 0.0
         self._troubles: set[str] = set()
 
@@ -47,26 +43,24 @@ class Reporter:
             self._troubles.add(trouble)
             self._console.say(trouble)
 
-    def _begin(self, name: str) -> None:
-        if not self._total:
-            self._announce(name)
-        self._total = max(self._total, self._done + 1)
-        self._console.progress("compiling", self._done, self._total, "kernel")
+    def _begin(self, _name: str) -> None:
+        if not self._begun:
+            self._announce()
+        self._begun += 1
+        self._show()
 
-    def _announce(self, name: str) -> None:
+    def _announce(self) -> None:
         from ..support import jit
         from ..warmup import missing
 
-        self._total = len({name, *missing(self._jobs)})
-        about = " to ".join(f"{max(1, round(self._total * seconds))}" for seconds in SECONDS)
-        often = (
-            "once; sparklod warmup does it in advance" if jit.CACHE_FOLDER else "in every run: no cache can be written"
-        )
-        self._console.say(
-            f"Compiling {count_of(self._total, 'kernel')} for this machine, about {about} s ({often}) ..."
-        )
+        advance = f"once; sparklod warmup compiles all {len(missing())} in advance"
+        often = advance if jit.CACHE_FOLDER else "in every run: no cache can be written"
+        self._console.say(f"Compiling kernels for this machine, half a minute or less ({often}) ...")
 
     def _end(self, seconds: float) -> None:
         self._done += 1
         self._seconds += seconds
-        self._console.progress("compiling", self._done, max(self._total, self._done), "kernel")
+        self._show()
+
+    def _show(self) -> None:
+        self._console.progress("compiling", self._done, 0, "kernel")  # how many a command needs is not known

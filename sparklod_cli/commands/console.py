@@ -7,6 +7,7 @@ import os
 import sys
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from time import monotonic
 from types import TracebackType
 from typing import Any, TextIO
 
@@ -15,6 +16,10 @@ import click
 from ..support.printable import MOST, printable
 from ..support.stdout import silence
 from ..support.units import count_of as count_of
+from ..support.units import format_size
+
+#: Seconds between two lines of progress where standard error is a log.
+LOG_INTERVAL = 10
 
 
 @dataclass
@@ -90,7 +95,7 @@ def _unheard() -> Iterator[None]:
 
 
 class Console:
-    """Prints lines on standard error, and a progress bar for each stage of work if that is a terminal.
+    """Prints lines on standard error, and the progress of each stage of work: a bar on a terminal, lines in a log.
 
     Used as a context manager, which clears the bar. Its `progress` is a `sparklod_cli.support.progress.Progress`.
     """
@@ -99,6 +104,7 @@ class Console:
         self._quiet, self._verbose = quiet, verbose
         self._bars = not quiet and is_terminal(sys.stderr)
         self._bar: Any = None
+        self._stage, self._stage_start, self._logged = "", 0.0, 0.0
         self._ended = contextlib.ExitStack()
 
     def __enter__(self) -> Console:
@@ -135,6 +141,7 @@ class Console:
 
     def progress(self, stage: str, done: int, total: int, unit: str) -> None:
         if not self._bars:
+            self._log_progress(stage, done, total, unit)
             return
         if self._bar is None or self._bar.desc != stage:
             from tqdm import tqdm
@@ -144,12 +151,18 @@ class Console:
             self._bar = tqdm(total=total, desc=stage, leave=False, file=sys.stderr, dynamic_ncols=True, **scaled)
         self._bar.update(done - self._bar.n)
 
-    def announce_compiling(self, *jobs: str) -> None:
-        """Prints messages about kernels that are compiled, until this console ends.
+    def _log_progress(self, stage: str, done: int, total: int, unit: str) -> None:
+        """Print a line about a stage that takes long, every `LOG_INTERVAL` seconds."""
+        now = monotonic()
+        if stage != self._stage:
+            self._stage, self._stage_start, self._logged = stage, now, now
+        if now - self._logged >= LOG_INTERVAL and done < total:
+            self._logged = now
+            amount = f"{format_size(done)} of {format_size(total)}" if unit == "B" else f"{done:,} of {total:,} {unit}s"
+            self.say(f"{stage}: {amount} ({100 * done / total:.0f} %), {now - self._stage_start:.0f} s")
 
-        Args:
-            jobs: the jobs of `warmup.JOBS` that follow.
-        """
+    def announce_compiling(self) -> None:
+        """Prints messages about kernels that are compiled, until this console ends."""
         from .compiling import Reporter
 
-        self._ended.callback(Reporter(self, jobs).listen())
+        self._ended.callback(Reporter(self).listen())

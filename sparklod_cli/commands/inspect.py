@@ -12,7 +12,7 @@ from .command import Command
 from .inspect_job import Job
 from .options.common import General, common_options, overwrite_option
 from .options.inspecting import Checks, Output, check_usage, inspect_options
-from .paths import InputPath, keep_apart
+from .paths import InputPath, keep_apart, name_outputs
 from .usage import options_of
 
 if TYPE_CHECKING:
@@ -47,6 +47,7 @@ def inspect(ctx: click.Context, /, files: tuple[Path, ...], **_: Any) -> None:
 
     A file that cannot be read is a finding, too, and does not stop the others.
     """
+    name_outputs(ctx, files[0])
     general = options_of(ctx, General)
     checks, output = options_of(ctx, Checks), options_of(ctx, Output)
     keep_apart(ctx)
@@ -55,7 +56,7 @@ def inspect(ctx: click.Context, /, files: tuple[Path, ...], **_: Any) -> None:
         from ..api.inspect_jobs import CheckSettings, DrawSettings
         from ..inspection.checking import read_original
 
-        console.announce_compiling(*(["inspect"] if output.html is None else ["inspect", "render"]))
+        console.announce_compiling()
         drawn = DrawSettings(
             histograms=output.histogram,
             plot=output.plot,

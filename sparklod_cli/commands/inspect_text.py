@@ -29,6 +29,7 @@ def lines(name: str, report: dict[str, Any]) -> Iterator[str]:
     yield f"{printable(name)}  {report['format']}{size}"
     about = [count_of(report["splats"], noun), f"SH {report['sh_degree']}"]
     about += ["antialiased"] * bool(report["antialiased"])
+    about += [f"{report['up']} is up"] * bool(report["up"])
     if "fractional_bits" in report["header"]:
         about.append(f"{report['header']['fractional_bits']} fractional bits")
     yield _row("holds", ", ".join(about))

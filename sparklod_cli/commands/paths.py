@@ -7,6 +7,7 @@ import os
 import stat
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +17,22 @@ from ..codecs.sog.names import META
 from ..codecs.streamed_sog.names import MANIFEST
 from ..support.addresses import Address, Place, place_of
 from ..support.stdin import DASH
+from ..tables.files import FORMS
 from .console import is_terminal
 from .usage import flag_of
 
 #: What a place is taken by.
 INPUT, OUTPUT = "an input", "an output"
+
+#: Why no output is named after standard input, and what to do.
+NAMELESS = "standard input has no name to derive one from; name the output file"
+
+
+@dataclass(frozen=True)
+class Folder:
+    """A folder named where an output file is expected: the file is written into it, as cp and mv do."""
+
+    path: Place
 
 
 class _NamedPath(click.Path):
@@ -68,11 +80,53 @@ class InputPath(_NamedPath):
 class OutputPath(_NamedPath):
     """A file that a command writes, or with `folder` a folder that it fills.
 
-    With `suffixes`, that is all it is written as: `keep_apart` refuses a name that promises something else. With
-    `addresses`, also s3://bucket/file and the like.
+    A file may be given as a `Folder`: a name that ends in a slash, or an existing folder. With `suffixes`, that is all
+    it is written as: `keep_apart` refuses a name that promises something else. With `addresses`, also s3://bucket/file
+    and the like.
     """
 
     _to_do = "write a file and upload that"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        place = super().convert(value, param, ctx)
+        is_folder = not self.folder and (
+            os.fsdecode(value).endswith(("/", os.sep)) or (isinstance(place, Path) and os.path.isdir(place))  # noqa: PTH112
+        )
+        return Folder(place) if is_folder else place
+
+
+def name_outputs(ctx: click.Context, source: Place | None) -> None:
+    """Replace each parameter that is a `Folder` by the path of the file in it, which is named after an input.
+
+    Args:
+        ctx: of the command.
+        source: the input; None where there is none, which other checks report.
+
+    Raises:
+        click.UsageError: the input is standard input, which has no name.
+    """
+    for parameter in ctx.command.params:
+        value = ctx.params.get(parameter.name or "")
+        if source is None or not isinstance(value, Folder):
+            continue
+        if source == DASH:
+            raise click.UsageError(f"{flag_of(ctx, parameter.name or '')} {value.path}: {NAMELESS}", ctx)
+        suffix = next(iter(getattr(parameter.type, "suffixes", ())), f".{ctx.params.get('form') or next(iter(FORMS))}")
+        ctx.params[parameter.name or ""] = value.path / f"{stem_of(source)}{suffix}"
+
+
+def require_suffix(flag: str, output: Place, endings: Iterable[str]) -> None:
+    """Raise a `click.UsageError` where the name of an output has no suffix, which would choose its format.
+
+    Args:
+        flag: that names the output.
+        output: a file; standard output, pipes and devices need no suffix.
+        endings: suffixes, and names of files, that are possible.
+    """
+    if output == DASH or output.suffix or _is_stream(output):
+        return
+    names = ", ".join(each if each.startswith(".") else f"/{each}" for each in endings)
+    raise click.UsageError(f"{flag} {output} has no suffix to tell the format; end it in {names}, or in / for a folder")
 
 
 def keep_apart(ctx: click.Context, stands_for: Mapping[str, Iterable[Place]] | None = None) -> None:
@@ -104,7 +158,9 @@ def keep_apart(ctx: click.Context, stands_for: Mapping[str, Iterable[Place]] | N
     for parameter, kind, path in promised:
         if path == DASH:
             raise click.BadParameter("it cannot go to standard output; name a file or folder", ctx, parameter)
-        if kind.suffixes and path.suffix.lower() not in ("", *kind.suffixes):
+        if kind.suffixes:
+            require_suffix(flag_of(ctx, parameter.name or ""), path, kind.suffixes)
+        if kind.suffixes and path.suffix and path.suffix.lower() not in kind.suffixes:
             raise click.BadParameter(
                 f"{str(path)!r} does not end in {' or '.join(kind.suffixes)}, which is what is written", ctx, parameter
             )

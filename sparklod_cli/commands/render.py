@@ -18,7 +18,7 @@ from .command import COMMON, Command
 from .options import appearance, cameras, comparison, cut, inputs, pictures, streamed_sog, streaming
 from .options.camera_options import camera_options
 from .options.common import General, common_options
-from .paths import claim_stdout, keep_apart
+from .paths import claim_stdout, keep_apart, name_outputs
 from .usage import exclude, given, options_of
 
 if TYPE_CHECKING:
@@ -72,8 +72,11 @@ class RenderOptions:
         Raises:
             click.UsageError: options contradict each other, or have nothing to do.
         """
+        read = options_of(ctx, inputs.Inputs)
+        if ctx.params["compare"]:
+            name_outputs(ctx, read.first)
         asked = cls(
-            options_of(ctx, inputs.Inputs),
+            read,
             options_of(ctx, cameras.PictureCameras),
             options_of(ctx, cut.PictureCut),
             options_of(ctx, streamed_sog.Detail),
@@ -140,24 +143,19 @@ def _draw(ctx: click.Context, asked: RenderOptions) -> None:
     budget = None if asked.cut.full else asked.cut.one_budget()
     instances = asked.inputs.instances()
     # What is wrong with the output is said before much is read.
-    _output(ctx, asked, instances, asked.cameras.least_count())
+    _output(ctx, asked, asked.cameras.least_count())
     with general.console() as console:
         from ..api.jobs import draw_files
         from .render_text import report
 
-        console.announce_compiling("render")
+        console.announce_compiling()
 
         def place(path: CameraPath) -> tuple[Output, PictureSettings]:
             return _place(ctx, asked, instances, path)
 
         def ready(path: CameraPath, scenes: Scenes) -> None:
-            notes = [*path.notes, *scenes.notes, *_upside_down(asked, scenes)]
             streamed_sog.check_scenes(ctx, scenes)
-            unused = streamed_sog.without_effect(ctx, scenes, (*cut.CUTS, *streaming.OF_LOADING))
-            if unused:
-                unused_flags = ", ".join(unused)
-                notes.append(f"no file has levels to choose, so all splats are drawn; no effect: {unused_flags}")
-            for note in notes:
+            for note in (*path.notes, *scenes.notes, *_upside_down(asked, scenes)):
                 console.say(note)
             console.detail(f"  read in {time.perf_counter() - start:.2f} s")
 
@@ -215,7 +213,7 @@ def _upside_down(asked: RenderOptions, scenes: Scenes) -> list[str]:
 
     The default stays: SPZ files converted from trained PLY often keep y down, and so do those of build-lod.
     """
-    if asked.cameras.up is not None or asked.cameras.camera_path is not None:
+    if scenes.up is not None or asked.cameras.up is not None or asked.cameras.camera_path is not None:
         return []
     plain = (loaded for loaded in scenes.loaded if loaded.scene.format.startswith("SPZ") and not loaded.is_tree)
     return [
@@ -225,11 +223,12 @@ def _upside_down(asked: RenderOptions, scenes: Scenes) -> list[str]:
     ]
 
 
-def _output(ctx: click.Context, asked: RenderOptions, instances: list[Instance], cameras: int) -> Output:
+def _output(ctx: click.Context, asked: RenderOptions, cameras: int) -> Output:
     """Where the pictures of some cameras go."""
-    scene = asked.inputs.scene or instances[0].file
-    assert scene is not None
-    return asked.pictures.place(ctx, scene, cameras, sheet=asked.pictures.sheet or len(asked.cameras.views) > 1)
+    assert asked.inputs.first is not None  # or there would be no instances
+    return asked.pictures.place(
+        ctx, asked.inputs.first, cameras, sheet=asked.pictures.sheet or len(asked.cameras.views) > 1
+    )
 
 
 def _place(
@@ -244,7 +243,7 @@ def _place(
     from ..images import animation
     from ..images.sequence import PictureSettings, frame_rate
 
-    look, output = asked.appearance, _output(ctx, asked, instances, len(path.cameras))
+    look, output = asked.appearance, _output(ctx, asked, len(path.cameras))
     if output.form == "npy":
         exclude(ctx, look.of_pictures(), "a .npy, which holds numbers")
     settings = PictureSettings(

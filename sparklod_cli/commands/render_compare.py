@@ -15,7 +15,7 @@ from ..support.stdin import DASH
 from .console import Console, count_of, for_screen, is_terminal
 from .options.common import table_form
 from .options.streamed_sog import check_scenes
-from .paths import keep_apart
+from .paths import Folder, keep_apart
 
 if TYPE_CHECKING:
     from ..api.jobs import Compared
@@ -38,7 +38,7 @@ def compare(ctx: click.Context, asked: RenderOptions) -> int:
 
     keep_apart(ctx, files_read(asked, instances))
     with asked.general.console() as console:
-        console.announce_compiling("render")
+        console.announce_compiling()
         start = time.perf_counter()
 
         def ready(path: CameraPath, scenes: Scenes) -> None:
@@ -75,6 +75,7 @@ def _table(asked: RenderOptions) -> TableOutput:
     from ..tables.output import TableOutput
 
     output = asked.pictures.output
+    assert not isinstance(output, Folder)  # see `name_outputs`
     nowhere = _on_screen(asked) or (output is None and asked.general.as_json)
     return TableOutput(
         path=None if output == DASH else output,

@@ -15,15 +15,8 @@ if TYPE_CHECKING:
 
 #: What clamping does to a scene and what to do about it, by column of `Splats` and whether the upper end clamps.
 CLAMPED_BY_SPZ = {
-    ("scale", False): (
-        "scales",
-        "too small to be seen from farther away than 0.1 units; if the whole scene is that small, enlarge it (--scale)",
-    ),
-    ("scale", True): (
-        "scales",
-        "such splats, of a sky perhaps, shrink; make the scene smaller (--scale), or leave them out (--within,"
-        " --max-box)",
-    ),
+    ("scale", False): ("scales", "mostly how thick flat splats are; --format rad keeps them"),
+    ("scale", True): ("scales", "such splats, of a sky perhaps, shrink; --format rad keeps them"),
     ("rgb", False): ("colours", "darker than black, so the loss is hardly visible"),
     ("rgb", True): ("colours", "brighter than white, so the loss is hardly visible"),
     ("sh", False): ("SH", "reflections get weaker; render --diff shows whether it matters"),
@@ -31,6 +24,17 @@ CLAMPED_BY_SPZ = {
 }
 _THIN, _WIDE = "mostly how thick flat splats are; --rad-scales ln_f16 keeps them", "--rad-scales ln_f16 keeps them"
 _FAR, _COLORS = "--rad-center f32_lebytes keeps them", "the loss is hardly visible; --rad-rgb {wide} keeps them"
+#: What can be seen of clamped values, by the same.
+CONSEQUENCES = {
+    ("center", False): "splats are farther away",
+    ("center", True): "splats are farther away",
+    ("scale", False): "splats are smaller",
+    ("scale", True): "splats are larger",
+    ("rgb", False): "colours are darker",
+    ("rgb", True): "colours are brighter",
+    ("sh", False): "reflections are stronger",
+    ("sh", True): "reflections are stronger",
+}
 #: "{wide}" is the encoding that holds the values.
 CLAMPED_BY_RAD = {
     ("center", True): ("coordinates", _FAR),
@@ -40,6 +44,10 @@ CLAMPED_BY_RAD = {
     ("rgb", True): ("colours", _COLORS),
     ("sh", True): ("SH", "reflections get weaker; --rad-sh {wide} keeps them"),
 }
+
+#: Words for columns of which leaves have values that an output clamps, and the share of splats from which it is said.
+COLUMNS = {"center": "centres", "scale": "scales", "rgb": "colours", "sh": "reflections (SH)"}
+LEAST_SHARE = 0.001
 
 
 def report_baked(console: Console, source: Place, target: Place, baked: Baked) -> None:
@@ -58,8 +66,11 @@ def report_baked(console: Console, source: Place, target: Place, baked: Baked) -
         console.say(f"  left out: {describe(baked.dropped)}")
     for note in baked.notes:
         console.say(f"  {note}")
+    consequences = _consequences(baked)
+    if consequences:
+        console.say(f"  {consequences}")
     for clamp in baked.clamps:
-        console.say(f"  {_clamped(clamp, baked)}")
+        console.detail(f"  {_clamped(clamp, baked)}")
     tree = f"{baked.method} tree" if baked.method is not None else "the same tree"
     tree += ", refined" if baked.refine is not None else ""
     console.detail(f"  {baked.format} -> {tree} -> {_written(baked)}; {_stages(baked.seconds)}")
@@ -117,9 +128,25 @@ def _written(baked: Baked) -> str:
     return f"RAD LoD, {encodings}{palette}"
 
 
+def _consequences(baked: Baked) -> str:
+    """Return a line on the visible effect of clamping; empty where nothing of it can be seen."""
+    from ..codecs.clamps import matters
+
+    shares: dict[str, float] = {}
+    for clamp in baked.clamps:
+        if matters(clamp.column, above=clamp.above, visible=clamp.visible, leaves=baked.splats):
+            text = CONSEQUENCES[clamp.column, clamp.above]
+            shares[text] = max(shares.get(text, 0.0), 100 * clamp.visible / baked.splats)
+    if not shares:
+        return ""
+    form, more = (
+        ("SPZ", "--format rad keeps more of them") if baked.chunks is None else ("RAD", "-v says what keeps them")
+    )
+    return f"{' and '.join(f'{share:.2g} % of {text}' for text, share in shares.items())} than {form} can hold; {more}"
+
+
 def _clamped(clamp: Clamp, baked: Baked) -> str:
     """How many nodes have values that were clamped, how far these were off, and what that means."""
-    from ..codecs.clamps import MANY
     from ..codecs.rad.encodings import LARGEST_F16
 
     form, table = ("SPZ", CLAMPED_BY_SPZ) if baked.chunks is None else ("RAD", CLAMPED_BY_RAD)
@@ -130,23 +157,10 @@ def _clamped(clamp: Clamp, baked: Baked) -> str:
     where = "beyond ±" if clamp.both else f"{where} "
     farthest = clamp.farthest or 0.0  # no -0
     advice = advice.format(wide="f16" if abs(farthest) <= LARGEST_F16 else "f32")
-    if form == "SPZ" and clamp.deeper and clamp.splats > MANY * baked.nodes:
-        advice = _remedy(clamp, baked)
     return (
         f"{name} of {share} are {where}{clamp.end:.3g}, {way} to {farthest:.3g}, and are clamped to what {form} holds:"
         f" {advice}"
     )
-
-
-def _remedy(clamp: Clamp, baked: Baked) -> str:
-    """What keeps scales of which many are too small for SPZ.
-
-    A scene that is enlarged has fewer fractional bits, for as many as it grows by; there must be some to give away.
-    """
-    multiple = clamp.multiple(baked.nodes)
-    if multiple is None or multiple > 2 ** (baked.fractional_bits or 0):
-        return "--format rad keeps them"
-    return f"--scale {multiple} or --format rad keeps them"
 
 
 def report_extracted(console: Console, source: Place, target: Place, extracted: Extracted) -> None:
@@ -156,6 +170,17 @@ def report_extracted(console: Console, source: Place, target: Place, extracted: 
         f" {count_of(extracted.splats, 'splat')}, SH {extracted.sh_degree}, {size_of(extracted.bytes)},"
         f" {_total(extracted.seconds)}"
     )
+    losses = ["holds no reflections (SH)"] if extracted.drops_sh else []
+    losses += [
+        f"clamps the {COLUMNS[column]} of {100 * count / extracted.splats:.3g} % of the splats"
+        for column, count in extracted.clamped.items()
+        if count >= LEAST_SHARE * extracted.splats
+    ]
+    if losses:
+        console.say(f"  {extracted.output_format} {', and '.join(losses)}")
+    if extracted.up_lost is not None:
+        up = extracted.up_lost
+        console.say(f"  {up} is up, which this format cannot note; give --up={up} to render, traverse and view")
     console.detail(f"  {extracted.format}; {_stages(extracted.seconds)}")
 
 

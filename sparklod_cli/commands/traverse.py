@@ -16,7 +16,7 @@ from .options import cameras, cut, inputs, streamed_sog, streaming
 from .options import table as tables
 from .options.camera_options import camera_options
 from .options.common import General, common_options
-from .paths import claim_stdout, keep_apart
+from .paths import claim_stdout, keep_apart, name_outputs
 from .usage import options_of
 
 if TYPE_CHECKING:
@@ -67,6 +67,7 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
     Coordinates are those of the files; --up, --world-transform and --camera-axes bring cameras into them.
     """
     files, where, lod = options_of(ctx, inputs.Inputs), options_of(ctx, cameras.Cameras), options_of(ctx, cut.Cut)
+    name_outputs(ctx, files.first)
     network, place, general = (
         options_of(ctx, streaming.Streaming),
         options_of(ctx, tables.Table),
@@ -81,7 +82,7 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
     instances = files.instances()
     besides = {"scene": files.read(instances), "world_transform": where.files()}
     keep_apart(ctx, besides)
-    outputs = place.outputs(ctx, as_json=general.as_json)
+    outputs = place.outputs(as_json=general.as_json)
     asserts = place.assertions()
     start = time.perf_counter()
     with general.console() as console:
@@ -94,7 +95,7 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
             streamed_sog.check_scenes(ctx, scenes)
             keep_apart(ctx, {**besides, "indices_out": outputs.index_files(path.numbers, len(instances))})
 
-        console.announce_compiling("traverse")
+        console.announce_compiling()
         screen = outputs.table.on_stdout and is_terminal(sys.stdout)
         files_viewed = ViewedFiles(
             instances, where.camera_source(), where.settings(), lod.precision, general.threads, console.progress
@@ -125,7 +126,7 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
                 f"warning: only {written.in_front:.1%} of the splats lie in front of the cameras; path and scene may"
                 " not share their axes (--camera-axes, --world-transform, --up)"
             )
-        on_stdout = place.summary_on_stdout(ctx, as_json=general.as_json)
+        on_stdout = place.summary_on_stdout(as_json=general.as_json)
         ctx.exit(_report(console, traversed, place.summary, as_json=general.as_json, on_stdout=on_stdout))
 
 
@@ -145,7 +146,7 @@ def _report(console: Console, traversed: Traversed, summary: bool | None, *, as_
     if as_json:
         held = [{"assert": each.assertion.text, "held": each.held, "value": each.value} for each in outcomes]
         click.echo(json.dumps(whole.as_dict() | {"asserts": held}, allow_nan=False))
-    if on_stdout:
+    if on_stdout and summary is not False:
         click.echo("\n".join(lines(whole)))
     elif summary or (summary is None and is_terminal(sys.stderr)):
         for line in lines(whole):

@@ -1,4 +1,4 @@
-"""`sparklod view`: a page that shows splat files in Spark."""
+"""`sparklod view`: a page that shows splat files in Spark, or in PlayCanvas."""
 
 from __future__ import annotations
 
@@ -28,6 +28,7 @@ EXAMPLES = """
 \b
 Examples:
   sparklod view scene-lod.rad
+  sparklod view web/lod-meta.json                         # in PlayCanvas
   sparklod view scene-lod.spz --look-at 0,-1,4:0,0,0 --budget 500k
   sparklod view quick-lod.spz quality-lod.spz             # both, with a box for each
   sparklod view scene-lod.rad --camera-path path.json
@@ -50,14 +51,15 @@ Examples:
 )
 @click.pass_context
 def view(ctx: click.Context, /, files: tuple[Path, ...], **_: Any) -> None:
-    """Show splat files in Spark, in a browser.
+    """Show splat files in Spark or PlayCanvas, in a browser.
 
     Serves a page and the files that it shows, prints its address and opens it in a browser, until Ctrl-C ends it. The
-    page has a slider for the budget, colours by level, and what Spark draws and how fast; it copies the camera as
+    page has a slider for the budget, colours by level, and what is drawn and how fast; it copies the camera as
     --look-at, and plays camera paths that are dropped onto it.
 
-    Trees in RAD files are streamed, chunk by chunk, as a viewer on the web streams them. Spark and three.js come from a
-    CDN unless --spark-dir names a folder that has them.
+    Trees in RAD files are streamed, chunk by chunk, as a viewer on the web streams them. Streamed SOG is shown in
+    PlayCanvas, everything else in Spark; both, and three.js, come from a CDN unless --spark-dir names a folder that
+    has them.
     """
     general, page, place = options_of(ctx, General), options_of(ctx, Page), options_of(ctx, Place)
     keep_apart(ctx)

@@ -16,7 +16,7 @@ EXAMPLES = """
 \b
 Examples:
   sparklod warmup                                  # once, after pip install
-  RUN pip install sparklod && sparklod warmup      # in a Dockerfile
+  RUN pip install ./sparklod && sparklod warmup    # in a Dockerfile
   NUMBA_CACHE_DIR=.cache/numba sparklod warmup     # in CI, with that folder cached
 """
 
@@ -44,10 +44,10 @@ def warmup(jobs: int, as_json: bool, quiet: bool, verbose: bool) -> None:
     """
     with Console(quiet=quiet, verbose=verbose) as console:
         from ..support import jit
-        from ..warmup import JOBS, missing, warm_up
+        from ..warmup import missing, warm_up
 
-        for name in sorted(missing(JOBS)):
-            console.detail(f"  {name} must be compiled")
+        for unit in missing():
+            console.detail(f"  {unit.name} must be compiled")
         start = time.perf_counter()
         compiled = warm_up(processes=jobs, progress=console.progress)
         seconds = time.perf_counter() - start

@@ -31,7 +31,7 @@ def load_matplotlib() -> ModuleType:
     Raises:
         SparklodError: it is not installed.
     """
-    with optional_import("charts are drawn by matplotlib", "sparklod[render]"):
+    with optional_import("charts are drawn by matplotlib", "render"):
         import matplotlib
         import matplotlib.backends.backend_agg
         import matplotlib.figure

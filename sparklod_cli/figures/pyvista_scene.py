@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from ..model.splats import FloatArray, Splats
 from ..support.errors import SparklodError
 from ..support.optional import optional_import
+from ..support.python_process import program_command
 from .ellipsoids import Points, ellipsoids, rotation, sphere
 from .viewpoint import Viewpoint
 
@@ -60,10 +61,10 @@ def load_pyvista() -> ModuleType:
     if sys.platform == "linux" and not os.environ.get("DISPLAY"):
         # Without this VTK warns, and falls back to EGL only where the libraries of X are installed.
         os.environ.setdefault("VTK_DEFAULT_OPENGL_WINDOW", "vtkEGLRenderWindow")
-    with optional_import("pictures are drawn by pyvista", "sparklod[render]"):
+    with optional_import("pictures are drawn by pyvista", "render"):
         import pyvista
     try:
-        subprocess.run([sys.executable, "-c", PROBE], check=True, capture_output=True, timeout=60)
+        subprocess.run(program_command(PROBE), check=True, capture_output=True, timeout=60)
     except (OSError, subprocess.SubprocessError):
         libraries = "libegl1 libgl1-mesa-dri"
         raise SparklodError(

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..cameras.frame import direction_of
 from ..images.text import BACKGROUND
 from ..lod.kernels.tree_links import find_depths
 from ..model.gaussian import spark_size
@@ -32,8 +33,8 @@ MOST_CELLS, MOST_LINES = 150, 48
 #: Most chunks whose boxes are drawn.
 MOST_CHUNKS = 16
 
-#: Viewing direction, from the front, the right and above, and the up axis: y points down in scenes of 3DGS.
-DIRECTION, UP = np.array([-0.62, 0.5, -1.0]), np.array([0.0, -1.0, 0.0])
+#: Viewing direction, from the back, the right and above: how far it goes to the right, up, and to the front.
+DIRECTION = -0.62, -0.5, 1.0
 
 #: Left, top, right and bottom of the scene in the picture, 0..1; title, labels and colour scale are around it.
 FRAME = (0.09, 0.2, 0.85, 0.93)
@@ -94,7 +95,8 @@ def plot(scene: Scene, *, by: str = "level", depth: int | None = None, size: tup
     coloring = color_by(by, splats, subject.index, subject.depths)
     chosen = splats.take(subject.index)
     low, high = bounds(splats.take(drawable))
-    eye = viewpoint(box_lines(low[None], high[None]), DIRECTION, UP, aspect=size[0] / size[1], frame=FRAME)
+    up = np.array(direction_of(scene.up))
+    eye = viewpoint(box_lines(low[None], high[None]), _direction(up), up, aspect=size[0] / size[1], frame=FRAME)
     with Stage(low, high, size, BACKGROUND) as stage:
         drawn = stage.splats(chosen, coloring.rgb, eye)
         if len(subject.index) < subject.total:
@@ -108,6 +110,12 @@ def plot(scene: Scene, *, by: str = "level", depth: int | None = None, size: tup
     lines = [line for line in (drawn, voxels, boxes) if line]
     png = write_png(pixels, subject.title, lines, coloring, eye, low, high)
     return Picture(png, "; ".join([subject.title, f"coloured by {coloring.title}", *lines]))
+
+
+def _direction(up: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(3,) viewing direction `DIRECTION` in a world where `up`, (3,) an axis, is up."""
+    right = np.array([0.0, 1.0, 0.0] if up[0] else [1.0, 0.0, 0.0])
+    return np.array(DIRECTION) @ np.stack([right, up, np.cross(right, up)])
 
 
 def _subject(scene: Scene, depth: int | None, drawable: NDArray[np.bool_]) -> _Subject:

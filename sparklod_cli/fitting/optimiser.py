@@ -49,7 +49,8 @@ class Optimiser:
         found = drawing.gradients(by_image)
         terms = nodes.columns.sh.shape[1]
         rgb, sh = gradients.by_sh(shaded.center, camera.position, terms, shaded.rgb, found.rgb)
-        columns = adam.Gradients(found.center, found.log_scale, found.turn, found.lod_opacity, rgb, sh)
+        derivatives = found.center, found.log_scale, found.turn, found.lod_opacity, rgb, sh
+        columns = adam.Gradients(*map(np.ascontiguousarray, derivatives))
         rates = adam.Rates(*map(np.float32, rates))
         precision = np.float32((USUAL_ERROR / error) ** 2)
         adam.step(nodes.columns, nodes.old, seen, self._slots, columns, rates, self._moments, precision)

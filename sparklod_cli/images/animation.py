@@ -47,7 +47,7 @@ def load_imageio(form: str) -> ModuleType:
     Raises:
         SparklodError: it is not installed.
     """
-    with optional_import(f".{form} is written by imageio", "sparklod[video]"):
+    with optional_import(f".{form} is written by imageio", "video"):
         import imageio.v2
         import imageio_ffmpeg
 

@@ -89,7 +89,7 @@ class Blocks:
         starts: the indices of the first splats.
         tree: of all splats, where it is in memory.
         sound: no splat can be invalid, so that whoever looks for those needs no more columns.
-        antialiased, format, notes, header, chunk_bytes: as in `Scene`.
+        antialiased, up, format, notes, header, chunk_bytes: as in `Scene`.
         coded: the codes of a sound file, which tell more in less time than what they are decoded to.
     """
 
@@ -102,6 +102,7 @@ class Blocks:
     tree: LodTree | None = None
     sound: bool = False
     antialiased: bool = False
+    up: str | None = None
     format: str = ""
     notes: tuple[str, ...] = ()
     header: Mapping[str, int] = field(default_factory=dict)
@@ -118,7 +119,7 @@ class Blocks:
             rows = Splats(**{name: getattr(scene.splats, name)[part] for name in COLUMNS})
             return Block(start, rows, None if tree is None else LodTree(tree.child_count[part], tree.child_start[part]))
 
-        about = scene.antialiased, scene.format, scene.notes, scene.header, scene.chunk_bytes
+        about = scene.antialiased, scene.up, scene.format, scene.notes, scene.header, scene.chunk_bytes
         return cls._in_memory(count, scene.splats.sh_degree, at, step, scene.tree, False, *about)
 
     @classmethod
@@ -130,7 +131,7 @@ class Blocks:
             rows = coded.decode(slice(start, start + CHUNK_NODES), columns)
             return Block(start, *rows, coded.sound, known)
 
-        about = coded.antialiased, coded.format, coded.notes, coded.header
+        about = coded.antialiased, coded.up, coded.format, coded.notes, coded.header
         found = cls._in_memory(coded.count, coded.sh_degree, at, CHUNK_NODES, coded.tree, coded.sound, *about)
         return replace(found, coded=known)
 
@@ -179,9 +180,10 @@ class Blocks:
             (),
             None,
             False,
-            header.antialiased,
+            header.noted.antialiased,
+            header.noted.up,
             file.format,
-            (),
+            header.noted.problems,
             file.about,
             file.chunk_bytes,
         )

@@ -40,7 +40,7 @@ CODES: dict[str, tuple[str, str]] = {
     "values.invisible": (WARNING, "many splats (leaves of a tree) have opacity 0 or scale 0 and cannot be drawn"),
     "values.scale-clamped": (
         WARNING,
-        "scales of many splats (leaves of a tree) lie at an end of the range of the format",
+        "splats (leaves of a tree) are as small as the range of the format allows, more than 0.1 %, or one is as large",
     ),
     "values.center-clamped": (ERROR, "centres lie at the end of the range of the format"),
     "values.center-far": (WARNING, "centres lie farther out than the float16 of viewers can hold"),

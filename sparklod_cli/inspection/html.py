@@ -186,6 +186,8 @@ def _figures(report: Mapping[str, Any]) -> str:
         cards.append(("SH degree", number_text(report["sh_degree"]), ""))
     if report.get("antialiased") is not None:
         cards.append(("Antialiased", "yes" if report["antialiased"] else "no", ""))
+    if report.get("up") is not None:
+        cards.append(("Up", text_of(report["up"]), "axis that points up"))
     cards += [(title, number_text(header[name]), "") for name, title in HEADER.items() if name in header]
     items = []
     for title, value, small in cards:

@@ -12,11 +12,14 @@ from numpy.typing import NDArray
 
 from ..codecs import coverage
 from ..codecs.octahedral import STEPS_8_8_8, encode_axis_angle, encode_lod_alpha
+from ..codecs.rad.encoding import rounded
 from ..codecs.rad.encodings import CODINGS
 from ..codecs.rad.layout import PROPERTIES, Row
 from ..codecs.sh_bits import ALL_BITS, ShBytes, enough
 from ..codecs.spz_layout import LOD, Layout
 from ..codecs.spz_values import to_code
+from ..codecs.statistics import Statistics
+from ..codecs.steps import fine_bits
 from ..model.scene import Scene
 from ..model.sh import COEFFICIENTS
 from ..model.splats import FloatArray, Splats
@@ -71,6 +74,25 @@ class Coding:
     degrees: float
 
 
+def codings_of(scene: Scene, leaves: Splats, original: Splats, facts: RadFacts | None) -> Iterator[Coding | str]:
+    """Yield the codings in which a writer may have put leaves, the most likely first; or why there is none.
+
+    Args:
+        scene: the tree.
+        leaves: of the tree.
+        original: the splats that may have become the leaves.
+        facts: of the RAD file that the tree is from; None for SPZ.
+    """
+    if facts is None:
+        yield from (of_spz(scene, leaves, covering=covering) for covering in (True, False))
+        return
+    # RAD does not store to how many bits centres were rounded. By default the scales decide; else the leaves tell.
+    scales, bits = Statistics.of_leaves(original, {"leaf_scale"}).leaf_scale, _fractional_bits(leaves.center)
+    assert scales is not None
+    for guess, covering in ((fine_bits(scales), True), (bits, True), (bits, False)):
+        yield of_rad(facts, leaves, guess, covering=covering)
+
+
 def of_spz(scene: Scene, leaves: Splats, *, covering: bool) -> Coding:
     """The coding of an SPZ file that a scene was read from.
 
@@ -103,12 +125,13 @@ def of_spz(scene: Scene, leaves: Splats, *, covering: bool) -> Coding:
     return Coding(encode, steps, DEGREES[3 if version == 2 else 4])
 
 
-def of_rad(facts: RadFacts, leaves: Splats, *, covering: bool) -> Coding | str:
+def of_rad(facts: RadFacts, leaves: Splats, rounded_to: int | None, *, covering: bool) -> Coding | str:
     """The coding of a RAD file; or why there is none. A palette of SH, whose entries stand for many, is left out.
 
     Args:
         facts: of the file.
-        leaves: its leaves, whose centres may have been rounded to multiples of a power of two.
+        leaves: its leaves.
+        rounded_to: bits after the binary point to which its writer rounded centres; None for not at all.
         covering: as for SPZ.
     """
     mixed = [name for name, found in facts.properties.items() if "," in found.encoding]
@@ -134,7 +157,9 @@ def of_rad(facts: RadFacts, leaves: Splats, *, covering: bool) -> Coding | str:
                 yield _rad_codes(splats, row, found, name)
 
     def encode(splats: Splats) -> Coded:
-        splats = _covering(splats, facts, bits) if covering else splats
+        splats = _covering(splats, facts, rounded_to) if covering else splats
+        if rounded_to is not None:
+            splats = dataclasses.replace(splats, center=rounded(splats.center, rounded_to))
         numbers = np.concatenate(list(numbers_of(splats)), axis=1)
         axis = np.stack(encode_axis_angle(splats.quat_xyzw, STEPS_8_8_8), axis=1)
         parts = [np.ascontiguousarray(each).view(np.uint8).reshape(len(splats), -1) for each in (numbers, axis)]
@@ -160,9 +185,9 @@ def _covering(splats: Splats, facts: RadFacts, bits: int | None) -> Splats:
     found = facts.properties.get("scales")
     if found is None:
         return splats
-    rounded = CODINGS[found.encoding].rounded(splats.scale, found.min or 0.0, found.max or 0.0)
+    scale = CODINGS[found.encoding].rounded(splats.scale, found.min or 0.0, found.max or 0.0)
     blur = 0.0 if bits is None else 2.0**-bits
-    return dataclasses.replace(splats, opacity=coverage.kept(splats.opacity, splats.scale, rounded, blur))
+    return dataclasses.replace(splats, opacity=coverage.kept(splats.opacity, splats.scale, scale, blur))
 
 
 def _rad_codes(splats: Splats, row: Row, found: PropertyFacts, encoding: str) -> NDArray[np.int32]:

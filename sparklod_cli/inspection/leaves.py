@@ -10,7 +10,7 @@ from ..model.selection import Selection
 from ..support.errors import InvalidSplatsError
 from ..support.units import count_of
 from .findings import Finding
-from .leaf_codes import Coded, Coding, of_rad, of_spz
+from .leaf_codes import Coded, Coding, codings_of
 from .rad import RadFacts
 
 #: Most leaves, without an equal splat or one at the same place of the order, that are searched for nearby: searching
@@ -43,8 +43,7 @@ def check(scene: Scene, original: Scene, facts: RadFacts | None = None) -> list[
     if leaves.sh_degree != splats.sh_degree:
         return [Finding("expect.leaves", f"SH degree {leaves.sh_degree}, but the original has {splats.sh_degree}")]
     missing = None
-    for covering in (True, False):
-        coding = of_spz(scene, leaves, covering=covering) if facts is None else of_rad(facts, leaves, covering=covering)
+    for coding in codings_of(scene, leaves, splats, facts):
         if isinstance(coding, str):
             return [Finding("expect.leaves", coding)]
         unpaired = _unpaired(coding.encode(leaves), coding.encode(splats), coding)

@@ -121,7 +121,8 @@ def survey(path: Path, *, check: bool) -> Survey | None:
     if fatal:
         return Survey(None, None, findings_of(violations), fatal)
     facts = _facts(header, gathered)
-    head = Head(name_of(header), facts.bytes, header.count, header.max_sh, header.antialiased)
+    noted = header.noted
+    head = Head(name_of(header), facts.bytes, header.count, header.max_sh, noted.antialiased, noted.up)
     return Survey(head, facts, findings_of(violations), [])
 
 

@@ -83,6 +83,7 @@ class Report:
         format: name for display; None if the file could not be read.
         splats: number of splats, or nodes of a tree.
         sh_degree, antialiased: of the splats.
+        up: the axis that the file says points up: "y", "-z"; None where it does not say.
         header: fields of the header, which depend on the format.
         bytes_per_splat: size over splats.
         compression_ratio: size of the decoded splats, as 4-byte floats, over that of the file.
@@ -101,6 +102,7 @@ class Report:
     splats: int | None = None
     sh_degree: int | None = None
     antialiased: bool | None = None
+    up: str | None = None
     header: dict[str, int] = dataclasses.field(default_factory=dict)
     bytes_per_splat: float | None = None
     compression_ratio: float | None = None
@@ -212,6 +214,7 @@ def _of_headers(path: Path, surveyed: Surveyed) -> Report:
         head.splats,
         head.sh_degree,
         head.antialiased,
+        head.up,
         bytes_per_splat=_bytes_per_splat(head.bytes, head.splats),
         compression_ratio=_compression_ratio(head.bytes, head.splats, head.sh_degree),
         **_facts_of(surveyed),
@@ -294,6 +297,7 @@ def _of_blocks(
         splats=blocks.count,
         sh_degree=blocks.sh_degree,
         antialiased=blocks.antialiased,
+        up=blocks.up,
         header=dict(blocks.header),
         bytes_per_splat=_bytes_per_splat(size, blocks.count),
         compression_ratio=_compression_ratio(size, blocks.count, blocks.sh_degree),

@@ -152,7 +152,7 @@ def _head(manifest: Manifest, chunks: Mapping[str, Chunk], facts: StreamedSogFac
         count += chunks[manifest.environment].count
     degree = max((chunk.sh_degree for chunk in read), default=0)
     antialiased = any(chunk.antialiased for chunk in read)
-    return Head(f"{FORMAT} {VERSION}", facts.bytes, count, degree, antialiased)
+    return Head(f"{FORMAT} {VERSION}", facts.bytes, count, degree, antialiased, manifest.noted.up)
 
 
 def _names_of(manifest: Manifest, level: int) -> list[str]:

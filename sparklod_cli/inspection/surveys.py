@@ -13,7 +13,7 @@ class Head:
         format: name for display.
         bytes: of all files together.
         splats: as reading it gives; nodes of a tree.
-        sh_degree, antialiased: of the splats.
+        sh_degree, antialiased, up: of the splats.
     """
 
     format: str
@@ -21,3 +21,4 @@ class Head:
     splats: int
     sh_degree: int
     antialiased: bool
+    up: str | None

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from ..codecs import quantize
+from ..codecs import clamps, quantize
 from ..model.scene import Scene
 from ..model.splats import COLUMNS
 from .blocks import Block, Blocks, Tally, largest
@@ -26,9 +26,8 @@ OF_INVALID = {
 #: Columns of `Splats` that are looked at besides those that make a splat invalid.
 USED = ("center", "scale", "opacity")
 
-#: Shares of splats above which clamped scales and invisible splats are findings: a few of either are the rounding of
-#: good files.
-MANY_CLAMPED, MANY_INVISIBLE = 0.01, 0.1
+#: Share of splats above which invisible ones are a finding: a few are the rounding of good files.
+MANY_INVISIBLE = 0.1
 
 #: Coordinates from this on become infinite in float16, which Spark's PackedSplats use.
 FLOAT16_END = 65_520
@@ -79,7 +78,6 @@ class ValueChecks:
         count: splats so far.
         checked: of them, those of which few may be invisible or clamped: the leaves of a tree, or all.
         invisible: of these, valid or not.
-        small: of them, those whose scale is at the lower end.
         tallies: by what is wrong.
     """
 
@@ -88,7 +86,6 @@ class ValueChecks:
     count: int = 0
     checked: int = 0
     invisible: int = 0
-    small: int = 0
     tallies: dict[str, Tally] = field(default_factory=dict)
 
     def _add(self, what: str, mask: NDArray[np.bool_], block: Block) -> None:
@@ -105,7 +102,6 @@ class ValueChecks:
         self.count += part.count
         self.checked += part.checked
         self.invisible += part.invisible
-        self.small += part.small
         for what, tally in part.tallies.items():
             self.tallies.setdefault(what, Tally()).merge(tally)
 
@@ -129,10 +125,9 @@ class ValueChecks:
         self._add("invisible", valid & invisible, block)
         self._add("center", valid & (furthest >= self.ends.center), block)
         low, high = self.ends.scale
-        if high < math.inf:  # a smallest scale that was clamped is not visible
-            small = some & (most > 0) & (most <= low)
-            self.small += int(np.count_nonzero(small & valid))
-            self._add("scale", small | (some & (most >= high)), block)
+        if high < math.inf:  # see `clamps.tally` for what of it can be seen
+            self._add("small", some & valid & (most > 0) & (most <= low), block)
+            self._add("large", some & valid & (most >= high), block)
         self._add("far", valid & (furthest >= FLOAT16_END), block)
 
     def findings(self) -> list[Finding]:
@@ -154,13 +149,12 @@ class ValueChecks:
         if self.ends.center < math.inf:
             text = f"a coordinate is {self.ends.center:g}, the end of the range of its code"
             report("values.center-clamped", "center", text)
-        if "scale" in self.tallies and self.tallies["scale"].count > MANY_CLAMPED * self.checked:
-            low, high = self.ends.scale
-            small = 2 * self.small > self.tallies["scale"].count
-            text = (
-                f"a scale is {low:.2g} or {high:.0f}, the ends of the range of its code; baking with"
-                f" --scale {100 if small else 0.01} or --format rad keeps such scales"
-            )
-            report("values.scale-clamped", "scale", text)
+        for what, end in zip(("small", "large"), self.ends.scale, strict=True):
+            visible = self.tallies.get(what, Tally()).count
+            if clamps.matters("scale", above=what == "large", visible=visible, leaves=self.checked):
+                text = (
+                    f"a scale is {end:.2g}, the end of the range of its code; RAD with --rad-scales ln_f16 keeps such"
+                )
+                report("values.scale-clamped", what, text)
         report("values.center-far", "far", f"a coordinate is {FLOAT16_END:,} or more, which float16 cannot hold")
         return found

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from .beside import companions
     from .chunks import read_rad_chunk, read_rad_header
     from .details import detail_files, detail_sink
-    from .identity import Identity, content_of, files_of, identity_of
+    from .identity import Identity, content_of, files_of, identity_of, stamp_of
     from .level_files import LevelFiles, has_levels, read_level_files
     from .names import is_file_name
     from .rad_file import RadFile
@@ -36,7 +36,7 @@ _NAMES = {
     "io.beside": ("companions",),
     "io.chunks": ("read_rad_chunk", "read_rad_header"),
     "io.details": ("detail_files", "detail_sink"),
-    "io.identity": ("Identity", "content_of", "files_of", "identity_of"),
+    "io.identity": ("Identity", "content_of", "files_of", "identity_of", "stamp_of"),
     "io.level_files": ("LevelFiles", "has_levels", "read_level_files"),
     "io.names": ("is_file_name",),
     "io.rad_file": ("RadFile",),
@@ -91,6 +91,7 @@ __all__ = [
     "sink",
     "sink_together",
     "size_of_input",
+    "stamp_of",
     "write_stdout",
     "write_together",
     "write_whole",

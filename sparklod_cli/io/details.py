@@ -11,8 +11,8 @@ from pathlib import Path
 from ..codecs.sog.files import MAX_META, names_beside
 from ..codecs.sog.names import META
 from ..codecs.streamed_sog.manifest import MAX_MANIFEST, parse
-from ..codecs.streamed_sog.names import chunk_name, folders_of, is_folder, is_ours
-from ..support import atomic_set
+from ..codecs.streamed_sog.names import chunk_name, folders_of, is_folder, is_named, is_ours
+from ..support import atomic_set, folders
 from ..support.addresses import Address, Place
 from ..support.errors import FormatError, OutputError
 from .names import reason_of
@@ -76,13 +76,13 @@ def _write(path: Place, files: Files, *, overwrite: bool) -> int:
     if isinstance(target, Address):
         return send_together(target, placed(), former=[target.parent / name for name in former], overwrite=overwrite)
     try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        return atomic_set.write(
-            target.parent,
-            placed(),
-            overwrite=overwrite,
-            outdated=lambda names: [name for name in former if name not in names],
-        )
+        with folders.created(target.parent):
+            return atomic_set.write(
+                target.parent,
+                placed(),
+                overwrite=overwrite,
+                outdated=lambda names: [name for name in former if name not in names],
+            )
     except FileExistsError as error:
         taken = Path(error.filename or target)
         if taken.exists() and not taken.is_file():
@@ -121,7 +121,7 @@ def _former(target: Place) -> list[str]:
         metas = parse(_content(target, MAX_MANIFEST)).names()
         for meta in metas:
             folder = target.parent / meta.partition("/")[0]
-            if is_ours(meta) and meta.endswith("/" + META) and not (isinstance(folder, Path) and folder.is_symlink()):
+            if is_named(meta) and not (isinstance(folder, Path) and folder.is_symlink()):
                 found.append(meta)
                 with contextlib.suppress(OSError):
                     images = names_beside(_content(target.parent / meta, MAX_META))

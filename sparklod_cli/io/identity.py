@@ -13,7 +13,7 @@ from ..support.addresses import Address, Place
 from ..support.errors import UnreadableError
 from ..support.stdin import DASH, name_of, spooled
 from .beside import companions
-from .names import reason_of
+from .names import reason_unreadable
 
 #: Places of a file that are looked at, and bytes at each: 4 MB of a large one, which takes milliseconds. Chosen.
 PLACES, PLACE_BYTES = 64, 1 << 16
@@ -75,6 +75,19 @@ def identity_of(path: Place) -> Identity:
     return Identity(name_of(path), size, modified, digest.hexdigest())
 
 
+def stamp_of(path: Place) -> str:
+    """Size and date of a file, or its version at an address: what changes when it is written, without reading it.
+
+    Raises:
+        UnreadableError: there is no such file.
+    """
+    with _readable():
+        if isinstance(path, Address):
+            return path.version()
+        found = path.stat()
+        return f"{found.st_size} {found.st_mtime_ns}"
+
+
 def content_of(path: Place) -> str:
     """A digest of all of a file; - is standard input. Some 0.5 GB a second.
 
@@ -105,4 +118,4 @@ def _readable() -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise UnreadableError(f"cannot be read: {reason_of(error)}") from None
+        raise UnreadableError(f"cannot be read: {reason_unreadable(error)}") from None

@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+import itertools
 import os
-from pathlib import PurePath
+from pathlib import Path, PurePath
 
 from ..codecs.rad import names as rad_names
 from ..codecs.sog import names as sog_names
+from ..support.similar import near
+
+#: Names in a folder that are compared with one that is missing: more take longer than a person expects of an error.
+MOST_NAMES = 10_000
+
+#: How similar two names are that may be meant by one another, as `difflib` measures it: a letter or two differ.
+SIMILAR = 0.8
 
 
 def is_file_name(text: str) -> bool:
@@ -32,6 +40,20 @@ def number_of(name: str, header: str) -> int | None:
     if header.lower() == sog_names.META:
         return sog_names.number_of(name)
     return rad_names.number_of(name, PurePath(header).stem)
+
+
+def reason_unreadable(error: OSError) -> str:
+    """Return what the system says of an input that cannot be read, and a file of a similar name if it is missing."""
+    reason = reason_of(error)
+    if not isinstance(error, FileNotFoundError) or not isinstance(error.filename, (str, PurePath)):
+        return reason
+    folder, name = Path(error.filename).parent, Path(error.filename).name
+    try:
+        with os.scandir(folder) as entries:
+            names = [entry.name for entry in itertools.islice(entries, MOST_NAMES)]
+    except OSError:
+        return reason
+    return reason + near(name, names, cutoff=SIMILAR, folder=folder)
 
 
 def reason_of(error: OSError) -> str:

@@ -20,7 +20,7 @@ from ..support.errors import UnknownFormatError, UnreadableError
 from ..support.progress import Progress, silent
 from ..support.stdin import DASH, spooled
 from .beside import in_folder, open_beside
-from .names import reason_of
+from .names import reason_unreadable
 
 if TYPE_CHECKING:
     from ..codecs.gpu import dump
@@ -168,7 +168,7 @@ def readable() -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise UnreadableError(f"cannot be read: {reason_of(error)}") from None
+        raise UnreadableError(f"cannot be read: {reason_unreadable(error)}") from None
 
 
 def read_arrays(path: Path) -> dump.Arrays | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ..codecs.encoder import Encoder, Get
 from ..codecs.formats import Format
@@ -14,6 +15,9 @@ from ..support.addresses import Address, Place
 from ..support.progress import Progress, silent
 from .together import SinkTogether, sink_together
 from .writing import Sink, sink
+
+if TYPE_CHECKING:
+    from ..codecs.rad.repacking import PackedChunks
 
 
 @dataclass(frozen=True)
@@ -46,6 +50,17 @@ class SceneSink:
             files = codec.encode_files(scene, options, threads=threads, progress=progress)
             return self.together((name, (content,)) for name, content in files)
         return self.together(codec.encode_chunked(scene, options, self.stem, threads=threads, progress=progress))
+
+    def repack(self, chunks: PackedChunks) -> int:
+        """Write the chunks of a RAD file as they stand, and return how many bytes were written.
+
+        Raises:
+            OutputError: see `scene_sink`.
+        """
+        if self.whole is not None:
+            return self.whole(chunks.in_one_file())
+        assert self.together is not None
+        return self.together(chunks.in_files(self.stem))
 
     def assemble(self, encoder: Encoder, get: Get, *, threads: int = 1, progress: Progress = silent) -> int:
         """Writes a tree whose windows are encoded, and returns how many bytes it wrote.

@@ -8,7 +8,7 @@ from pathlib import Path
 from ..codecs import rgba
 from ..model.splats import FloatArray
 from ..support.errors import FormatError, UnreadableError
-from .names import reason_of
+from .names import reason_unreadable
 
 #: Bytes of a text that is read whole: instances, expectations, matrices. Parsed it may take thirty times as much.
 MAX_TEXT = 1 << 24
@@ -19,7 +19,7 @@ def read_text(path: Path) -> str:
     try:
         return str(_read_up_to(path, MAX_TEXT), "utf-8-sig")
     except (OSError, ValueError) as error:
-        reason = reason_of(error) if isinstance(error, OSError) else "it is not text"
+        reason = reason_unreadable(error) if isinstance(error, OSError) else "it is not text"
         raise UnreadableError(f"{path} cannot be read: {reason}") from None
 
 
@@ -47,7 +47,7 @@ def read_together(path: Path, sets: Collection[Collection[str]], limit: int) -> 
             names = [path.name, *(name for name in others if name != path.name and (folder / name).is_file())]
         return {name: _read_up_to(folder / name, limit) for name in names}
     except OSError as error:
-        raise UnreadableError(f"{path} cannot be read: {reason_of(error)}") from None
+        raise UnreadableError(f"{path} cannot be read: {reason_unreadable(error)}") from None
 
 
 def read_rgba(path: Path, count: int, rows: slice | None = None) -> FloatArray:
@@ -62,7 +62,7 @@ def read_rgba(path: Path, count: int, rows: slice | None = None) -> FloatArray:
         with path.open("rb") as file:
             return rgba.decode(file, count, rows)
     except OSError as error:
-        raise FormatError(f"{path} cannot be read: {reason_of(error)}") from None
+        raise FormatError(f"{path} cannot be read: {reason_unreadable(error)}") from None
     except FormatError as error:
         raise type(error)(f"{path} {error}") from None
 

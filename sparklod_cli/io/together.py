@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from ..support import atomic_set
+from ..support import atomic_set, folders
 from ..support.addresses import Address, Place
 from ..support.errors import OutputError
 from ..support.stdin import DASH
@@ -57,13 +57,13 @@ def write_together(path: Place, files: Files, *, overwrite: bool) -> int:
     target = Path(os.path.realpath(path))
     placed = ((target.name if number_of(name, target.name) is None else name, pieces) for name, pieces in files)
     try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        return atomic_set.write(
-            target.parent,
-            placed,
-            overwrite=overwrite,
-            outdated=lambda names: (each.name for each in chunk_files(target) if each.name not in names),
-        )
+        with folders.created(target.parent):
+            return atomic_set.write(
+                target.parent,
+                placed,
+                overwrite=overwrite,
+                outdated=lambda names: (each.name for each in chunk_files(target) if each.name not in names),
+            )
     except FileExistsError as error:
         raise _taken(Path(error.filename or path)) from None
     except OSError as error:

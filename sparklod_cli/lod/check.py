@@ -7,12 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..model.selection import EXAMINED, Selection
-from ..model.splats import COLUMNS, UNIT_TOLERANCE, Splats, describe_invalid
+from ..codecs.sound import check_valid, is_valid_and_visible
+from ..model.selection import Selection
+from ..model.splats import Splats
 from ..support.errors import InvalidSplatsError
 from ..support.jit import threads_for
-from ..support.parallel import blocks_of, ordered_map
-from .kernels.drawable import count_doubtful
 from .kernels.geometry import find_bounds
 
 
@@ -37,23 +36,10 @@ def check_setting(name: str, value: float, least: float, most: float) -> None:
         raise ValueError(f"{name} {value} is not within {least} to {most}")
 
 
-def all_drawable(splats: Splats, threads: int) -> bool:
-    """Whether splats are valid and visible beyond doubt; where not, `Splats.invalid` and `Selection` tell.
-
-    Rounding differs from theirs, so a rotation has to be nearer to a unit one.
-    """
-    tolerance = np.float32(UNIT_TOLERANCE / 2)
-
-    def is_drawable(part: slice) -> bool:
-        columns = (getattr(splats, name)[part].reshape(-1) for name in COLUMNS)
-        return int(count_doubtful(*columns, tolerance)) == 0
-
-    return all(list(ordered_map(is_drawable, blocks_of(len(splats), EXAMINED), threads)))
-
-
 def select(selection: Selection, splats: Splats, threads: int) -> tuple[Splats, dict[str, int]]:
     """`Selection.apply`, which takes longer where nothing is to be dropped."""
-    if len(splats) and replace(selection, drop_invalid=False) == Selection() and all_drawable(splats, threads):
+    drops_nothing = len(splats) and replace(selection, drop_invalid=False) == Selection()
+    if drops_nothing and all(is_valid_and_visible(splats, threads)):
         return splats, {}
     return selection.apply(splats, threads=threads)
 
@@ -67,8 +53,7 @@ def check(splats: Splats) -> Bounds:
     if len(splats) == 0:
         raise InvalidSplatsError("no splat is left to build a tree of")
     with threads_for(len(splats)) as threads:
-        if not all_drawable(splats, threads) and (invalid := splats.invalid()):
-            raise InvalidSplatsError(f"{describe_invalid(invalid)}: see Selection.apply")
+        check_valid(splats, threads)
         low, high, smallest, largest = find_bounds(splats.center, splats.scale, threads)
     check_visible(smallest, float(splats.opacity.min()))
     return Bounds(low, high, smallest, largest)

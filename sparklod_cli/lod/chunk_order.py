@@ -24,7 +24,7 @@ from ..support.progress import Progress, silent
 from .chunk_parts import Index, parts_of
 from .families import families_of, placed, taken
 from .foveation import set_foveation
-from .kernels.chunk_demand import fill_demand
+from .kernels.chunk_demand import DEMAND_BYTES, LANES, fill_demand
 from .kernels.chunk_inside import sort_within_chunks
 from .kernels.chunk_sets import Families, split_sets
 from .kernels.family_links import find_limits
@@ -50,9 +50,11 @@ LEAST_BUDGET = 1 / 16
 #: Bases of the Halton sequences that viewpoints are made of.
 PRIMES = (2, 3, 5, 7, 11, 13, 17)
 
-#: Families that a bake out of core puts in order at a time, and the bytes that each takes on two threads. Chosen: 1.3
-#: GB, for the families of some 15 million splats.
-MOST_FAMILIES, FAMILY_BYTES = 1 << 22, 300
+#: Families that a bake out of core puts in order at a time: those of some 15 million splats. Chosen: 0.7 GB.
+MOST_FAMILIES = 1 << 22
+
+#: Bytes that a family takes while it is put in order, without those that each thread takes. Measured.
+FAMILY_BYTES = 124
 
 Matrix = NDArray[np.float64]
 
@@ -102,7 +104,7 @@ def family_order(
         count: (F,) number of its children.
         center: (F, 3) its centre, world units.
         size: (F,) its feature size, world units.
-        most: how many families are put in order at a time, each of which takes `FAMILY_BYTES`; None for all. Parts, see
+        most: how many families are put in order at a time, see `family_bytes`; None for all. Parts, see
             `chunk_parts.parts_of`, are each put in order as if they were a tree, one after the other.
         progress: called with the number of nodes that have a chunk.
 
@@ -121,6 +123,11 @@ def family_order(
             found.append(members[largest[_sequence(families, filled, total, progress)]])
         filled += int(families.count.sum(dtype=np.int64))
     return np.concatenate(found)
+
+
+def family_bytes(threads: int) -> int:
+    """Return the bytes that each of the families takes that are put in order at a time."""
+    return FAMILY_BYTES + DEMAND_BYTES * min(threads, VIEWPOINTS // LANES)
 
 
 def _part(parent: Index, members: Index) -> Index:
@@ -147,26 +154,35 @@ def _families(
     threads: int,
 ) -> Families:
     """The families in an order."""
-    place = np.empty(len(order), np.int32)
-    place[order] = np.arange(len(order), dtype=np.int32)
-    above = parent[order]
-    parent = np.where(above < 0, np.int32(-1), place[above])
-    centers, counts = center[order], count[order]
-    rank = np.empty((len(order), 3), np.int32)
-    for axis in range(3):
-        bits = centers[:, axis].view(np.uint32)
-        ordered = np.where(bits >> 31, ~bits, bits | np.uint32(1 << 31))  # in the order of the numbers
-        _, by_place = sort_by_key(ordered.astype(np.uint64), np.arange(len(order), dtype=np.uint32), 32, threads)
-        rank[by_place, axis] = np.arange(len(order), dtype=np.int32)
     records = np.empty(len(order), NODE)
-    records["x"], records["y"], records["z"] = centers.T
-    records["size"], records["child_count"] = size[order], counts
+    records["x"], records["y"], records["z"] = center[order].T
+    records["size"], records["child_count"] = size[order], count[order]
     records["child_start"] = 0  # not read
+    parent, rank, views = _parents_in(order, parent), _ranks_in(order, center, threads), viewpoints(center[order])
     demand = np.empty((len(order), VIEWPOINTS), np.uint8)
     total = 1 + int(count.sum(dtype=np.int64))
     least = min(total * LEAST_BUDGET, float(CHUNK_NODES))
-    fill_demand(records, parent, viewpoints(centers), least, float(total), demand)
-    return Families(parent, counts.astype(np.int32), rank, demand)
+    fill_demand(records, parent, views, least, float(total), demand)
+    return Families(parent, count[order].astype(np.int32), rank, demand)
+
+
+def _parents_in(order: NDArray[np.uint32], parent: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Return the (F,) place of each family's parent, -1 without one, where families are in an order."""
+    place = np.empty(len(order), np.int32)
+    place[order] = np.arange(len(order), dtype=np.int32)
+    above = parent[order]
+    return np.where(above < 0, np.int32(-1), place[above])
+
+
+def _ranks_in(order: NDArray[np.uint32], center: FloatArray, threads: int) -> NDArray[np.int32]:
+    """Return the (F, 3) ranks of the centres along each axis, where families are in an order."""
+    rank = np.empty((len(order), 3), np.int32)
+    for axis in range(3):
+        bits = center[order, axis].view(np.uint32)
+        ordered = np.where(bits >> 31, ~bits, bits | np.uint32(1 << 31))  # in the order of the numbers
+        _, by_place = sort_by_key(ordered.astype(np.uint64), np.arange(len(order), dtype=np.uint32), 32, threads)
+        rank[by_place, axis] = np.arange(len(order), dtype=np.int32)
+    return rank
 
 
 def _sequence(families: Families, filled: int, total: int, progress: Progress) -> Index:

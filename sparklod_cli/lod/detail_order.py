@@ -20,32 +20,40 @@ SIBLINGS = 15
 #: Weight of opacity beside each of red, green and blue, as pictures may have any background. Chosen.
 ALPHA_WEIGHT = 1.0
 
+#: Standard deviation of the logarithms of the leaves' sizes from which on their number counts in full. Those of trained
+#: scenes differ by 0.6 and more. Chosen.
+SIZES_DIFFER = 0.3
+
 #: Splats or pairs that are worked on at a time, so that their columns stay in the cache. Chosen.
 BLOCK = 1 << 14
 
 Column = NDArray[np.float64]
 
 
+@np.errstate(over="ignore", invalid="ignore")  # where splats are as large as numbers are
 def losses(nodes: Splats, tree: LodTree, parent: NDArray[np.int32]) -> Column:
     """(M,) float64 loss of each node if it is drawn instead of what is below it; no less than that of any node below.
 
-    The loss of a node is the root of its picture error, times its feature size, times its leaves. The picture error is
-    the squared difference between the picture of the node and that of its children, over red, green, blue and opacity,
-    on the planes of the three axes; like the size squared, an area. The number of leaves is what says how much detail
-    was here: where a scene has small splats close together, training put them there because pictures showed the need.
+    The loss of a node is the root of its picture error, times its feature size, times its leaves (to a power of at most
+    1). The picture error is the squared difference between the picture of the node and that of its children, over red,
+    green, blue and opacity, on the planes of the three axes; like the size squared, an area. The number of leaves is
+    what says how much detail was here: where a scene has small splats close together, training put them there because
+    pictures showed the need. Where all leaves have one size, as in a point cloud, it says nothing but how densely was
+    sampled: the power is 0.
 
     Args:
         nodes: M splats of a tree in final order.
         tree: of them.
         parent: (M,) of each node, -1 of the root.
     """
-    with np.errstate(over="ignore", invalid="ignore"):
-        size = spark_size(nodes).astype(np.float64)
-        loss = np.sqrt(picture_errors(with_plain_opacity(nodes), parent)) * size
+    size = spark_size(nodes).astype(np.float64)
+    loss = np.sqrt(picture_errors(with_plain_opacity(nodes), parent)) * size
+    logs = np.log(np.maximum(size[tree.is_leaf], np.finfo(np.float64).tiny))
+    power = min(1.0, float(logs.std()) / SIZES_DIFFER)
     leaves = tree.is_leaf.astype(np.float64)
     for family, starts, members in _families(tree):
         leaves[family] = np.add.reduceat(leaves[members], starts)
-        own = np.nan_to_num(loss[family], nan=0.0) * leaves[family]
+        own = np.nan_to_num(loss[family], nan=0.0) * leaves[family] ** power
         loss[family] = np.maximum(own, np.maximum.reduceat(loss[members], starts))
     return loss
 

@@ -85,7 +85,7 @@ class Forest:
         part = self.nodes[start : start + len(tree.size)]
         part["x"], part["y"], part["z"] = tree.center.T
         part["size"] = tree.size
-        part["child_start"] = tree.tree.child_start
+        part["child_start"] = tree.tree.first_child()
         part["child_count"] = tree.tree.child_count
 
     def __len__(self) -> int:

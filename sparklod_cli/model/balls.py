@@ -13,8 +13,12 @@ from .splats import Splats
 
 Matrix = NDArray[np.float64]
 
-#: Standard deviations out to which a splat counts: there an eighth of its opacity is left, exp(-2).
+#: Standard deviations out to which an opaque splat counts. There an opacity of an eighth is left, exp(-2); fainter
+#: splats count out to where as much is left of them.
 SEEN = 2.0
+
+#: Columns of `Splats` that `balls_of` reads.
+USED = ("center", "scale", "opacity")
 
 
 @dataclass(frozen=True)
@@ -54,7 +58,8 @@ def balls_of(splats: Splats, index: NDArray[Any] | slice, object_to_world: Matri
     """
     with np.errstate(all="ignore"):
         center = splats.center[index].astype(np.float64) @ object_to_world[:3, :3].T + object_to_world[:3, 3]
-        times = SEEN * float(np.cbrt(np.linalg.det(object_to_world[:3, :3])))
-        radius = times * splats.scale[index].max(axis=1, initial=0).astype(np.float64)
+        times = float(np.cbrt(np.linalg.det(object_to_world[:3, :3])))
+        seen = np.sqrt(np.clip(SEEN**2 + 2 * np.log(splats.opacity[index].astype(np.float64)), 0, SEEN**2))
+        radius = seen * times * splats.scale[index].max(axis=1, initial=0).astype(np.float64)
         finite = np.isfinite(center).all(axis=1) & np.isfinite(radius)
     return Balls(center[finite], radius[finite])

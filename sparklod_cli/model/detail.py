@@ -33,7 +33,7 @@ class DetailScene:
             to level; None where nobody measured it.
         environment: splats far outside, which are drawn whatever the levels are; None without.
         antialiased: trained with the opacity compensation of Mip-Splatting.
-        format, notes, header: as of `Scene`.
+        format, notes, header, up: as of `Scene`.
     """
 
     splats: Splats
@@ -46,6 +46,7 @@ class DetailScene:
     format: str = ""
     notes: tuple[str, ...] = ()
     header: Mapping[str, int] = field(default_factory=dict)
+    up: str | None = None
 
     def __post_init__(self) -> None:
         regions, levels = self.counts.shape
@@ -88,4 +89,4 @@ class DetailScene:
         splats = self.splats.take(self.level(0))
         if self.environment is not None:
             splats = Splats.concat([splats, self.environment])
-        return Scene(splats, None, self.antialiased, self.format, self.notes, self.header)
+        return Scene(splats, None, self.antialiased, self.format, self.notes, self.header, up=self.up)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..support.errors import TreeError
+from .splats import read_only
 
 #: The most children of a node: child counts are uint16 in Spark's nodes and in SPZ files.
 MAX_CHILDREN = 65535
@@ -19,19 +20,36 @@ class LodTree:
 
     Attributes:
         child_count: (M,) uint16, 0 for a leaf.
-        child_start: (M,) uint32 index of the first child, 0 for a leaf.
+        child_start: (M,) uint32 index of the first child; of a leaf it means nothing, and writers leave it 0.
     """
 
     child_count: NDArray[np.uint16]
     child_start: NDArray[np.uint32]
 
+    def __post_init__(self) -> None:
+        for name, dtype in (("child_count", np.uint16), ("child_start", np.uint32)):
+            column = getattr(self, name)
+            if column.dtype != dtype or column.ndim != 1:
+                raise ValueError(
+                    f"{name} is {column.dtype}{list(column.shape)}, expected {np.dtype(dtype)} of one dimension"
+                )
+
     def __len__(self) -> int:
         return len(self.child_count)
+
+    def frozen(self) -> LodTree:
+        """Return this tree with read-only columns, as `Splats.frozen`."""
+        count, start = read_only(self.child_count), read_only(self.child_start)
+        return self if count is self.child_count and start is self.child_start else LodTree(count, start)
 
     @property
     def is_leaf(self) -> NDArray[np.bool_]:
         """(M,) bool, true for nodes without children."""
         return self.child_count == 0
+
+    def first_child(self) -> NDArray[np.uint32]:
+        """Return the (M,) uint32 index of the first child, 0 for a leaf."""
+        return np.where(self.is_leaf, np.uint32(0), self.child_start)
 
     def depths(self) -> NDArray[np.int32]:
         """(M,) int32 number of edges from the root to each node, of a tree that `validate` accepts."""
@@ -50,7 +68,8 @@ class LodTree:
     def validate(self) -> None:
         """Checks that this is a single tree with root 0, in linear time.
 
-        Each node but the root is the child of exactly one node, which comes before it; a leaf's `child_start` is 0.
+        Each node but the root is the child of exactly one node, which comes before it. As in Spark, nothing is asked of
+        the `child_start` of a leaf.
 
         Raises:
             TreeError: an invariant is violated; names the first node that violates it.
@@ -62,7 +81,6 @@ class LodTree:
         node = np.flatnonzero(self.child_count)
         start = self.child_start[node].astype(np.int64)
         end = start + self.child_count[node]
-        self._fail_at(np.flatnonzero(self.is_leaf & (self.child_start != 0)), "is a leaf with a child_start")
         self._fail_at(node[start <= node], "comes after one of its children")
         self._fail_at(node[end > len(self)], "has children past the last node")
         # Ranges of children, sorted by their start, cover 1..M exactly once if each begins where the last one ended.

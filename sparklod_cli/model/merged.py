@@ -16,6 +16,7 @@ from .sh import COEFFICIENTS
 from .splats import Splats
 from .streams import SceneStream
 from .transforms import Transform
+from .up_axis import common, rotated
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,8 +37,8 @@ class Placed:
 def merged(parts: Sequence[Placed]) -> SceneStream:
     """One scene of several: their splats in this order, of the highest SH degree; lower ones are padded with zeros.
 
-    It is antialiased if most of the splats are; notes tell where they differ. What is wrong with one of them is raised
-    with its name.
+    It is antialiased if most of the splats are; notes tell where they differ. An axis points up that does in all of
+    them. What is wrong with one of them is raised with its name.
 
     Args:
         parts: at least one.
@@ -53,6 +54,7 @@ def merged(parts: Sequence[Placed]) -> SceneStream:
         antialiased,
         " and ".join(sorted({part.stream.format for part in parts})),
         tuple(dict.fromkeys(notes)),
+        up=common(rotated(part.stream.up, part.transform.rotation) for part in parts),
     )
 
 

@@ -13,11 +13,15 @@ from .coding import PLAIN, FileCoding
 from .lod_tree import LodTree
 from .sh import COEFFICIENTS
 from .splats import Splats, describe_invalid
+from .up_axis import AXES
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Scene:
     """Splats, and what a file says of them all.
+
+    The columns of splats and tree become read-only views, so that a scene cannot change after it was drawn. Arrays that
+    were passed in keep their flags; what is drawn after a write to one of them is undefined.
 
     Attributes:
         splats: N splats, in the order and the axes of the file.
@@ -28,6 +32,7 @@ class Scene:
         header: numbers of the file's header that the splats do not tell, by name ("version", "fractional_bits").
         chunk_bytes: of each of its chunks in the file, where its format has chunks; None elsewhere.
         coding: how the file holds its scales; `coding.PLAIN` where it has the very numbers.
+        up: the axis that points up, one of `up_axis.AXES` ("y", "-z"); None where the file does not say.
     """
 
     splats: Splats
@@ -38,6 +43,14 @@ class Scene:
     header: Mapping[str, int] = field(default_factory=dict)
     chunk_bytes: tuple[int, ...] | None = None
     coding: FileCoding = PLAIN
+    up: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.up is not None and self.up not in AXES:
+            raise ValueError(f"up is {self.up!r}; give one of {', '.join(AXES)}, or None")
+        object.__setattr__(self, "splats", self.splats.frozen())
+        if self.tree is not None:
+            object.__setattr__(self, "tree", self.tree.frozen())
 
     @classmethod
     def from_arrays(
@@ -50,6 +63,7 @@ class Scene:
         sh: ArrayLike | None = None,
         *,
         antialiased: bool = False,
+        up: str | None = None,
     ) -> Scene:
         """A scene of N splats from arrays of numbers, which are copied only where they are not C-contiguous float32.
 
@@ -61,9 +75,11 @@ class Scene:
             rgb: (N, 3) display-referred colours, 0..1; SH_C0 * f_dc + 0.5 of a trained file.
             sh: (N, K, 3) higher SH coefficients, K = 0, 3, 8 or 15; None for none.
             antialiased: trained with the opacity compensation of Mip-Splatting.
+            up: the axis that points up, such as "y" or "-z"; None where it is unknown.
 
         Raises:
-            ValueError: an array has another shape, or holds something else than real numbers; names it.
+            ValueError: an array has another shape, or holds something else than real numbers; names it. There is no
+                such axis.
             InvalidSplatsError: splats have numbers that no Gaussian has: NaN, a negative scale, a quaternion of another
                 length than 1.
         """
@@ -83,7 +99,7 @@ class Scene:
         invalid = splats.invalid()
         if invalid:
             raise InvalidSplatsError(describe_invalid(invalid))
-        return cls(splats, antialiased=antialiased)
+        return cls(splats, antialiased=antialiased, up=up)
 
     def __len__(self) -> int:
         return len(self.splats)

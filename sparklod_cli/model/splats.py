@@ -29,6 +29,15 @@ INVALID = {
 UNIT_TOLERANCE = 1e-3
 
 
+def read_only(array: NDArray[Any]) -> NDArray[Any]:
+    """Return a read-only view of an array, or the array itself if it is read-only."""
+    if not array.flags.writeable:
+        return array
+    view = array.view()
+    view.flags.writeable = False
+    return view
+
+
 @dataclass(frozen=True)
 class Splats:
     """N Gaussian splats as C-contiguous float32 columns.
@@ -87,6 +96,11 @@ class Splats:
     def concat(cls, parts: Sequence[Splats]) -> Splats:
         """All parts in order; they must have the same SH degree."""
         return cls(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in COLUMNS})
+
+    def frozen(self) -> Splats:
+        """Return these splats with read-only columns: views, so that whoever has the arrays keeps theirs writable."""
+        columns = {name: read_only(getattr(self, name)) for name in COLUMNS}
+        return self if all(columns[name] is getattr(self, name) for name in COLUMNS) else Splats(**columns)
 
     def take(self, index: NDArray[Any] | slice) -> Splats:
         """The splats of an index array, a boolean mask or a slice: the one way to filter, permute and truncate."""

@@ -21,7 +21,7 @@ class SceneStream:
     Attributes:
         count: N splats, as the files promise.
         sh_degree: of all blocks.
-        antialiased, format, notes, header: as in `Scene`.
+        antialiased, format, notes, header, up: as in `Scene`.
         read: called with the range of splats that are wanted, gives them in order in blocks of any length; may be
             called again. Formats that cannot be entered in the middle read and skip what comes before.
     """
@@ -33,6 +33,7 @@ class SceneStream:
     format: str = ""
     notes: tuple[str, ...] = ()
     header: Mapping[str, int] = field(default_factory=dict)
+    up: str | None = None
 
     def blocks(self) -> Iterator[Splats]:
         """All splats, in order."""
@@ -47,7 +48,7 @@ class NodeStream:
         count: M nodes.
         leaves: how many of them are leaves.
         sh_degree: of all windows.
-        antialiased: as in `Scene`.
+        antialiased, up: as in `Scene`.
         read: called with a range of nodes, returns them and their tree columns, whose `child_start` counts from the
             first node of the whole tree; may be called again, from several threads at once.
     """
@@ -57,6 +58,7 @@ class NodeStream:
     sh_degree: int
     antialiased: bool
     read: Callable[[int, int], tuple[Splats, LodTree]]
+    up: str | None = None
 
     def windows(self, rows: int) -> Iterator[tuple[Splats, LodTree]]:
         """All nodes, in order, so many at a time."""
@@ -72,8 +74,8 @@ def stream_of(scene: Scene) -> SceneStream:
         for first in range(start, stop, BLOCK_SPLATS):
             yield scene.splats.take(slice(first, min(first + BLOCK_SPLATS, stop)))
 
-    splats = scene.splats
-    return SceneStream(len(splats), splats.sh_degree, read, scene.antialiased, scene.format, scene.notes, scene.header)
+    splats, about = scene.splats, (scene.antialiased, scene.format, scene.notes, scene.header, scene.up)
+    return SceneStream(len(splats), splats.sh_degree, read, *about)
 
 
 def collected(stream: SceneStream, progress: Progress = silent) -> Scene:
@@ -84,4 +86,4 @@ def collected(stream: SceneStream, progress: Progress = silent) -> Scene:
         for name in COLUMNS:
             getattr(splats, name)[part] = getattr(block, name)
         progress("reading", done, stream.count, "splat")
-    return Scene(splats, None, stream.antialiased, stream.format, stream.notes, stream.header)
+    return Scene(splats, None, stream.antialiased, stream.format, stream.notes, stream.header, up=stream.up)

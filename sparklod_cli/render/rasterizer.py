@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cameras.camera import Camera
-from ..cameras.pose import FLIP
+from ..cameras.pose import FARTHEST, FLIP
 from ..support.jit import threads_in_use
 from .kernels import ellipse, project, raster, tiles
 from .settings import BLUR, CLIP, MAX_STD_DEV, MIN_ALPHA, STD_DEV_PER_D, RasterSettings
@@ -124,6 +124,6 @@ def _aligned(count: int) -> NDArray[np.float32]:
 
 
 def world_to_camera(camera: Camera) -> NDArray[np.float32]:
-    """(3, 4): into axes with y down, looking along z."""
+    """(3, 4): into axes with y down, looking along z; of cameras at the end of float32's range, clipped to that."""
     turned = camera.camera_to_world @ FLIP
-    return np.linalg.inv(turned)[:3].astype(np.float32)
+    return np.clip(np.linalg.inv(turned)[:3], -FARTHEST, FARTHEST).astype(np.float32)

@@ -66,7 +66,7 @@ def whole_scene(detail: DetailScene) -> Scene:
     """All levels and the environment as one plain scene."""
     parts = [detail.splats] if detail.environment is None else [detail.splats, detail.environment]
     splats = parts[0] if len(parts) == 1 else Splats.concat([part.with_max_sh(_degree(parts)) for part in parts])
-    return Scene(splats, None, detail.antialiased, detail.format, detail.notes, detail.header)
+    return Scene(splats, None, detail.antialiased, detail.format, detail.notes, detail.header, up=detail.up)
 
 
 def files_of(found: LevelFiles) -> DetailFiles:

@@ -23,6 +23,7 @@ from ..model.instances import Instance, Matrix
 from ..model.nodes import Nodes
 from ..model.scene import Scene
 from ..model.splats import Splats
+from ..model.up_axis import common, rotated
 from ..support.units import count_of
 from .detail_scene import LoadedDetail
 from .loaded_scene import Index, LoadedScene, depth_of, nodes_of
@@ -130,6 +131,12 @@ class Scenes:
     def title(self) -> str:
         """The names of the scenes."""
         return ", ".join(dict.fromkeys(loaded.name for loaded in self.loaded))
+
+    @property
+    def up(self) -> str | None:
+        """The axis of the world that points up, one of `up_axis.AXES`, where all files say the same; else None."""
+        placed = zip(self.instances, self.of_instance, strict=True)
+        return common(rotated(loaded.scene.up, at.transform.rotation) for at, loaded in placed)
 
     @functools.cached_property
     def trees(self) -> list[LoadedScene]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..cameras.framing import SAMPLE
 from ..io import RadFile
-from ..model.balls import Balls, balls_of
+from ..model.balls import USED, Balls, balls_of
 from ..model.instances import Instance
 from ..model.lod_tree import LodTree
 from ..model.scene import Scene
@@ -60,7 +60,16 @@ def empty_scene(file: RadFile) -> Scene:
     tree = LodTree(np.zeros(0, np.uint16), np.zeros(0, np.uint32))
     header = file.header
     splats = Splats.empty(0, header.max_sh)
-    return Scene(splats, tree, header.antialiased, file.format, header=dict(file.about), chunk_bytes=file.chunk_bytes)
+    return Scene(
+        splats,
+        tree,
+        header.noted.antialiased,
+        file.format,
+        header.noted.problems,
+        dict(file.about),
+        file.chunk_bytes,
+        up=header.noted.up,
+    )
 
 
 def sampled_balls(instances: Sequence[Instance], scenes: Sequence[LoadedScene]) -> Balls:
@@ -119,5 +128,5 @@ def _leaves_of(loaded: LoadedScene) -> Iterator[tuple[Splats, Index]]:
     if not isinstance(loaded, PagedScene):
         yield loaded.splats, loaded.leaves
         return
-    for splats, tree in loaded.pages.blocks(("center", "scale")):
+    for splats, tree in loaded.pages.blocks(USED):
         yield splats, np.flatnonzero(tree.is_leaf)

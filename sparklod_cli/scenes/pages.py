@@ -85,7 +85,7 @@ class Pages:
         found, part = self._nodes_of(splats, tree, coding), self.nodes[start : start + len(tree)]
         part["x"], part["y"], part["z"] = found.center.T
         part["size"] = found.size
-        part["child_start"], part["child_count"] = tree.child_start, tree.child_count
+        part["child_start"], part["child_count"] = tree.first_child(), tree.child_count
         self.present[number] = True
         known = start + np.flatnonzero(self.depth[start : start + len(tree)])
         self._descend(known if number else np.concatenate([np.zeros(1, np.int64), known]))
@@ -94,7 +94,6 @@ class Pages:
         """Raises a `TreeError` for children that no tree has; `LodTree.validate` has the same texts."""
         first, node = tree.child_start.astype(np.int64), start + np.arange(len(tree))
         for mask, what in (
-            (tree.is_leaf & (first != 0), "is a leaf with a child_start"),
             (~tree.is_leaf & (first <= node), "comes after one of its children"),
             (~tree.is_leaf & (first + tree.child_count > self.count), "has children past the last node"),
         ):

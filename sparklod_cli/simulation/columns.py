@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from ..support.errors import SparklodError
+from ..support.similar import near
 from ..tables.columns import FRAME, Column
-from ..tables.files import near
 
 COLUMNS = (
     *FRAME,

@@ -172,7 +172,7 @@ class Simulation:
         total = where | {"instance": TOTAL} | _shape(drawn.whole, settings.budget) | _change(selected, kept, before)
         total |= {
             "stop_reason": cut.reason,
-            "pixel_scale_min": cut.least if np.isfinite(cut.least) else None,
+            "pixel_scale_min": cut.least,
             "missing": cut.missing,
             "traverse_ms": 1000 * cut.seconds,
         }

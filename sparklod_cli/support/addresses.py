@@ -19,15 +19,13 @@ from urllib.parse import unquote, urlsplit
 
 from .errors import SparklodError
 from .optional import optional_import
+from .printable import redacted, without_secrets
 
-#: How addresses begin. A letter and a colon alone are a drive of Windows.
-ADDRESS = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+)://")
+#: How addresses begin, chained ones too (simplecache::s3://). A letter and a colon alone are a drive of Windows.
+ADDRESS = re.compile(r"((?:[A-Za-z][A-Za-z0-9+.-]*::)*[A-Za-z][A-Za-z0-9+.-]+)://")
 
 #: Bytes that are asked for at once by those who read little at a time; a request takes as long as some megabytes.
 READ_AHEAD = 1 << 23
-
-#: What stands where something of an address is not shown.
-HIDDEN = "***"
 
 
 @dataclass(frozen=True)
@@ -44,12 +42,7 @@ class Address:
 
     def __str__(self) -> str:
         """The address without a password, or a query, which may be a signature."""
-        whole, query = _cut(self.url)
-        scheme, rest = whole.split("://", 1)
-        host, slash, path = rest.partition("/")
-        user, at, host = host.rpartition("@")
-        shown = f"{HIDDEN}@" if at and ":" in user else f"{user}{at}"
-        return f"{scheme}://{shown}{host}{slash}{path}" + (f"?{HIDDEN}" if query else "")
+        return redacted(self.url)
 
     def __repr__(self) -> str:
         return f"Address({str(self)!r})"
@@ -175,13 +168,13 @@ class Address:
         except PermissionError as error:
             raise PermissionError(errno.EACCES, f"no permission ({self._shown(error)})", str(self)) from None
         except OSError as error:
-            raise OSError(error.errno or errno.EIO, error.strerror or self._shown(error), str(self)) from None
+            raise OSError(error.errno or errno.EIO, self._shown(error.strerror or error), str(self)) from None
         except Exception as error:  # packages that talk to services have errors of their own
             raise OSError(errno.EIO, f"{type(error).__name__}: {self._shown(error)}", str(self)) from None
 
-    def _shown(self, error: Exception) -> str:
-        """The text of an error, which may have the address in it."""
-        return str(error).replace(self.url, str(self))
+    def _shown(self, error: Exception | str) -> str:
+        """The text of an error, which may have the address in it, or parts that must not be shown."""
+        return without_secrets(str(error), self.url)
 
 
 class _Ranged(io.RawIOBase):
@@ -240,7 +233,7 @@ def size_of(place: Place) -> int:
 
 def _cut(url: str) -> tuple[str, str]:
     """An address before its query, and the query with its mark, which only those of the web have."""
-    if not url.lower().startswith(("http://", "https://")):
+    if not url.lower().rpartition("::")[2].startswith(("http://", "https://")):
         return url, ""
     path, mark, query = url.partition("?")
     return path, mark + query
@@ -249,13 +242,18 @@ def _cut(url: str) -> tuple[str, str]:
 @functools.lru_cache(maxsize=64)
 def _system(url: str) -> tuple[Any, str]:
     """The file system that opens an address, and what the address is called there."""
-    with optional_import("addresses are opened by fsspec and packages for each service", "sparklod[cloud]"):
+    with optional_import("addresses are opened by fsspec and packages for each service", "cloud"):
         import fsspec
 
         try:
             # Others write at the same time, so a list of files is old at once.
             system, path = fsspec.core.url_to_fs(url, use_listings_cache=False)
-        except ValueError:
-            known = url.split("://", 1)[0]
-            raise SparklodError(f"nothing is known that opens addresses of {known}://; s3, gs and az are") from None
+        except ImportError:
+            raise
+        except Exception as error:  # services take their addresses apart, each in its way
+            reason = f"{type(error).__name__}: {without_secrets(str(error), url)}"
+            scheme = url.split("://", 1)[0]
+            raise SparklodError(
+                f"addresses of {scheme}:// cannot be opened ({reason}); those of s3, gs and az can"
+            ) from None
     return system, path

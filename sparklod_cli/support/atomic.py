@@ -49,6 +49,7 @@ def write(target: Path, pieces: Iterable[bytes | memoryview], *, overwrite: bool
         return _write_named(target, pieces, overwrite, sync)
     with os.fdopen(descriptor, "w+b") as file:
         size = fill(file, pieces, sync=sync)
+        target.parent.mkdir(parents=True, exist_ok=True)  # another run that failed may have removed it as empty
         try:
             _name(file, target, overwrite)
         except FileExistsError:

@@ -6,9 +6,10 @@ import contextlib
 import functools
 import inspect
 import os
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 #: How long OpenMP's threads spin while they wait for one another at the end of a parallel loop. By default they
@@ -24,9 +25,9 @@ if "OMP_WAIT_POLICY" not in os.environ:
         os.environ.setdefault(_name, _value)
 
 from . import jit_cache, jit_link, jit_threads  # noqa: E402
-from .errors import out_of_memory  # noqa: E402
-from .jit_cache import CODE, SUFFIX, Trouble, is_whole, pattern_of, start_of  # noqa: E402
-from .jit_types import describe, key_of  # noqa: E402
+from .errors import SparklodError, out_of_memory  # noqa: E402
+from .jit_cache import CODE, SUFFIX, Trouble, is_whole, start_of  # noqa: E402
+from .jit_types import describe, example, fits, key_of  # noqa: E402
 from .kernel_sources import PACKAGE, digest_of, sources_of  # noqa: E402
 
 #: Called with the name of a kernel when its compilation begins, and with its duration in seconds when it ends.
@@ -96,19 +97,24 @@ class Kernel:
     Args:
         function: the Python function.
         options: how to compile it.
+        signatures: the types that Python calls it with, see `kernel`.
 
     Attributes:
         py_func: the Python function.
         options: how to compile it.
+        signatures: the types that Python calls it with.
         compiler: see `jit_numba.compiler_of`; None as long as nothing had to be compiled.
         called: what runs with arguments of the types of a key, see `jit_types.key_of`.
     """
 
-    def __init__(self, function: Callable[..., Any], options: Options) -> None:
+    def __init__(
+        self, function: Callable[..., Any], options: Options, signatures: Sequence[Sequence[Any]] = ()
+    ) -> None:
         functools.update_wrapper(self, function)
-        self.py_func, self.options = function, options
+        self.py_func, self.options, self.signatures = function, options, signatures
         self.compiler: Any = None
         self.called: dict[Hashable, Callable[..., Any]] = {}
+        self._called: dict[str, Callable[..., Any]] = {}
 
     def __call__(self, *arguments: Any, **named: Any) -> Any:
         if named or self.py_func.__defaults__:
@@ -124,25 +130,62 @@ class Kernel:
     def __reduce__(self) -> str:
         return self.py_func.__qualname__
 
+    @functools.cached_property
+    def examples(self) -> dict[str, tuple[Any, ...]]:
+        """Arguments of each declared signature, by their description."""
+        every = [tuple(map(example, types)) for types in self.signatures]
+        return {str(describe(arguments)): arguments for arguments in every}
+
+    def declared(self, arguments: tuple[Any, ...]) -> str | None:
+        """Return the description of the declared signature that arguments fit; None if there is none."""
+        text = describe(arguments)
+        return next((declared for declared in self.examples if text is not None and fits(text, declared)), None)
+
     def _find(self, key: Hashable | None, arguments: tuple[Any, ...]) -> Callable[..., Any]:
         """What to call with arguments of these types."""
-        text = None if key is None else describe(arguments)
+        text = None if key is None else self.declared(arguments) or describe(arguments)
         if text is None:
-            return self._dispatcher()
-        path = None
-        if CACHE_FOLDER is not None and jit_link.is_tested():
-            path = CACHE_FOLDER / f"{start_of(self.py_func)}-{jit_cache.digest(text)}{CODE}"
-        called = None if path is None else self._load(path)
+            return self._guarded(self._dispatcher())
+        called = self._called.get(text)
         if called is None:
-            called = self._compile(path, arguments)
+            called = self._called[text] = self._guarded(self.prepare(text, arguments))
         self.called[key] = called
         return called
 
+    def _guarded(self, called: Callable[..., Any]) -> Callable[..., Any]:
+        return jit_threads.guarded(called) if self.options.parallel else called
+
+    def prepare(self, text: str, arguments: tuple[Any, ...] = ()) -> Callable[..., Any]:
+        """Load machine code, or compile it if the cache has none.
+
+        Args:
+            text: types, as `jit_types.describe` has them.
+            arguments: of these types; unnecessary where the kernel declares them.
+        """
+        path = self._path(text)
+        called = None if path is None else self._load(path)
+        return self._compile(path, self.examples.get(text, arguments)) if called is None else called
+
+    def is_cached(self, text: str) -> bool:
+        """Return True if this process can load machine code for types that `jit_types.describe` describes as `text`."""
+        if CACHE_FOLDER is None:
+            return False
+        path = self._path(text)
+        # Where machine code is not linked, numba names the file.
+        files = [*([] if path is None else [path]), *CACHE_FOLDER.glob(f"{start_of(self.py_func)}-*{SUFFIX}")]
+        with contextlib.suppress(OSError):
+            return any(file.is_file() and is_whole(file.read_bytes()) for file in files)
+        return False
+
+    def _path(self, text: str) -> Path | None:
+        """The file of machine code for types; None if there cannot be one."""
+        if CACHE_FOLDER is None or not jit_link.is_tested():
+            return None
+        return CACHE_FOLDER / f"{start_of(self.py_func)}-{jit_cache.digest(text)}{CODE}"
+
     def _dispatcher(self) -> Callable[..., Any]:
         """What numba calls with arguments of any types, or refuses them with."""
-        from . import jit_numba
-
-        dispatcher: Callable[..., Any] = jit_numba.compiler_of(self).dispatcher
+        dispatcher: Callable[..., Any] = load_compiler().compiler_of(self).dispatcher
         return dispatcher
 
     def _load(self, path: Path) -> Callable[..., Any] | None:
@@ -158,9 +201,7 @@ class Kernel:
 
     def _compile(self, path: Path | None, arguments: tuple[Any, ...]) -> Callable[..., Any]:
         """Compiles the kernel, and writes the machine code to a file if it can be linked, as it is in this process."""
-        from . import jit_numba
-
-        compiler = jit_numba.compiler_of(self)
+        compiler = load_compiler().compiler_of(self)
         if jit_link.is_tested():
             try:
                 code = compiler.machine_code(arguments)
@@ -178,23 +219,29 @@ class Kernel:
 
 
 def kernel(
-    *, parallel: bool = False, nogil: bool = False, inline: bool = False, contract: bool = False
+    *types: Any, parallel: bool = False, nogil: bool = False, inline: bool = False, contract: bool = False
 ) -> Callable[[Callable[..., Any]], Any]:
     """Decorator for a compiled function.
 
     Without fastmath, because results must not depend on the number of threads. Machine code is cached in the
     package, or in the user's cache directory if the package is read-only; if neither is writable, every run compiles.
 
+    A kernel that Python calls declares the types of its arguments, see `jit_types`: numbers `i8`, arrays `f4[:, :]`
+    that it reads, arrays `out(f4[:])` that it writes to, and NamedTuples of them with `jit_types.fields`. It is
+    compiled for these, by `sparklod warmup` or when it is first called. Where it only reads, arrays may be read-only.
+
     Args:
+        types: of the arguments; a tuple for each signature if there are several; nothing if only kernels call it.
         parallel: the function has loops that run on the threads of `use_threads`.
         nogil: releases the GIL, so that other Python threads can run.
         inline: always inlines the function into its callers, which LLVM does not always do by itself.
         contract: allows fused multiply-add, which rounds once instead of twice, on processors that have it.
     """
     options = Options(parallel, nogil, inline, contract)
+    signatures = types if not types or isinstance(types[0], tuple) else (types,)
 
     def decorate(function: Callable[..., Any]) -> Any:
-        return function if _is_disabled() else Kernel(function, options)
+        return function if _is_disabled() else Kernel(function, options, signatures)
 
     return decorate
 
@@ -205,19 +252,6 @@ def _is_disabled() -> bool:
         return bool(int(os.environ.get("NUMBA_DISABLE_JIT") or 0))
     except ValueError:
         return False
-
-
-def is_cached(name: str) -> bool:
-    """Whether this process can load the compiled code of a kernel, which is named "module.function"."""
-    if CACHE_FOLDER is None:
-        return False
-    suffixes = [CODE, SUFFIX] if jit_link.is_tested() else [SUFFIX]
-    sources = list(PACKAGE.glob(f"*/kernels/{name.partition('.')[0]}.py"))
-    with contextlib.suppress(OSError):
-        patterns = (pattern_of(name, source, suffix) for suffix in suffixes for source in sources)
-        files = (file for pattern in patterns for file in CACHE_FOLDER.glob(pattern))
-        return any(file.is_file() and is_whole(file.read_bytes()) for file in files)
-    return False
 
 
 def use_threads(count: int) -> None:
@@ -254,13 +288,25 @@ def threading_layer() -> str:
     return jit_threads.layer().name
 
 
-def require_compiler() -> None:
-    """Loads numba, which otherwise happens when something has to be compiled.
+def load_compiler() -> ModuleType:
+    """Import `jit_numba` and, with it, numba, which otherwise happens when something has to be compiled.
 
     Raises:
-        ImportError: it is missing or broken.
+        ImportError: numba is missing or broken.
+        SparklodError: its settings in the current folder are malformed.
     """
-    from . import jit_numba  # noqa: F401
+    try:
+        from . import jit_numba
+    except ImportError:
+        raise
+    except Exception as error:  # of the parser, or of numba where values are of no type that it knows
+        if not jit_cache.SETTINGS.exists():
+            raise
+        raise SparklodError(
+            f"{jit_cache.SETTINGS} in the current folder, which numba reads, is malformed"
+            f" ({' '.join(str(error).split())}); correct it, remove it, or work in another folder"
+        ) from None
+    return jit_numba
 
 
 #: Who is told of compilations and of a cache that does not work, see `listen`.

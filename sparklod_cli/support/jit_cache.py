@@ -45,22 +45,8 @@ SETTINGS = Path(".numba_config.yaml")
 
 def start_of(function: Callable[..., Any]) -> str:
     """The start of the names of a function's files, which stands for its sources and for this machine."""
-    return _start(stem_of(function), Path(function.__code__.co_filename))
-
-
-def pattern_of(stem: str, source: Path, suffix: str = CODE) -> str:
-    """Glob pattern of the files of a kernel that this process can load: those for its processor, numba and Python.
-
-    Args:
-        stem: "module.function".
-        source: the module.
-        suffix: `CODE` or `SUFFIX`.
-    """
-    return f"{_start(stem, source)}-*{suffix}"
-
-
-def _start(stem: str, source: Path) -> str:
-    return f"{stem}-{digest_of(sources_of(source))}-{_machine()}"
+    source = Path(function.__code__.co_filename)
+    return f"{stem_of(function)}-{digest_of(sources_of(source))}-{_machine()}"
 
 
 @functools.cache

@@ -18,7 +18,6 @@ import sys
 import threading
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -31,9 +30,6 @@ TESTED = {("linux", "x86_64")}
 
 #: Bytes of the length of what precedes the object code in a file.
 LENGTH = 4
-
-#: Bytes of the digests of objects in machine code.
-_DIGEST = 20
 
 #: What parallel code takes of the threading layer besides `numba_parallel_for`.
 SCHEDULING = (
@@ -100,39 +96,23 @@ def link(code: MachineCode, function: Callable[..., Any]) -> Callable[..., Any]:
         return _linker().link(code, function)
 
 
-#: Objects in machine code, such as the class of the arrays that kernels return, by their address and digest.
-_unpickled: dict[tuple[int, bytes], Any] = {}
+#: numba's function that makes an object of its pickle, such as the class of an array that a kernel returns. numba's own
+#: calls Python code, which would load numba, and in which Python handles signals: a `KeyboardInterrupt` raised there is
+#: lost, or ends in a `SystemError`. This one calls `pickle.loads`, which is C. Pointers are integers here, because
+#: versions of LLVM write them differently.
+UNPICKLE = """
+declare i64 @PyBytes_FromStringAndSize(i64, i64)
+declare i64 @PyObject_CallFunctionObjArgs(i64, ...)
+declare void @Py_DecRef(i64)
 
-
-def _unpickle(address: int, pickled: bytes, digest: bytes) -> Any:
-    """An object in machine code, which is made once."""
-    key = address, digest
-    if key not in _unpickled:
-        _unpickled[key] = pickle.loads(pickled)
-    return _unpickled[key]
-
-
-def _provide_unpickle(helpers: Any) -> None:
-    """Has numba's extension module unpickle with `_unpickle` instead of the same function in a module of numba.
-
-    The first time that it unpickles, which is here, it imports that module, by the `__import__` of the code that is
-    running, and keeps the function. It unpickles the class of every array that a kernel returns.
-    """
-    if "numba" in sys.modules:
-        return
-    name = "numba.core.serialize"
-    module: Any = ModuleType(name)
-    module._numba_unpickle = _unpickle
-    call = ctypes.PYFUNCTYPE(ctypes.py_object, ctypes.c_char_p, ctypes.c_int, ctypes.c_char_p)
-    nothing = pickle.dumps(None)
-    arguments = nothing, len(nothing), bytes(_DIGEST)
-    scope = {"unpickle": call(helpers.c_helpers["unpickle"]), "arguments": arguments}
-    sys.modules[name] = module
-    try:
-        eval("unpickle(*arguments)", {**scope, "__builtins__": {"__import__": lambda *_: None}})
-    finally:
-        del sys.modules[name]
-
+define i64 @unpickle(i64 %data, i32 %size, i64 %digest) {{
+  %length = sext i32 %size to i64
+  %pickled = call i64 @PyBytes_FromStringAndSize(i64 %data, i64 %length)
+  %object = call i64 (i64, ...) @PyObject_CallFunctionObjArgs(i64 {loads}, i64 %pickled, i64 0)
+  call void @Py_DecRef(i64 %pickled)
+  ret i64 %object
+}}
+"""
 
 _lock = threading.RLock()
 
@@ -164,7 +144,6 @@ class _Linker:
         helpers: Any = extension("_helperlib")
         memory: Any = extension("core.runtime._nrt_python")
         memory.memsys_use_cpython_allocator()
-        _provide_unpickle(helpers)
         symbols = {"_Py_NoneStruct": id(None)}
         for name, address in {**helpers.c_helpers, **self._dynfunc.c_helpers}.items():
             symbols[name] = symbols[f"numba_{name}"] = address  # functions of the C library have no prefix
@@ -173,7 +152,16 @@ class _Linker:
         for error in vars(builtins).values():
             if isinstance(error, type) and issubclass(error, BaseException):
                 symbols[f"PyExc_{error.__name__}"] = id(error)
+        symbols["numba_unpickle"] = self._unpickle()
         return symbols
+
+    def _unpickle(self) -> int:
+        """Return the address of `UNPICKLE`."""
+        builder = self._orc.JITLibraryBuilder().add_ir(UNPICKLE.format(loads=id(pickle.loads)))
+        library = builder.add_current_process().export_symbol("unpickle").link(self._engine, "unpickle")
+        address: int = library["unpickle"]
+        library.detach()
+        return address
 
     def _library(self, name: str, symbols: dict[str, int]) -> str:
         builder = self._orc.JITLibraryBuilder()

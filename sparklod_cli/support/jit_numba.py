@@ -16,7 +16,7 @@ import numba
 import numpy as np
 from llvmlite import ir
 from numba import types
-from numba.core import caching, cgutils, compiler, event
+from numba.core import caching, cgutils, compiler, event, serialize
 from numba.core.serialize import dumps
 from numba.extending import intrinsic
 from numba.np.ufunc import parallel
@@ -28,6 +28,10 @@ from .jit_lean import lean
 from .jit_link import MachineCode
 
 _lock = threading.RLock()
+
+# numba calls this Python function while a kernel returns; if a signal handler raised an exception in it, such as
+# `KeyboardInterrupt`, that would be lost or end in a `SystemError`. A second call for an object runs no Python code.
+serialize._numba_unpickle = functools.cache(serialize._numba_unpickle)
 
 
 class Compiler:

@@ -10,6 +10,7 @@ import importlib.util
 import os
 import sys
 import threading
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -28,6 +29,10 @@ TBB, TBB_VERSION = {"linux": "libtbb.so.12", "darwin": "libtbb.12.dylib", "win32
 
 _lock = threading.RLock()
 
+#: Held while a parallel kernel runs on a layer that is not thread-safe. Reentrant, because a signal handler or a
+#: finaliser can call a kernel in the thread that holds it.
+_running = threading.RLock()
+
 
 class Layer:
     """A threading layer whose threads have been started.
@@ -42,6 +47,12 @@ class Layer:
         self.name, self.module, self.most = name, module, most
         self._use = ctypes.CFUNCTYPE(None, ctypes.c_int)(module.set_num_threads)
         self._in_use = ctypes.CFUNCTYPE(ctypes.c_int)(module.get_num_threads)
+
+    def launch(self, most: int) -> None:
+        """Start the threads, which run kernels of the calling thread, and of threads that set no number."""
+        ctypes.CFUNCTYPE(None, ctypes.c_int)(self.module.launch_threads)(most)
+        self.most = most
+        self.use(most)
 
     def use(self, count: int) -> None:
         """Has kernels that this thread calls run on `count` threads, or on all if there are fewer.
@@ -74,15 +85,51 @@ def _layer() -> Layer:
         for name in LAYERS:
             with contextlib.suppress(ImportError, OSError, ValueError):
                 return _started(name)
-    from . import jit_numba
+    from .jit import load_compiler
 
-    return jit_numba.threading_layer()
+    layer: Layer = load_compiler().threading_layer()
+    return layer
 
 
 def started() -> Layer | None:
     """The threading layer, if its threads have been started."""
     with _lock:
         return _layer() if _layer.cache_info().currsize else None
+
+
+def guarded(called: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function that calls a parallel kernel, one at a time where the layer is not thread-safe.
+
+    numba's own layer, workqueue, which is used where neither TBB nor OpenMP is installed, aborts the process if two
+    threads run parallel loops at the same time.
+
+    Args:
+        called: machine code of a parallel kernel.
+    """
+    if layer().name != "workqueue":
+        return called
+
+    def one_at_a_time(*arguments: Any) -> Any:
+        with _running:
+            return called(*arguments)
+
+    return one_at_a_time
+
+
+def _after_fork() -> None:
+    """Run kernels on one thread in a forked process, which has none of the threads of its parent.
+
+    GNU's OpenMP would wait for them forever, so numba ends the process; workqueue would crash.
+    """
+    global _lock, _running
+    _lock, _running = threading.RLock(), threading.RLock()  # another thread of the parent may hold them
+    layer = started()
+    if layer is not None:
+        layer.launch(1)
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_after_fork)
 
 
 def _started(name: str) -> Layer:
@@ -98,9 +145,8 @@ def _started(name: str) -> Layer:
     if most < 1:
         raise ValueError(f"NUMBA_NUM_THREADS is {most}")
     module: Any = extension(LAYERS[name])
-    ctypes.CFUNCTYPE(None, ctypes.c_int)(module.launch_threads)(most)
     started = Layer(name, module, most)
-    started.use(most)
+    started.launch(most)
     return started
 
 

@@ -1,23 +1,38 @@
-"""Imports of packages that only an extra of sparklod brings, and what to install where one is missing."""
+"""Imports of packages that only an extra of sparklod brings, and how to install what is missing."""
 
 from __future__ import annotations
 
 import contextlib
+import os
+import sys
 from collections.abc import Iterator
+from pathlib import Path
 
 from .errors import SparklodError
 
+#: Folder that this package is in: a checkout, or one of installed packages.
+_HOME = Path(__file__).parents[2]
+
+#: Name of this distribution, for pip.
+DISTRIBUTION = "sparklod"
+
+#: Variables that name the active environment, where "pip" is that of this interpreter.
+_ENVIRONMENTS = ("VIRTUAL_ENV", "CONDA_PREFIX")
+
 
 @contextlib.contextmanager
-def optional_import(purpose: str, requirement: str, error: type[SparklodError] = SparklodError) -> Iterator[None]:
+def optional_import(
+    purpose: str, extra: str = "", error: type[SparklodError] = SparklodError, *, package: str = ""
+) -> Iterator[None]:
     """Turns a failed import inside it into an error that says what to install.
 
     The import stays a statement, so that type checkers and import-linter see it.
 
     Args:
         purpose: what takes the package, and which one: "charts are drawn by matplotlib".
-        requirement: what pip installs: "sparklod[render]".
+        extra: the extra that brings it: "render".
         error: class of the error.
+        package: what pip installs, if no extra brings it.
 
     Raises:
         SparklodError: the package is not installed, or does not load; of the class `error`.
@@ -25,5 +40,56 @@ def optional_import(purpose: str, requirement: str, error: type[SparklodError] =
     try:
         yield
     except ImportError as reason:
-        quoted = f"'{requirement}'" if "[" in requirement else requirement  # shells expand brackets
-        raise error(f"{purpose}: pip install {quoted} ({reason})") from None
+        hint = pip_install(package) if package else install_hint(extra)
+        raise error(f"{purpose}: {hint} ({reason})") from None
+
+
+def pip_install(*arguments: str) -> str:
+    """Return a command line that has the pip of this interpreter install something."""
+    import shlex
+
+    is_active = any(os.environ.get(name) == sys.prefix for name in _ENVIRONMENTS)
+    pip = ["pip"] if is_active else [sys.executable, "-m", "pip"]
+    return shlex.join([*pip, "install", *arguments])
+
+
+def install_hint(extra: str = "", *options: str) -> str:
+    """Return a command line that installs what this installation of sparklod, or one of its extras, requires.
+
+    No package index is known to have sparklod. So the command names the checkout that it was installed from, or else
+    the packages that are missing.
+
+    Args:
+        extra: name of the extra; empty for what sparklod always requires.
+        options: of pip.
+    """
+    from importlib import metadata  # takes long to load
+
+    from .requirements import required_by
+
+    checkout = _checkout()
+    if checkout is not None:
+        editable = ["-e"] if checkout == _HOME else []
+        return pip_install(*options, *editable, f"{checkout}[{extra}]" if extra else str(checkout))
+    try:
+        required = list(required_by(DISTRIBUTION, extra))
+    except metadata.PackageNotFoundError:
+        what = f"the extra {extra} of sparklod" if extra else "sparklod"
+        return f"install {what} with pip, from a checkout of its repository"
+    missing = [one for one in required if one.missing] or required
+    return pip_install(*options, *(f"{one.name}>={one.least}" if one.least else one.name for one in missing))
+
+
+def _checkout() -> Path | None:
+    """The folder of the repository that this package is in, or was installed from; None if there is none any more."""
+    import json
+    from importlib import metadata
+    from urllib.parse import unquote, urlsplit
+
+    folders = [_HOME]
+    with contextlib.suppress(metadata.PackageNotFoundError, ValueError, AttributeError):
+        source = json.loads(metadata.distribution(DISTRIBUTION).read_text("direct_url.json") or "{}")
+        address = urlsplit(source.get("url", ""))
+        if address.scheme == "file" and "dir_info" in source:
+            folders.append(Path(unquote(address.path)))
+    return next((folder for folder in folders if (folder / "pyproject.toml").is_file()), None)

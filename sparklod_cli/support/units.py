@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-import math
 import re
 
-#: Decimal prefixes, in either case: a lower-case m cannot sensibly mean a thousandth of a bit.
-PREFIXES = {"": 1, "k": 10**3, "m": 10**6, "g": 10**9}
+#: Prefixes in lower case, as either case is understood: m cannot sensibly mean a thousandth of a bit.
+PREFIXES = {"": 1, "k": 10**3, "m": 10**6, "g": 10**9, "t": 10**12}
+PREFIXES |= {"ki": 1 << 10, "mi": 1 << 20, "gi": 1 << 30, "ti": 1 << 40}
 
-NUMBER = r"(?P<number>(?:[0-9]{1,30}(?:\.[0-9]{0,30})?|\.[0-9]{1,30})(?:[eE][+-]?[0-9]{1,2})?)"
-COUNT = rf"{NUMBER}\s*(?P<prefix>[kKmMgG]?)"
-SIZE = rf"{NUMBER}\s*(?:(?P<prefix>[kKmMgG]?)(?P<binary>i?)(?:B|(?i:bytes?))?)"
-LATENCY = rf"{NUMBER}\s*(?P<unit>ms|s)"
-BANDWIDTH = rf"{NUMBER}\s*(?P<prefix>[kKmMgG]?)(?P<unit>(?i:bits?|bytes?)|b|B)(?:/s|ps)?"
+NUMBER = r"(?P<number>(?:[0-9]{1,30}(?:\.[0-9]{0,30})?|\.[0-9]{1,30})(?:[eE][+-]?[0-9]{1,2})?)\s*"
+PREFIX = r"(?P<prefix>(?:[kKmMgGtT][iI]?)?)"
+COUNT = rf"{NUMBER}(?P<prefix>[kKmMgGtT]?)"
+SIZE = rf"{NUMBER}{PREFIX}(?i:B|bytes?)?"
+TIME = rf"{NUMBER}(?P<unit>ms|s)"
+BANDWIDTH = rf"{NUMBER}{PREFIX}(?P<unit>(?i:bits?|bytes?)|b|B)(?:/s|ps)?"
 
 
 def count_of(count: int, noun: str, plural: str | None = None) -> str:
@@ -31,7 +32,8 @@ def format_size(size: float) -> str:
 def parse_bandwidth(text: str) -> float:
     """Bytes per second of a text such as 20Mbit, 20Mbit/s, 20Mbps (bits) or 2.5MB/s, 2.5MBps, 2.5Mbyte (bytes).
 
-    As a letter, b is a bit and B a byte; words may have either case. Prefixes are decimal: k, M, G.
+    As a letter, b is a bit and B a byte; words may have either case. k, M, G and T are powers of 1000, or of 1024 with
+    an i.
 
     Raises:
         ValueError: the text is not a bandwidth above 0.
@@ -48,23 +50,23 @@ def parse_bandwidth(text: str) -> float:
     return value if unit == "B" or unit.lower().startswith("byte") else value / 8
 
 
-def parse_latency(text: str) -> float:
-    """Seconds of a text such as 60ms or 0.1s.
+def parse_time(text: str) -> float:
+    """Return the seconds of a text such as 60ms or 0.1s.
 
     A number without a unit is an error: some tools mean seconds by it, others milliseconds.
 
     Raises:
-        ValueError: the text is not a latency.
+        ValueError: the text is not a time.
     """
-    match = re.fullmatch(LATENCY, text.strip())
+    match = re.fullmatch(TIME, text.strip())
     if match is None:
-        raise ValueError(f"{text!r} is not a latency: a number, 0 or more, and a unit, such as 60ms or 0.1s")
+        raise ValueError(f"{text!r} is not a time: a number, 0 or more, and a unit, such as 60ms or 0.1s")
     value = float(match["number"])
     return value / 1000 if match["unit"] == "ms" else value
 
 
 def parse_count(text: str) -> int:
-    """A whole number of a text such as 65536, 500k or 1.5M; k, M and G are thousands, millions and billions.
+    """A whole number of a text such as 65536, 500k or 1.5M; k, M, G and T are powers of 1000.
 
     Raises:
         ValueError: the text is not a count.
@@ -79,7 +81,7 @@ def parse_count(text: str) -> int:
 
 
 def parse_size(text: str) -> int:
-    """Bytes of a text such as 3000000, 3M, 3MB or 3MiB: k, M and G are powers of 1000, or of 1024 with an i.
+    """Bytes of a text such as 3000000, 3M, 3 MB or 3MiB: k, M, G and T are powers of 1000, or of 1024 with an i.
 
     Raises:
         ValueError: the text is not a size.
@@ -87,12 +89,7 @@ def parse_size(text: str) -> int:
     from fractions import Fraction
 
     match = re.fullmatch(SIZE, text.strip())
-    value = Fraction(-1, 2)
-    if match is not None and (match["prefix"] or not match["binary"]):
-        power = PREFIXES[match["prefix"].lower()]
-        if match["binary"]:
-            power = 1024 ** round(math.log(power, 1000))
-        value = Fraction(match["number"]) * power
+    value = Fraction(match["number"]) * PREFIXES[match["prefix"].lower()] if match else Fraction(-1, 2)
     if value.denominator != 1:
         raise ValueError(f"{text!r} is not a size: whole bytes, such as 3000000, 3MB or 3MiB")
     return int(value)

@@ -6,10 +6,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 
+from ..support.similar import near
 from . import conditions
 from .columns import Column, Row
 from .conditions import SIGNS, BadAssertionError, is_number, number_text
-from .files import near
 from .statistics import STATISTICS, Number, is_statistic, numbers, statistic, totals
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 #: The value of a cell; None for an empty one, such as the churn of the first frame.
@@ -27,9 +28,14 @@ class Column:
     meaning: str
 
     def rounded(self, value: Cell) -> Cell:
-        """A value rounded to the digits of this column. Rows hold rounded values, so that all file formats agree."""
+        """A value rounded to the digits of this column. Rows hold rounded values, so that all file formats agree.
+
+        A number that is not finite, of splats that are not, is an empty cell.
+        """
         if not self.digits or value is None:
             return value
+        if not math.isfinite(float(value)):
+            return None
         return float(format(value, self.digits)) + 0.0  # adding 0 turns -0 into 0
 
     def text(self, value: Cell) -> str:

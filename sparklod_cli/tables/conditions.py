@@ -12,6 +12,7 @@ from decimal import Decimal
 from typing import Any
 
 from ..support.errors import SparklodError
+from ..support.units import PREFIXES
 from .statistics import Number
 
 SIGNS: dict[str, Callable[[Any, Any], bool]] = {
@@ -27,8 +28,6 @@ TEXT = re.compile(r"\s*(?P<left>[^<>=!]*?)\s*(?P<sign>[<>=!]+)\s*(?P<right>[^<>=
 NUMBER = re.compile(
     r"(?P<number>[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]{1,3})?)\s*(?P<unit>%|[kKMG]?(?:i?B)?)"
 )
-PREFIXES = {"": 1, "k": 10**3, "K": 10**3, "M": 10**6, "G": 10**9}
-BINARY = {"Ki": 1 << 10, "ki": 1 << 10, "Mi": 1 << 20, "Gi": 1 << 30}
 
 #: Values that are no numbers, as JSON spells them. A text is put in quotes, as there.
 WORDS: dict[str, Any] = {"true": True, "false": False, "null": None}
@@ -110,7 +109,7 @@ def _number(text: str, right: str) -> Number:
     if not found:
         raise BadAssertionError(f"{text!r}: {right!r} is not a number such as 0.2, 500k, 2M or 20%")
     prefix = found["unit"].removesuffix("B")
-    factor = Decimal("0.01") if prefix == "%" else BINARY.get(prefix) or PREFIXES.get(prefix, 0)
+    factor = Decimal("0.01") if prefix == "%" else PREFIXES.get(prefix.lower(), 0)
     number = float(Decimal(found["number"]) * factor)  # in decimals, so that 1.1k is 1100
     if not factor:
         raise BadAssertionError(f"{text!r}: {right!r} has no unit that is known; write k, M, G, %, MB or MiB")

@@ -25,14 +25,6 @@ QUOTED = ',"\r\n'
 FORMULAS = ("=", "+", "-", "@", "\t", "\r", "\n")
 
 
-def near(name: str, known: Iterable[str], *, cutoff: float = 0.6) -> str:
-    """The end of an error about an unknown name: ", did you mean ...?"; empty if no known name is similar."""
-    import difflib  # which takes a millisecond, and is needed after a mistake only
-
-    found = difflib.get_close_matches(name, list(known), n=3, cutoff=cutoff)
-    return f", did you mean {' or '.join(found)}?" if found else ""
-
-
 def encode(rows: Iterable[Row], columns: Sequence[Column], form: str) -> Iterator[bytes]:
     """The pieces of a file of rows. CSV and JSON are made row by row, so that long paths take no memory.
 
@@ -59,7 +51,7 @@ def load_pyarrow() -> ModuleType:
     Raises:
         SparklodError: it is not installed.
     """
-    with optional_import("Parquet is written by pyarrow", "sparklod[parquet]"):
+    with optional_import("Parquet is written by pyarrow", "parquet"):
         import pyarrow
         import pyarrow.parquet
     return pyarrow

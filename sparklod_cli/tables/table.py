@@ -61,7 +61,7 @@ class Table(Sequence[Row]):
         Raises:
             SparklodError: pandas is not installed.
         """
-        with optional_import("to_pandas needs pandas", "pandas"):
+        with optional_import("to_pandas needs pandas", package="pandas"):
             import pandas
         kinds = {int: "Int64", float: "float64", str: "string"}
         cells = {column.name: self.column(column.name) for column in self.columns}

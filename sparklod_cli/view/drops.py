@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import binascii
 import contextlib
+import dataclasses
 import math
 import os
 import tempfile
@@ -20,7 +21,6 @@ from ..io import write_whole
 from ..io.names import leads_away
 from ..support.errors import CameraPathError
 from ..support.untrusted import parse_json, quoted_value
-from .start import Point
 
 #: Bytes of a request with camera files, in base64: COLMAP's images.txt of a large scene has 50 MB.
 MAX_BYTES = 1 << 27
@@ -32,12 +32,12 @@ MAX_FILES = 16
 MAX_CAMERAS = 20_000
 
 
-def parse_drop(body: bytes, up: Point | None) -> dict[str, Any]:
+def parse_drop(body: bytes, settings: Settings) -> dict[str, Any]:
     """The path of some dropped files, as `frames_of` has it.
 
     Args:
         body: JSON, {"files": [{"name": text, "data": base64}]}.
-        up: direction that is up, for cameras of which the files have only eye and target; None for their default.
+        settings: of the cameras; `up` is left out of those of files whose cameras have up axes of their own.
 
     Raises:
         CameraPathError: they are no camera path that sparklod reads.
@@ -49,17 +49,17 @@ def parse_drop(body: bytes, up: Point | None) -> dict[str, Any]:
         for name, data in contents.items():
             write_whole(Path(folder, name), [data], overwrite=True)
         try:
-            return frames_of(_read(Path(folder, first), up))
+            return frames_of(_read(Path(folder, first), settings))
         except CameraPathError as error:
             raise CameraPathError(str(error).replace(f"{folder}{os.sep}", "")) from None
 
 
-def _read(path: Path, up: Point | None) -> CameraPath:
+def _read(path: Path, settings: Settings) -> CameraPath:
     """The cameras of a file; those that have up axes of their own keep them."""
-    if up is not None:
+    if settings.up is not None:
         with contextlib.suppress(CameraPathError):
-            return read_path(path, settings=Settings(up=up))
-    return read_path(path)
+            return read_path(path, settings=settings)
+    return read_path(path, settings=dataclasses.replace(settings, up=None))
 
 
 def _contents(body: bytes) -> Mapping[str, bytes]:

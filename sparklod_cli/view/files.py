@@ -17,14 +17,16 @@ from ..codecs.rad.header import MAGIC, read_header
 from ..codecs.rad.records import RadHeader
 from ..codecs.sog.names import META
 from ..codecs.streamed_sog.names import MANIFEST
-from ..io.beside import in_folder, path_beside
-from ..io.names import reason_of
+from ..io.beside import companions, in_folder, path_beside
+from ..io.level_files import read_level_files
+from ..io.names import reason_unreadable
 from ..io.plain import open_plain
 from ..model.nodes import CHUNK_NODES
 from ..support.errors import FormatError, NotSplatsError, UnknownFormatError, UnreadableError
+from ..support.printable import printable
 from ..support.untrusted import quoted_value
 
-#: What Spark calls the formats that sparklod reads.
+#: What Spark calls the formats that sparklod reads; PlayCanvas shows the one that is missing, Streamed SOG.
 SPARK_TYPES = {
     "compressed PLY": "ply",
     "PLY": "ply",
@@ -38,10 +40,14 @@ SPARK_TYPES = {
 #: How files begin that sparklod reads and Spark 2.2.0 does not, and what they are.
 UNREAD = ((rb"NGSP", "SPZ version 4"), (rb"ply\s+format (?!binary_little)", "PLY that is ascii or big-endian"))
 
+#: What can show files, and its name for display.
+ENGINES = {"spark": "Spark", "playcanvas": "PlayCanvas"}
+
 #: Media types by suffix; anything else is bytes.
 MEDIA_TYPES = {
     ".html": "text/html; charset=utf-8",
     ".js": "text/javascript; charset=utf-8",
+    ".mjs": "text/javascript; charset=utf-8",
     ".css": "text/css; charset=utf-8",
     ".json": "application/json",
     ".svg": "image/svg+xml",
@@ -62,7 +68,7 @@ class ShownFile:
         name: for display.
         url: where the page finds it, relative to the page.
         format: for display: "RAD", "SPZ".
-        spark_type: what Spark calls its format.
+        spark_type: what Spark calls its format; None where PlayCanvas shows it.
         header: of a RAD file.
         files: itself and what it refers to, by the names that it is served under.
         note: why Spark will not show it; None where nothing is known against it.
@@ -72,10 +78,15 @@ class ShownFile:
     name: str
     url: str
     format: str
-    spark_type: str
+    spark_type: str | None
     header: RadHeader | None
     files: Mapping[str, Path]
     note: str | None = None
+
+    @property
+    def engine(self) -> str:
+        """Engine that shows the file, one of `ENGINES`."""
+        return "playcanvas" if self.spark_type is None else "spark"
 
     @property
     def paged(self) -> bool:
@@ -102,10 +113,15 @@ def shown_files(paths: Sequence[Path]) -> list[ShownFile]:
     """The files that a page shows, each with those that it refers to.
 
     Raises:
-        FormatError: a file cannot be read, is of no known format, or refers to one that is missing or elsewhere; the
-            text names it.
+        FormatError: a file cannot be read, is of no known format, or refers to one that is missing or elsewhere; or
+            they are for different engines; the text names it.
     """
-    return [_named(path, f"data/{number}") for number, path in enumerate(paths)]
+    shown = [_named(path, f"data/{number}") for number, path in enumerate(paths)]
+    other = next((file for file in shown if file.engine != shown[0].engine), None)
+    if other is not None:
+        names = f"{shown[0].path} by {ENGINES[shown[0].engine]}, {other.path} by {ENGINES[other.engine]}"
+        raise NotSplatsError(f"one page cannot show all of these files: {names}; view them one after the other")
+    return shown
 
 
 def _named(path: Path, folder: str) -> ShownFile:
@@ -114,7 +130,7 @@ def _named(path: Path, folder: str) -> ShownFile:
     except FormatError as error:
         raise type(error)(f"{path}: {error}") from None
     except OSError as error:
-        raise UnreadableError(f"{path}: cannot be read: {reason_of(error)}") from None
+        raise UnreadableError(f"{path}: cannot be read: {reason_unreadable(error)}") from None
 
 
 def _shown(path: Path, folder: str) -> ShownFile:
@@ -135,14 +151,15 @@ def _shown(path: Path, folder: str) -> ShownFile:
     form = sniff(head, path.suffix)
     if form is None:
         raise UnknownFormatError(f"not a splat file that sparklod reads ({', '.join(form.name for form in FORMATS)})")
-    if form.name not in SPARK_TYPES:
-        raise NotSplatsError(f"Spark does not read {form.name}; bake it first with sparklod build-lod")
     name = f"{folder}/{path.name}"
     files = {name: path.resolve()}
-    if header is not None:
+    if form.detailed:
+        files |= {f"{folder}/{beside}": _inside(path, path.parent / beside) for beside in _manifest_files(path)}
+    elif header is not None:
         files |= {f"{folder}/{chunk}": beside for chunk, beside in _chunk_files(path, header)}
     note = _note(path.name, head, header)
-    return ShownFile(path, path.name, url_of(name), form.name, SPARK_TYPES[form.name], header, files, note)
+    file_type = SPARK_TYPES.get(form.name)
+    return ShownFile(path, printable(path.name), url_of(name), form.name, file_type, header, files, note)
 
 
 def _note(name: str, head: bytes, header: RadHeader | None) -> str | None:
@@ -167,9 +184,18 @@ def _chunk_files(path: Path, header: RadHeader) -> Iterator[tuple[str, Path]]:
         yield name, _inside(path, beside)
 
 
+def _manifest_files(path: Path) -> list[str]:
+    """Return the names of all files that a manifest and its chunks refer to; `FormatError` where a chunk is missing."""
+    files = dict.fromkeys(beside.relative_to(path.parent).as_posix() for beside in companions(path, ()))
+    missing = next((name for name in read_level_files(path).manifest.names() if name not in files), None)
+    if missing is not None:
+        raise FormatError(f"its chunk file {quoted_value(missing)} is missing")
+    return list(files)
+
+
 def _inside(path: Path, beside: Path) -> Path:
-    """The real path of a file that another one names; `FormatError` where a link leads out of their folder."""
+    """The real path of a file that another one names; `FormatError` where a link leads out of its folder."""
     real = beside.resolve()
-    if real.parent != path.parent.resolve():
+    if real.parent != path.parent.resolve() / beside.relative_to(path.parent).parent:
         raise FormatError(f"{quoted_value(beside.name)}, which it names, is a link to another folder; copy it there")
     return real

@@ -1,4 +1,4 @@
-"""Spark and three.js, which the page draws with: from a CDN at fixed versions, or from a folder of node_modules."""
+"""The libraries that the page draws with: from a CDN at fixed versions, or from a folder of node_modules."""
 
 from __future__ import annotations
 
@@ -11,10 +11,13 @@ from ..support.errors import SparklodError
 from ..support.printable import printable
 from ..support.untrusted import parse_json
 
-SPARK, THREE = "@sparkjsdev/spark", "three"
+SPARK, PLAYCANVAS, THREE = "@sparkjsdev/spark", "playcanvas", "three"
+
+#: What each engine of `files.ENGINES` needs; the page has its vectors from three.js, whatever draws.
+PACKAGES = {"spark": (SPARK, THREE), "playcanvas": (PLAYCANVAS, THREE)}
 
 #: The versions that the page was tested with.
-VERSIONS = {SPARK: "2.2.0", THREE: "0.187.0"}
+VERSIONS = {SPARK: "2.2.0", PLAYCANVAS: "2.23.3", THREE: "0.187.0"}
 
 #: Serves the files of npm packages as they were published.
 CDN = "https://cdn.jsdelivr.net/npm"
@@ -23,6 +26,7 @@ CDN = "https://cdn.jsdelivr.net/npm"
 #: that has another one. Spark imports one module of three's examples, three's first module imports its core.
 MODULES = {
     (SPARK, "dist/spark.module.js"): "OQEdbh3DPqIT6IsNEl9DQBNeBw4p2sTknDP1lrT6MjlQoTIEtzzM5LZ4ljB1QCh3",
+    (PLAYCANVAS, "build/playcanvas.min.mjs"): "jIMtMpSIHxCHjnqekLLvZ9pz0cGMfA5JXdcO5YcNe5+Kn2IgCATDYJK4MjQVpxS+",
     (THREE, "build/three.module.js"): "T/E3B9AvPtLn5PKD7aTSFqizQcA4kHDfU0lub7u0fvM4w9BMGcSb3yI7r5LqMAMn",
     (THREE, "build/three.core.js"): "drH6BueSlcvoXCwAqWkNJvXwu2Ax3mnGOmZnIXaomedIw+uXSP9Bf/XIUINgLUW+",
     (THREE, "examples/jsm/postprocessing/Pass.js"): "927X5fcqlqKPsXZV1w3tv5BZx797OXX3D/TDJk0FHwJd12z58B5aqS77g5LZoprI",
@@ -31,6 +35,7 @@ MODULES = {
 #: What the page and Spark call modules, and what those names begin or are.
 NAMES = {
     SPARK: (SPARK, "dist/spark.module.js"),
+    PLAYCANVAS: (PLAYCANVAS, "build/playcanvas.min.mjs"),
     THREE: (THREE, "build/three.module.js"),
     "three/addons/": (THREE, "examples/jsm/"),
 }
@@ -41,7 +46,7 @@ LICENSE = "LICENSE"
 
 @dataclass(frozen=True)
 class Libraries:
-    """Where the page finds Spark and three.js.
+    """Addresses and files of the packages of an engine.
 
     Attributes:
         versions: by package.
@@ -59,7 +64,9 @@ class Libraries:
 
     def import_map(self) -> dict[str, dict[str, str]]:
         """What `<script type="importmap">` holds."""
-        imports = {name: self._url(package, path) for name, (package, path) in NAMES.items()}
+        imports = {
+            name: self._url(package, path) for name, (package, path) in NAMES.items() if package in self.versions
+        }
         return {"imports": imports} | ({"integrity": dict(self.integrity)} if self.integrity else {})
 
     def _url(self, package: str, path: str) -> str:
@@ -78,35 +85,39 @@ def _url(base: str, package: str, version: str | None, path: str) -> str:
     return f"{base}/{package}{f'@{version}' if version else ''}/{path}"
 
 
-def from_cdn() -> Libraries:
-    """The libraries of the CDN."""
+def from_cdn(engine: str = "spark") -> Libraries:
+    """The libraries of the CDN for an engine."""
+    versions = {package: VERSIONS[package] for package in PACKAGES[engine]}
     integrity = {
-        _url(CDN, package, VERSIONS[package], path): f"sha384-{digest}" for (package, path), digest in MODULES.items()
+        _url(CDN, package, versions[package], path): f"sha384-{digest}"
+        for (package, path), digest in MODULES.items()
+        if package in versions
     }
-    return Libraries(VERSIONS, CDN, CDN, integrity, {})
+    return Libraries(versions, CDN, CDN, integrity, {})
 
 
-def from_folder(folder: Path) -> Libraries:
-    """The libraries of a folder that has a node_modules, or is one.
+def from_folder(folder: Path, engine: str = "spark") -> Libraries:
+    """The libraries for an engine of a folder that has a node_modules, or is one.
 
     Raises:
         SparklodError: a package, or a module of it, is missing; the text says how to install it.
     """
     packages = folder if folder.name == "node_modules" else folder / "node_modules"
-    install = f"npm install --prefix {folder} " + " ".join(f"{name}@{version}" for name, version in VERSIONS.items())
+    install = f"npm install --prefix {folder} " + " ".join(f"{name}@{VERSIONS[name]}" for name in PACKAGES[engine])
     versions, files = {}, {}
-    for package in VERSIONS:
+    for package in PACKAGES[engine]:
         if not (packages / package).is_dir():
             raise SparklodError(f"{packages} has no {package}; install it with {install}")
         versions[package] = _version(packages / package)
         files[f"lib/{package}/{LICENSE}"] = packages / package / LICENSE
     for package, path in MODULES:
-        files[f"lib/{package}/{path}"] = packages / package / path
+        if package in versions:
+            files[f"lib/{package}/{path}"] = packages / package / path
     # A link, such as those of pnpm, is followed here, once.
     files = {name: path.resolve() for name, path in files.items() if path.is_file()}
     for package, path in NAMES.values():
         name = f"lib/{package}/{path}"
-        if not path.endswith("/") and name not in files:
+        if package in versions and not path.endswith("/") and name not in files:
             raise SparklodError(f"{packages / package} has no {path}; install {package} anew with {install}")
     return Libraries(versions, str(folder), "./lib", {}, files)
 

@@ -155,7 +155,7 @@ class Handler(BaseHTTPRequestHandler):
     def _answer_json(self, body: bytes) -> None:
         status, answer = HTTPStatus.OK, {}
         try:
-            answer = parse_drop(body, self.server.site.up)
+            answer = parse_drop(body, self.server.site.cameras)
         except SparklodError as error:
             status, answer = HTTPStatus.UNPROCESSABLE_ENTITY, {"error": str(error)}
         data = json.dumps(answer).encode()

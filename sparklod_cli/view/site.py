@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from .. import __version__
+from ..cameras.frame import Settings as CameraSettings
 from ..cameras.path import CameraPath
 from .drops import frames_of
 from .files import Resources, ShownFile
@@ -24,7 +25,8 @@ from .start import Extent, Point, Start
 #: Files of the page, in the package's folder `page`; `INDEX` is a template.
 INDEX = "index.html"
 PAGE = (
-    *("boot.js", "view.js", "scene.js", "controls.js", "sizes.js", "panel.js", "player.js", "paths.js", "text.js"),
+    *("boot.js", "view.js", "spark.js", "playcanvas.js", "scene.js", "sizes.js"),
+    *("controls.js", "panel.js", "player.js", "paths.js", "text.js"),
     "style.css",
 )
 
@@ -64,11 +66,11 @@ class Site:
 
     Attributes:
         resources: all of it, by name.
-        up: direction that is up where it was given, for camera paths that are dropped onto the page.
+        cameras: settings of camera paths that are dropped onto the page.
     """
 
     resources: Resources
-    up: Point | None
+    cameras: CameraSettings
 
 
 def site_of(
@@ -77,7 +79,7 @@ def site_of(
     look: Look,
     libraries: Libraries,
     *,
-    up: Point | None,
+    cameras: CameraSettings,
     served: bool,
 ) -> Site:
     """The site of some files.
@@ -87,7 +89,7 @@ def site_of(
         extents: what they hold.
         look: how the page shows them at first.
         libraries: that it draws with.
-        up: direction that is up, where it was given.
+        cameras: settings of camera paths that are dropped onto the page.
         served: by `server`, which parses camera paths; otherwise the page can read those of sparklod itself.
     """
     folder = files(__package__).joinpath("page")
@@ -96,6 +98,7 @@ def site_of(
         "generator": GENERATOR,
         "version": __version__,
         "title": title,
+        "engine": shown[0].engine,
         "files": [_file(file, extent) for file, extent in zip(shown, extents, strict=True)],
         "start": dataclasses.asdict(look.start),
         "up": look.up,
@@ -113,7 +116,7 @@ def site_of(
     resources.update(libraries.files)
     for file in shown:
         resources.update(file.files)
-    return Site(resources, up)
+    return Site(resources, cameras)
 
 
 def _file(shown: ShownFile, extent: Extent) -> dict[str, Any]:
@@ -125,7 +128,9 @@ def _file(shown: ShownFile, extent: Extent) -> dict[str, Any]:
         "bytes": shown.bytes,
         "splats": extent.splats,
         "leaves": extent.leaves,
+        "levels": extent.levels,
         "chunks": None if shown.header is None else len(shown.header.chunks),
+        "first_bytes": None if shown.header is None else sum(entry.bytes for entry in shown.header.chunks[:1]),
         "paged": shown.paged,
         "chunked": shown.header is not None and shown.header.chunked,
     }

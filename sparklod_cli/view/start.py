@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
@@ -14,12 +15,13 @@ from ..cameras.camera import Camera, Matrix
 from ..cameras.defaults import ELEVATION
 from ..cameras.frame import DEFAULT_FOV_Y, Settings
 from ..cameras.sources import Views, WholeScene
-from ..codecs.rad.codec import read_chunk
+from ..codecs.rad.codec import count_leaves, read_chunk
+from ..codecs.rad.places import file_of
 from ..codecs.rad.records import RadHeader
-from ..io import examine_scene
+from ..io import examine_scene, read_levels
 from ..io.names import reason_of
 from ..io.plain import open_plain
-from ..model.balls import Balls, balls_of
+from ..model.balls import USED, Balls, balls_of
 from ..model.splats import Splats
 from ..support.errors import InvalidSplatsError, SparklodError, UnreadableError
 from ..support.progress import Progress, silent
@@ -48,15 +50,19 @@ class Extent:
 
     Attributes:
         splats: how many, nodes where it is a tree.
-        leaves: how many of a tree, or nodes where it is not read to its end; None without one.
+        leaves: how many of a tree, or splats of level 0 where there are detail levels; None without either.
         balls: what its splats cover; only the coarsest of a large RAD tree.
         sizes: (2,) the range of the feature sizes of its splats, but for a few at either end, world units.
+        up: as in `Scene`.
+        levels: detail levels; None without.
     """
 
     splats: int
     leaves: int | None
     balls: Balls
     sizes: tuple[float, float]
+    up: str | None
+    levels: int | None = None
 
 
 @dataclass(frozen=True)
@@ -90,7 +96,9 @@ def extent_of(shown: ShownFile, *, threads: int = 1, progress: Progress = silent
     try:
         if shown.header is not None and shown.header.lod_tree and len(shown.header.chunks) > 1:
             return _coarse_extent(shown, shown.header)
-        scene = examine_scene(shown.path, columns=("center", "scale"), threads=threads, progress=progress)
+        if shown.spark_type is None:
+            return _detail_extent(shown.path, threads, progress)
+        scene = examine_scene(shown.path, columns=USED, threads=threads, progress=progress)
     except SparklodError as error:
         raise type(error)(f"{shown.path}: {error}") from None
     except OSError as error:
@@ -98,24 +106,38 @@ def extent_of(shown: ShownFile, *, threads: int = 1, progress: Progress = silent
     leaves = None if scene.tree is None else np.flatnonzero(scene.tree.is_leaf)
     index = slice(None) if leaves is None else leaves
     balls = balls_of(scene.splats, index, np.eye(4))
-    return Extent(len(scene.splats), None if leaves is None else len(leaves), balls, _sizes(scene.splats))
+    return Extent(len(scene.splats), None if leaves is None else len(leaves), balls, _sizes(scene.splats), scene.up)
 
 
 def _coarse_extent(shown: ShownFile, header: RadHeader) -> Extent:
-    """That of a RAD tree by its first chunk alone, as a viewer first has it: a file may have gigabytes.
+    """That of a RAD tree by its first chunk, as a viewer first has it, and its leaves: a file may have gigabytes.
 
     A cut through the chunk, its nodes that have no children in it, covers the whole scene.
     """
+    beside = {Path(key).name: path for key, path in shown.files.items()}
+
+    def opened(name: str) -> BinaryIO:
+        return open_plain(beside[name])
+
     entry = header.chunks[0]
-    name = shown.path.name if entry.filename is None else entry.filename
-    with open_plain(next(path for key, path in shown.files.items() if Path(key).name == name)) as file:
-        chunk = read_chunk(file, entry, header)
+    with opened(shown.path.name) as file:
+        with file_of(entry, file, opened) as first:
+            chunk = read_chunk(first, entry, header)
+        leaves = count_leaves(file, header, opened)
     assert chunk.tree is not None
     start, count = (column.astype(np.int64) for column in (chunk.tree.child_start, chunk.tree.child_count))
     cut = np.flatnonzero((count == 0) | (start + count > len(chunk.splats)))
     smallest, largest = _sizes(chunk.splats)
     balls = balls_of(chunk.splats, cut, np.eye(4))
-    return Extent(header.count, header.count, balls, (smallest / BELOW, largest))
+    return Extent(header.count, leaves, balls, (smallest / BELOW, largest), header.noted.up)
+
+
+def _detail_extent(path: Path, threads: int, progress: Progress) -> Extent:
+    """Return the extent of a scene at several detail levels, without its environment, which is all around."""
+    scene = read_levels(path, threads=threads, progress=progress)
+    coarsest = scene.splats.take(scene.level(scene.levels - 1))
+    balls = balls_of(coarsest, slice(None), np.eye(4))
+    return Extent(len(scene.splats), int(scene.counts[:, 0].sum()), balls, _sizes(scene.splats), scene.up, scene.levels)
 
 
 def _sizes(splats: Splats) -> tuple[float, float]:

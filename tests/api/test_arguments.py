@@ -187,3 +187,19 @@ def test_cameras_and_instances_of_no_sense_are_refused(scene: sparklod.Scene, tm
     path = tmp_path / "instances.json"
     path.write_text(json.dumps({"instances": [{"file": str(ONE)}]}))
     assert [each.file for each in sparklod.read_instances(str(path))] == [ONE]
+
+
+@pytest.mark.parametrize("name", ["", "new.spz/", "out.spz"])
+def test_a_folder_is_no_file_to_write(name: str, scene: sparklod.Scene, tmp_path: Path) -> None:
+    (tmp_path / "out.spz").mkdir()
+    for write in (lambda path: sparklod.write(path, scene), sparklod.show(np.zeros((8, 8, 4), np.float32)).save):
+        with pytest.raises(sparklod.OutputError, match="is a folder; name a file in it"):
+            write(f"{tmp_path}/{name}")
+    assert not any((tmp_path / "out.spz").iterdir())
+
+
+@pytest.mark.parametrize("encoding", [None, "ext"])
+def test_a_name_without_suffix_is_refused(encoding: str | None, scene: sparklod.Scene, tmp_path: Path) -> None:
+    with pytest.raises(sparklod.FormatError, match=r"written as \.\w+, .*which the name does not end in"):
+        sparklod.write(tmp_path / "out", scene, encoding=encoding)
+    assert not any(tmp_path.iterdir())

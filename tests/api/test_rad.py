@@ -190,8 +190,8 @@ def test_wrong_options_are_refused_before_anything_is_written(
         ({"rgb_min": 1, "rgb_max": 0}, ValueError, "rgb_min is 1, which is not below rgb_max, 0"),
         ({"ln_scale_min": 9}, ValueError, "ln_scale_min is 9, which is not below ln_scale_max, 9"),
         ({"sh2_max": 0}, ValueError, "sh2_max is 0; give a number above 0"),
-        ({"rgb_max": float("nan")}, ValueError, "rgb_max is nan; give a finite number"),
-        ({"ln_scale_max": 1e39}, ValueError, "ln_scale_max is 1e+39; give a finite number"),
+        ({"rgb_max": float("nan")}, ValueError, "rgb_max is nan; give a number"),
+        ({"ln_scale_max": 1e39}, ValueError, "ln_scale_max is 1e+39; give a number"),
         ({"rgb_min": "a"}, TypeError, "rgb_min is 'a'; give a number"),
     ],
 )

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
 
 import pytest
 
-from sparklod_cli.bake import BakeSettings, bake_unless_there
+from sparklod_cli.bake import BakeSettings, bake_unless_there, skipping
 from sparklod_cli.bake.skipping import SUFFIX
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
+from sparklod_cli.io import identity
+from sparklod_cli.lod.detail_settings import DetailSettings
 from sparklod_cli.support.errors import OutputError
 from tests.conftest import FIXTURES
 
 SETTINGS = BakeSettings()
+STREAMED = BakeSettings(suffix=".json", detail=DetailSettings(levels=(0.3,)))
 CHUNKED = BakeSettings(suffix=".rad", options=WriteOptions(rad=RadOptions(chunked=True)))
 
 
@@ -82,6 +86,62 @@ def test_a_chunk_that_is_gone_is_missed(scene: Path, tmp_path: Path) -> None:
     chunk.unlink()
     assert bake_unless_there(scene, target, CHUNKED, overwrite=True) is not None
     assert chunk.exists()
+
+
+def damage(path: Path, *, keep_date: bool) -> None:
+    """Flips a bit in the middle of a file, or in the version that a header notes, since the names in it are needed."""
+    times = path.stat()
+    data = bytearray(path.read_bytes())
+    place = data.find(b"sparklod ") + len("sparklod ")
+    data[place if b"sparklod " in data else len(data) // 2] ^= 1
+    path.write_bytes(data)
+    os.utime(path, ns=(times.st_atime_ns, times.st_mtime_ns + (not keep_date)))
+
+
+@pytest.mark.parametrize("name", ["a.spz", "a.rad", "a-0.radc", "web/lod-meta.json", "web/0_0/sh0.webp"])
+def test_damage_in_any_file_is_found(scene: Path, tmp_path: Path, name: str) -> None:
+    """By its date, or where that was set back, by `verify` alone."""
+    settings = {"a.spz": SETTINGS, "web": STREAMED}.get(name.split("/")[0], CHUNKED)
+    target = tmp_path / {"a-0.radc": "a.rad", "web/0_0/sh0.webp": "web/lod-meta.json"}.get(name, name)
+    target.parent.mkdir(exist_ok=True)
+    bake_unless_there(scene, target, settings)
+    damage(tmp_path / name, keep_date=False)
+    file = re.escape(Path(name).name)
+    with pytest.raises(OutputError, match=rf"{file} was changed since it was baked"):
+        bake_unless_there(scene, target, settings)
+    bake_unless_there(scene, target, settings, overwrite=True)
+    damage(tmp_path / name, keep_date=True)
+    assert bake_unless_there(scene, target, settings) is None
+    with pytest.raises(OutputError, match=rf"{file} was changed since it was baked"):
+        bake_unless_there(scene, target, settings, verify=True)
+    bake_unless_there(scene, target, settings, overwrite=True, verify=True)
+    assert bake_unless_there(scene, target, settings, verify=True) is None
+
+
+def test_nothing_is_read_whose_size_and_date_are_unchanged(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    target = tmp_path / "a.rad"
+    bake_unless_there(scene, target, CHUNKED)
+    read: list[str] = []
+    content_of = skipping.content_of
+    monkeypatch.setattr(skipping, "content_of", lambda file: read.append(file.name) or content_of(file))
+    assert bake_unless_there(scene, target, CHUNKED) is None
+    assert read == []
+    assert bake_unless_there(scene, target, CHUNKED, verify=True) is None
+    assert sorted(read) == ["a-0.radc", "a.rad", "scene.ply"]
+
+
+def test_an_input_whose_date_was_set_back_is_found_by_verify(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(identity, "PLACE_BYTES", 1)  # so that the sample misses the damage, as in a large file
+    target = tmp_path / "a.spz"
+    bake_unless_there(scene, target, SETTINGS)
+    damage(scene, keep_date=True)
+    assert bake_unless_there(scene, target, SETTINGS) is None
+    with pytest.raises(OutputError, match=r"scene\.ply changed since"):
+        bake_unless_there(scene, target, SETTINGS, verify=True)
 
 
 @pytest.mark.parametrize("note", [None, "", "[]", "{}", '{"recipe": {"inputs": 3}}', "\x00"])

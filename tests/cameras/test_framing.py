@@ -104,12 +104,33 @@ def test_the_largest_thousandth_of_the_balls_is_left_out() -> None:
 
 def test_a_backdrop_is_not_framed() -> None:
     random = np.random.default_rng(0)
-    center = random.normal(size=(20_000, 3)) + np.array([5, 6, 7])
+    center = random.uniform(-1, 1, (20_000, 3)) + np.array([5, 6, 7])
     center[:1000] = 1e6 * random.normal(size=(1000, 3))
     kept = covered(Balls(center, np.zeros(20_000)))
     middle, radius = framing(center)
     assert np.linalg.norm(kept.center - middle, axis=1).max() <= OUTSIDE * radius
     assert len(kept.center) == pytest.approx(19_000, rel=0.01)
+
+
+def test_stray_splats_and_haze_are_not_framed() -> None:
+    """Around a ground whose splats touch each other are small ones with room between them, and faint ones."""
+    random = np.random.default_rng(0)
+    splats = Splats.zeros(22_000, 0)
+    splats.center[:20_000, ::2] = random.uniform(-1, 1, (20_000, 2))
+    splats.center[20_000:] = random.uniform(-2.5, 2.5, (2_000, 3))
+    splats.scale[:20_000], splats.scale[20_000:] = 0.01, 0.005
+    splats.opacity[:] = 1
+    splats.scale[21_000:], splats.opacity[21_000:] = 0.3, 0.1
+    kept = covered(balls_of(splats, slice(None), np.eye(4)))
+    assert np.abs(kept.center).max() <= 1.2
+    assert np.count_nonzero(np.abs(kept.center).max(axis=1) <= 1) > 0.99 * 20_000
+
+
+@pytest.mark.parametrize(("opacity", "radius"), [(1, 2), (50, 2), (math.exp(-1.5), 1), (math.exp(-2), 0), (0, 0)])
+def test_a_fainter_splat_covers_less(opacity: float, radius: float) -> None:
+    splats = Splats.zeros(1, 0)
+    splats.scale[:], splats.opacity[:] = 1, opacity
+    assert balls_of(splats, slice(None), np.eye(4)).radius == pytest.approx(radius, abs=1e-3)
 
 
 def test_framing_ignores_splats_far_away() -> None:
@@ -129,6 +150,7 @@ def test_framing_ignores_splats_far_away() -> None:
 @pytest.mark.filterwarnings("error")
 def test_balls_have_the_places_of_finite_splats() -> None:
     splats = Splats.zeros(5, 0)
+    splats.opacity[:] = 1
     splats.scale[:] = (0.1, 0.5, 0.2)
     splats.center[:, 0] = (1, 2, np.nan, 3e38, 4)
     splats.scale[4] = np.inf

@@ -97,7 +97,7 @@ def test_windows_are_encoded_anywhere_and_count_what_they_clamp(
     pieces = pickle.loads(sent).pieces(lambda number, name: found[number][name], threads=1, progress=silent)
     assert b"".join(pieces) == b"".join(codec.encode(scene, PALETTE))
     tallies = [found[number][encoder.CLAMPED] for number in sorted(found)]
-    expected = clamps.find(scene.splats, ranges=ranges)
+    expected = clamps.find(scene.splats, ranges=ranges, tree=scene.tree)
     assert clamps.clamps_of(clamps.merged(tallies), ranges) == expected
     assert set(expected.splats) >= {"sh"}
 

@@ -41,8 +41,8 @@ def flushed(blocks: Iterable[bytes], flush: int) -> bytes:
     return b"".join(packer.compress(block) + packer.flush(flush) for block in blocks) + packer.flush()
 
 
-def ours(data: bytes) -> bytes:
-    return b"".join(compression.gzip_member([data], [Run(len(data))], 5, 1, silent))
+def ours(data: bytes, comment: bytes = b"") -> bytes:
+    return b"".join(compression.gzip_member([data], [Run(len(data))], 5, 1, silent, comment=comment))
 
 
 @functools.cache
@@ -53,6 +53,7 @@ def members(size: int = 2 * BLOCK + 7) -> dict[str, bytes]:
     words = [(data[:20_000] * 30)[:BLOCK]] * 3  # which refer to each other
     return {
         "ours": ours(data),
+        "commented": ours(data, b"a comment"),
         "python": gzip.compress(data, 1),
         "full flush": flushed(blocks, zlib.Z_FULL_FLUSH),
         "sync flush": flushed(blocks, zlib.Z_SYNC_FLUSH),
@@ -80,6 +81,22 @@ def test_all_writers_are_read_to_the_end(kind: str, threads: int) -> None:
         assert reader.behind() == behind[:2]
 
 
+@pytest.mark.parametrize("size", [1, inflate.MOST_COMMENT - 1, inflate.MOST_COMMENT, 1 << 17])
+def test_a_comment_is_read_up_to_a_size(size: int) -> None:
+    reader = Inflate(io.BytesIO(ours(b"data", b"c" * size)))
+    assert reader.comment == (b"c" * size if size < inflate.MOST_COMMENT else b"")
+    assert reader.read(9) == b"data"
+    reader.finish(allow_more=False)
+
+
+@pytest.mark.parametrize("cut", range(10, 20))
+def test_a_member_that_ends_in_its_comment_is_cut_short(cut: int) -> None:
+    reader = Inflate(io.BytesIO(ours(b"data", b"a comment")[:cut]))
+    assert reader.read(9) == b""
+    with pytest.raises(TruncatedError):
+        reader.finish(allow_more=False)
+
+
 def test_only_what_refers_to_itself_is_inflated_by_itself(monkeypatch: pytest.MonkeyPatch) -> None:
     """As many parts as blocks, and of the last one no flush tells the end."""
     alone: list[bool] = []
@@ -92,7 +109,7 @@ def test_only_what_refers_to_itself_is_inflated_by_itself(monkeypatch: pytest.Mo
 
     monkeypatch.setattr(inflate, "_alone", counted)
     every = members()
-    expected = {"ours": [True] * 2, "full flush": [True] * 2, "python": [], "stored": [False]}
+    expected = {"ours": [True] * 2, "commented": [True] * 2, "full flush": [True] * 2, "python": [], "stored": [False]}
     for kind, parts in expected.items():
         alone.clear()
         reader = Inflate(io.BytesIO(every[kind]), 2)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from types import ModuleType
 
 import numpy as np
@@ -57,7 +58,10 @@ def test_a_tree_whose_leaves_were_counted_settles_as_the_whole(
 ) -> None:
     monkeypatch.setattr(statistics, "_BLOCK", 64)
     scene, needed = tree_of(2_000, 3), codec.needed(DEFAULTS)
-    scene.splats.center[0], scene.splats.scale[0] = 3_000, 80  # the root
+    splats = scene.splats
+    center, scale = splats.center.copy(), splats.scale.copy()
+    center[0], scale[0] = 3_000, 80  # the root
+    scene = dataclasses.replace(scene, splats=dataclasses.replace(splats, center=center, scale=scale))
     assert scene.tree is not None
     leaves = Statistics.of_leaves(scene.splats.take(scene.tree.is_leaf), needed, threads=2)
     found = Statistics.of_tree(scene, leaves, needed, threads=2)

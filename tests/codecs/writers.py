@@ -24,8 +24,10 @@ from fixtures import (
 from sparklod_cli.codecs import octahedral, ply, quantize, sh_palette, splat, spz
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import codec as rad
+from sparklod_cli.codecs.rad.encodings import LARGEST_F16
 from sparklod_cli.codecs.rad.header import ENCODING_KEYS
 from sparklod_cli.codecs.rad.layout import choices
+from sparklod_cli.codecs.rad.options import HALF
 from sparklod_cli.codecs.sog import codec as sog
 from sparklod_cli.codecs.sog import codings
 from sparklod_cli.codecs.sog.codebook import codebook
@@ -76,6 +78,7 @@ class Case:
         precision: by how much the columns of a scene may change.
         lod: whether the scene must have a tree.
         held: the splats that the file must hold, in its order.
+        reach: the largest coordinate that the format can hold; scenes that go beyond are refused.
     """
 
     format: str
@@ -83,6 +86,7 @@ class Case:
     precision: Callable[[Scene], Precision]
     lod: bool = False
     held: Callable[[Splats], Splats] = everything
+    reach: float = np.inf
 
 
 def put(content: Content, directory: Path, form: str) -> Path:
@@ -358,10 +362,11 @@ def ksplat_precision(source: Scene, level: int, sections: str) -> Precision:
 def held_by_ksplat(splats: Splats, sections: str) -> Splats:
     """Returns the splats with SH up to degree 2, and zeros where a section has a lower degree."""
     cut = by_hand_ksplat.parts(len(splats), SECTIONS[sections])
-    held = splats.take(slice(None)).with_max_sh(max(degree for _, degree in cut))
+    held = splats.with_max_sh(max(degree for _, degree in cut))
+    sh = held.sh.copy()
     for part, degree in cut:
-        held.sh[part, (0, 3, 8)[degree] :] = 0
-    return held
+        sh[part, (0, 3, 8)[degree] :] = 0
+    return dataclasses.replace(held, sh=sh)
 
 
 KSPLAT = {
@@ -526,6 +531,7 @@ RAD = BY_HAND_RAD | {
         functools.partial(as_rad, options=options),
         functools.partial(written_rad_precision, options=options),
         lod,
+        reach=LARGEST_F16 if options.center in HALF else np.inf,
     )
     for index, (way, options) in enumerate(RAD_OPTIONS.items())
     for lod in ((False, True) if index < 2 else (bool(index % 2),))

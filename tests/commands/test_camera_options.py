@@ -117,6 +117,13 @@ def test_a_dolly_lasts_as_long_as_it_is_told() -> None:
     assert "more than" in usage_error("--dolly", "--seconds", "1e6")
 
 
+@pytest.mark.parametrize("orbit", [(), ("--orbit", "24")])
+def test_an_orbit_lasts_as_long_as_its_seconds(orbit: tuple[str, ...]) -> None:
+    plain, slow = cameras(*orbit).cameras, cameras(*orbit, "--seconds", "12").cameras
+    assert [camera.time for camera in slow] == pytest.approx([12 * at / len(plain) for at in range(len(plain))])
+    assert all(np.array_equal(a.camera_to_world, b.camera_to_world) for a, b in zip(plain, slow, strict=True))
+
+
 def test_look_at_is_one_camera_that_looks_there() -> None:
     (camera,) = cameras("--look-at", "-1,2,-3:-1,2,5", scene=no_scene).cameras
     assert camera.position.tolist() == [-1, 2, -3]
@@ -172,7 +179,9 @@ def test_wrong_camera_options_are_errors_that_name_them() -> None:
     assert "--center can only be used with --orbit or --dolly" in usage_error(
         "--center", "0,0,0", "--look-at", "0,0,0:1,1,1"
     )
-    assert "--seconds can only be used with --dolly or --keyframes" in usage_error("--seconds", "3")
+    only = "--seconds can only be used with --orbit or --dolly or --keyframes"
+    assert only in usage_error("--seconds", "3", "--look-at", "0,0,0:1,1,1")
+    assert "--fps cannot be used with --seconds of an orbit" in usage_error("--seconds", "3", "--fps", "30")
     for wrong in ("1,2,3", "1,2,3:1,2", "1,2,3:1,2,3", "a:b", "1,2,3:4,5,nan"):
         assert "Invalid value for '--look-at'" in usage_error("--look-at", wrong)
     assert "fewer than two keyframes" in usage_error("--keyframes", "1,2,3:4,5,6")

@@ -6,6 +6,7 @@ import io
 
 import pytest
 
+from sparklod_cli.commands import console as console_module
 from sparklod_cli.commands.console import Console, count_of, say_error
 
 
@@ -34,6 +35,20 @@ def test_a_terminal_gets_a_bar_a_stage(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_file_or_a_quiet_terminal_gets_none(monkeypatch: pytest.MonkeyPatch) -> None:
     assert shown_on(io.StringIO(), monkeypatch) == ""
     assert shown_on(Terminal(), monkeypatch, quiet=True) == ""
+
+
+@pytest.mark.parametrize("quiet", [False, True])
+def test_a_log_gets_a_line_of_a_long_stage_every_ten_seconds(quiet: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    log, clock = io.StringIO(), iter([0, 4, 9, 11, 15, 22, 29, 33, 100, 104, 109])
+    monkeypatch.setattr("sys.stderr", log)
+    monkeypatch.setattr(console_module, "monotonic", lambda: next(clock))
+    with Console(quiet=quiet, verbose=False) as console:
+        for done in range(8):
+            console.progress("refining", 250 * done, 1750, "step")
+        for done in range(3):
+            console.progress("writing", done, 4, "B")
+    lines = ["refining: 750 of 1,750 steps (43 %), 11 s", "refining: 1,250 of 1,750 steps (71 %), 22 s"]
+    assert log.getvalue().splitlines() == ([] if quiet else lines)
 
 
 def test_colour_is_for_terminals_that_want_it(monkeypatch: pytest.MonkeyPatch) -> None:

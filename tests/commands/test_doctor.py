@@ -17,7 +17,7 @@ from sparklod_cli.doctor import Check
 from tests.conftest import ROOT
 
 FINE = Check("sparklod", "ok", "0.1.0")
-NOTE = Check("extra video", "note", "imageio is missing", "pip install 'sparklod[video]'")
+NOTE = Check("extra video", "note", "imageio is missing", "pip install imageio")
 PROBLEM = Check("numba", "problem", "is \x1b[31mmissing", "pip install 'numba>=0.60'")
 
 
@@ -38,7 +38,7 @@ def test_columns_are_aligned_and_advice_is_below(
     assert captured.out.splitlines() == [
         "ok      sparklod     0.1.0",
         "note    extra video  imageio is missing",
-        "                     -> pip install 'sparklod[video]'",
+        "                     -> pip install imageio",
         "problem numba        is \\x1b[31mmissing",
         "                     -> pip install 'numba>=0.60'",
     ]

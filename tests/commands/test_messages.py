@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import re
 from pathlib import Path
 
@@ -87,50 +88,47 @@ def clamped_scene(tmp_path: Path, **values: float) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "said"),
+    ("name", "value", "detail", "consequence"),
     [
-        ("scale", 1e-7, r"scales of \d+ nodes? \(.* %\) are below 4.4e-05, down to 1e-07"),
-        ("scale", 4e3, r"scales of \d+ nodes? \(.* %\) are above 391, up to 4e\+03"),
-        ("rgb", -3.0, r"colours of \d+ nodes? \(.* %\) are below -0.444, down to -3"),
-        ("rgb", 4.0, r"colours of \d+ nodes? \(.* %\) are above 1.44, up to 4"),
-        ("sh", -2.0, r"SH of \d+ nodes? \(.* %\) are below -1, down to -2"),
-        ("sh", 2.5, r"SH of \d+ nodes? \(.* %\) are above 0.996, up to 2.5"),
+        ("scale", 1e-7, "scales of N are below 4.4e-05, down to 1e-07", "1.7 % of splats are smaller"),
+        ("scale", 4e3, "scales of N are above 391, up to 4e+03", "1.7 % of splats are larger"),
+        ("rgb", -3.0, "colours of N are below -0.444, down to -3", ""),  # black is black
+        ("rgb", 4.0, "colours of N are above 1.44, up to 4", "1.7 % of colours are brighter"),
+        ("sh", -2.0, "SH of N are below -1, down to -2", ""),  # too few to be seen
+        ("sh", 2.5, "SH of N are above 0.996, up to 2.5", ""),
     ],
 )
-def test_what_is_clamped_is_said_with_its_end_and_what_to_do(
-    name: str, value: float, said: str, tmp_path: Path, capsys: Said
+def test_what_is_clamped_is_said_in_a_line_and_with_verbose_in_detail(
+    name: str, value: float, detail: str, consequence: str, tmp_path: Path, capsys: Said
 ) -> None:
-    assert run(["build-lod", str(clamped_scene(tmp_path, **{name: value}))]) == 0
+    source = clamped_scene(tmp_path, **{name: value, "opacity": 0.5})
+    assert run(["build-lod", str(source)]) == 0
+    _, *lines = capsys.readouterr().err.splitlines()
+    expected = [f"  {consequence} than SPZ can hold; --format rad keeps more of them"] if consequence else []
+    assert lines == expected
+    assert run(["build-lod", str(source), "--overwrite", "-v"]) == 0
     err = capsys.readouterr().err
-    advice = CLAMPED_BY_SPZ[name, "above" in said][1]
-    if value == 1e-7:  # one of few nodes is many
-        advice = "--scale 1000 or --format rad keeps them"
+    advice = CLAMPED_BY_SPZ[name, "above" in detail][1]
+    said = re.escape(detail).replace("N", r"\d+ nodes? \(.* %\)")
     assert re.search(rf"\n  {said}, and are clamped to what SPZ holds: {re.escape(advice)}\n", err), err
     assert err.count("clamped to") == 1
+    assert "--scale" not in err
 
 
-@pytest.mark.parametrize(
-    ("small", "scale", "advice"),
-    [
-        (300, 1e-6, "--scale 100 or --format rad keeps them"),
-        (300, 1e-9, "--format rad keeps them"),  # such a scene would be too large for positions
-        (2, 1e-6, CLAMPED_BY_SPZ["scale", False][1]),
-    ],
-)
-def test_a_scene_too_small_for_spz_is_told_how_much_larger_it_fits(
-    small: int, scale: float, advice: str, tmp_path: Path, capsys: Said
-) -> None:
+@pytest.mark.parametrize("column", [slice(0, 1), slice(0, 3)])
+@pytest.mark.parametrize("count", [0, 1, 2, 300])
+def test_the_note_and_inspect_go_by_one_rule(count: int, column: slice, tmp_path: Path, capsys: Said) -> None:
+    """That flat splats get thicker cannot be seen; that whole splats grow can, if they are more than 0.1 %."""
     splats = random_splats(1_000)
-    splats.scale[:small, 0] = scale
-    source = tmp_path / "small.ply"
+    splats.scale[:count, column] = 1e-6
+    splats.opacity[:] = 0.5
+    source, output = tmp_path / "small.ply", tmp_path / "small-lod.spz"
     source.write_bytes(b"".join(ply.encode(Scene(splats))))
-    assert run(["build-lod", str(source)]) == 0
-    err = capsys.readouterr().err
-    said = r"are below 4.4e-05, down to 1e-\d+, and are clamped to what SPZ holds: "
-    assert re.search(said + re.escape(advice) + "\n", err), err
-    if "--scale" in advice and small > 2:
-        assert run(["build-lod", str(source), "--scale", "100", "-o", str(tmp_path / "large-lod.spz")]) == 0
-        assert "clamped" not in capsys.readouterr().err
+    assert run(["build-lod", str(source), "-o", str(output)]) == 0
+    assert ("than SPZ can hold" in capsys.readouterr().err) == (count > 1 and column.stop == 3)
+    assert run(["inspect", str(output), "--check", "--json"]) == 0
+    codes = [each["code"] for each in json.loads(capsys.readouterr().out)["findings"]]
+    assert ("values.scale-clamped" in codes) == (count > 1 and column.stop == 3)
 
 
 def test_counts_of_one_have_a_singular_noun(tmp_path: Path, capsys: Said) -> None:

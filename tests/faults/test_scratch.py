@@ -3,17 +3,23 @@ same bytes."""
 
 from __future__ import annotations
 
+import dataclasses
 import os
+import shutil
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from sparklod_cli.bake import BakeSettings, Resources, bake
+from sparklod_cli.bake import BakeSettings, Resources, bake, bake_unless_there
+from sparklod_cli.bake.out_of_core import manifest
+from sparklod_cli.bake.out_of_core.job import PUBLISHED
 from sparklod_cli.bake.out_of_core.manifest import SUFFIX
-from sparklod_cli.support.errors import InvalidSplatsError, ScratchError
+from sparklod_cli.bake.out_of_core.store import FolderStore
+from sparklod_cli.support.errors import InvalidSplatsError, OutputError, ScratchError
 from tests.faults.runs import DEMO, ENVIRONMENT, mounted
 from tests.signals import heed_signals
 
@@ -87,7 +93,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, str], byt
     for method, suffix in (("quick", ".rad"), ("quality", ".spz")):
         target = folder / f"{method}{suffix}"
         baked(target, folder / "scratch", method)
-        assert list((folder / "scratch").iterdir()) == []
+        assert not (folder / "scratch").exists()
         found[method, suffix] = target.read_bytes()
     return found
 
@@ -139,6 +145,60 @@ def test_an_interrupted_bake_says_what_is_left_and_is_refused_or_begun_anew(
     assert list(scratch.iterdir()) == []
 
 
+def stop_at_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Interrupts bakes when their output is in place, and nothing of their scratch is removed."""
+    clear = manifest._clear
+
+    def interrupted(store: FolderStore) -> None:
+        if store.has(PUBLISHED):
+            raise KeyboardInterrupt
+        clear(store)
+
+    monkeypatch.setattr(manifest, "_clear", interrupted)
+
+
+@pytest.mark.parametrize("bakes", [bake, bake_unless_there], ids=lambda bakes: bakes.__name__)
+def test_a_bake_whose_output_is_in_place_is_resumed(
+    bakes: Callable[..., object], tmp_path: Path, whole: dict[tuple[str, str], bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    target, settings = tmp_path / "out.rad", BakeSettings(suffix=".rad")
+    resources = Resources(block_splats=BLOCK_SPLATS, resume=True)
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        stop_at_the_end(patch)
+        bakes(DEMO, target, settings, resources=resources)
+    assert target.read_bytes() == whole["quick", ".rad"]
+    with pytest.raises(OutputError, match="--overwrite"):
+        bakes(DEMO, target, settings, resources=dataclasses.replace(resources, resume=False))
+    bakes(DEMO, target, settings, resources=resources)
+    assert target.read_bytes() == whole["quick", ".rad"]
+    assert not (tmp_path / f"out.rad{SUFFIX}").exists()
+
+
+def test_a_file_that_an_interrupted_bake_did_not_write_is_not_replaced(tmp_path: Path) -> None:
+    target, scratch = tmp_path / "out.rad", tmp_path / "scratch"
+    begun(target, scratch, "quick", 23, "kill").communicate()
+    target.write_bytes(b"mine")
+    with pytest.raises(OutputError, match=r"out\.rad exists, add --overwrite"):
+        baked(target, scratch, resume=True)
+    assert target.read_bytes() == b"mine"
+
+
+def test_results_that_somebody_removed_are_an_error_that_says_what_helps(
+    tmp_path: Path, whole: dict[tuple[str, str], bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    target, scratch = tmp_path / "out.rad", tmp_path / "scratch"
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        stop_at_the_end(patch)
+        baked(target, scratch)
+    target.unlink()
+    shutil.rmtree(next(scratch.iterdir()) / "encoded")
+    shutil.rmtree(next(scratch.iterdir()) / "families")
+    with pytest.raises(ScratchError, match=r"^families/\d+ is missing in the scratch folder .*anew with --overwrite"):
+        baked(target, scratch, resume=True)
+    baked(target, scratch, overwrite=True)
+    assert target.read_bytes() == whole["quick", ".rad"]
+
+
 def test_leftover_results_are_refused_or_removed_by_a_bake_in_memory_too(tmp_path: Path) -> None:
     target = tmp_path / "out.rad"
     begun(target, tmp_path, "quick", 12, "kill").communicate()
@@ -169,12 +229,13 @@ def test_a_full_scratch_disk_is_one_error_and_room_lets_it_go_on(
         assert list(disk.iterdir()) == []
 
 
-def test_an_input_that_cannot_be_baked_leaves_no_scratch(tmp_path: Path) -> None:
+def test_an_input_that_cannot_be_baked_leaves_no_folder(tmp_path: Path) -> None:
     source = tmp_path / "cut.ply"
     data = bytearray(DEMO.read_bytes())
     data[-100_000:] = b"\xff" * 100_000  # not finite
     source.write_bytes(data)
-    resources = Resources(scratch_dir=tmp_path / "scratch", block_splats=BLOCK_SPLATS)
-    with pytest.raises(InvalidSplatsError, match="--on-invalid drop"):
-        bake(source, tmp_path / "out.spz", BakeSettings(), resources=resources)
-    assert list((tmp_path / "scratch").iterdir()) == []
+    for scratch in (tmp_path / "scratch", None):
+        resources = Resources(scratch_dir=scratch, block_splats=BLOCK_SPLATS)
+        with pytest.raises(InvalidSplatsError, match="--on-invalid drop"):
+            bake(source, tmp_path / "new" / "out.spz", BakeSettings(), resources=resources)
+    assert [path.name for path in tmp_path.iterdir()] == ["cut.ply"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import io
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -20,6 +21,7 @@ from sparklod_cli.lod import quick
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.support.errors import SparklodError
+from sparklod_cli.support.optional import install_hint
 from tests.scenes import random_splats
 
 SIZE = (320, 200)
@@ -173,7 +175,7 @@ def fresh() -> Iterator[None]:
 class TestWhereNoneCanBeDrawn:
     def test_a_missing_pyvista_is_named(self, scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setitem(sys.modules, "pyvista", None)
-        with pytest.raises(SparklodError, match=r"pip install 'sparklod\[render\]'") as caught:
+        with pytest.raises(SparklodError, match=re.escape(install_hint("render"))) as caught:
             plot(scene)
         assert "\n" not in str(caught.value)
 

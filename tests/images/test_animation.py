@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import itertools
+import re
 import subprocess
 import sys
 from collections.abc import Iterable
@@ -14,6 +15,7 @@ from PIL import Image, ImageSequence
 
 from sparklod_cli.images import animated_webp, animation, gif
 from sparklod_cli.support.errors import SparklodError
+from sparklod_cli.support.optional import install_hint
 
 COLORS = [(250, 10, 10), (10, 250, 10), (10, 10, 250), (240, 240, 10)]
 
@@ -186,6 +188,6 @@ def test_a_video_has_the_frames(size: tuple[int, int], form: str) -> None:
 @pytest.mark.parametrize("form", ["mp4", "webm"])
 def test_a_missing_imageio_is_named(form: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "imageio", None)
-    with pytest.raises(SparklodError, match=rf"^\.{form} is written by imageio: pip install 'sparklod\[video\]'"):
+    with pytest.raises(SparklodError, match=rf"^\.{form} is written by imageio: {re.escape(install_hint('video'))}"):
         animation.check(form, 30)
     animation.check("gif", 30)

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sparklod_cli.cli import run
-from sparklod_cli.codecs import spz, spz_options
+from sparklod_cli.codecs import ply, spz, spz_options
 from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.inspection import leaves
 from sparklod_cli.inspection.findings import Finding
@@ -53,6 +53,40 @@ def test_the_leaves_of_a_baked_tree_are_the_splats(source: str, version: int, tm
 def test_the_leaves_of_real_trees_are_the_splats(source: str, tmp_path: Path) -> None:
     path = real_scene(source)
     assert check(baked(path, tmp_path), read_scene(path)) == []
+
+
+def one_place() -> Splats:
+    splats = random_splats(300, sh_degree=2)
+    splats.center[:] = [3, 2, 1]
+    return splats
+
+
+def tiny() -> Splats:
+    splats = random_splats(300, extent=3e-7)
+    splats.scale[:] = 1.5e-8
+    return splats
+
+
+def two_sizes() -> Splats:
+    splats = random_splats(600, extent=5e5)
+    splats.scale[:300], splats.scale[300:] = 8e-7, 8e3
+    splats.center[:100] *= 1e-9
+    return splats
+
+
+@pytest.mark.parametrize("scene", [one_place, tiny, two_sizes])
+@pytest.mark.parametrize("options", [[], ["--rad-center", "f32"]])
+def test_leaves_of_rad_are_the_splats_however_centres_were_rounded(
+    scene: Callable[[], Splats], options: list[str], tmp_path: Path
+) -> None:
+    source, tree = tmp_path / "scene.ply", tmp_path / "tree.rad"
+    source.write_bytes(b"".join(ply.encode(Scene(scene()))))
+    assert run(["build-lod", str(source), "-o", str(tree), "-q", *options]) == 0
+    assert run(["inspect", str(tree), "--leaves-of", str(source)]) == 0
+    changed = scene()
+    changed.center[7] += 30 * changed.scale[7].max()
+    source.write_bytes(b"".join(ply.encode(Scene(changed))))
+    assert run(["inspect", str(tree), "--leaves-of", str(source)]) == 3
 
 
 @pytest.mark.parametrize("bits", [0, 4, 9])
@@ -113,8 +147,9 @@ def changed_leaf(change: Callable[[Splats, int, Scene], None], degree: int = 1) 
     scene = tree_of(splats)
     assert scene.tree is not None
     node = int(np.flatnonzero(scene.tree.is_leaf)[123])
-    change(scene.splats, node, scene)
-    return node, check(scene, Scene(splats))
+    changed = Splats(**{name: column.copy() for name, column in vars(scene.splats).items()})
+    change(changed, node, scene)
+    return node, check(dataclasses.replace(scene, splats=changed), Scene(splats))
 
 
 def moved(steps: int) -> Callable[[Splats, int, Scene], None]:
@@ -160,8 +195,8 @@ def test_a_difference_of_one_step_in_many_leaves_is_no_finding(monkeypatch: pyte
     monkeypatch.setattr(leaves, "MAX_SEARCHED", 50, raising=False)
     splats = random_splats(300, sh_degree=1)
     scene = tree_of(splats)
-    scene.splats.rgb[:] += 0.007
-    assert check(scene, Scene(splats)) == []
+    brighter = dataclasses.replace(scene.splats, rgb=scene.splats.rgb + np.float32(0.007))
+    assert check(dataclasses.replace(scene, splats=brighter), Scene(splats)) == []
 
 
 def test_a_leaf_that_takes_the_place_of_another_is_found() -> None:

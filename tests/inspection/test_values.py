@@ -231,9 +231,10 @@ def test_centres_at_the_end_of_the_fixed_point_are_a_finding(version: int, sign:
 def test_many_scales_at_the_ends_of_their_code_are_a_finding() -> None:
     header = {"version": 3, "fractional_bits": 12}
     for end in np.exp(np.float32([-10, 255 / 16 - 10])):
-        splats = random_splats(200)
+        splats = random_splats(2_000)
         splats.scale[:2] = end
-        assert codes(splats, **header) == []  # a hundredth is not many
+        large = bool(end > 1)  # one of a sky may fill the picture; of others, a thousandth is not many
+        assert codes(splats, **header) == ["values.scale-clamped"] * large
         splats.scale[7] = end
         assert codes(splats, **header) == ["values.scale-clamped"]
         assert codes(splats) == []

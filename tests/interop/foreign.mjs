@@ -7,6 +7,7 @@
 //   {do: 'convert', source, path, spz}  splat-transform writes `path`, in the format of its name: {}
 //   {do: 'ksplat', source, path, level, section, block, bucket}
 //                                       mkkellogg's writer, of a PLY: {}
+//   {do: 'spz', path}                   mkkellogg's reader of SPZ: {centers}, in the axes of the file
 //   {do: 'splat', source, path}         gsplat.js's writer, of a PLY: {}
 // and {error} where it fails.
 import { mkdirSync, readFileSync, writeFileSync } from 'node:fs';
@@ -91,6 +92,21 @@ const actions = {
     const generator = SplatBufferGenerator.getStandardGenerator(1, level, section, undefined, block, bucket);
     writeFileSync(path, new Uint8Array(generator.generateFromUncompressedSplatArray(splats).bufferData));
     return {};
+  },
+
+  async spz({ path }) {
+    const { SpzLoader } = await load('@mkkellogg/gaussian-splats-3d');
+    const { Vector3 } = await load('three');
+    globalThis.window = { setTimeout }; // which it calls, and by which others would take this for a browser
+    const loading = SpzLoader.loadFromFileData(new Uint8Array(bytes(path)), 0, 0, false, 0);
+    const buffer = await loading.finally(() => delete globalThis.window);
+    const centers = [];
+    for (let splat = 0; splat < buffer.getSplatCount(); splat++) {
+      const center = new Vector3();
+      buffer.getSplatCenter(splat, center);
+      centers.push(center.toArray());
+    }
+    return { centers };
   },
 
   async splat({ source, path }) {

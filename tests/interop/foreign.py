@@ -36,6 +36,10 @@ class Foreign:
         self._node.ask({"do": action, "source": str(source), "path": str(path), **options})
         return path
 
+    def spz_centers(self, path: Path) -> NDArray[np.float64]:
+        """(N, 3) the centres that mkkellogg's viewer reads of an SPZ, as the file has them."""
+        return np.array(self._node.ask({"do": "spz", "path": str(path)})["centers"])
+
     def read(self, path: Path) -> Splats:
         """Has splat-transform decode a file; returns the splats in the axes of PLY files."""
         answer = self._node.ask({"do": "read", "path": str(path), "out": str(self._scratch / "column")})

@@ -277,3 +277,23 @@ def test_splats_of_other_writers_are_near_their_source(file: File) -> None:
 @pytest.mark.parametrize("file", [*WRITTEN[3::4], *FILES[len(WRITTEN) :]], indirect=True)
 def test_files_of_other_writers_can_be_baked(file: File, tmp_path: Path) -> None:
     assert run(["build-lod", str(file.path), "-o", str(tmp_path / "out.spz")]) == 0
+
+
+@pytest.mark.parametrize("name", ["hand-v1.spz", "sh3-v2.spz"])
+def test_mkkelloggs_viewer_reads_spz_1_and_2(foreign: Foreign, name: str) -> None:
+    path = FIXTURES / "golden" / name
+    np.testing.assert_allclose(foreign.spz_centers(path), read_scene(path).splats.center, rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["sh3-v3.spz", "hand-v4.spz", "tree-v2.spz", "tree-v3.spz"])
+def test_mkkelloggs_viewer_refuses_other_spz(foreign: Foreign, name: str) -> None:
+    """As docs/formats.md says: once this fails, its table has changed."""
+    with pytest.raises(AssertionError, match="reading 'shDegree'"):
+        foreign.spz_centers(FIXTURES / "golden" / name)
+
+
+@pytest.mark.parametrize("name", ["hand-v1.spz", "tree-v2.spz", "tree-v3.spz", "hand-v4.spz"])
+def test_splat_transform_reads_all_nodes_of_any_spz(foreign: Foreign, name: str) -> None:
+    path = FIXTURES / "golden" / name
+    theirs = flipped(foreign.read(path)).center
+    np.testing.assert_allclose(theirs, read_scene(path).splats.center, rtol=1e-6)

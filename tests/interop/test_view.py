@@ -12,7 +12,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -24,10 +24,12 @@ import pytest
 from PIL import Image
 
 from sparklod_cli.cli import run
-from sparklod_cli.view.libraries import CDN, MODULES, VERSIONS
+from sparklod_cli.view.libraries import CDN, MODULES, PACKAGES, PLAYCANVAS, THREE, VERSIONS
 from tests.conftest import FIXTURES
 from tests.interop import npm
 from tests.interop.conftest import PAGE
+from tests.interop.engines import PACKAGES as ENGINES
+from tests.interop.engines.conftest import engines_dir as engines_dir
 from tests.interop.node import Node
 from tests.interop.pictures import psnr
 from tests.signals import heed_signals
@@ -40,6 +42,9 @@ BUDGET = 3_000
 
 #: Least PSNR in dB of a picture of the page from one of `sparklod render`: Spark rounds to 8 bits after every splat.
 LEAST = 40
+
+#: The same of PlayCanvas, whose blur and falloff are others.
+LEAST_OF_PLAYCANVAS = 28
 
 #: How often the page is asked whether something has come about, which takes moments.
 PATIENCE = 1_000
@@ -65,9 +70,11 @@ class Tab:
         """Asks `view_page.mjs` for something."""
         return self.node.ask({"do": do, **request})
 
-    def open(self, url: str, *, without: list[str] | None = None) -> None:
+    def open(
+        self, url: str, *, without: list[str] | None = None, size: tuple[int, int] = SIZE, hold: bool = False
+    ) -> None:
         """Opens a page."""
-        self.ask("open", url=url, width=SIZE[0], height=SIZE[1], without=without or [])
+        self.ask("open", url=url, width=size[0], height=size[1], without=without or [], hold=hold)
 
     def settled(self) -> dict[str, Any]:
         """The state of the page, once its picture is that of its camera."""
@@ -161,15 +168,79 @@ def rendered(file: Path, camera: list[str], out: Path, budget: int = BUDGET) -> 
     return pixels(out)
 
 
+def test_on_a_phone_the_panel_leaves_the_middle_of_the_scene_free(tab: Tab, packages: Path, trees: Path) -> None:
+    width, height = 390, 844
+    with Served(packages, trees / "demo.spz") as url:
+        tab.open(url, size=(width, height))
+        tab.settled()
+        targets = tab.ask("targets")["targets"]
+        assert {"panel-hide", "help-open", "budget", "levels", "orbit", "copy"} <= targets.keys()
+        assert {name: sides for name, sides in targets.items() if min(sides) < 44} == {}
+        x, y = tab.ask("middle")["middle"]
+        assert x == pytest.approx(width / 2, abs=1)
+        assert 0.2 * height < y < 0.3 * height
+        tab.ask("click", id="panel-hide")
+        tab.settled()
+        assert tab.ask("middle")["middle"] == pytest.approx([width / 2, height / 2], abs=1)
+        assert tab.ask("targets")["targets"].keys() == {"panel-show"}
+        tab.ask("click", id="panel-show")
+        tab.settled()
+        assert tab.ask("middle")["middle"] == pytest.approx([x, y], abs=1)
+
+
+@pytest.mark.parametrize("name", ["demo.spz", "demo.rad"])
+def test_the_page_says_what_it_loads_with_bytes(name: str, tab: Tab, packages: Path, trees: Path) -> None:
+    with Served(packages, trees / name) as url:
+        tab.open(url, hold=True)
+        loading = tab.until(lambda state: state["loading"] is not None)["loading"]
+        assert loading.startswith(f"{name}: loading")
+        assert loading.endswith(f" of {(trees / name).stat().st_size / 1e6:.1f} MB")
+        tab.ask("release")
+        assert tab.settled()["loading"] is None
+
+
+def test_streamed_sog_is_shown_in_playcanvas(
+    tab: Tab, packages: Path, trees: Path, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    """From the camera of the page, which it copies out; its modules have the digests that the page asks a CDN for."""
+    engines: Path = request.getfixturevalue("engines_dir")
+    (tmp_path / "node_modules").mkdir()
+    for package, folder in ((PLAYCANVAS, engines), (THREE, packages)):
+        (tmp_path / "node_modules" / package).symlink_to(folder / "node_modules" / package)
+    check_digests(tmp_path, (PLAYCANVAS, THREE))
+    assert ENGINES[PLAYCANVAS] == VERSIONS[PLAYCANVAS]
+    manifest = trees / "web" / "lod-meta.json"
+    assert run(["build-lod", str(FIXTURES / "demo.ply"), "-o", str(manifest), "-q"]) == 0
+    with Served(tmp_path, manifest, *LOOK) as url:
+        tab.open(url)
+        state = tab.settled()
+        assert state["faults"] == []
+        assert state["camera"] == "--look-at=0,-3.4,9:0,-1.1,0 --fov=40"
+        assert (state["drawn"], state["budget"]) == (27_800, "27,800 (all)")
+        theirs = tab.picture(tmp_path / "page.png")
+        ours = rendered(manifest, state["camera"].split(), tmp_path / "r.png", 27_800)
+        assert psnr(theirs - ours) >= LEAST_OF_PLAYCANVAS
+        tab.ask("press", key="l")
+        assert tab.until(lambda state: state["legend"] is not None)["legend"] == "01"
+        tab.ask("fill", id="budget", value="0")
+        tab.until(lambda state: 0 < state["drawn"] < 27_800)
+
+
 def eye_of(camera: str) -> list[float]:
     return [float(value) for value in camera.partition("=")[2].partition(":")[0].split(",")]
 
 
 def test_the_digests_are_those_of_the_packages(packages: Path) -> None:
-    assert {name: PAGE[name] for name in VERSIONS} == VERSIONS
+    assert {name: PAGE[name] for name in PACKAGES["spark"]}.items() <= VERSIONS.items()
+    check_digests(packages, PACKAGES["spark"])
+
+
+def check_digests(packages: Path, names: Collection[str]) -> None:
+    """Assert that modules of packages have the digests by which the page asks a CDN for them."""
     for (package, path), digest in MODULES.items():
-        data = (packages / "node_modules" / package / path).read_bytes()
-        assert base64.b64encode(hashlib.sha384(data).digest()).decode() == digest, path
+        if package in names:
+            data = (packages / "node_modules" / package / path).read_bytes()
+            assert base64.b64encode(hashlib.sha384(data).digest()).decode() == digest, path
 
 
 def test_the_page_shows_what_render_draws(shown: Tab, trees: Path, tmp_path: Path) -> None:

@@ -2,11 +2,18 @@
 // playwright-core, CHROMIUM is the browser's program.
 //
 // A request a line on stdin, an answer a line on stdout, {error} where it fails:
-//   {do: 'open', url, width, height, without}  a new tab with that page, which gets nothing from the hosts of `without`
+//   {do: 'open', url, width, height, without, hold}
+//                             a new tab with that page, which gets nothing from the hosts of `without`, and no splats
+//                             before 'release' with `hold`
+//   {do: 'release'}
 //   {do: 'settle'}            waits until the cut and the order of the splats are those of the camera, and have been drawn
 //   {do: 'state'}             what the panel says and what Spark has
 //   {do: 'message'}           waits for the page to say something, and answers {text}
 //   {do: 'picture', out}      writes a PNG of the page without its panel
+//   {do: 'screenshot', out}   writes a PNG of the page as it is
+//   {do: 'click', id}         clicks, or touches, an element
+//   {do: 'targets'}           {targets}: the width and height of everything that can be clicked, by id or name
+//   {do: 'middle'}            {middle}: where the target of the camera is, in pixels of the page
 //   {do: 'press', key}        presses a key
 //   {do: 'fill', id, value}   fills a field, or moves a slider
 //   {do: 'drag', dx, dy}      drags the scene by pixels
@@ -23,11 +30,17 @@ const browser = await playwright.chromium.launch({ executablePath: chromium, arg
 let tab;
 let faults = [];
 
-async function open({ url, width, height, without = [] }) {
+let release = async () => ({});
+
+async function open({ url, width, height, without = [], hold = false }) {
   await tab?.close();
   faults = [];
   tab = await browser.newPage({ viewport: { width, height } });
   for (const host of without) await tab.route(`**://${host}/**`, (route) => route.abort());
+  if (hold) {
+    const released = new Promise((done) => (release = async () => (done(), {})));
+    await tab.route('**/data/**', (route) => released.then(() => route.continue()));
+  }
   tab.on('console', (message) => console.error(message.text()));
   tab.on('pageerror', (error) => faults.push(String(error)));
   await tab.goto(url);
@@ -38,7 +51,9 @@ async function open({ url, width, height, without = [] }) {
 function progress() {
   const view = window.sparklod;
   if (!view) return null;
-  const { spark, camera } = view;
+  const { spark, app } = view.stage;
+  if (app) return { busy: view.files.some((shown) => shown.loading), frame: app.frame, drawn: view.stage.drawn };
+  const { camera } = view;
   const { pager } = spark;
   const isPaged = view.files.some((shown) => shown.paged);
   const isTree = view.files.some((shown) => shown.isTree);
@@ -46,7 +61,7 @@ function progress() {
   const isCut = !isTree || (cut && cut === spark.lastLod && !spark.lodDirty && cut.pos.distanceTo(camera.position) < 1e-6);
   const isLoaded = !isPaged || (pager && !pager.fetchers.length && !pager.fetched.length && !pager.newUploads.length);
   const busy = spark.sorting || spark.sortDirty || !spark.activeSplats || !isCut || !isLoaded;
-  return { busy: Boolean(busy), frame: view.renderer.info.render.frame, drawn: spark.activeSplats };
+  return { busy: Boolean(busy), frame: view.stage.renderer.info.render.frame, drawn: spark.activeSplats };
 }
 
 async function settle() {
@@ -54,17 +69,19 @@ async function settle() {
   for (;;) {
     const now = await tab.evaluate(progress);
     if (!now || now.busy || now.drawn !== from?.drawn) from = now && !now.busy ? now : null;
-    else if (now.frame >= from.frame + 4) return {};
+    else if (now.frame >= from.frame + 10) return {};
     await tab.waitForTimeout(30);
   }
 }
 
-const state = () =>
-  tab.evaluate((found) => {
+const state = async () => {
+  while (!(await tab.evaluate(() => Boolean(window.sparklod)))) await tab.waitForTimeout(30);
+  return tab.evaluate((found) => {
     const text = (id) => document.getElementById(id).textContent;
-    const { spark, files, player, group } = window.sparklod;
+    const { stage, files, player } = window.sparklod;
     return {
-      drawn: spark.activeSplats,
+      loading: document.getElementById('loading').hidden ? null : text('loading'),
+      drawn: stage.drawn,
       said: text('drawn'),
       budget: text('budget-text'),
       camera: document.getElementById('camera').value,
@@ -75,11 +92,12 @@ const state = () =>
       message: document.getElementById('message').hidden ? null : text('message-text'),
       playing: player.playing,
       time: player.time,
-      paged: files.map((shown) => shown.paged),
-      meshes: group.children.length,
+      paged: files.map((shown) => Boolean(shown.paged)),
+      meshes: stage.group?.children.length,
       faults: found,
     };
   }, faults);
+};
 
 async function message() {
   const said = tab.locator('#message-text');
@@ -92,10 +110,32 @@ async function message() {
 
 async function picture({ out }) {
   await tab.keyboard.press('h');
+  await settle(); // the picture moves to the middle of the page
+  const button = (value) => tab.evaluate((each) => (document.getElementById('panel-show').style.visibility = each), value);
+  await button('hidden');
   await tab.screenshot({ path: out });
+  await button('');
   await tab.keyboard.press('h');
   return {};
 }
+
+const screenshot = async ({ out }) => (await tab.screenshot({ path: out }), {});
+const click = async ({ id }) => (await tab.locator(`#${id}`).click(), {});
+
+const targets = () =>
+  tab.evaluate(() => {
+    const all = [...document.querySelectorAll('button, select, input')];
+    const boxes = all.filter((each) => each.checkVisibility()).map((each) => [each.closest('label') ?? each, each]);
+    const named = boxes.map(([target, each]) => [each.id || target.textContent, target.getBoundingClientRect()]);
+    return { targets: Object.fromEntries(named.map(([name, { width, height }]) => [name, [width, height]])) };
+  });
+
+const middle = () =>
+  tab.evaluate(() => {
+    const { controls, camera } = window.sparklod;
+    const { x, y } = controls.target.project(camera);
+    return { middle: [((1 + x) / 2) * window.innerWidth, ((1 - y) / 2) * window.innerHeight] };
+  });
 
 const press = async ({ key }) => (await tab.keyboard.press(key), {});
 const fill = async ({ id, value }) => (await tab.locator(`#${id}`).fill(value), {});
@@ -121,7 +161,7 @@ async function drop({ name, text }) {
   return {};
 }
 
-const requests = { open, settle, state, message, picture, press, fill, drag, drop };
+const requests = { open, release: () => release(), settle, state, message, picture, screenshot, click, targets, middle, press, fill, drag, drop };
 for await (const line of createInterface({ input: process.stdin })) {
   const { do: name, ...request } = JSON.parse(line);
   const answer = await requests[name](request).catch((error) => ({ error: String(error?.message ?? error) }));

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import tracemalloc
 from collections.abc import Iterator
 
 import numpy as np
@@ -20,6 +21,7 @@ from sparklod_cli.model.gaussian import spark_size
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.nodes import CHUNK_NODES, Nodes
 from sparklod_cli.model.splats import Splats
+from sparklod_cli.support.threads import on_threads
 from tests.lod.forests import links
 from tests.lod.trees import check_threads
 from tests.references import chunk_splits
@@ -255,3 +257,20 @@ def test_demand_never_rises_from_parent_to_child() -> None:
     fill_demand(nodes, parent, views, 20.0, float(nodes["child_count"].sum()), demand)
     assert (demand[1:] <= demand[parent[1:]]).all()
     assert demand[0].min() > 0 and len(np.unique(demand)) > 50
+
+
+def test_families_take_the_memory_that_is_estimated() -> None:
+    rng, families = np.random.default_rng(3), 1 << 17
+    parent = ((np.arange(families) - 1) // 3).astype(np.int32)
+    parent[0] = -1
+    count, center = np.full(families, 3, np.uint16), rng.random((families, 3), np.float32)
+    size = np.exp(-6 * rng.random(families)).astype(np.float32)
+    chunk_order.family_order(parent[:9], count[:9], center[:9], size[:9])  # loads kernels
+    tracemalloc.start()
+    try:
+        with on_threads(2):
+            chunk_order.family_order(parent, count, center, size)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak / families == pytest.approx(chunk_order.family_bytes(2), rel=0.1)

@@ -12,7 +12,6 @@ from pathlib import Path
 import pytest
 
 from sparklod_cli.support.jit_cache import INNER, is_whole
-from sparklod_cli.warmup import JOBS
 from tests.conftest import FIXTURES, ROOT
 from tests.signals import heed_signals
 
@@ -50,7 +49,7 @@ def test_a_signal_ends_a_compilation_at_once_and_leaves_a_whole_cache(
     assert "->" not in rest  # as of a bake that is done
     assert not (tmp_path / "tree.spz").exists()
     kept = list(cache.rglob(f"*{INNER}"))
-    assert len(kept) < len(JOBS["quality"].kernels) / 2  # it did not go on to the end
+    assert len(kept) < 9  # it did not go on to the end: a bake has several times as many
     assert all(is_whole(path.read_bytes()) for path in kept)
 
 

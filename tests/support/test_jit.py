@@ -17,6 +17,7 @@ import pytest
 
 from sparklod_cli.support import jit
 from sparklod_cli.support.jit import prefetch as jit_prefetch
+from sparklod_cli.support.jit_types import f4, out
 from sparklod_cli.support.kernel_sources import sources_of
 from tests.conftest import ROOT
 
@@ -80,12 +81,67 @@ def test_a_change_of_a_kernel_or_constant_changes_the_names_of_those_that_depend
     assert changes == [{"prune"}, {"merge", "node_rows"}, set(names)]
 
 
+@jit.kernel(f4[:], out(f4[:]))
+def double(values: Any, doubled: Any) -> None:
+    for index in range(len(values)):
+        doubled[index] = values[index] * 2
+
+
+def test_read_only_arrays_are_read_by_the_same_code(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(jit, "CACHE_FOLDER", tmp_path)
+    kernel = jit.Kernel(double.py_func, double.options, double.signatures)
+    values, doubled = np.arange(5, dtype=np.float32), np.empty(5, np.float32)
+    np.save(tmp_path / "values.npy", values)
+    frozen = values.copy()
+    frozen.flags.writeable = False
+    begun: list[str] = []
+    stop = jit.listen(begun.append, lambda seconds: None, print)
+    for each in (values, frozen, np.load(tmp_path / "values.npy", mmap_mode="r")):
+        doubled[:] = 0
+        kernel(each, doubled)
+        assert np.array_equal(doubled, values * 2)
+    stop()
+    assert begun == ["test_jit.double"]
+    (signature,) = kernel.examples
+    assert kernel.is_cached(signature)
+    assert kernel.declared((frozen, doubled)) == kernel.declared((values, doubled)) == signature
+    for wrong in ((values, frozen), (values.astype(np.float64), doubled), (values[::2], doubled[::2]), (values,)):
+        assert kernel.declared(wrong) is None
+    with pytest.raises(numba.TypingError, match="readonly array"):
+        kernel(values, frozen)
+    assert np.array_equal(frozen, values)
+
+
+def test_numba_refuses_a_kernel_that_writes_to_what_it_declares_to_read(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(jit, "CACHE_FOLDER", tmp_path)
+    kernel = jit.kernel(out(f4[:]), f4[:])(double.py_func)
+    with pytest.raises(numba.TypingError, match="readonly array"):
+        kernel(np.zeros(2, np.float32), np.zeros(2, np.float32))
+
+
 def test_kernels_run_without_compilation() -> None:
     code = "from sparklod_cli.lod.kernels.geometry import ellipsoid_area; print(ellipsoid_area(1.0, 1.0, 1.0))"
     environment = {**os.environ, "NUMBA_DISABLE_JIT": "1"}
     command = [sys.executable, "-c", code]
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=True)
     assert float(done.stdout) == pytest.approx(12.566, abs=1e-3)
+
+
+@pytest.mark.parametrize("content", [b"a: [b\n", b"- a\n", b"\xff\xfe"])
+def test_malformed_settings_of_numba_are_an_error_that_names_them(content: bytes, tmp_path: Path) -> None:
+    pytest.importorskip("yaml")  # without which numba reads no settings
+    (tmp_path / ".numba_config.yaml").write_bytes(content)
+    code = (
+        "import sys; sys.path.insert(0, sys.argv[1]); from sparklod_cli.support import errors, jit\n"
+        "try: jit.load_compiler()\n"
+        "except errors.SparklodError as error: print(error)"
+    )
+    command = [sys.executable, "-c", code, str(ROOT)]
+    said = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True).stdout
+    assert said.startswith(".numba_config.yaml in the current folder, which numba reads, is malformed (")
+    assert said.count("\n") == 1
 
 
 def test_compilations_are_reported_but_not_nested_ones(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,8 +15,8 @@ from typing import Any
 import pytest
 
 from sparklod_cli.support import atomic, jit, jit_link
-from sparklod_cli.support.jit_cache import CODE, INNER, SUFFIX, is_whole, pattern_of
-from sparklod_cli.warmup import JOBS
+from sparklod_cli.support.jit_cache import CODE, INNER, SUFFIX, is_whole, start_of
+from sparklod_cli.warmup import units
 from tests.conftest import ROOT
 
 DAMAGE: dict[str, Callable[[bytes], bytes]] = {
@@ -65,23 +65,21 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Cache]:
 
 def test_code_compiled_for_another_processor_is_not_used(cache: Cache) -> None:
     cache.compiles()
-    for suffix in SUFFIXES:
-        pattern = pattern_of("test_jit_cache.twice", Path(__file__), suffix)
-        assert list(cache.folder.glob(pattern))
-        call = f"pattern_of('test_jit_cache.twice', Path({__file__!r}), {suffix!r})"
-        code = f"from pathlib import Path; from sparklod_cli.support.jit_cache import pattern_of; print({call})"
-        for changed, same in (({}, True), ({"NUMBA_NUM_THREADS": "1"}, True), ({"NUMBA_CPU_NAME": "generic"}, False)):
-            command, environment = [sys.executable, "-c", code], {**os.environ, **changed}
-            other = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
-            assert other.stdout.startswith("test_jit_cache.twice-")
-            assert (other.stdout.strip() == pattern) == same
+    start = start_of(twice)
+    assert list(cache.folder.glob(f"{start}-*"))
+    code = "from sparklod_cli.support.jit_cache import start_of; from tests.support.test_jit_cache import twice"
+    for changed, same in (({}, True), ({"NUMBA_NUM_THREADS": "1"}, True), ({"NUMBA_CPU_NAME": "generic"}, False)):
+        command, environment = [sys.executable, "-c", f"{code}; print(start_of(twice))"], {**os.environ, **changed}
+        other = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
+        assert other.stdout.startswith("test_jit_cache.twice-")
+        assert (other.stdout.strip() == start) == same
 
 
 def test_settings_in_a_file_for_numba_count(tmp_path: Path) -> None:
     code = """
 from pathlib import Path
-from sparklod_cli.support import jit_cache, jit_link
-print(jit_cache.pattern_of('fast_math.exp2', Path(jit_cache.__file__)), jit_link.is_tested())
+from sparklod_cli.support import fast_math, jit_cache, jit_link
+print(jit_cache.start_of(fast_math.exp2.py_func), jit_link.is_tested())
 """
     found = []
     for settings in ("", "opt: 1\n"):
@@ -199,11 +197,11 @@ def test_a_command_heals_a_cache_in_which_every_file_is_damaged(tmp_path: Path) 
     assert jit.CACHE_FOLDER is not None
     copy = tmp_path / "cache" / jit.CACHE_FOLDER.name
     copy.mkdir(parents=True)
-    for name in JOBS["inspect"].kernels:
-        (source,) = jit.PACKAGE.glob(f"*/kernels/{name.partition('.')[0]}.py")
-        for suffix in SUFFIXES:
-            for path in jit.CACHE_FOLDER.glob(pattern_of(name, source, suffix)):
-                shutil.copy(path, copy)
+    for unit in units():
+        if unit.name.partition(".")[0] in ("digits", "spz_codes", "tree_links"):  # those of inspect
+            for suffix in SUFFIXES:
+                for path in jit.CACHE_FOLDER.glob(f"{start_of(unit.kernel.py_func)}-*{suffix}"):
+                    shutil.copy(path, copy)
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
     scene = ROOT / "fixtures" / "sh1-ascii.ply"
     tree = str(tmp_path / "tree.spz")

@@ -22,7 +22,7 @@ pytestmark = pytest.mark.skipif(not jit_link.is_tested(), reason="machine code i
 
 #: Kernels, and what scripts call them with.
 KERNELS = """
-import os, sys, threading
+import os, signal, sys, threading, time, warnings
 import numpy as np
 from sparklod_cli.support import jit
 from sparklod_cli.support.jit import kernel, prange
@@ -47,16 +47,27 @@ def refuse(number):
         raise ValueError("too many")
     return number
 
+@kernel(nogil=True)
+def slow(values, times):
+    found = values + 1
+    for _ in range(times):
+        for i in range(len(values)):
+            found[i] = found[i] / 3 + values[i]
+    return found, values * 2
+
 values = np.arange(20_000.0)
 expected = values * values
 """
 
 #: Fills the cache: the process that compiles, and links what it has compiled.
-FILL = "assert (squares(values) == expected).all() and total(values) == values.sum() and refuse(1) == 1"
+FILL = """
+assert (squares(values) == expected).all() and total(values) == values.sum() and refuse(1) == 1
+slow(values, 1)
+"""
 
 #: What holds in a process that finds everything in the cache, one after another.
 SCRIPTS = {
-    "numba is not loaded": f"{FILL}; assert 'numba' not in sys.modules",
+    "numba is not loaded": f"{FILL}assert 'numba' not in sys.modules",
     "errors come through": """
 for number in (3, 4):
     try:
@@ -76,16 +87,6 @@ for arguments in [(), (1, 2)]:
     raise SystemExit("nothing was raised")
 """,
     "arguments by name": "assert refuse(number=2) == 2",
-    "many threads at once": """
-right = []
-def call():
-    for _ in range(20):
-        right.append((squares(values) == expected).all() and total(values) == values.sum())
-threads = [threading.Thread(target=call) for _ in range(8)]
-for thread in threads: thread.start()
-for thread in threads: thread.join()
-assert len(right) == 160 and all(right) and 'numba' not in sys.modules
-""",
     "threads are set for each thread": """
 jit.use_threads(1)
 seen = []
@@ -129,6 +130,7 @@ assert numba.get_num_threads() == 2
     "arrays outlive the process's modules": "kept = squares(values)[::2]; import builtins; builtins.kept = kept",
     "a forked process": """
 assert total(values) == values.sum()
+warnings.simplefilter("ignore", DeprecationWarning)  # Python 3.12 advises against forks
 child = os.fork()
 if not child:
     right = total(values) == values.sum() and (squares(values) == expected).all() and 'numba' not in sys.modules
@@ -138,22 +140,73 @@ assert os.waitpid(child, 0)[1] == 0
 }
 
 
+#: What holds however kernels are called, see `WAYS`.
+EVERYWHERE = {
+    "many threads at once": """
+right = []
+def call():
+    for _ in range(20):
+        right.append((squares(values) == expected).all() and total(values) == values.sum())
+threads = [threading.Thread(target=call) for _ in range(8)]
+for thread in threads: thread.start()
+for thread in threads: thread.join()
+assert len(right) == 160 and all(right)
+""",
+    "a process forked from one that used all threads": """
+assert (squares(values) == expected).all()
+warnings.simplefilter("ignore", DeprecationWarning)  # Python 3.12 advises against forks
+child = os.fork()
+if not child:
+    right = jit.threads_in_use() == 1
+    for count in (1, 2):
+        jit.use_threads(count)
+        right &= (squares(values) == expected).all()
+    thread = threading.Thread(target=lambda: seen.append((squares(values) == expected).all()))
+    seen = []
+    thread.start(); thread.join()
+    os._exit(0 if right and seen == [True] else 1)
+assert os.waitpid(child, 0)[1] == 0
+assert (squares(values) == expected).all() and jit.threads_in_use() == 2
+""",
+    "an interruption while a result is returned": """
+def interrupt():
+    time.sleep(0.02)
+    os.kill(os.getpid(), signal.SIGINT)
+slow(values, 1)
+for _ in range(3):
+    thread = threading.Thread(target=interrupt)
+    try:
+        thread.start()
+        slow(values, 3000)
+        time.sleep(60)
+    except KeyboardInterrupt:
+        thread.join()
+    else:
+        raise SystemExit("nothing was raised")
+""",
+}
+
+#: Threading layers, and whether numba calls the kernels instead of `jit_link`.
+WAYS = [(layer, by_numba) for layer in ("the first", "workqueue") for by_numba in (False, True)]
+
+
 @pytest.fixture(scope="module")
 def kernels(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the module of kernels and a cache that has them."""
     folder = tmp_path_factory.mktemp("kernels")
     (folder / "scripted.py").write_text(KERNELS)
     run(folder, FILL)
-    assert len(list((folder / "cache").rglob(f"*{CODE}"))) == 3
+    assert len(list((folder / "cache").rglob(f"*{CODE}"))) == 4
     return folder
 
 
-def run(folder: Path, script: str) -> None:
+def run(folder: Path, script: str, **settings: str) -> None:
     environment = {
         **os.environ,
         "NUMBA_CACHE_DIR": str(folder / "cache"),
         "NUMBA_NUM_THREADS": "2",
         "PYTHONPATH": os.pathsep.join([str(ROOT), str(folder)]),
+        **settings,
     }
     command = [sys.executable, "-c", f"from scripted import *\n{script}"]
     done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=120)
@@ -163,6 +216,24 @@ def run(folder: Path, script: str) -> None:
 @pytest.mark.parametrize("script", SCRIPTS.values(), ids=SCRIPTS)
 def test_in_a_process_that_finds_everything_in_the_cache(kernels: Path, script: str) -> None:
     run(kernels, script)
+
+
+@pytest.mark.parametrize("script", EVERYWHERE.values(), ids=EVERYWHERE)
+@pytest.mark.parametrize(("layer", "by_numba"), WAYS)
+def test_however_kernels_are_called(kernels: Path, layer: str, by_numba: bool, script: str) -> None:
+    if by_numba:
+        settings = {} if layer == "the first" else {"NUMBA_THREADING_LAYER": layer}
+        run(
+            kernels,
+            f"from sparklod_cli.support import jit_link; jit_link.is_tested = lambda: False\n{script}",
+            **settings,
+        )
+    else:
+        choose = "" if layer == "the first" else f"jit_threads.LAYERS = {{{layer!r}: jit_threads.LAYERS[{layer!r}]}}"
+        run(
+            kernels,
+            f"from sparklod_cli.support import jit_threads; {choose}\n{script}\nassert 'numba' not in sys.modules",
+        )
 
 
 @pytest.fixture

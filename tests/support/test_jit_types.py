@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import itertools
 from collections import namedtuple
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
 import pytest
 
-from sparklod_cli.support.jit_types import describe, key_of
+from sparklod_cli.support.jit_types import Type, b1, describe, example, f4, fields, fits, i8, key_of, out, u2, u4
 
 Pair = namedtuple("Pair", "first second")
 Other = namedtuple("Other", "first second")
@@ -51,6 +51,36 @@ def test_texts_and_keys_tell_types_apart_as_numba_does() -> None:
 def test_the_order_and_the_grouping_of_arguments_count() -> None:
     arguments: list[Any] = [(1, 2.0), (2.0, 1), ((1, 2.0),), ((1,), 2.0), (1,), ()]
     assert len({key_of(each) for each in arguments}) == len({describe(each) for each in arguments}) == len(arguments)
+
+
+@fields(f4[:, :], out(i8[:]), b1)
+class Columns(NamedTuple):
+    first: Any
+    second: Any
+    third: Any
+
+
+def test_examples_are_of_the_declared_types() -> None:
+    declared = [u4, f4[:], f4[:, :, :], out(u2[:]), Columns, out(Columns), Type(RECORD)[:]]
+    writeable, frozen = np.zeros((1, 1), "f4"), readonly(np.zeros((1, 1), "f4"))
+    expected = [
+        *(np.uint32(1), readonly(np.zeros(3, "f4")), readonly(np.zeros((1, 2, 3), "f4")), np.zeros(2, "u2")),
+        *(Columns(frozen, np.zeros(1, "i8"), True), Columns(writeable, np.zeros(1, "i8"), False)),
+        readonly(np.zeros(2, RECORD)),
+    ]
+    assert describe(map(example, declared)) == describe(expected)
+
+
+def test_only_arrays_that_are_read_may_be_read_only_or_not() -> None:
+    values, frozen = np.zeros((2, 3), "f4"), readonly(np.zeros((2, 3), "f4"))
+    texts = {name: str(describe([value, 1])) for name, value in {"values": values, "frozen": frozen}.items()}
+    assert fits(texts["values"], texts["frozen"])
+    assert fits(texts["frozen"], texts["frozen"])
+    assert not fits(texts["frozen"], texts["values"])
+    assert not fits(str(describe([values])), texts["frozen"])
+    for one, other in itertools.product(VALUES, VALUES):
+        same = str(describe([one])).replace(" readonly", "") == str(describe([other])).replace(" readonly", "")
+        assert same or not fits(str(describe([one])), str(describe([other])))
 
 
 @pytest.mark.parametrize(

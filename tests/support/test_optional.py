@@ -2,22 +2,112 @@
 
 from __future__ import annotations
 
+import json
 import re
+import shlex
 import sys
+from importlib import metadata
+from pathlib import Path
 
 import pytest
 
+from sparklod_cli.support import optional, requirements
 from sparklod_cli.support.errors import CameraPathError, SparklodError
-from sparklod_cli.support.optional import optional_import
+from sparklod_cli.support.optional import install_hint, optional_import, pip_install
+from sparklod_cli.support.requirements import Required
+from tests.conftest import ROOT
 
 
-@pytest.mark.parametrize(("requirement", "typed"), [("sparklod[video]", "'sparklod[video]'"), ("pandas", "pandas")])
-def test_a_missing_package_says_what_to_install(requirement: str, typed: str, monkeypatch: pytest.MonkeyPatch) -> None:
+class Installed:
+    """Distribution of which the origin is known to pip, or not."""
+
+    def __init__(self, origin: object) -> None:
+        self._origin = origin
+
+    def read_text(self, name: str) -> str | None:
+        assert name == "direct_url.json"
+        return None if self._origin is None else json.dumps(self._origin)
+
+
+@pytest.fixture
+def install(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> object:
+    """Has sparklod seem to be installed from somewhere, in an active environment, with some packages missing."""
+    monkeypatch.setattr(optional, "_HOME", tmp_path / "site-packages")
+    monkeypatch.setenv("VIRTUAL_ENV", sys.prefix)
+    required = [Required("numpy", "1.26", "2.0"), Required("pyvista", "0.45", None), Required("pandas", "", None)]
+    monkeypatch.setattr(requirements, "required_by", lambda name, extra="": iter(required))
+    return lambda origin: monkeypatch.setattr(metadata, "distribution", lambda name: Installed(origin))
+
+
+def test_the_extra_of_a_checkout_is_installed_by_its_path(install, tmp_path: Path) -> None:
+    checkout = tmp_path / "a folder"
+    checkout.mkdir()
+    (checkout / "pyproject.toml").touch()
+    install({"url": checkout.as_uri(), "dir_info": {}})
+    assert install_hint("render") == f"pip install '{checkout}[render]'"
+    assert install_hint() == f"pip install '{checkout}'"
+
+
+@pytest.mark.parametrize(
+    "origin",
+    [
+        None,  # from an index
+        {"url": "file:///nowhere/sparklod-1-py3-none-any.whl", "archive_info": {}},
+        {"url": "file:///nowhere/sparklod", "dir_info": {}},  # a checkout that is gone
+        {"url": "https://example.org/sparklod.git", "vcs_info": {"vcs": "git", "commit_id": "0" * 40}},
+    ],
+)
+def test_elsewhere_the_missing_packages_are_named(install, origin: object) -> None:
+    install(origin)
+    assert install_hint("render") == "pip install 'pyvista>=0.45' pandas"
+
+
+def test_where_no_package_is_missing_all_are_named(install, monkeypatch: pytest.MonkeyPatch) -> None:
+    install(None)
+    monkeypatch.setattr(requirements, "required_by", lambda name, extra="": iter([Required("numpy", "1.26", "2.0")]))
+    assert install_hint("", "--force-reinstall") == "pip install --force-reinstall 'numpy>=1.26'"
+
+
+def test_a_copy_that_is_not_installed_names_the_extra(install, monkeypatch: pytest.MonkeyPatch) -> None:
+    def absent(name: str, extra: str = "") -> None:
+        raise metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(metadata, "distribution", absent)
+    monkeypatch.setattr(requirements, "required_by", absent)
+    assert "the extra render of sparklod" in install_hint("render")
+
+
+def test_the_hint_of_this_checkout_names_it() -> None:
+    assert shlex.split(install_hint("video"))[-2:] == ["-e", f"{ROOT}[video]"]
+
+
+@pytest.mark.parametrize("name", ["VIRTUAL_ENV", "CONDA_PREFIX"])
+def test_the_pip_is_that_of_this_interpreter(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    for each in ("VIRTUAL_ENV", "CONDA_PREFIX"):
+        monkeypatch.delenv(each, raising=False)
+    assert pip_install("pandas") == f"{sys.executable} -m pip install pandas"
+    monkeypatch.setenv(name, "/another/environment")
+    assert pip_install("pandas") == f"{sys.executable} -m pip install pandas"
+    monkeypatch.setenv(name, sys.prefix)
+    assert pip_install("pandas>=2") == "pip install 'pandas>=2'"
+
+
+def test_no_text_names_a_package_that_is_on_no_index() -> None:
+    paths = [*(ROOT / "sparklod_cli").rglob("*.py"), *(ROOT / "docs").rglob("*.md"), ROOT / "README.md"]
+    assert not [path for path in paths if re.search(r"pip install[^.\n]* '?sparklod\b(?!_)", path.read_text())]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "hint"), [({"extra": "video"}, install_hint("video")), ({"package": "pandas"}, pip_install("pandas"))]
+)
+def test_a_missing_package_says_what_to_install(
+    arguments: dict[str, str], hint: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(sys.modules, "colorsys", None)
-    said = rf"^colours are mixed by colorsys: pip install {re.escape(typed)} \(import of colorsys halted"
+    said = rf"^colours are mixed by colorsys: {re.escape(hint)} \(import of colorsys halted"
     with (
         pytest.raises(CameraPathError, match=said) as caught,
-        optional_import("colours are mixed by colorsys", requirement, CameraPathError),
+        optional_import("colours are mixed by colorsys", error=CameraPathError, **arguments),
     ):
         import colorsys  # noqa: F401
     assert caught.value.__suppress_context__

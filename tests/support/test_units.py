@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sparklod_cli.support.units import parse_bandwidth, parse_count, parse_latency
+from sparklod_cli.support.units import parse_bandwidth, parse_count, parse_size, parse_time
 
 
 @pytest.mark.parametrize(
@@ -33,6 +33,9 @@ from sparklod_cli.support.units import parse_bandwidth, parse_count, parse_laten
         ("8B", 8.0),
         (".5kB", 500.0),
         ("1e3bit", 125.0),
+        ("1MiB/s", 1 << 20),
+        ("8Kibit", 1024.0),
+        ("1Tbit", 1.25e11),
     ],
 )
 def test_bandwidths_are_bytes_a_second(text: str, expected: float) -> None:
@@ -42,8 +45,8 @@ def test_bandwidths_are_bytes_a_second(text: str, expected: float) -> None:
 @pytest.mark.parametrize(
     ("text", "expected"), [("60ms", 0.06), ("0ms", 0.0), ("0.1s", 0.1), ("2 s", 2.0), (" 1e2ms", 0.1)]
 )
-def test_latencies_are_seconds(text: str, expected: float) -> None:
-    assert parse_latency(text) == expected
+def test_times_are_seconds(text: str, expected: float) -> None:
+    assert parse_time(text) == expected
 
 
 @pytest.mark.parametrize(
@@ -65,10 +68,23 @@ def test_counts_may_have_the_units_k_m_and_g(text: str, expected: int) -> None:
     assert parse_count(text) == expected
 
 
+@pytest.mark.parametrize("space", ["", " ", "  "])
+@pytest.mark.parametrize("unit", ["", "B", "b", "bytes"])
+@pytest.mark.parametrize(
+    ("prefix", "factor"),
+    [
+        *(("", 1), ("k", 1e3), ("K", 1e3), ("M", 1e6), ("m", 1e6), ("G", 1e9), ("g", 1e9), ("T", 1e12)),
+        *(("ki", 1 << 10), ("Ki", 1 << 10), ("Mi", 1 << 20), ("GI", 1 << 30), ("Ti", 1 << 40)),
+    ],
+)
+def test_sizes_are_bytes(prefix: str, factor: float, unit: str, space: str) -> None:
+    assert parse_size(f"600{space}{prefix}{unit}") == 600 * factor
+
+
 BAD = ["", "k", "Mbit", "-1", "-5ms", "-20Mbit", "nan", "inf", "1e999", "1,000", "٣", "1 2", "0x10", "a\nb"]
 
 
-@pytest.mark.parametrize("text", [*BAD, "20", "20M", "0Mbit", "0.0B/s", "20Mibit", "20MiB/s", "20Mbit/h", "20Tbit"])
+@pytest.mark.parametrize("text", [*BAD, "20", "20M", "0Mbit", "0.0B/s", "20ibit", "20iB/s", "20Mbit/h", "20Pbit"])
 def test_texts_that_are_not_bandwidths_are_refused(text: str) -> None:
     with pytest.raises(ValueError, match="bandwidth") as caught:
         parse_bandwidth(text)
@@ -76,9 +92,9 @@ def test_texts_that_are_not_bandwidths_are_refused(text: str) -> None:
 
 
 @pytest.mark.parametrize("text", [*BAD, "60", "0", "60us", "60 m", "infs", "60m s"])
-def test_texts_that_are_not_latencies_are_refused(text: str) -> None:
-    with pytest.raises(ValueError, match="is not a latency") as caught:
-        parse_latency(text)
+def test_texts_that_are_not_times_are_refused(text: str) -> None:
+    with pytest.raises(ValueError, match="is not a time") as caught:
+        parse_time(text)
     assert "\n" not in str(caught.value)
 
 
@@ -89,8 +105,15 @@ def test_texts_that_are_not_counts_are_refused(text: str) -> None:
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("text", [*BAD, "1.5", "4i", "4iB", "4Gx", "4 G B", "1e-9M"])
+def test_texts_that_are_not_sizes_are_refused(text: str) -> None:
+    with pytest.raises(ValueError, match="is not a size") as caught:
+        parse_size(text)
+    assert "\n" not in str(caught.value)
+
+
 @given(text=st.text(max_size=12) | st.from_regex(r"[0-9.eE+-]{1,8}[kKmMgGbBits/]{0,6}", fullmatch=True))
-@pytest.mark.parametrize("parse", [parse_bandwidth, parse_latency, parse_count])
+@pytest.mark.parametrize("parse", [parse_bandwidth, parse_time, parse_count, parse_size])
 def test_any_text_is_understood_or_refused(parse: Callable[[str], float], text: str) -> None:
     with contextlib.suppress(ValueError):
         assert parse(text) >= 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import shutil
@@ -12,8 +13,9 @@ import pytest
 
 import sparklod_cli as sparklod
 from sparklod_cli.api import viewing
-from sparklod_cli.codecs.rad.header import pack_header
+from sparklod_cli.codecs.rad.header import pack_header, read_chunk_header
 from sparklod_cli.codecs.rad.records import RadChunkEntry, RadHeader
+from sparklod_cli.io import read_levels
 from sparklod_cli.support.errors import CameraPathError, FormatError, SparklodError
 from sparklod_cli.view.files import shown_files
 from tests.conftest import FIXTURES
@@ -46,7 +48,7 @@ def test_the_page_is_told_what_each_file_is(name: str, kind: str, leaves: bool |
     scene = sparklod.read(GOLDEN / name)
     assert (file["type"], file["splats"]) == (kind, len(scene.splats))
     assert (file["leaves"] is not None) == bool(leaves)
-    if kind == "spz" and scene.tree is not None:
+    if scene.tree is not None:
         assert file["leaves"] == int(scene.tree.is_leaf.sum())
 
 
@@ -70,9 +72,45 @@ def test_a_folder_that_is_no_splat_file_is_not_called_a_sog(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("name", ["sh1-streamed-sog", "sh1-streamed-sog/lod-meta.json"])
-def test_streamed_sog_is_refused_as_spark_does_not_read_it(name: str) -> None:
-    with pytest.raises(FormatError, match=r"Spark does not read Streamed SOG; bake it first"):
-        shown_files([GOLDEN / name])
+def test_streamed_sog_is_shown_by_playcanvas_with_all_its_files(name: str) -> None:
+    site = prepared([GOLDEN / name])
+    settings = settings_of(GOLDEN / name)
+    (file,) = settings["files"]
+    scene = read_levels(GOLDEN / name)
+    assert (settings["engine"], file["url"], file["levels"]) == ("playcanvas", "data/0/lod-meta.json", scene.levels)
+    assert (file["splats"], file["leaves"]) == (len(scene.splats), int(scene.counts[:, 0].sum()))
+    folder = GOLDEN / "sh1-streamed-sog"
+    names = {f"data/0/{each.relative_to(folder).as_posix()}" for each in folder.rglob("*") if each.is_file()}
+    assert {each for each in site.resources if each.startswith("data/")} == names
+    assert file["bytes"] == sum(each.stat().st_size for each in folder.rglob("*") if each.is_file())
+
+
+def test_streamed_sog_is_framed_without_its_environment(tmp_path: Path) -> None:
+    shutil.copytree(GOLDEN / "sh1-streamed-sog", tmp_path / "web")
+    start = settings_of(tmp_path / "web")["start"]
+    coarse = read_levels(tmp_path / "web")
+    level = coarse.splats.take(coarse.level(coarse.levels - 1))
+    assert np.linalg.norm(np.subtract(start["center"], np.median(level.center, axis=0))) < start["radius"]
+    manifest = json.loads((tmp_path / "web" / "lod-meta.json").read_text())
+    del manifest["environment"]
+    (tmp_path / "web" / "lod-meta.json").write_text(json.dumps(manifest))
+    assert settings_of(tmp_path / "web")["start"] == start
+
+
+def test_files_of_different_engines_are_refused_together() -> None:
+    with pytest.raises(FormatError, match=r"cannot show all of these files: .*tree-v3\.spz by Spark, .* by PlayCanvas"):
+        shown_files([TREE, GOLDEN / "sh1-streamed-sog"])
+
+
+@pytest.mark.skipif(os.name != "posix", reason="POSIX only")
+def test_a_missing_chunk_and_a_folder_that_is_a_link_are_refused(tmp_path: Path) -> None:
+    shutil.copytree(GOLDEN / "sh1-streamed-sog", tmp_path / "web")
+    (tmp_path / "web" / "1_0").rename(tmp_path / "away")
+    with pytest.raises(FormatError, match=r"chunk file '1_0/meta\.json' is missing"):
+        shown_files([tmp_path / "web"])
+    (tmp_path / "web" / "1_0").symlink_to(tmp_path / "away")
+    with pytest.raises(FormatError, match=r"is a link to another folder; copy it there"):
+        shown_files([tmp_path / "web"])
 
 
 @pytest.mark.parametrize(
@@ -164,16 +202,30 @@ def test_the_first_look_is_that_of_render() -> None:
     assert ahead / np.linalg.norm(ahead) == pytest.approx(camera.forward)
 
 
-def test_a_large_rad_tree_is_framed_by_its_first_chunk_alone(tmp_path: Path) -> None:
+def test_a_large_rad_tree_is_framed_by_its_first_chunk_and_only_its_leaves_are_counted(tmp_path: Path) -> None:
     shutil.copytree(CHUNKED.parent, tmp_path / "rad")
-    whole = settings_of(tmp_path / "rad" / CHUNKED.name)["start"]
-    for number in (1, 2):  # which would be found to be damaged
-        (tmp_path / "rad" / f"sh3-{number}.radc").write_bytes(b"RADC")
-    coarse = settings_of(tmp_path / "rad" / CHUNKED.name)["start"]
-    assert coarse == whole
-    scene = sparklod.read(CHUNKED)
+    whole = settings_of(tmp_path / "rad" / CHUNKED.name)
+    for number in (1, 2):  # what else they hold would be found to be damaged
+        keep_child_counts(tmp_path / "rad" / f"sh3-{number}.radc")
+    found = settings_of(tmp_path / "rad" / CHUNKED.name)
+    assert found == whole
+    coarse, scene = found["start"], sparklod.read(CHUNKED)
+    assert scene.tree is not None
+    assert found["files"][0]["leaves"] == int(scene.tree.is_leaf.sum()) < len(scene)
     distance = np.linalg.norm(scene.splats.center - np.array(coarse["center"]), axis=1)
     assert coarse["radius"] == pytest.approx(float(np.quantile(distance, 0.9)), rel=0.5)
+
+
+def keep_child_counts(path: Path) -> None:
+    """Overwrite all properties of a chunk but the numbers of children."""
+    data = path.read_bytes()
+    chunk = read_chunk_header(io.BytesIO(data))
+    counts = next(each for each in chunk.properties if each.name == "child_count")
+    start = chunk.bytes + counts.offset
+    damaged = bytearray(b"\xff" * len(data))
+    for part in (slice(0, chunk.bytes), slice(start, start + counts.bytes)):
+        damaged[part] = data[part]
+    path.write_bytes(damaged)
 
 
 def test_the_options_of_the_first_look_are_told() -> None:
@@ -203,3 +255,12 @@ def test_a_broken_file_is_named(tmp_path: Path) -> None:
     path.write_bytes(TREE.read_bytes()[:-20])
     with pytest.raises(SparklodError, match=f"^{path}: "):
         settings_of(path)
+
+
+def test_a_name_that_is_no_text_is_shown_escaped(tmp_path: Path) -> None:
+    name = os.fsdecode(b"\xff.spz")
+    shutil.copy(TREE, tmp_path / name)
+    resources = prepared([tmp_path / name]).resources
+    assert rb"<title>\xff.spz" in bytes(resources["index.html"])  # type: ignore[arg-type]
+    (file,) = settings_of(tmp_path / name)["files"]
+    assert (file["name"], file["url"]) == (r"\xff.spz", "data/0/%FF.spz")

@@ -13,13 +13,18 @@ import pytest
 
 from sparklod_cli.api import viewing
 from sparklod_cli.support.errors import SparklodError
-from sparklod_cli.view.libraries import MODULES, VERSIONS, from_cdn, from_folder
+from sparklod_cli.view.libraries import MODULES, PACKAGES, VERSIONS, from_cdn, from_folder
+from tests.conftest import FIXTURES
 from tests.view.conftest import TREE, prepared
 
+#: A file of each engine.
+SHOWN = {"spark": TREE, "playcanvas": FIXTURES / "golden" / "sh1-streamed-sog"}
 
-def page_of(libraries: Path | None) -> tuple[dict[str, dict[str, str]], str]:
+
+def page_of(libraries: Path | None, engine: str) -> tuple[dict[str, dict[str, str]], str]:
     """The import map of the page, and its policy."""
-    index = prepared([TREE], viewing.ViewSettings(None, None, None, None, None, libraries)).resources["index.html"]
+    settings = viewing.ViewSettings(None, None, None, None, None, libraries)
+    index = prepared([SHOWN[engine]], settings).resources["index.html"]
     assert isinstance(index, bytes)
     found = re.search(r'<script type="importmap">(.*?)</script>', index.decode(), re.DOTALL)
     policy = re.search(r'http-equiv="Content-Security-Policy" content="([^"]*)"', index.decode())
@@ -29,26 +34,28 @@ def page_of(libraries: Path | None) -> tuple[dict[str, dict[str, str]], str]:
     return json.loads(found[1]), html.unescape(policy[1])
 
 
-def test_the_cdn_is_asked_for_fixed_versions_by_their_digests() -> None:
-    mapped, policy = page_of(None)
+@pytest.mark.parametrize("engine", PACKAGES)
+def test_the_cdn_is_asked_for_fixed_versions_by_their_digests(engine: str) -> None:
+    mapped, policy = page_of(None, engine)
     assert all(url.startswith("https://") for url in mapped["imports"].values())
-    assert len(mapped["integrity"]) == len(MODULES)
+    assert len(mapped["integrity"]) == sum(package in PACKAGES[engine] for package, _ in MODULES)
     for url, digest in mapped["integrity"].items():
         assert any(f"{package}@{version}/" in url for package, version in VERSIONS.items())
         assert re.fullmatch(r"sha384-[A-Za-z0-9+/]{64}", digest)
         assert url in policy
-    assert from_cdn().notes() == []
+    assert from_cdn(engine).notes() == []
 
 
-def test_a_folder_needs_no_other_host(packages: Path) -> None:
-    mapped, policy = page_of(packages)
+@pytest.mark.parametrize("engine", PACKAGES)
+def test_a_folder_needs_no_other_host(packages: Path, engine: str) -> None:
+    mapped, policy = page_of(packages, engine)
     assert "http" not in json.dumps(mapped) + policy
-    site = prepared([TREE], viewing.ViewSettings(None, None, None, None, None, packages))
+    site = prepared([SHOWN[engine]], viewing.ViewSettings(None, None, None, None, None, packages))
     for url in mapped["imports"].values():
         name = url.removeprefix("./")
         assert any(each == name or (url.endswith("/") and each.startswith(name)) for each in site.resources)
     licenses = [name for name in site.resources if name.endswith("/LICENSE")]
-    assert len(licenses) == len(VERSIONS)
+    assert len(licenses) == len(PACKAGES[engine])
 
 
 def test_node_modules_itself_can_be_given(packages: Path) -> None:
@@ -66,7 +73,7 @@ def test_links_of_a_package_manager_are_followed(packages: Path, tmp_path: Path)
 def test_a_folder_without_a_package_says_how_to_install_it(packages: Path, package: str) -> None:
     (packages / "node_modules" / package).rename(packages / "away")
     with pytest.raises(SparklodError, match=f"has no {package}; install it with npm install --prefix {packages} "):
-        from_folder(packages)
+        from_folder(packages, next(engine for engine, needed in PACKAGES.items() if package in needed))
 
 
 def test_a_package_without_its_module_is_told(packages: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib.util
 import logging
 import tempfile
 import warnings
@@ -43,13 +42,22 @@ OWN_CONFIG = {
     "distributed.worker.memory.target": False,
     "distributed.worker.memory.spill": False,
     "distributed.worker.memory.pause": False,
+    # Their HTTP servers know no credentials: they serve nothing until they are stopped, as soon as they have started.
+    "distributed.scheduler.http.routes": [],
+    "distributed.worker.http.routes": [],
 }
 
 #: Loggers of Dask and what it is made of, and a level that nothing reaches.
-TALKERS, SILENT = ("bokeh", "distributed", "tornado"), logging.CRITICAL + 1
+TALKERS, SILENT = ("distributed", "tornado"), logging.CRITICAL + 1
 
 #: What listens for requests on this machine alone.
 LOOPBACK = "127.0.0.1"
+
+#: How the address of a scheduler begins that knows its clients by their certificates.
+TLS = "tls://"
+
+#: Variables by which Dask is given the files for that.
+CERTIFICATES = "DASK_DISTRIBUTED__COMM__TLS__CA_FILE, ..__CLIENT__CERT and ..__CLIENT__KEY"
 
 
 @dataclass(frozen=True)
@@ -82,12 +90,13 @@ def cluster(
         memory: bytes that workers of our own share, or that a task of a cluster that runs may take; None for the part
             of what is available, or of the memory of a worker, that is usual.
         scratch: folder for files of workers of our own; one for temporary files unless given.
-        say: is told the address of the dashboard, and of workers that are lost.
+        say: is told the address of the dashboard of a cluster that runs, whether anybody can give it tasks, and of
+            workers that are lost.
 
     Raises:
         SparklodError: there is no distributed, or no scheduler or worker answers.
     """
-    with optional_import("clusters are Dask's", "sparklod[cluster]"):
+    with optional_import("clusters are Dask's", "cluster"):
         import distributed  # noqa: F401  # sets its loggers up
     with contextlib.ExitStack() as stack:
         stack.enter_context(_quiet())
@@ -100,8 +109,12 @@ def cluster(
             threads = settings.threads or 1
             client = stack.enter_context(_connected(settings.scheduler))
             limit = _least_memory(client, memory)
-        if importlib.util.find_spec("bokeh") is not None or settings.scheduler is not None:
             say(f"the cluster's dashboard is at {client.dashboard_link}")
+            if not client.scheduler.address.startswith(TLS):
+                say(
+                    f"{client.scheduler.address} asks for no credentials: anybody who reaches it can run programs on"
+                    " its workers; docs/cluster.md says how to use TLS"
+                )
         with Connection(client, say) as connection:
             yield ClusterEngine(connection, threads=threads, memory=limit)
 
@@ -113,8 +126,8 @@ def _connected(address: str) -> Iterator[Any]:
 
     whole = address if "://" in address else f"tcp://{address}"
     try:
-        client = Client(whole, timeout=PATIENCE, set_as_default=False)
-    except (OSError, ValueError, TypeError) as error:
+        client = Client(whole, timeout=PATIENCE, security=_credentials(whole), set_as_default=False)
+    except (OSError, ValueError) as error:
         raise SparklodError(
             f"no scheduler answers at {whole} ({error}); start one with dask scheduler, and dask worker {whole}"
         ) from None
@@ -131,12 +144,31 @@ def _connected(address: str) -> Iterator[Any]:
             client.close(timeout=1)
 
 
+def _credentials(address: str) -> Any:
+    """Return the certificates that Dask's configuration names; fail where an address needs some, or none can be read.
+
+    Without them, Dask fails at the end of the process, after a minute.
+    """
+    from distributed import Security
+
+    security = Security()
+    try:
+        context = security.get_connection_args("client")["ssl_context"]
+    except OSError as error:
+        raise SparklodError(f"a file that {CERTIFICATES} name cannot be read ({error})") from None
+    if context is None and address.startswith(TLS):
+        raise SparklodError(f"{address} asks for a certificate; set {CERTIFICATES}")
+    return security
+
+
 @contextlib.contextmanager
 def _started(workers: int, threads: int, memory: int | None, scratch: Path | None) -> Iterator[Any]:
-    """A client of a cluster of processes on this machine."""
+    """A client of a cluster of processes on this machine, which answer nobody else: other users reach their ports."""
     import dask
-    from distributed import Client, LocalCluster
+    from distributed import Client, LocalCluster, Security
 
+    with optional_import("processes know each other by certificates of cryptography", "sparklod[cluster]"):
+        security = Security.temporary()  # for this cluster alone; workers get the key through pipes
     with contextlib.ExitStack() as stack:
         folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="sparklod-", dir=scratch))
         stack.enter_context(dask.config.set(OWN_CONFIG))
@@ -145,7 +177,8 @@ def _started(workers: int, threads: int, memory: int | None, scratch: Path | Non
                 n_workers=workers,
                 threads_per_worker=1,
                 host=LOOPBACK,
-                dashboard_address=f"{LOOPBACK}:8787",
+                security=security,
+                dashboard_address=None,
                 memory_limit=_memory_limit(workers, memory),
                 local_directory=folder,
                 env={"NUMBA_NUM_THREADS": str(threads)},
@@ -156,6 +189,7 @@ def _started(workers: int, threads: int, memory: int | None, scratch: Path | Non
         except (OSError, RuntimeError, TimeoutError) as error:
             raise SparklodError(f"no cluster can be started on this machine: {error}") from None
         stack.callback(_end, own)
+        own.loop.add_callback(own.scheduler.http_server.stop)
         client = stack.enter_context(contextlib.closing(Client(own, timeout=PATIENCE, set_as_default=False)))
         yield client
 

@@ -20,7 +20,7 @@ from .cluster_pool import Connection, Pool
 from .cluster_worker import PROBE, Probed, probe, run_call, run_task
 from .contracts import Store, Task
 
-_INSTALL = f"pip install 'sparklod[cluster]=={__version__}' there, and start it again"
+_INSTALL = f"install sparklod {__version__} with its extra cluster there, and start it again"
 
 
 class ClusterEngine:

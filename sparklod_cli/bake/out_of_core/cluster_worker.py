@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from ... import __version__
+from ...support import machine
 from ...support.errors import memory_errors_translated
 from ...support.progress import silent
 from .contracts import Store, Task
@@ -81,6 +82,7 @@ def run_task(packed: bytes, task: Task, threads: int) -> tuple[int, int]:
     if not job.store.has(task.name):
         with memory_errors_translated():
             task.run(job, *task.arguments, threads=threads, progress=silent)
+        machine.release_memory()
     return job.store.traffic.written, job.store.traffic.read
 
 
@@ -90,6 +92,7 @@ def run_call(call: Callable[..., Any], arguments: tuple[Any, ...], threads: int)
 
 
 def dask_setup(worker: Any) -> None:
-    """Prepares a worker process that sparklod started: Ctrl-C in a terminal is for the client, which ends workers."""
+    """Prepares a worker process that sparklod started: it has no dashboard, and the client ends it, no Ctrl-C."""
+    worker.http_server.stop()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.environ.setdefault("NUMBA_NUM_THREADS", "1")

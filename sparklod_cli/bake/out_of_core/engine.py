@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from ...support import machine
 from ...support.progress import Progress
 from .contracts import Task
 
@@ -29,6 +30,7 @@ class LocalEngine:
             if not job.store.has(task.name):
                 within = _Within(stage, done, task.weight, total, progress)
                 task.run(job, *task.arguments, threads=self.threads, progress=within)
+                machine.release_memory()  # for the next one, which may need most
             done += task.weight
             progress(stage, done, total, "splat")
 

@@ -5,6 +5,7 @@ Coefficients are peaks of processes (VmHWM), as `benchmarks/bench_memory.py` mea
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 from ...model.sh import COEFFICIENTS
@@ -47,10 +48,10 @@ OF_BLOCK = {"quick": _Bytes(300, 50), "quality": _Bytes(350, 50)}
 #: Out of core, a node of those that are read, gathered or encoded at once, and how many these are.
 OF_WINDOW, WINDOW = _Bytes(230, 50), 1 << 19
 
-#: Out of core, a splat of the whole scene: the order of its families.
+#: Out of core, a splat of the whole scene while its nodes are put in order, before and after that for streaming.
 OF_ORDER = 20
 
-#: Families a splat of the input, and bytes of each outside of the part that is put in an order for streaming.
+#: Families a splat of the input, and bytes of each while parts of them are put in the order for streaming.
 FAMILIES, OF_FAMILY = 0.4, 40
 
 #: In the scratch folder, a splat of the input; by method. Those of blocks are removed when their nodes are made.
@@ -73,7 +74,9 @@ def in_memory_bytes(method: str, splats: int, sh_degree: int) -> int:
     return PROCESS + IN_MEMORY[method].of(splats, sh_degree)
 
 
-def out_of_core_bytes(method: str, splats: int, sh_degree: int, block_splats: int, *, in_chunks: bool = False) -> int:
+def out_of_core_bytes(
+    method: str, splats: int, sh_degree: int, block_splats: int, *, in_chunks: bool = False, threads: int = 1
+) -> int:
     """Bytes that a bake out of core takes at its peak.
 
     Args:
@@ -81,14 +84,15 @@ def out_of_core_bytes(method: str, splats: int, sh_degree: int, block_splats: in
         splats, sh_degree: of the input; `sh_degree` as far as it is kept.
         block_splats: of a block.
         in_chunks: families are put in an order for streaming at the end.
+        threads: to work on.
     """
-    from ...lod.chunk_order import FAMILY_BYTES, MOST_FAMILIES  # takes long to load, and this is asked out of core only
+    from ...lod.chunk_order import MOST_FAMILIES, family_bytes  # takes long to load, and this is asked out of core only
 
     window = OF_WINDOW.of(min(2 * splats, WINDOW), sh_degree)
     block = OF_BLOCK[method].of(min(splats, block_splats), sh_degree)
     families = int(FAMILIES * splats) if in_chunks else 0
-    arranging = FAMILY_BYTES * min(families, MOST_FAMILIES) + OF_FAMILY * families
-    return PROCESS + OF_ORDER * splats + max(window, block, arranging)
+    arranging = family_bytes(threads) * min(families, MOST_FAMILIES) + OF_FAMILY * families
+    return PROCESS + max(window, block, OF_ORDER * splats, arranging)
 
 
 def scratch_bytes(method: str, splats: int, sh_degree: int) -> int:
@@ -102,19 +106,20 @@ def scratch_bytes(method: str, splats: int, sh_degree: int) -> int:
 
 
 def block_splats_within(
-    memory: int | None, method: str, splats: int, sh_degree: int, *, in_chunks: bool = False
+    memory: int | None, method: str, splats: int, sh_degree: int, *, in_chunks: bool = False, threads: int = 1
 ) -> int | None:
     """The splats of a block, a power of two, so that nearly the same memory gives the same blocks.
 
     Args:
         memory: bytes that a bake may take; None for any number.
-        method, splats, sh_degree, in_chunks: as for `out_of_core_bytes`.
+        method, splats, sh_degree, in_chunks, threads: as for `out_of_core_bytes`.
 
     Returns:
         None where the memory is too little for blocks of `LEAST_BLOCK_SPLATS`.
     """
     size = MOST_BLOCK_SPLATS
-    while memory is not None and out_of_core_bytes(method, splats, sh_degree, size, in_chunks=in_chunks) > memory:
+    needed = functools.partial(out_of_core_bytes, method, splats, sh_degree, in_chunks=in_chunks, threads=threads)
+    while memory is not None and needed(size) > memory:
         size //= 2
         if size < LEAST_BLOCK_SPLATS:
             return None

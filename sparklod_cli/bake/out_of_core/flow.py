@@ -23,7 +23,7 @@ from ..settings import BakeSettings
 from ..written import WrittenTree
 from .blocks import cut_into_blocks
 from .contracts import Engine, Store, Task
-from .job import ORDER, Job, clean_of, encoded_of, stage_of
+from .job import ORDER, PUBLISHED, Job, clean_of, encoded_of, stage_of
 from .nodes import encode, encoded_chunk, node_stream
 from .order import WINDOW_NODES, put_order
 from .parts import parts_of
@@ -104,6 +104,7 @@ def bake_out_of_core(
     ]
     engine.run("encoding", tasks, job, progress)
     clock.end("encode")
+    store.put(PUBLISHED, {})
     written = output.write_windows(encoder, functools.partial(encoded_chunk, store), threads, progress)
     clock.end("write")
     return BakedOutOfCore(written, findings, tree.nodes.count, tree.levels, job.blocks.count, clock.seconds)

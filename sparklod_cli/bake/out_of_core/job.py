@@ -98,8 +98,9 @@ def clean_of(group: int) -> str:
     return f"clean/{group}"
 
 
-#: Names of the root, and of what is known of all nodes when they are in order.
-ROOT, ORDER = "root", "order"
+#: Names of the root, of what is known of all nodes when they are in order, and of the mark that the output is published
+#: from then on.
+ROOT, ORDER, PUBLISHED = "root", "order", "published"
 
 
 def forget(store: Store, damaged: Collection[str]) -> None:

@@ -7,7 +7,7 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-from ...support import leftovers
+from ...support import folders, leftovers
 from ...support.errors import ScratchError
 
 #: The file that the run at work has locked.
@@ -16,27 +16,30 @@ LOCK = "lock"
 
 @contextlib.contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """A context in which no other run works in a folder; it is made if need be, and removed if nothing is left in it.
+    """A context in which no other run works in a folder; it is made if need be, and removed if nothing is left in it,
+    as are those of its parents that were made.
 
     Raises:
         ScratchError: another run is at work there, it is nobody's scratch folder, or it cannot be made.
     """
     path = folder / LOCK
-    try:
-        descriptor = _opened_lock(path)
-    except OSError as error:
-        raise ScratchError(
-            f"cannot write in the scratch folder {folder}: {(error.strerror or str(error)).lower()}; choose another one"
-            " with --scratch-dir"
-        ) from None
-    try:
-        yield
-    finally:
-        if leftovers.HAS_LOCKS:
-            _remove_empty(path)
-        os.close(descriptor)
-        if not leftovers.HAS_LOCKS:  # Windows cannot remove a file that is open
-            _remove_empty(path)
+    with contextlib.ExitStack() as stack:
+        try:
+            stack.enter_context(folders.created(folder.parent))
+            descriptor = _opened_lock(path)
+        except OSError as error:
+            raise ScratchError(
+                f"cannot write in the scratch folder {folder}: {(error.strerror or str(error)).lower()}; choose another"
+                " one with --scratch-dir"
+            ) from None
+        try:
+            yield
+        finally:
+            if leftovers.HAS_LOCKS:
+                _remove_empty(path)
+            os.close(descriptor)
+            if not leftovers.HAS_LOCKS:  # Windows cannot remove a file that is open
+                _remove_empty(path)
 
 
 def _opened_lock(path: Path) -> int:

@@ -153,10 +153,10 @@ def at_work(
 
 
 def _clear(store: Store) -> None:
-    """Removes all that is there but the lock."""
+    """Removes all that is there but the lock; last the files that tell what it is, for a run that is killed here."""
     folder = _folder_of(store)
     if folder is not None:
-        for path in folder.iterdir():
+        for path in sorted(folder.iterdir(), key=lambda path: (path.is_file(), path.name)):
             if path.is_dir():
                 shutil.rmtree(path, ignore_errors=True)
             elif path.name != LOCK:

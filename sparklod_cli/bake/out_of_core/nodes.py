@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...codecs.encoder import rows_of, windows_of
+from ...codecs.sound import check_valid
 from ...model.lod_tree import LodTree
 from ...model.splats import Splats
 from ...model.streams import NodeStream
@@ -31,7 +32,8 @@ def node_stream(job: Job, count: int, leaves: int) -> NodeStream:
         leaves: of these.
     """
     read = functools.partial(_read, job.store, width_of(job.sh_degree))
-    return NodeStream(count, leaves, job.sh_degree, job.stream.antialiased, read)
+    up = job.settings.up_of(job.stream.up)
+    return NodeStream(count, leaves, job.sh_degree, job.stream.antialiased, read, up)
 
 
 def encode(job: Job, window: int, *, threads: int, progress: Progress) -> None:
@@ -41,6 +43,7 @@ def encode(job: Job, window: int, *, threads: int, progress: Progress) -> None:
     start = window * WINDOW_NODES
     stop = min(start + WINDOW_NODES, encoder.count)
     splats, tree = _read(job.store, width_of(job.sh_degree), start, stop, threads)
+    check_valid(splats, threads)
 
     def encoded(part: slice) -> dict[str, NDArray[np.generic]]:
         return encoder.encode(*rows_of(splats, tree, part), start + part.start)

@@ -173,6 +173,11 @@ class FileStore(ABC):
                 f"{name} in the scratch folder {self.folder} is damaged: {error}; run it again with --resume, which"
                 " makes it anew"
             ) from None
+        except (FileNotFoundError, NotADirectoryError):
+            raise ScratchError(
+                f"{name} is missing in the scratch folder {self.folder}: somebody removed it; begin anew with"
+                " --overwrite, without --resume"
+            ) from None
         except OSError as error:
             self._refused("read", error)
 

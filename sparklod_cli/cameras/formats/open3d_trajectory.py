@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from ...support.errors import CameraPathError
+from ...support.optional import install_hint
 from ..frame import NO_LENS, Frame, Lens, Settings
 from .source import Files, Parsed, finite, side
 
@@ -95,7 +96,7 @@ def load_open3d() -> ModuleType:
         import open3d
     except ModuleNotFoundError as error:
         raise CameraPathError(
-            f"reading it takes the package {error.name}, which is not installed; pip install 'sparklod[render]'"
+            f"reading it takes the package {error.name}, which is not installed: {install_hint('render')}"
         ) from None
     except (ImportError, OSError) as error:
         reason = " ".join(str(error).split())

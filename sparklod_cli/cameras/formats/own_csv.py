@@ -7,7 +7,7 @@ import math
 from collections.abc import Collection
 
 from ...support.errors import CameraPathError
-from ..frame import DEFAULT_UP, Frame, Lens, Settings
+from ..frame import Frame, Lens, Settings
 from ..generators import frame_looking
 from .source import Files, Parsed, finite, posed, side
 
@@ -78,7 +78,7 @@ def _frame(row: list[str], names: list[str], way: str, settings: Settings) -> Fr
     lens = Lens(size, fov=None if fov is None else math.radians(fov))
     name = values.get("name", "")
     if QUAT[0] not in values:
-        up = numbers(UP) if UP[0] in values else settings.up or DEFAULT_UP
+        up = numbers(UP) if UP[0] in values else settings.up_axis
         return frame_looking(numbers(POSITION), numbers(TARGET), up, lens, time, name)
     x, y, z, w = numbers(QUAT)
     return Frame(posed([w, x, y, z], numbers(POSITION), way), lens, time, name)

@@ -10,7 +10,7 @@ import numpy as np
 from ...support.errors import CameraPathError
 from ..axes import Axes
 from ..camera import Matrix
-from ..frame import DEFAULT_UP, NO_LENS, Frame, Lens, Settings
+from ..frame import NO_LENS, Frame, Lens, Settings
 from ..generators import Key, between, frame_looking
 from .source import Files, Json, Parsed, brief, posed, side
 
@@ -33,7 +33,7 @@ def parse(files: Files, settings: Settings) -> Parsed:
         raise CameraPathError("fps is not positive")
     if root.has("keyframes"):
         keys = [_key(item) for item in root.get("keyframes").items()]
-        frames = between(keys, settings.fps or fps, settings.up or DEFAULT_UP, lens)
+        frames = between(keys, settings.fps or fps, settings.up_axis, lens)
         return Parsed(frames, fps=fps, turned=all(key.up for key in keys))
     axes, items = _axes(root), list(root.get("frames").items())
     turned = all(item.has("up") or not item.has("eye") for item in items)
@@ -54,7 +54,7 @@ def _frame(item: Json, default: Lens, axes: Axes, settings: Settings) -> Frame:
     time = item.get("time").number() if item.has("time") else None
     name = item.get("name").text() if item.has("name") else ""
     if item.has("eye"):
-        up = item.get("up").numbers(3) if item.has("up") else settings.up or DEFAULT_UP
+        up = item.get("up").numbers(3) if item.has("up") else settings.up_axis
         return frame_looking(item.get("eye").numbers(3), item.get("target").numbers(3), up, lens, time, name)
     return Frame(_matrix(item), lens, time, name, None if settings.axes else axes)
 

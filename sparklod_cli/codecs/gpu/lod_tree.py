@@ -40,11 +40,10 @@ def pack(
         size: computes (N,) feature sizes, world units: `spark_size`, or `design_size` of Spark's pages for comparison.
 
     Raises:
-        FormatError: the numbers of nodes and splats differ, or a node has more children than a uint16 holds.
+        FormatError: the numbers of nodes and splats differ.
     """
     if len(tree) != len(splats):
         raise FormatError(f"{len(tree):,} nodes, but {len(splats):,} splats")
-    _check_child_count(tree.child_count)
     words = np.empty((len(splats), 4), np.uint32)
 
     @np.errstate(over="ignore")
@@ -79,12 +78,9 @@ def unpack(arrays: Mapping[str, NDArray[Any]]) -> Nodes:
         FormatError: the array is missing or has another shape or type, or a node has more children than a uint16 holds.
     """
     rows = checked_words(arrays, {"lod_tree": 4})["lod_tree"].view(NODE)[:, 0]
-    _check_child_count(rows["child_count"])
-    tree = LodTree(rows["child_count"].astype(np.uint16), rows["child_start"].copy())
-    return Nodes(rows["center"].astype(np.float32), rows["size"].astype(np.float32), tree)
-
-
-def _check_child_count(child_count: NDArray[Any]) -> None:
+    child_count = rows["child_count"]
     if child_count.max(initial=0) > MAX_CHILDREN:
         node = int(np.argmax(child_count > MAX_CHILDREN))
         raise FormatError(f"node {node} has {child_count[node]:,} children, a uint16 holds at most {MAX_CHILDREN:,}")
+    tree = LodTree(child_count.astype(np.uint16), rows["child_start"].copy())
+    return Nodes(rows["center"].astype(np.float32), rows["size"].astype(np.float32), tree)

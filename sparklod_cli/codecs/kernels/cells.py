@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...support.jit import kernel, prange
+from ...support.jit_types import f4, f8, i8, out, u4
 
 #: Rows that a cell's direction is found from, spaced evenly over its members. Measured: 8,192 gain nothing.
 SAMPLE = 2048
@@ -145,7 +146,7 @@ def squared_error(rows, weight, cell, origin):
     return max(error, 0.0)
 
 
-@kernel(parallel=True)
+@kernel(f4[:, :], f8[:], out(u4[:]), i8[:], i8[:], out(i8[:]), out(f8[:, :]), out(f8[:]), parallel=True)
 def halve_cells(rows, weight, members, begin, end, cuts, errors, places):
     """Sorts the members of each cell into two halves.
 
@@ -179,7 +180,7 @@ def halve_cells(rows, weight, members, begin, end, cuts, errors, places):
             errors[k, 1] = squared_error(rows, weight, cell[first:], mean)
 
 
-@kernel(parallel=True)
+@kernel(f4[:, :], f8[:], u4[:], i8[:], out(f4[:, :]), parallel=True)
 def average_cells(rows, weight, members, begin, codes):
     """Fills each code with the weighted mean of the rows of its cell; codes of empty cells are left as they are.
 

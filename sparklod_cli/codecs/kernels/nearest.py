@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...support.jit import kernel, prange
+from ...support.jit_types import f4, i4, i8, out, u4
 
 #: Codes of a group.
 GROUP = 256
@@ -21,7 +22,7 @@ LANES = 16
 SHARE = 64
 
 
-@kernel(parallel=True)
+@kernel(f4[:, :], f4[:, :, :], f4[:, :], i8, out(i4[:, :]), out(f4[:, :]), parallel=True)
 def find_neighbours(codes, blocks, groups, search, near, distance):
     """Fills the nearest other codes of each code, nearest first, from the groups that are nearest to its own.
 
@@ -60,7 +61,7 @@ def find_neighbours(codes, blocks, groups, search, near, distance):
                         distance[c, at], near[c, at] = sums[lane], h * GROUP + lane
 
 
-@kernel(parallel=True)
+@kernel(f4[:, :], u4[:], i8[:], f4[:, :], i4[:, :], f4[:, :], out(i4[:]), out(f4[:]), parallel=True)
 def choose_codes(rows, members, begin, codes, near, distance, labels, errors):
     """Fills the nearest code of each row, of the one that it has and that one's neighbours.
 

@@ -5,13 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from ...support.jit import kernel, prange
+from ...support.jit_types import u4
 
 #: Odd multipliers with irregular bits: 2 ** 64 / golden ratio, and the second of MurmurHash3's finalizer.
 SPREAD, MIX = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xC4CEB9FE1A85EC53)
 SHIFT = np.uint64(29)
 
 
-@kernel(parallel=True)
+@kernel(u4[:, :], parallel=True)
 def hash_rows(bits):
     """A hash of each row: equal for equal rows, different for nearly all others.
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...support.jit import kernel
+from ...support.jit_types import f4, i2, i8, out, u1
 
 #: Bits of a coordinate that are counted at a time, half of it.
 HALF_BITS = 12
@@ -12,7 +13,7 @@ HALF_BITS = 12
 LOWEST = 1 << 23
 
 
-@kernel(nogil=True)
+@kernel(u1[:, :], out(i8[:, :]), nogil=True)
 def count_bytes(codes, counts):
     """Counts the bytes of each column.
 
@@ -25,7 +26,7 @@ def count_bytes(codes, counts):
             counts[column, codes[row, column]] += 1
 
 
-@kernel(nogil=True)
+@kernel(u1[:, :], out(i8[:, :]), nogil=True)
 def count_ends(codes, counts):
     """Counts the largest and the smallest byte of rows.
 
@@ -38,7 +39,7 @@ def count_ends(codes, counts):
         counts[max(a, b, c), min(a, b, c)] += 1
 
 
-@kernel(nogil=True)
+@kernel(u1[:, :], i8, i8, out(i8[:]), nogil=True)
 def count_squares(codes, first, last, counts):
     """Counts sums of squares of what bytes differ from 128 by.
 
@@ -55,7 +56,7 @@ def count_squares(codes, first, last, counts):
         counts[total] += 1
 
 
-@kernel(nogil=True)
+@kernel(u1[:, :], i8, i8, i2[:], out(i8[:, :]), nogil=True)
 def count_halves(codes, axis, shift, rows, counts):
     """Counts half of the bits of a coordinate.
 
@@ -82,7 +83,7 @@ def count_halves(codes, axis, shift, rows, counts):
     return total - LOWEST * len(codes)
 
 
-@kernel(nogil=True)
+@kernel(u1[:, :], u1[:, :], f4[:], f4[:], out(f4[:]), nogil=True)
 def fill_sizes(scales, alphas, scale_of, factor_of, size):
     """Feature sizes, as `gaussian.spark_size` computes them.
 
@@ -99,7 +100,7 @@ def fill_sizes(scales, alphas, scale_of, factor_of, size):
         size[row] = factor_of[alphas[row, 0]] * (mean / np.float32(3))
 
 
-@kernel(nogil=True)
+@kernel(u1[:, :], u1[:, :], u1[:, :], f4[:], f4[:], f4, out(f4[:, :]), nogil=True)
 def fill_extremes(alphas, scales, positions, opacity_of, scale_of, step, found):
     """Opacities, largest scales and largest absolute coordinates.
 
@@ -122,7 +123,7 @@ def fill_extremes(alphas, scales, positions, opacity_of, scale_of, step, found):
         found[2, row] = np.float32(furthest) * step
 
 
-@kernel(nogil=True)
+@kernel(u1[:, :], f4[:], out(f4[:, :]), nogil=True)
 def look_up(codes, table, out):
     """What each byte stands for.
 

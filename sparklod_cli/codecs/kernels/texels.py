@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from ...support.jit import kernel
+from ...support.jit_types import f4, i8, out, u1, u4
 
 _BYTE = np.uint32(255)
 _8, _16, _24 = np.uint32(8), np.uint32(16), np.uint32(24)
 
 
-@kernel(nogil=True)
+@kernel(u4[:], out(u1[:, :]), i8, nogil=True)
 def place_bytes(pixels, out, place):
     """Puts red, green and blue into one byte of each of three words.
 
@@ -26,7 +27,7 @@ def place_bytes(pixels, out, place):
         out[i, 8 + place] = p & _BYTE
 
 
-@kernel(nogil=True)
+@kernel(u4[:, :], f4[:, :], out(f4[:, :]), nogil=True)
 def look_up_words(words, tables, out):
     """Fills (N, 3) float32 by (3, 65536) tables and the lower halves of (N, 3) uint32, which may be the same memory."""
     for i in range(len(words)):
@@ -34,7 +35,7 @@ def look_up_words(words, tables, out):
             out[i, axis] = tables[axis, words[i, axis] & np.uint32(0xFFFF)]
 
 
-@kernel(nogil=True)
+@kernel(u4[:], u4[:], f4[:, :], out(f4[:, :]), nogil=True)
 def look_up(pixels, shifts, tables, out):
     """Fills (N, C) float32 by (C, 256) tables and the bytes that stand at (C,) uint32 `shifts` of (N,) pixels."""
     for i in range(len(pixels)):
@@ -42,7 +43,7 @@ def look_up(pixels, shifts, tables, out):
             out[i, k] = tables[k, pixels[i] >> shifts[k] & _BYTE]
 
 
-@kernel(nogil=True)
+@kernel(u4[:], f4[:], out(f4[:, :]), nogil=True)
 def fill_quats(pixels, components, out):
     """Fills (N, 4) quaternions x y z w.
 
@@ -79,7 +80,7 @@ def fill_quats(pixels, components, out):
         out[i, 0], out[i, 1], out[i, 2], out[i, 3] = x, y, z, w
 
 
-@kernel(nogil=True)
+@kernel(u4[:], f4[:, :], out(f4[:, :]), nogil=True)
 def gather_rows(pixels, rows, out):
     """Fills rows by their labels, red + 256 * green, unless one is beyond the last.
 

@@ -18,14 +18,17 @@ from ..encoder import Get, Kept, results, windows_of
 from ..options import DEFAULTS, WriteOptions
 from .encoding import CHUNK, RadEncoder
 from .encoding import encoder as encoder
+from .options import held as held
 from .options import needed as needed
 from .options import settled as settled
 from .reading import RadChunk as RadChunk
+from .reading import count_leaves as count_leaves
 from .reading import decode as decode
 from .reading import examine as examine
 from .reading import name_of as name_of
 from .reading import read_chunk as read_chunk
 from .reading import stream as stream
+from .repacking import PackedChunks as PackedChunks
 from .stored import stored as stored
 
 #: Bytes of chunks that wait in memory for their header; beyond, they wait on disk.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -22,16 +21,16 @@ from ...support.progress import Progress, silent
 from .. import clamps, coverage, octahedral
 from ..clamps import Range
 from ..encoder import CLAMPED, Encoded, Get, windows_of
+from ..noted import comment_of
 from ..options import WriteOptions
 from ..splat_encoding import SplatEncoding
-from .comment import comment_of
+from .containers import in_files, in_one_file
 from .encodings import BLOCK, CODINGS
-from .header import pack_chunk_header, pack_header, padding
+from .header import pack_chunk_header, padding
 from .layout import BY_NAME, PROPERTIES, RANGES, SIZES, Row
-from .names import SUFFIX, chunk_name
 from .options import code_range
 from .palette import Palette
-from .records import GZ, Property, RadChunkEntry, RadChunkHeader, RadHeader
+from .records import GZ, Property, RadChunkHeader, RadHeader
 
 #: Names of the arrays of a window's result: the bytes of a chunk, and their number.
 CHUNK, SIZE = "chunk", "size"
@@ -65,7 +64,7 @@ class RadEncoder:
         count: splats of the file, which are nodes where there is a tree.
         sh_degree: of them.
         tree: whether there is one.
-        antialiased: as in `Scene`.
+        antialiased, up: as in `Scene`.
         options: with nothing left open.
         palette: of SH, or None.
         ranges: beyond which values are counted; none unless somebody wants to know.
@@ -78,6 +77,7 @@ class RadEncoder:
     options: WriteOptions
     palette: Palette | None = None
     ranges: tuple[Range, ...] = ()
+    up: str | None = None
 
     @property
     def _codes(self) -> SplatEncoding:
@@ -89,16 +89,21 @@ class RadEncoder:
         """The bytes of a chunk, and how many they are."""
         chunk = np.frombuffer(self._chunk(splats, tree, start), np.uint8)
         result = {CHUNK: chunk, SIZE: np.array([len(chunk)])}
-        return result | ({CLAMPED: clamps.tally(splats, self.ranges)} if self.ranges else {})
+        return result | (
+            {CLAMPED: clamps.tally(splats, self.ranges, None if tree is None else tree.is_leaf)} if self.ranges else {}
+        )
 
     def pieces(self, get: Get, *, threads: int, progress: Progress) -> Iterator[bytes]:
         """The header and all chunks."""
         windows = windows_of(self.count)
         sizes = [int(get(number, SIZE)[0]) for number in range(len(windows))]
-        yield pack_header(self._header(map(RadChunkEntry, itertools.accumulate(sizes, initial=0), sizes)))
-        for number, part in enumerate(windows):
-            yield get(number, CHUNK).tobytes()
-            progress("writing", part.stop, self.count, "splat")
+
+        def chunks() -> Iterator[bytes]:
+            for number, part in enumerate(windows):
+                yield get(number, CHUNK).tobytes()
+                progress("writing", part.stop, self.count, "splat")
+
+        yield from in_one_file(self._header, sizes, chunks())
 
     def files(self, chunks: Iterable[NDArray[np.uint8]], stem: str) -> Iterator[tuple[str, Iterable[bytes]]]:
         """The files of a scene whose chunks are files of their own, see `codec.encode_chunked`.
@@ -107,27 +112,14 @@ class RadEncoder:
             chunks: in order, asked for one by one.
             stem: of the names.
         """
-        entries = []
-        for number, chunk in enumerate(chunks):
-            name = chunk_name(stem, number)
-            entries.append(RadChunkEntry(0, len(chunk), name))
-            yield name, [chunk.tobytes()]
-        yield stem + SUFFIX, [pack_header(self._header(entries))]
+        return in_files(self._header, (chunk.tobytes() for chunk in chunks), stem)
 
-    def _header(self, entries: Iterable[RadChunkEntry]) -> RadHeader:
-        """The header of the file whose chunks are there."""
-        chunks = tuple(entries)
-        return RadHeader(
-            self.count,
-            self.sh_degree,
-            self.tree,
-            CHUNK_NODES,
-            sum(entry.bytes for entry in chunks),
-            chunks,
-            self._codes,
-            None if self.palette is None else len(self.palette.codes),
-            comment_of(antialiased=self.antialiased),
-        )
+    @property
+    def _header(self) -> RadHeader:
+        """The header of the file, without its chunks."""
+        codes = None if self.palette is None else len(self.palette.codes)
+        comment = comment_of(antialiased=self.antialiased, up=self.up)
+        return RadHeader(self.count, self.sh_degree, self.tree, CHUNK_NODES, 0, (), self._codes, codes, comment)
 
     def _chunk(self, splats: Splats, tree: LodTree | None, start: int) -> bytes:
         payload, properties, at = [], [], 0
@@ -237,7 +229,7 @@ def encoder(
     palette = None
     if rad.sh_codes is not None and sh_degree and count:
         palette = Palette.of(scene, rad.sh_codes, threads, progress)
-    return RadEncoder(count, sh_degree, tree, scene.antialiased, options, palette, ranges)
+    return RadEncoder(count, sh_degree, tree, scene.antialiased, options, palette, ranges, scene.up)
 
 
 def rounded(center: FloatArray, bits: int) -> FloatArray:

@@ -21,6 +21,9 @@ from ..quantize import Bytes
 #: Largest finite float16. Larger values are clamped to it: rounded they would be infinite.
 LARGEST_F16 = np.float32(65504)
 
+#: Largest float16 whose exponential float32 holds, a step below `quantize.LARGEST_LOG`.
+LARGEST_LOG_F16 = np.float16(88.6875)
+
 #: Splats that are coded at a time: they and what is computed of them stay in the processor's cache.
 BLOCK = 1 << 13
 
@@ -119,7 +122,7 @@ def _signed_table(low: float, high: float) -> FloatArray:
 
 def _encode_log(values: NDArray[Any], low: float, high: float) -> NDArray[Any]:
     with np.errstate(divide="ignore"):
-        return np.log(values.astype(np.float64)).astype(np.float32)
+        return np.minimum(np.log(values.astype(np.float64)), LARGEST_LOG_F16).astype(np.float32)
 
 
 def _decode_log_f16(codes: Bytes, count: int, numbers: int, low: float, high: float) -> NDArray[Any]:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..magnitudes import LOWER, UPPER, Magnitudes, tops
-from ..splat_encoding import SCALE_ZERO, SplatEncoding
+from ..splat_encoding import LARGEST_END, SCALE_ZERO, SplatEncoding
 from ..statistics import Statistics
 from ..steps import SMALL_QUANTILE
 
@@ -69,7 +69,7 @@ def _linear_range(found: Magnitudes) -> tuple[float, float]:
         return (lows[low] + highs[high]) / total + ((high - low) / 255) ** 2 / 12
 
     low, high = min(itertools.product(sorted(lows), sorted(highs)), key=error)
-    return _outward(low, False), _outward(high, True)
+    return _outward(max(low, -LARGEST_END), False), _outward(min(high, LARGEST_END), True)
 
 
 def _largest(found: Magnitudes) -> float:
@@ -82,7 +82,7 @@ def _largest(found: Magnitudes) -> float:
     def error(top: float) -> float:
         return _clamping(counts, top) / total + (top / 127) ** 2 / 12
 
-    return max(GRID, _outward(min(tops(counts, total, most, BEYOND), key=error), True))
+    return max(GRID, _outward(min(*tops(counts, total, most, BEYOND), LARGEST_END, key=error), True))
 
 
 def _log_range(scale: Magnitudes) -> tuple[float, float]:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import math
 
+import numpy as np
+
 from ...model.nodes import CHUNK_NODES
 from ...model.scene import Scene
 from ...model.sh import COEFFICIENTS
@@ -20,6 +22,9 @@ from .layout import AUTO, OPTIONS, PROPERTIES, RANGES, Row, choices
 
 #: What "auto" stands for, where the scene does not decide.
 AUTOMATIC = RadOptions("f32_lebytes", "r8", "r8", "ln_0r8", "oct88r8", "s8")
+
+#: Encodings of centres as float16.
+HALF = ("f16", "f16_lebytes")
 
 #: Range of logarithms of scales from which float16 is used: steps of a byte would be as coarse as SPZ's, 6 %.
 WIDE_LOG_RANGE = 16.0
@@ -43,7 +48,8 @@ def needed(options: WriteOptions) -> frozenset[str]:
     ranges = NEEDED if rad.ranges is None else frozenset[str]()
     rounds = {"leaf_scale"} if _rounds(rad) else set()
     turns = {"leaf_length"} if rad.orientation == AUTO else set()
-    return ranges | rounds | turns
+    reach = {"reach"} if rad.center in HALF else set()
+    return ranges | rounds | turns | reach
 
 
 def _rounds(rad: RadOptions) -> bool:
@@ -59,7 +65,7 @@ def settled(scene: Scene | Statistics, options: WriteOptions) -> WriteOptions:
         options: that may leave choices open.
 
     Raises:
-        FormatError: there are more splats than the format can number.
+        FormatError: there are more splats than the format can number, or centres as float16 do not reach far enough.
         ValueError: an encoding is unknown, or the palette has no code or more than a label can name.
     """
     rad = options.rad
@@ -72,6 +78,11 @@ def settled(scene: Scene | Statistics, options: WriteOptions) -> WriteOptions:
     found = scene if isinstance(scene, Statistics) else Statistics.of_scene(scene, needed(options))
     if found.count >= 1 << 32:
         raise FormatError(f"{found.count:,} splats; RAD numbers at most {(1 << 32) - 1:,}")
+    if rad.center in HALF and np.float16(min(found.reach or 0, LARGEST_F16)) >= LARGEST_F16:
+        raise FormatError(
+            f"coordinates reach {found.reach:.6g}, and {rad.center} holds less than {LARGEST_F16:.0f};"
+            " choose another encoding of centres, such as f32"
+        )
     ranges = rad.ranges or fitted(found)
     chosen = {name: getattr(AUTOMATIC, name) if value == AUTO else value for name, value in given.items()}
     if rad.scales == AUTO and ranges.ln_scale_max - ranges.ln_scale_min > WIDE_LOG_RANGE:

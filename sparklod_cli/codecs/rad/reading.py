@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import BinaryIO
 
 import numpy as np
@@ -26,8 +26,9 @@ from ..sound import with_sound_tree
 from ..stream import size_of
 from . import promises
 from .decoding import Packed, fill
-from .header import read_header
-from .places import Beside, bytes_of, file_of, size_beside
+from .header import read_chunk_header, read_header
+from .layout import BY_NAME
+from .places import Beside, bytes_of, file_of, size_beside, start_of
 from .records import RadChunkEntry, RadChunkHeader, RadHeader
 
 
@@ -91,7 +92,8 @@ def examine(
     sizes = tuple(entry.bytes for entry in header.chunks)
     facts = facts_of(header, palette)
     coding = coding_of(header, codings)
-    return Scene(splats, tree, header.antialiased, name_of(header), header=facts, chunk_bytes=sizes, coding=coding)
+    noted, name = header.noted, name_of(header)
+    return Scene(splats, tree, noted.antialiased, name, noted.problems, facts, sizes, coding, noted.up)
 
 
 def stream(
@@ -127,7 +129,9 @@ def stream(
             yield from ordered_map(run, chunks_of(file, header, beside, numbers), threads)
 
     facts = facts_of(header, palette)
-    return SceneStream(header.count, header.max_sh, read, header.antialiased, name_of(header), header=facts)
+    noted, name = header.noted, name_of(header)
+    about = noted.antialiased, name, noted.problems, facts, noted.up
+    return SceneStream(header.count, header.max_sh, read, *about)
 
 
 def checked_header(file: BinaryIO, beside: Beside | None) -> RadHeader:
@@ -232,6 +236,34 @@ def chunks_of(file: BinaryIO, header: RadHeader, beside: Beside | None, numbers:
         with file_of(entry, file, beside) as source:
             data = bytes_of(entry, header, source)
         yield Packed.of(data, number, header)
+
+
+def count_leaves(file: BinaryIO, header: RadHeader, beside: Beside | None) -> int:
+    """Return the number of leaves of a tree, of which only the numbers of children are read.
+
+    Args:
+        file: that of the header.
+        header: of a tree.
+        beside: opens the files that the header names; None if there are none to open.
+
+    Raises:
+        FormatError: a chunk is cut short, corrupt, or not the one that the header means.
+    """
+    leaves = 0
+    for number, entry in enumerate(header.chunks):
+        with file_of(entry, file, beside) as source:
+            start = start_of(entry, header)
+            source.seek(start)
+            chunk = read_chunk_header(source)
+            check(promises.chunk_violations(header, number, chunk, entry.bytes))
+            leaves += chunk.count
+            for each in chunk.properties:
+                if each.name == "child_count":
+                    source.seek(start + chunk.bytes + each.offset)
+                    packed = Packed(number, chunk, memoryview(source.read(each.bytes)))
+                    children = packed.values(replace(each, offset=0), BY_NAME[each.name], chunk.count)
+                    leaves -= int(np.count_nonzero(children))
+    return leaves
 
 
 def _check_promise(count: int, header: RadHeader, size: int) -> None:

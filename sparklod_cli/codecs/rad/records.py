@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
+from ..noted import Noted, read_comment
 from ..splat_encoding import SplatEncoding
-from . import comment
 
 #: The compression of properties: a raw deflate stream, whatever its name says.
 GZ = "gz"
@@ -66,10 +67,10 @@ class RadHeader:
         """Whether the chunks are files of their own."""
         return bool(self.filenames)
 
-    @property
-    def antialiased(self) -> bool:
-        """Whether the splats were trained with the opacity compensation of Mip-Splatting; only sparklod notes that."""
-        return comment.tells_antialiased(self.comment)
+    @functools.cached_property
+    def noted(self) -> Noted:
+        """Note of sparklod in the comment."""
+        return read_comment(self.comment)
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ codes, and files of other programs may have ranges chunk by chunk.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, BinaryIO
 
@@ -61,11 +61,7 @@ class StoredRad:
         How centres are rounded stays open where the encoding is that of "auto": it matters for merged splats.
         """
         rad = options.rad
-        found = {
-            BY_NAME[name].option: each.encoding
-            for name, each in self.chunks[0].properties.items()
-            if BY_NAME[name].option
-        }
+        found = encodings_of(self.chunks[0].properties.values())
         if found.get("center") == AUTOMATIC.center:
             found["center"] = AUTO
         chosen: dict[str, Any] = {name: found.get(name, AUTO) for name in OPTIONS if getattr(rad, name) == AUTO}
@@ -124,6 +120,11 @@ def stored(file: BinaryIO, *, beside: Beside | None = None) -> StoredRad:
             codes[row.name] = np.ascontiguousarray(_by_splat(flat, row, each.encoding))
         chunks.append(StoredChunk(packed.header.base, properties, codes))
     return StoredRad(header, tuple(chunks))
+
+
+def encodings_of(properties: Iterable[Property]) -> dict[str, str]:
+    """Return the encodings of a chunk's properties, by the field of `RadOptions`."""
+    return {BY_NAME[each.name].option: each.encoding for each in properties if BY_NAME[each.name].option}
 
 
 def _kept(properties: Mapping[str, Property]) -> list[Row]:

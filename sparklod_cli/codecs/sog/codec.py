@@ -6,6 +6,7 @@ are read, and version 2 is written.
 
 from __future__ import annotations
 
+from .options import held as held
 from .options import settled as settled
 from .reading import decode as decode
 from .reading import stream as stream

@@ -44,7 +44,7 @@ def center_table(low: Wide, high: Wide) -> FloatArray:
     """
     logs = quantize.range_table(low, high, LAST_WORD + 1)
     with np.errstate(over="ignore"):
-        return np.copysign(np.expm1(np.abs(logs)), logs).astype(np.float32)
+        return np.copysign(np.expm1(np.abs(logs)), logs).astype(np.float32, order="C")
 
 
 def encode_quat(quat_xyzw: FloatArray) -> Bytes:

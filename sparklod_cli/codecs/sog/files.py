@@ -16,9 +16,8 @@ from ...support.units import count_of
 from ...support.untrusted import ZIP_ERRORS, parse_json, quoted, quoted_value
 from ..compression import check_promise
 from ..stream import size_of
-from .lossless import PIECE, Pixels, Read
 from .names import META
-from .webp import WebPHeader, bands, read_header
+from .webp import PIECE, Pixels, Read, WebPHeader, pixels_of, read_header
 
 #: Largest meta.json, bytes; codebooks take 15,000.
 MAX_META = 1 << 22
@@ -170,22 +169,18 @@ class Files:
         with self._opened(self.meta.name(texture, "files", index), most) as (header, _):
             return header.width, header.height
 
-    def pixels(self, texture: str, index: int, count: int) -> Iterator[tuple[slice, Pixels]]:
-        """The first `count` pixels of an image, row by row, some at a time, and which these are.
+    def pixels(self, texture: str, index: int, count: int) -> Pixels:
+        """The first `count` pixels of an image, row by row.
 
         Raises:
             FormatError: it is corrupt, or has fewer, or far more.
         """
-        name, done = self.meta.name(texture, "files", index), 0
+        name = self.meta.name(texture, "files", index)
         with self._opened(name, SPARE_FACTOR * count + SPARE_TEXELS) as (header, read):
             total = header.width * header.height
             if total < count:
                 raise FormatError(f"{quoted_value(name)} has {count_of(total, 'texel')} for {count_of(count, 'splat')}")
-            for band in bands(header, read, name):
-                part = slice(done, min(done + len(band), count))
-                if part.start < count:
-                    yield part, band[: part.stop - part.start]
-                done += len(band)
+            return pixels_of(header, read, name)[:count]
 
     def bytes_of(self, texture: str, index: int) -> int:
         """Bytes of an image, as they are stored."""

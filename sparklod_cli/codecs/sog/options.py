@@ -8,11 +8,13 @@ import math
 import numpy as np
 
 from ...model.scene import Scene
-from ...model.splats import Splats, describe_invalid
+from ...model.splats import Splats
 from ...support.defaults import MAX_SH_CODES
 from ...support.errors import FormatError
 from ...support.units import count_of
+from ..clamps import Range
 from ..options import WriteOptions
+from ..sound import check_valid
 from .images import MAX_SIDE, size_for
 
 #: Fewest codes of a palette where nobody chooses, and the steps in which it grows, as PlayCanvas's writer has them.
@@ -32,8 +34,9 @@ def settled(scene: Scene, options: WriteOptions) -> WriteOptions:
     """These options with nothing left open: `encode` writes the scene with them.
 
     Raises:
-        FormatError: the scene has a tree or no splats, or values that SOG cannot hold: invalid ones, opacities above 1,
-            more splats than an image has texels.
+        FormatError: the scene has a tree or no splats, or values that SOG cannot hold: opacities above 1, more splats
+            than an image has texels.
+        InvalidSplatsError: a splat is invalid.
         ValueError: the palette has no code, or more than a label can name.
     """
     codes = options.sog.sh_codes
@@ -52,11 +55,14 @@ def settled(scene: Scene, options: WriteOptions) -> WriteOptions:
     return dataclasses.replace(options, sog=sog)
 
 
+def held(options: WriteOptions, sh_degree: int) -> tuple[Range, ...]:
+    """Return the values that SOG holds without clamping them: its codebooks suit any."""
+    return ()
+
+
 def _check(splats: Splats) -> None:
     """Raises a `FormatError` where splats have values that SOG cannot hold."""
-    invalid = splats.invalid()
-    if invalid:
-        raise FormatError(f"{describe_invalid(invalid)}; SOG holds no such splats, leave them out")
+    check_valid(splats, threads=1)
     most = float(splats.opacity.max())
     if most > 1:
         raise FormatError(f"opacities reach {most:.6g}, and SOG holds 0 to 1; clip them first")

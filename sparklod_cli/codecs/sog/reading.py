@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import BinaryIO
 
@@ -21,10 +21,11 @@ from .. import quantize
 from ..compression import check_promise
 from ..content import Content, Scratch, rows_in
 from ..kernels import texels
+from ..noted import read_note
 from ..stream import Positioned
 from . import codings
 from .files import Files, Meta
-from .lossless import Pixels
+from .webp import Pixels
 
 #: Most entries of the palette of SH: a label has 16 bits.
 MAX_PALETTE = 1 << 16
@@ -118,9 +119,7 @@ def _content(
 
     def fill_all(out: Splats, start: int, threads: int, progress: Progress) -> None:
         def work(step: Step) -> None:
-            # The values are judged when the image has been read to its end, as in a stream.
-            pieces = files.pixels(step.texture, step.index, count)
-            _refuse([step.fill(rows_in(out, part), pixels) for part, pixels in pieces])
+            _refuse(step.fill(out, files.pixels(step.texture, step.index, count)))
 
         tasks: list[Callable[[], object]] = [] if palette is None else [palette.values]
         tasks += [functools.partial(work, step) for step in in_order()]
@@ -138,7 +137,7 @@ def _content(
         def work(part: slice) -> None:
             rows = rows_in(out, part)
             for number, step in enumerate(ordered):
-                _refuse([step.fill(rows, pixels_of(number, slice(start + part.start, start + part.stop)))])
+                _refuse(step.fill(rows, pixels_of(number, slice(start + part.start, start + part.stop))))
             _finish(center_tables, rows)
 
         for_blocks(work, len(out), threads, lambda done: None)
@@ -146,7 +145,8 @@ def _content(
     antialiased = version == 2 and (meta.is_true("antialias") or meta.is_text("model", "antialiased"))
     header = {"version": version, "palette": palette.entries if palette is not None else 0, "bytes": files.size}
     fill = fill_some if unpacked is not None else fill_all
-    return Content(count, degree, fill, f"SOG {version}", antialiased, header=header)
+    noted = read_note(meta.root.get("asset"))
+    return Content(count, degree, fill, f"SOG {version}", antialiased, noted.problems, header, noted.up)
 
 
 def _unpacked(scratch: Scratch, progress: Progress, files: Files, steps: list[Step], count: int) -> PixelsOf:
@@ -154,7 +154,7 @@ def _unpacked(scratch: Scratch, progress: Progress, files: Files, steps: list[St
 
     def pieces() -> Iterator[bytes]:
         for number, step in enumerate(steps):
-            yield from (pixels.tobytes() for _, pixels in files.pixels(step.texture, step.index, count))
+            yield files.pixels(step.texture, step.index, count).tobytes()
             progress("reading", (number + 1) * count, len(steps) * count, "texel")
 
     source = Positioned(scratch(pieces))
@@ -210,9 +210,9 @@ def _fill_sh(palette: Palette, splats: Splats, pixels: Pixels) -> str | None:
     return f"an SH label is beyond the {len(rows):,} entries of its palette" if largest >= len(rows) else None
 
 
-def _refuse(problems: Iterable[str | None]) -> None:
-    """Raises the first problem."""
-    for problem in filter(None, problems):
+def _refuse(problem: str | None) -> None:
+    """Raise a problem, if there is one."""
+    if problem is not None:
         raise FormatError(problem)
 
 
@@ -271,7 +271,7 @@ class Palette:
         with self._lock:
             if self._values is None:
                 values = np.empty((self._texels, 3), np.float32)
-                for part, pixels in self._files.pixels("shN", 0, self._texels):
-                    texels.look_up(pixels, RED_GREEN_BLUE, np.tile(self._book, (3, 1)), values[part])
+                pixels = self._files.pixels("shN", 0, self._texels)
+                texels.look_up(pixels, RED_GREEN_BLUE, np.tile(self._book, (3, 1)), values)
                 self._values = values.reshape(-1, self.coefficients, 3)[: self.entries]
             return self._values

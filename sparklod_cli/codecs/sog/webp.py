@@ -1,21 +1,30 @@
-"""WebP images as bands of pixels: lossless ones as they are read, all others by Pillow, whole."""
+"""WebP images, which libwebp decodes by way of Pillow when their sides are known to be in bounds."""
 
 from __future__ import annotations
 
 import io
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from PIL.WebPImagePlugin import WebPImageFile
 
 from ...support.errors import FormatError
 from ...support.untrusted import quoted_value
-from .lossless import PIECE, ImageError, LosslessImage, Pixels, Read
 
-#: Bytes of the header of a file and of its first chunk, and those that are read of any file at first.
-HEADER, START = 20, 30
+#: (N,) A R G B from the most significant byte.
+Pixels = NDArray[np.uint32]
+
+#: Reads the next `size` bytes, or fewer, of which none are left at the end.
+Read = Callable[[int], bytes]
+
+#: Bytes that are read at a time.
+PIECE = 1 << 20
+
+#: Bytes that are read of any file at first: the headers of the file and of its first chunk, and what tells its sides.
+START = 30
 
 #: Flag of a WebP file's extended header.
 ANIMATED = 2
@@ -27,12 +36,10 @@ class WebPHeader:
 
     Attributes:
         start: these bytes.
-        kind: of its first chunk.
         width, height: in pixels.
     """
 
     start: bytes
-    kind: bytes
     width: int
     height: int
 
@@ -49,64 +56,32 @@ def read_header(read: Read, name: str) -> WebPHeader:
         if data[20] & ANIMATED:
             raise FormatError(f"{quoted_value(name)} is an animation, but SOG needs a still image")
         sides = int.from_bytes(data[24:27], "little"), int.from_bytes(data[27:30], "little")
-        return WebPHeader(data, kind, 1 + sides[0], 1 + sides[1])
+        return WebPHeader(data, 1 + sides[0], 1 + sides[1])
     if kind == b"VP8L":  # 14 bits each, minus one, after a byte of signature
         bits = int.from_bytes(data[21:25], "little")
-        return WebPHeader(data, kind, 1 + (bits & 0x3FFF), 1 + (bits >> 14 & 0x3FFF))
+        return WebPHeader(data, 1 + (bits & 0x3FFF), 1 + (bits >> 14 & 0x3FFF))
     if kind == b"VP8 ":  # 14 bits each, after a frame tag and a start code
         width, height = struct.unpack_from("<HH", data, 26)
-        return WebPHeader(data, kind, width & 0x3FFF, height & 0x3FFF)
+        return WebPHeader(data, width & 0x3FFF, height & 0x3FFF)
     raise FormatError(f"{quoted_value(name)} is not a WebP image")
 
 
-def bands(header: WebPHeader, read: Read, name: str) -> Iterator[Pixels]:
-    """All pixels of an image, some rows at a time; each band until the next.
+def pixels_of(header: WebPHeader, read: Read, name: str) -> Pixels:
+    """Return (width * height,) pixels, row by row.
 
     Args:
-        header: of `read_header`.
+        header: of `read_header`, whose sides are known to be in bounds: libwebp asks for memory by them.
         read: what comes after it.
         name: of the file, for messages.
 
     Raises:
-        FormatError: the image is corrupt.
+        FormatError: libwebp refuses the file, or its image is not complete.
     """
+    data = header.start + b"".join(iter(lambda: read(PIECE), b""))
     try:
-        if header.kind == b"VP8L":
-            yield from _lossless(header, read)
-        else:
-            yield _by_pillow(header.start + b"".join(iter(lambda: read(PIECE), b"")))
+        # Not by Image.open, which warns of large images and refuses larger ones.
+        with WebPImageFile(io.BytesIO(data)) as image:
+            texels = image if image.mode == "RGBA" else image.convert("RGBA")
+            return np.frombuffer(texels.tobytes("raw", "BGRA"), "<u4")
     except (OSError, ValueError, SyntaxError, EOFError) as error:
         raise FormatError(f"{quoted_value(name)} is a corrupt WebP image: {error}") from None
-
-
-def _lossless(header: WebPHeader, read: Read) -> Iterator[Pixels]:
-    """The pixels of the first chunk; what is behind it in the file only has to be there."""
-    size = int.from_bytes(header.start[4:8], "little") + 8 - HEADER
-    chunk = int.from_bytes(header.start[16:20], "little")
-    if chunk > size:
-        raise ImageError("its chunk is larger than its file")
-    ahead = header.start[HEADER:]
-    taken = len(ahead)
-
-    def of_chunk(wanted: int) -> bytes:
-        nonlocal ahead, taken
-        if ahead:
-            data, ahead = ahead[:chunk], b""
-            return data
-        data = read(min(wanted, max(0, chunk - taken)))
-        taken += len(data)
-        return data
-
-    yield from LosslessImage(of_chunk).bands()
-    while taken < size:
-        data = read(min(PIECE, size - taken))
-        if not data:
-            raise ImageError("its data end early")
-        taken += len(data)
-
-
-def _by_pillow(data: bytes) -> Pixels:
-    # Not by Image.open, which warns of large images and refuses larger ones: the size has been checked above.
-    with WebPImageFile(io.BytesIO(data)) as image:
-        texels = np.asarray(image if image.mode == "RGBA" else image.convert("RGBA"))
-    return np.ascontiguousarray(texels[:, :, [2, 1, 0, 3]]).view("<u4").ravel()

@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ... import __version__
 from ...model import morton
 from ...model.scene import Scene
 from ...model.splats import FloatArray, Splats
 from ...support.parallel import ordered_map
 from ...support.progress import Progress, silent
 from .. import quantize, sh_palette
+from ..noted import note_of
 from ..options import DEFAULTS, WriteOptions
 from . import codings
 from .archive import zipped
@@ -25,9 +25,6 @@ from .codebook import codebook, nearest
 from .images import Texels, encode_webp, image_of, size_for
 from .names import IMAGES, META
 from .options import settled
-
-#: How meta.json names what wrote the file; the version follows.
-GENERATOR = "sparklod "
 
 #: Power of the weights of splats in the palette of SH. With 1, pictures are better still, but the error of coefficients
 #: is larger than that of splat-transform's; docs/decisions has the measurements.
@@ -103,7 +100,7 @@ def encode_files(
         palette = sh_palette.cluster(splats.sh, options.sog.sh_codes, weight=weight, threads=threads, progress=progress)
         makers["shN"] = functools.partial(_sh, palette, splats.sh_degree, order)
 
-    meta: dict[str, Any] = {"version": 2, "asset": {"generator": GENERATOR + __version__}, "count": len(splats)}
+    meta: dict[str, Any] = {"version": 2, "asset": note_of(up=scene.up), "count": len(splats)}
     meta["antialias"] = scene.antialiased
     if scene.antialiased:
         meta["model"] = "antialiased"  # as PlayCanvas's tools have called it since 2026

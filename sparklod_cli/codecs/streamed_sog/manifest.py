@@ -7,13 +7,15 @@ report can be made of a file that breaks it.
 from __future__ import annotations
 
 import bisect
-import math
+import functools
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 from ...support.errors import FormatError, VersionError
 from ...support.untrusted import parse_json, quoted_value
+from .. import quantize
+from ..noted import Noted, read_note
 from .names import MANIFEST
 
 #: The version that is read and written. A manifest from before versions has none.
@@ -33,6 +35,9 @@ MAX_RUN = 1 << 28
 
 #: Most nodes of the tree: twice as many as there are regions of 8,192 splats in 500 million. Chosen.
 MAX_NODES = 1 << 17
+
+#: The largest magnitude of a coordinate of a bound: that of float32.
+LARGEST = float(quantize.LARGEST)
 
 Corner = tuple[float, float, float]
 Bound = tuple[Corner, Corner]
@@ -83,6 +88,11 @@ class Manifest:
     nodes: tuple[ManifestNode, ...]
     environment: str | None = None
     head: Mapping[str, Any] = field(default_factory=dict)
+
+    @functools.cached_property
+    def noted(self) -> Noted:
+        """Note of sparklod in "asset"."""
+        return read_note(self.head.get("asset"))
 
     def place(self, number: int) -> str:
         """Where a node is in the file: "tree.children[0]"."""
@@ -199,13 +209,13 @@ def _runs(lods: Any, keys: Mapping[str, int], files: int) -> dict[int, Run]:
 
 
 def _bound(value: Any) -> Bound | None:
-    """Two corners of three finite numbers each; None for anything else."""
+    """Return two corners of three numbers that are finite in float32, as viewers hold them; None for anything else."""
     if not isinstance(value, dict):
         return None
     low, high = (value.get(name) for name in ("min", "max"))
     corners = [each for each in (low, high) if isinstance(each, list) and len(each) == 3]
     numbers = [number for corner in corners for number in corner]
-    if len(numbers) != 6 or not all(type(each) in (int, float) and math.isfinite(each) for each in numbers):
+    if len(numbers) != 6 or not all(type(each) in (int, float) and abs(each) <= LARGEST for each in numbers):
         return None
     a, b, c, d, e, f = map(float, numbers)
     return (a, b, c), (d, e, f)

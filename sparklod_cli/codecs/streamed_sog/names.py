@@ -10,8 +10,10 @@ from ..sog.names import META, number_of
 #: The name of a manifest.
 MANIFEST = "lod-meta.json"
 
-#: The folder of the environment.
+#: The folder of the environment, and its file: a bundled SOG, the only form that both PlayCanvas and Babylon.js read.
+#: Former outputs have it unpacked in the same folder.
 ENVIRONMENT = "env"
+ENVIRONMENT_FILE = f"{ENVIRONMENT}/env.sog"
 
 _CHUNK = re.compile(r"(?:0|[1-9]\d{0,8})_(?:0|[1-9]\d{0,8})", re.ASCII)
 
@@ -22,9 +24,15 @@ def chunk_name(level: int, number: int) -> str:
 
 
 def is_ours(name: str) -> bool:
-    """Whether a file could be of an output: a file of an unpacked SOG, in the folder of a chunk or the environment."""
+    """Return True if a file could be of an output: named by its manifest, or an image in a folder of it."""
     folder, _, file = name.partition("/")
-    return is_folder(folder) and (file == META or number_of(file) is not None)
+    return is_named(name) or (is_folder(folder) and number_of(file) is not None)
+
+
+def is_named(name: str) -> bool:
+    """Return True if the manifest of an output could name a file: the meta.json of a chunk, or the environment."""
+    folder, _, file = name.partition("/")
+    return name == ENVIRONMENT_FILE or (is_folder(folder) and file == META)
 
 
 def is_folder(name: str) -> bool:

@@ -116,7 +116,7 @@ def _nodes(manifest: Manifest) -> Iterator[Violation]:
             text = f"{place} has {having} and {'no ' * (node.runs is None)}lods; a node has two children or lods"
             yield broken("nodes", text)
         if node.bound is None:
-            yield broken("bounds", f"{manifest.place(number)} has no bound of six finite numbers")
+            yield broken("bounds", f"{manifest.place(number)} has no bound of six numbers that are finite in float32")
         elif not is_box(node.bound):
             text = f"the bound of {manifest.place(number)} is {_text(node.bound)}, the wrong way round"
             yield broken("bounds", text, fatal=False)

@@ -18,6 +18,7 @@ from ...support.progress import Progress, silent
 from ...support.untrusted import quoted_value
 from ..compression import check_promise
 from ..content import Scratch
+from ..noted import Noted
 from ..promises import check
 from ..stream import size_of
 from .chunks import Beside, Chunk, Piece, check_count, filled, open_chunk
@@ -41,7 +42,7 @@ def decode(file: BinaryIO, *, threads: int = 1, progress: Progress = silent, bes
     """
     opened = _open(file, beside, full_detail=True)
     splats = filled(beside, opened.chunks, opened.sh_degree, threads, progress)
-    return Scene(splats, None, opened.antialiased, opened.format, (), opened.header)
+    return Scene(splats, None, *opened.about, up=opened.noted.up)
 
 
 def decode_levels(
@@ -69,10 +70,8 @@ def decode_levels(
         children,
         errors,
         environment,
-        opened.antialiased,
-        opened.format,
-        (),
-        opened.header,
+        *opened.about,
+        opened.noted.up,
     )
 
 
@@ -109,7 +108,7 @@ def stream(
             if stop >= end:
                 kept.pop(number, None)
 
-    return SceneStream(opened.count, opened.sh_degree, read, opened.antialiased, opened.format, (), opened.header)
+    return SceneStream(opened.count, opened.sh_degree, read, *opened.about, opened.noted.up)
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,9 +141,14 @@ class _Opened:
         return any(chunk.antialiased for chunk in self.chunks)
 
     @property
-    def format(self) -> str:
-        """For display."""
-        return f"Streamed SOG {VERSION}"
+    def noted(self) -> Noted:
+        """Note of sparklod in the manifest."""
+        return self.layout.manifest.noted
+
+    @property
+    def about(self) -> tuple[bool, str, tuple[str, ...], dict[str, int]]:
+        """`antialiased`, `format`, `notes` and `header` of `Scene`."""
+        return self.antialiased, f"Streamed SOG {VERSION}", self.noted.problems, self.header
 
     @property
     def header(self) -> dict[str, int]:

@@ -7,7 +7,7 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-from .manifest import Manifest, ManifestNode
+from .manifest import LARGEST, Manifest, ManifestNode
 
 #: Significant digits: those of a float32.
 DIGITS = 7
@@ -54,8 +54,9 @@ def _tree(nodes: tuple[ManifestNode, ...]) -> str:
 
 
 def _text(rounding: decimal.Context, number: float) -> str:
-    """A number of a bound, rounded to one side; one that has few enough digits stays as it is."""
-    return f"{float(rounding.create_decimal(repr(number))):.{DIGITS}g}"
+    """A number of a bound, rounded to one side, but not out of float32; with few enough digits it stays as it is."""
+    rounded = float(rounding.create_decimal(repr(number)))
+    return f"{rounded:.{DIGITS}g}" if abs(rounded) <= LARGEST else repr(number)
 
 
 def _list(texts: Any) -> str:

@@ -17,13 +17,15 @@ from ...support.progress import Progress, silent
 from ...support.units import count_of
 from ...support.untrusted import quoted_value
 from ..promises import Violation
+from ..sog import codings
 from .chunks import Beside, Chunk, filled, open_chunk
 from .manifest import MAX_MANIFEST, Manifest, Run, parse
 from .promises import broken, file_violations, is_box, leads_away, regions_of, violations
 
-#: By how much a splat may lie outside of its bound: a share of its own extent, by which codes of 8 bits change it; a
-#: share of the bound; and, for codes of logarithms of 16 bits, a share of the distance from the origin plus 1.
-LOOSE_EXTENT, LOOSE_BOUND, LOOSE_CENTER = 0.25, 1e-3, 2e-4
+#: By how much a splat may lie outside of its bound: a share of its own extent, by which codes of 8 bits change it; of
+#: its largest scale, since they turn it by up to 1.1 degrees; of the bound; and, for codes of logarithms of 16 bits, of
+#: the distance from the origin plus 1, or half a step of these codes where that is more.
+LOOSE_EXTENT, LOOSE_TURN, LOOSE_BOUND, LOOSE_CENTER = 0.25, 0.02, 1e-3, 2e-4
 
 #: Cells along each axis in which the order of a run is looked at; writers sort by as many, or by more.
 CELLS = 1 << 10
@@ -98,11 +100,12 @@ def survey_splats(
             text = f"{count_of(count, 'splat')} of {quoted_value(name)} have a number that is not finite"
             yield Violation("values.non-finite", text, fatal=False)
             continue
+        steps = np.ptp(codings.sign_log(splats.center), axis=0) / codings.LAST_WORD if len(splats) else 0.0
         for number, level, run in here:
             part = splats.take(slice(run.offset, run.offset + run.count))
             what = f"{manifest.place(number)} at level {level}"
             bound = manifest.nodes[number].bound
-            outside = _outside(part, np.array(bound)) if bound is not None and is_box(bound) else 0
+            outside = _outside(part, np.array(bound), steps) if bound is not None and is_box(bound) else 0
             if outside:
                 yield broken("extents", f"{count_of(outside, 'splat')} of {what} lie outside of its bound", fatal=False)
             descents = _descents(part.center)
@@ -113,22 +116,30 @@ def survey_splats(
         progress("checking", done, total, "splat")
 
 
-def _outside(splats: Splats, bound: NDArray[np.float64]) -> int:
-    """How many splats lie outside of (2, 3) lowest and highest corner with the ellipsoids of one standard deviation."""
-    loose = LOOSE_BOUND * np.abs(bound[1] - bound[0])
+def _outside(splats: Splats, bound: NDArray[np.float64], steps: NDArray[np.float64] | float) -> int:
+    """Count the splats that lie outside of a bound with the ellipsoids of one standard deviation.
+
+    Args:
+        splats: of a run.
+        bound: (2, 3) lowest and highest corner.
+        steps: (3,) of the codes of centres, as shares of the distance from the origin plus 1.
+    """
+    loose, step = LOOSE_BOUND * np.abs(bound[1] - bound[0]), np.maximum(LOOSE_CENTER, np.expm1(steps) / 2)
     count = 0
     for block in blocks_of(len(splats)):
         center = splats.center[block].astype(np.float64)
         extent = np.sqrt(covariance(splats.scale[block], splats.quat_xyzw[block])[:, [0, 3, 5]])
-        reach = (1 - LOOSE_EXTENT) * extent - loose - LOOSE_CENTER * (1 + np.abs(center))
+        turned = LOOSE_TURN * np.maximum.reduce(splats.scale[block].T)[:, None]
+        reach = (1 - LOOSE_EXTENT) * extent - turned - loose - step * (1 + np.abs(center))
         count += int(np.count_nonzero(np.any((center - reach < bound[0]) | (center + reach > bound[1]), axis=1)))
     return count
 
 
 def _descents(center: FloatArray) -> int:
     """How many splats come after one that they precede on the Morton curve."""
-    low, extent = center.min(axis=0, initial=np.inf), np.ptp(center, axis=0) if len(center) else 0
-    scaled = (center - low) / np.where(extent > 0, extent, 1) * CELLS
+    wide = center.astype(np.float64)
+    low, extent = wide.min(axis=0, initial=np.inf), np.ptp(wide, axis=0) if len(wide) else 0
+    scaled = (wide - low) / np.where(extent > 0, extent, 1) * CELLS
     order = order_of_cells(np.minimum(scaled, CELLS - 1).astype(np.uint32))
     rank = np.empty(len(order), np.int64)
     rank[order] = np.arange(len(order))

@@ -8,18 +8,20 @@ from typing import Protocol
 
 import numpy as np
 
-from ... import __version__
 from ...model import morton
 from ...model.detail import Bounds, DetailScene
 from ...model.scene import Scene
 from ...model.splats import Splats
+from ...support.errors import FormatError
 from ...support.parallel import ordered_map
 from ...support.progress import Progress, silent
+from .. import quantize
+from ..noted import note_of
 from ..options import WriteOptions
 from ..sog import codec as sog
 from ..sog.names import META
 from .manifest import VERSION, Bound, Manifest, ManifestNode, Run
-from .names import ENVIRONMENT, MANIFEST, chunk_name
+from .names import ENVIRONMENT_FILE, MANIFEST, chunk_name
 from .serialising import serialise
 
 #: Chunks that are encoded at a time: each takes some 0.5 KB a splat with SH of degree 2, measured.
@@ -77,8 +79,13 @@ def encode_files(
         progress: told of the splats that are written.
 
     Raises:
-        FormatError: SOG cannot hold the splats.
+        FormatError: SOG cannot hold the splats, or float32, as viewers have it, not the bounds of the regions.
     """
+    reach = float(np.abs(scene.bounds).max())
+    if reach > float(quantize.LARGEST):
+        raise FormatError(
+            f"its regions reach {reach:.3g}, and viewers hold at most {quantize.LARGEST:.3g}; scale it down"
+        )
     plans = planned(scene, settings.chunk_splats)
     total = len(scene.splats) + (0 if scene.environment is None else len(scene.environment))
     together = min(threads, TOGETHER)
@@ -87,14 +94,12 @@ def encode_files(
         """The files of a chunk; of the environment for None."""
         part = scene.environment if plan is None else _ordered(scene, plan)
         assert part is not None
-        folder = ENVIRONMENT if plan is None else plan.folder
-        files = sog.encode_files(
-            Scene(part, antialiased=scene.antialiased),
-            options,
-            threads=max(1, threads // together),
-            in_order=plan is not None,
-        )
-        return len(part), [(f"{folder}/{name}", data) for name, data in files]
+        one = Scene(part, antialiased=scene.antialiased, up=scene.up)
+        inside = max(1, threads // together)
+        if plan is None:
+            return len(part), [(ENVIRONMENT_FILE, b"".join(sog.encode(one, options, threads=inside)))]
+        files = sog.encode_files(one, options, threads=inside, in_order=True)
+        return len(part), [(f"{plan.folder}/{name}", data) for name, data in files]
 
     jobs: list[ChunkPlan | None] = [*plans]
     if scene.environment is not None:
@@ -141,8 +146,8 @@ def manifest_of(scene: DetailScene, plans: list[ChunkPlan], settings: Divided) -
     counts = scene.counts.sum(axis=0).tolist()
     head = {
         "version": VERSION,
-        "asset": {
-            "generator": f"sparklod {__version__}",
+        "asset": note_of(up=scene.up)
+        | {
             "chunkGaussians": settings.chunk_splats,
             "chunkExtent": int(settings.extent) if settings.extent == int(settings.extent) else settings.extent,
             "chunkMinGaussians": settings.min_splats,
@@ -151,7 +156,7 @@ def manifest_of(scene: DetailScene, plans: list[ChunkPlan], settings: Divided) -
         "counts": counts,
         "lodErrors": scene.errors is not None,
     }
-    environment = None if scene.environment is None else f"{ENVIRONMENT}/{META}"
+    environment = None if scene.environment is None else ENVIRONMENT_FILE
     filenames = tuple(f"{plan.folder}/{META}" for plan in plans)
     return Manifest(scene.levels, filenames, tuple(_nodes(scene, runs)), environment, head)
 

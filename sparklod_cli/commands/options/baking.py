@@ -108,8 +108,8 @@ OPTIONS: tuple[Callable[[Command], Command], ...] = (
         heading=COMMON,
         type=click.Choice(defaults.UP_AXES),
         default=defaults.UP_AXES[0],
-        help="Axis of the input that points up; the scene is turned so that it becomes +y. Scenes as trained are"
-        " mostly -y.",
+        help="Axis of the input that points up; the scene is turned so that it becomes +y, which the output notes for"
+        " render, traverse and view. Scenes as trained are mostly -y.",
     ),
     option(
         "--base",
@@ -284,6 +284,7 @@ def bake_settings(ctx: click.Context, *, suffix: str, raw: bool, streamed_sog: b
             within=asked["within"],
         ),
         transform=transform,
+        up=asked["up"] if is_given(ctx, "up") else None,
         rgba=asked["rgba"],
         suffix=suffix,
         options=write_options(ctx),

@@ -95,7 +95,8 @@ def camera_options(command: Command, *, still: bool = False) -> Command:
             "--up",
             type=Direction(),
             help="Direction that is up, as an axis such as -y or as x,y,z, for cameras of which only eye and target are"
-            " known.  [default: -y, as training leaves scenes with y down; y in SuperSplat's files]",
+            " known.  [default: the axis that the files note, or -y, as training leaves scenes with y down; y in"
+            " SuperSplat's files]",
         ),
         add(
             "--world-transform",
@@ -113,7 +114,8 @@ def camera_options(command: Command, *, still: bool = False) -> Command:
             "--seconds",
             metavar="S",
             type=Real(0, 1e6, min_open=True),
-            help="Duration of --dolly, and of --keyframes from one view to the next, in seconds.  [default: 2]",
+            help="Duration of --orbit, of --dolly, and of --keyframes from one view to the next, in seconds.  [default:"
+            " 2; of --orbit, N frames at --fps]",
         ),
         add(
             "--fps",

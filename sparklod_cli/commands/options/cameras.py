@@ -40,7 +40,7 @@ ONLY_WITH = {
     "center": ("orbit", "dolly", AROUND),
     "distance": ("orbit", "dolly", AROUND),
     "elevation": ("orbit", "dolly", AROUND),
-    "seconds": ("dolly", "keyframes"),
+    "seconds": ("orbit", "dolly", "keyframes", AROUND),
     "world_transform": ("camera_path", "look_at", "views", "keyframes"),
 }
 
@@ -60,7 +60,7 @@ class Cameras:
         camera_format, camera_axes: of `camera_path`.
         center, distance, elevation: of orbits and dollies, world units and degrees.
         up: x, y and z.
-        seconds: of dollies and between keyframes.
+        seconds: of orbits, of dollies and between keyframes.
         world_transform: 16 numbers, or the name of a file of them.
         size: width and height, pixels.
         fov: vertical, degrees.
@@ -108,10 +108,21 @@ class Cameras:
             if is_given(ctx, name) and self.source not in known:
                 named = [flag_of(ctx, each) for each in known if each in ctx.params]
                 refuse(ctx, [name], f"can only be used with {' or '.join(named)}")
-        if self.source not in PATHS and (self.still or self.source != AROUND):
-            refuse(ctx, OF_PATHS, "cannot be used with a camera that does not move; give a path, such as --orbit")
+        if self.source not in PATHS and not self._orbits:
+            refuse(
+                ctx,
+                (*OF_PATHS, "seconds"),
+                "cannot be used with a camera that does not move; give a path, such as --orbit",
+            )
+        if self._orbits and self.seconds is not None:
+            refuse(ctx, ["fps"], "cannot be used with --seconds of an orbit, which decides it")
         if self.up is not None and not any(self.up):
             raise click.UsageError("--up 0,0,0 is no direction; give another one")
+
+    @property
+    def _orbits(self) -> bool:
+        """Whether the cameras go around the scene."""
+        return self.orbit is not None or (self.source == AROUND and not self.still)
 
     def least_count(self) -> int:
         """The number of cameras, or the least number as far as it is known before a file is read."""
@@ -155,12 +166,13 @@ class Cameras:
         """
         from ...cameras.frame import Settings
 
+        fps = (self.orbit or ORBIT) / self.seconds if self._orbits and self.seconds is not None else self.fps
         return Settings(
             axes=Axes(self.camera_axes) if self.camera_axes else None,
             world=None if self.world_transform is None else _world(self.world_transform),
             size=self.size,
             fov_y=None if self.fov is None else math.radians(self.fov),
-            fps=self.fps,
+            fps=fps,
             every=self.every,
             up=self.up,
         )

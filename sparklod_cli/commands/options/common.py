@@ -17,7 +17,7 @@ from ...support.defaults import MAX_THREADS
 from ...tables.files import FORMS
 from ..command import COMMON, GENERAL, option, with_options
 from ..console import Console, Verbosity
-from ..paths import OutputPath
+from ..paths import OutputPath, require_suffix
 
 #: Suffixes, without a point, of what is no table, whatever format is asked for: splats, pictures, pages and arrays.
 NO_TABLES = {suffix[1:] for form in FORMATS for suffix in form.suffixes} - {*FORMS}
@@ -47,12 +47,15 @@ class General:
 
 
 def table_form(flag: str, output: Path | None, form: str | None = None) -> str:
-    """The format of a table that is asked for, or by a name; CSV where that has no suffix, or goes to standard output.
+    """The format of a table that is asked for, or by a name; CSV where it goes to standard output.
 
     Raises:
-        click.UsageError: nothing is written by that suffix, or it promises something else than `form`.
+        click.UsageError: nothing is written by that suffix, or it promises something else than `form`, or there is
+            neither.
     """
     suffix = output.suffix.lower() if output is not None else ""
+    if output is not None and form is None:
+        require_suffix(flag, output, (f".{each}" for each in FORMS))
     if not suffix:
         return form or next(iter(FORMS))
     if form is not None:

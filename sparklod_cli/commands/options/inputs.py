@@ -31,6 +31,11 @@ class Inputs:
     files: tuple[Path, ...]
     scene: Path | None
 
+    @property
+    def first(self) -> Path | None:
+        """The file that outputs are named after; None where there is no input."""
+        return self.scene or next(iter(self.files), None)
+
     def instances(self) -> list[Instance]:
         """The instances: each FILE once, untransformed, or those of the instances file.
 

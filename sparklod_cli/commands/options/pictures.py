@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ...images.defaults import JPEG_QUALITY, THUMBNAIL_SIZE, THUMBNAIL_SUPERSAMPLE
+from ...images.defaults import JPEG_QUALITY, MOVING, STILL, THUMBNAIL_SIZE, THUMBNAIL_SUPERSAMPLE
 from ..command import COMMON, option, with_options
-from ..paths import stem_of
+from ..paths import Folder, require_suffix, stem_of
 from ..usage import exclude, require
 from .common import Command, output_option, overwrite_option
 
@@ -40,7 +40,7 @@ class Pictures:
     """The values of the options of `picture_options`; None for those not given.
 
     Attributes:
-        output: a file, a name with a place for a number, or -.
+        output: a file, a name with a place for a number, a folder for files named after the input, or -.
         overwrite: replace files that exist.
         thumbnail: a small picture of the whole scene.
         sheet: put all pictures on a contact sheet.
@@ -48,7 +48,7 @@ class Pictures:
         jpeg_quality: of .jpg, 1 to 100.
     """
 
-    output: Path | None
+    output: Path | Folder | None
     overwrite: bool
     thumbnail: bool
     sheet: bool
@@ -74,9 +74,13 @@ class Pictures:
         """
         from ...images.output import output_for
 
-        name = scene.parent / (stem_of(scene) + ("-thumbnail" if self.thumbnail else ""))
+        named, folder = (None, self.output.path) if isinstance(self.output, Folder) else (self.output, scene.parent)
+        assert isinstance(folder, Path)  # pictures go to no addresses
+        if named is not None:
+            require_suffix("--output", named, (f".{form}" for form in dict.fromkeys((*STILL, *MOVING))))
+        name = folder / (stem_of(scene) + ("-thumbnail" if self.thumbnail else ""))
         try:
-            output = output_for(self.output, name, cameras, sheet=sheet)
+            output = output_for(named, name, cameras, sheet=sheet)
         except ValueError as error:
             raise click.UsageError(str(error)) from None
         if output.form != "jpg":
@@ -121,8 +125,9 @@ def picture_options(command: Command) -> Command:
         command,
         output_option(
             "Write a .png, .jpg, .webp or .npy (floats), or with out.%04d.png one for each camera; a .mp4,"
-            " .webm, .gif or .webp for an animation; with --compare a .csv, .json or .parquet; - is standard"
-            " output.  [default: NAME.png beside the first FILE; with --compare standard output]"
+            " .webm, .gif or .webp for an animation; with --compare a .csv, .json or .parquet; or into the folder FILE"
+            " as NAME.png; - is standard output.  [default: NAME.png beside the first FILE; with --compare standard"
+            " output]"
         ),
         overwrite_option,
         option(

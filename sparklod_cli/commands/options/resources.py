@@ -24,6 +24,8 @@ OF_BAKES = ("memory", "scratch_dir", "resume")
 
 def _memory(text: str) -> int:
     size = parse_size(text)
+    if not text.strip()[-1:].isalpha():
+        raise ValueError(f"{text!r} has no unit; write {text.strip()}G or {text.strip()}MB")
     if size < 1:
         raise ValueError(f"{text!r} is no memory to work in; give some, such as 4G")
     return size
@@ -37,8 +39,8 @@ def resources_options(command: Command) -> Command:
         add(
             "--memory",
             type=Quantity("SIZE", _memory),
-            help="Memory that a bake may take, such as 4G. A scene that needs more is baked out of core: block by"
-            " block, with a scratch folder.  [default: 75 % of what is available]",
+            help="Memory that a bake may take, such as 4G or '600 MB'. A scene that needs more is baked out of core:"
+            " block by block, with a scratch folder.  [default: 75 % of what is available]",
         ),
         add(
             "--scratch-dir",

@@ -10,8 +10,10 @@ import click
 
 from ...lod import detail_rule
 from ..command import option, with_options
-from ..usage import given, refuse, require
+from ..usage import refuse, require
 from .common import Command
+from .cut import CUTS
+from .streaming import OF_LOADING
 from .types import Real
 
 if TYPE_CHECKING:
@@ -68,17 +70,17 @@ class Detail:
 
 
 def check_scenes(ctx: click.Context, scenes: Scenes) -> None:
-    """Raises a `click.UsageError` where an option is for trees and the files are Streamed SOG, or the reverse."""
+    """Raise a `click.UsageError` where an option is for trees or Streamed SOG, and the files are something else."""
     if scenes.details:
         streamed = "is for trees; use --budget, --budget-mode and --lod-multiplier for Streamed SOG"
         refuse(ctx, [name for name in OF_TREES if name in ctx.params], streamed)
     elif scenes.trees:
         refuse(ctx, OPTIONS, "is for Streamed SOG, and no file is; --budget and --preset are for trees, too")
-
-
-def without_effect(ctx: click.Context, scenes: Scenes, others: tuple[str, ...]) -> list[str]:
-    """The flags that were given for cuts, where the scenes have none."""
-    return [] if scenes.trees or scenes.details else given(ctx, (*others, *OPTIONS))
+    else:
+        plain = (
+            "is for Level-of-Detail files, and no file is one, so that all splats are drawn; bake one with build-lod"
+        )
+        refuse(ctx, (*CUTS, *OF_LOADING, *OPTIONS), plain)
 
 
 def detail_options(command: Command) -> Command:

@@ -10,7 +10,7 @@ import click
 
 from ...lod import detail_rule
 from ...support import defaults
-from ...support.units import parse_bandwidth, parse_latency
+from ...support.units import parse_bandwidth, parse_time
 from ..command import option, with_options
 from ..usage import require
 from .common import Command
@@ -24,7 +24,7 @@ HEADING = "Streaming"
 #: Options that need --bandwidth.
 OF_BANDWIDTH = ("latency", "fetchers")
 
-#: The options of `streaming_options` with `pictures`, which have no effect where no tree is drawn.
+#: The options of `streaming_options` with `pictures`, for files with levels alone.
 OF_LOADING = ("after", "bandwidth", "latency", "fetchers", "chunk_cache")
 
 
@@ -91,7 +91,7 @@ def streaming_options(command: Command, *, pictures: bool = False) -> Command:
     add = functools.partial(option, heading=HEADING)
     after = add(
         "--after",
-        type=Quantity("TIME", parse_latency),
+        type=Quantity("TIME", parse_time),
         help="Draw what a visitor sees this long after opening a page with the files, such as 500ms, who waits in front"
         " of the camera; with --bandwidth.  [default: what is drawn once every chunk has arrived]",
     )
@@ -112,7 +112,7 @@ def streaming_options(command: Command, *, pictures: bool = False) -> Command:
         ),
         add(
             "--latency",
-            type=Quantity("TIME", parse_latency),
+            type=Quantity("TIME", parse_time),
             help="Time from a request to the first byte, such as 60ms.  [default: 0ms]",
         ),
         add(

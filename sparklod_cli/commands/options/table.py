@@ -15,7 +15,7 @@ from ...tables.files import FORMS
 from ..command import COMMON, option, with_options
 from ..console import is_terminal
 from ..paths import OutputPath
-from ..usage import exclude, given, require
+from ..usage import exclude, refuse, require
 from .common import Command, assert_errors, assert_option, output_option, overwrite_option, plot_option, table_form
 
 if TYPE_CHECKING:
@@ -60,15 +60,16 @@ class Table:
         """Raises a `click.UsageError` where options contradict each other, or have nothing to do."""
         if as_json and self.output is None:
             exclude(ctx, OF_TABLES, "--json without --output, which writes no table")
+        elif self.summary_on_stdout(as_json=as_json):
+            refuse(ctx, OF_TABLES, "is of the table, and a terminal gets the summary; redirect it, or add --output")
         if self.indices_out is None:
             require(ctx, ["padded"], "--indices-out")
 
-    def summary_on_stdout(self, ctx: click.Context, *, as_json: bool) -> bool:
+    def summary_on_stdout(self, *, as_json: bool) -> bool:
         """Whether the summary is printed instead of the table, which would scroll by on a terminal."""
-        asked = self.output is not None or as_json or self.summary is False or given(ctx, OF_TABLES)
-        return not asked and is_terminal(sys.stdout)
+        return self.output is None and not as_json and is_terminal(sys.stdout)
 
-    def outputs(self, ctx: click.Context, *, as_json: bool) -> FrameOutputs:
+    def outputs(self, *, as_json: bool) -> FrameOutputs:
         """Where the table and the other outputs go.
 
         Raises:
@@ -78,7 +79,7 @@ class Table:
         from ...simulation.outputs import FrameOutputs
         from ...tables.output import TableOutput
 
-        nowhere = self.output is None and (as_json or self.summary_on_stdout(ctx, as_json=as_json))
+        nowhere = self.output is None and (as_json or self.summary_on_stdout(as_json=as_json))
         table = TableOutput(
             path=None if self.output == DASH else self.output,
             form=None if nowhere else table_form("--output", self.output, self.form),

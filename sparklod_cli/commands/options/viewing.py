@@ -33,7 +33,7 @@ class Page:
         up: x, y and z.
         budget: splats.
         camera_path: file of cameras that the page plays.
-        spark_dir: folder whose node_modules has Spark and three.js.
+        spark_dir: folder whose node_modules has Spark, or PlayCanvas, and three.js.
     """
 
     look_at: Any
@@ -99,7 +99,7 @@ def view_options(command: Command) -> Command:
             "--spark-dir",
             metavar="DIR",
             type=InputPath(),
-            help="Take Spark and three.js from the node_modules of a folder.  [default: from a CDN]",
+            help="Take Spark, or PlayCanvas, and three.js from the node_modules of a folder.  [default: from a CDN]",
         ),
         common(
             "--export",
@@ -116,7 +116,8 @@ def view_options(command: Command) -> Command:
         page(
             "--up",
             type=Direction(),
-            help="Direction that is up, as an axis such as -y or as x,y,z.  [default: -y, as training leaves scenes]",
+            help="Direction that is up, as an axis such as -y or as x,y,z.  [default: the axis that the files note,"
+            " or -y, as training leaves scenes]",
         ),
         page(
             "--fov",

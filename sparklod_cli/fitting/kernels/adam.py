@@ -8,6 +8,7 @@ import numpy as np
 
 from ...model import gaussian
 from ...support.jit import kernel, prange
+from ...support.jit_types import f4, fields, i4, i8, out
 
 f32 = np.float32
 
@@ -46,6 +47,7 @@ EPSILON = f32(1e-8)
 rotation_matrix = kernel(inline=True)(gaussian.rotation_matrix)
 
 
+@fields(f4[:, :], f4[:, :], f4[:, :], f4[:], f4[:, :], f4[:, :, :])
 class Columns(NamedTuple):
     """Columns of N nodes, float32.
 
@@ -61,6 +63,7 @@ class Columns(NamedTuple):
     sh: Any
 
 
+@fields(f4[:, :], f4[:, :], f4[:, :], f4[:], f4[:, :], f4[:, :, :])
 class Gradients(NamedTuple):
     """Derivatives by the properties of M drawn splats, float32; see `render.gradients.SplatGradients`.
 
@@ -76,6 +79,7 @@ class Gradients(NamedTuple):
     sh: Any
 
 
+@fields(out(f4[:, :]), out(f4[:, :, :]), out(f4[:, :]), out(i4[:]), f4[:])
 class Moments(NamedTuple):
     """What Adam remembers of each merged splat.
 
@@ -91,6 +95,7 @@ class Moments(NamedTuple):
     reach: Any
 
 
+@fields(f4, f4, f4, f4, f4, f4)
 class Rates(NamedTuple):
     """How far a step goes, float32.
 
@@ -127,7 +132,7 @@ def moved(first, second, slot, column, of_property, gradient, rate, correction):
     return factor * first[slot, column], factor * first[slot, column + 1], factor * first[slot, column + 2]
 
 
-@kernel(parallel=True)
+@kernel(out(Columns), Columns, i8[:], i4[:], Gradients, Rates, Moments, f4, parallel=True)
 def step(nodes, old, index, slots, gradients, rates, moments, precision):
     """Moves the merged splats that were drawn against their gradients.
 

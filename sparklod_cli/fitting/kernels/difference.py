@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...support.jit import kernel, prange
+from ...support.jit_types import f4, f8, out
 
 f32 = np.float32
 ZERO, ONE = f32(0), f32(1)
@@ -16,7 +17,7 @@ def clipped(value):
     return min(max(value, ZERO), ONE)
 
 
-@kernel(parallel=True)
+@kernel(f4[:, :, :], f4[:, :, :], out(f8[:, :]), parallel=True)
 def squared_differences(image, full, sums):
     """Sums of squared differences over the pixels of each row.
 
@@ -39,7 +40,7 @@ def squared_differences(image, full, sums):
         sums[y, 1] = white
 
 
-@kernel(parallel=True)
+@kernel(f4[:, :, :], f4[:, :, :], f4, f4, out(f4[:, :, :]), parallel=True)
 def by_image(image, full, on_black, on_white, result):
     """The derivative of `on_black` and `on_white` times the halves of the squared differences on either background.
 

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
+from ...render.kernels.ellipse import Lens, Limits
 from ...support.jit import kernel, prange
+from ...support.jit_types import b1, f4, i8, out
+from .adam import Columns
 
 f32 = np.float32
 
 
-@kernel(parallel=True)
+@kernel(f4[:, :], f4[:], i8[:], f4[:, :], Lens, Limits, out(b1[:]), parallel=True)
 def mark_seen(center, lod_opacity, index, world_to_camera, lens, limits, seen):
     """Marks the nodes that `project` may draw: between near and far, with a centre in or near the picture.
 
@@ -41,7 +44,7 @@ def mark_seen(center, lod_opacity, index, world_to_camera, lens, limits, seen):
         seen[i] = visible
 
 
-@kernel(parallel=True)
+@kernel(Columns, i8[:], out(Columns), parallel=True)
 def gather(columns, index, found):
     """Copies some nodes.
 

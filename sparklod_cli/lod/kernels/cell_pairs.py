@@ -17,6 +17,7 @@ import numpy as np
 
 from ...support.fast_math import exp2
 from ...support.jit import kernel, prange
+from ...support.jit_types import b1, f4, i8, out, u4
 from .geometry import ellipsoid_area
 from .pair_cost import COVARIANCE, COVERED, DENSITY, LOG_DET, NEVER, WEIGHT, WIDTH, log_det, pair_costs
 from .pair_merge import semi_axes
@@ -280,7 +281,7 @@ def merge_span(nodes, is_first, rows, largest, begin, end, made, owner, row):
         owner[begin + i] = begin + (np.int64(joined[i]) if members[joined[i]] > 0 else i)
 
 
-@kernel(parallel=True)
+@kernel(u4[:], b1[:], out(f4[:, :]), f4, i8, parallel=True)
 def merge_in_cells(nodes, is_first, rows, largest, made):
     """Merges nodes with others of their cell, and fills the rows of the nodes that become parents.
 
@@ -308,7 +309,7 @@ def merge_in_cells(nodes, is_first, rows, largest, made):
     return owner, row
 
 
-@kernel()
+@kernel(u4[:], i8[:], u4[:])
 def split_families(nodes, owner, row):
     """Separates the members of families from the nodes that are left as they are.
 

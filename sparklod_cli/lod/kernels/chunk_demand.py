@@ -7,7 +7,8 @@ import math
 import numpy as np
 
 from ...support.jit import kernel, prange
-from .pixel_scale import INFINITE, ZERO, pixel_scale
+from ...support.jit_types import f8, i4, out, u1
+from .pixel_scale import NODES, VIEWS, ZERO, pixel_scale
 
 #: Viewpoints that one pass over the families serves. Measured: 8 take half as long as one by one.
 LANES = 8
@@ -16,8 +17,11 @@ LANES = 8
 BUCKET_SHIFT = 18
 BUCKETS = 1 << (31 - BUCKET_SHIFT)
 
+#: Bytes that each thread takes for a family: its buckets.
+DEMAND_BYTES = 2 * LANES
 
-@kernel(parallel=True)
+
+@kernel(NODES, i4[:], VIEWS, f8, f8, out(u1[:, :]), parallel=True)
 def fill_demand(families, parent, views, least, most, demand):
     """Fills the chance that a viewer at each viewpoint refines a family's parent, if its budget is unknown.
 
@@ -35,7 +39,6 @@ def fill_demand(families, parent, views, least, most, demand):
     span = math.log(most / least)
     for block in prange(len(views) // LANES):
         bucket = np.empty((len(families), LANES), np.int16)
-        limit = np.empty((len(families), LANES), np.float32)
         nodes = np.zeros((LANES, BUCKETS), np.int64)
         code = np.zeros((LANES, BUCKETS), np.uint8)
         first = block * LANES
@@ -45,9 +48,9 @@ def fill_demand(families, parent, views, least, most, demand):
                 scale = pixel_scale(families[family], views[first + lane])
                 if not scale >= ZERO:  # also not a number
                     scale = ZERO
-                scale = min(scale, limit[above, lane] if above >= 0 else INFINITE)
-                limit[family, lane] = scale
                 at = np.float32(scale).view(np.int32) >> BUCKET_SHIFT
+                if above >= 0:  # buckets ascend as scales do, so that the least one has the least bucket
+                    at = min(at, np.int32(bucket[above, lane]))
                 bucket[family, lane] = at
                 nodes[lane, at] += families[family].child_count
         for lane in range(LANES):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...support.jit import kernel, prange
+from ...support.jit_types import i4, i8, out
 from .sort import AXIS_BITS, interleave
 
 #: Bits of a key below its depth, and the depth from which on families keep the order that they have.
@@ -12,7 +13,7 @@ CODE_BITS = 57
 DEEP = 63
 
 
-@kernel(parallel=True)
+@kernel(i8[:], i4[:], i4[:, :], i8, out(i4[:]), out(i4[:]), out(i4[:]), parallel=True)
 def sort_within_chunks(bounds, parent, rank, axis_bits, sequence, chunk_of, depth):
     """Sorts the families of each chunk by the depth within it, then along a Morton curve.
 

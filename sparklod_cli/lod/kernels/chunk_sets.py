@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...support.jit import kernel, prange
+from ...support.jit_types import fields, i4, i8, out, u1
 
 #: Ways to split a set: along x, y, z (whole subtrees of roots, by the parent's centre), or by size.
 AXES = 4
@@ -28,6 +29,7 @@ FEW_CHUNKS = 8
 NEARLY_FULL = 64
 
 
+@fields(i4[:], i4[:], i4[:, :], u1[:, :])
 class Families(NamedTuple):
     """The families of a tree, in descending order of size; for a kernel to read.
 
@@ -234,7 +236,7 @@ def move_first_part(members, root, weight, spare):
     return length
 
 
-@kernel(parallel=True)
+@kernel(Families, i8[:, :], out(i4[:]), out(i4[:]), out(i4[:]), out(i8[:]), out(i4[:]), out(i8[:]), parallel=True)
 def split_sets(families, sets, sequence, set_of, root, weight, spare, lengths):
     """Splits each set in two; the first part of each fills whole chunks, but for very few nodes.
 

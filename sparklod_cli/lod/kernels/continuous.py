@@ -5,13 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from ...support.jit import kernel
-from .pixel_scale import pixel_scales
+from ...support.jit_types import f4, f8, i8, out, u4
+from .pixel_scale import NODES, VIEWS, pixel_scales
 
 #: In place of an infinite limit, so that logarithms are finite.
 LARGEST = np.finfo(np.float32).max
 
 
-@kernel(nogil=True)
+@kernel(NODES, out(i8[:]), out(i8[:]), nogil=True)
 def order_inner(nodes, inner, above):
     """Puts the M inner nodes of a tree in the order of their depths, those of a depth by index.
 
@@ -41,7 +42,7 @@ def order_inner(nodes, inner, above):
         parent[start : start + np.int64(nodes[node].child_count)] = place
 
 
-@kernel(nogil=True)
+@kernel(NODES, i8[:], i8[:], VIEWS, i8, out(f4[:]), nogil=True)
 def find_limits(nodes, inner, above, views, number, limit):
     """Finds the least pixel scale on the path from the root to each inner node.
 
@@ -59,7 +60,7 @@ def find_limits(nodes, inner, above, views, number, limit):
         limit[place] = min(limit[place], LARGEST)
 
 
-@kernel(nogil=True)
+@kernel(NODES, i8[:], f8[:], out(u4[:]), out(f8[:]), nogil=True)
 def blend(nodes, inner, share, node, weight):
     """The nodes with a weight above 0, ascending.
 

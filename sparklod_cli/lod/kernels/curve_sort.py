@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...support.jit import kernel, prange
+from ...support.jit_types import f4, f8, i8, u4
 from .node_rows import CURVE_BITS, place_on_curve
 
 #: Upper bits of a place by which nodes are split: 2048 counters fit the first-level cache. Chosen.
@@ -44,7 +45,7 @@ def sort_part(keys, index, other_keys, other_index, begin, end):
         index, other_index = other_index, index
 
 
-@kernel(parallel=True)
+@kernel(f4[:, :], u4[:], i8, u4[:], f8[:], f8, i8, parallel=True)
 def sort_along_curve(rows, row, leaves, nodes, low, step, threads):
     """Nodes in the order of their places on the curve, those in one place in the order that they had.
 

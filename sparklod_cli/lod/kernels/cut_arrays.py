@@ -7,7 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...support.jit import kernel
-from .pixel_scale import INFINITE, pixel_scale
+from ...support.jit_types import b1, fields, i4, i8, u2, u4
+from .pixel_scale import INFINITE, NODES, VIEWS, pixel_scale
 
 #: Buckets of pixel scales: the upper half of a float32's bits. A bucket is at most 0.8 % wide, and any number has one.
 BUCKET_BITS = 16
@@ -22,6 +23,7 @@ LEAF = np.int32(-(1 << 31))
 BUDGET, PIXEL, MISSING, EXHAUSTED, FULL = 0, 1, 2, 3, 4
 
 
+@fields(NODES, VIEWS, b1[:], i8)
 class Trees(NamedTuple):
     """Instances of trees as one camera sees them.
 
@@ -39,6 +41,7 @@ class Trees(NamedTuple):
     chunk_bits: Any
 
 
+@fields(i4, i8)
 class Stop(NamedTuple):
     """Where refinement stops.
 
@@ -51,6 +54,7 @@ class Stop(NamedTuple):
     budget: Any
 
 
+@fields(u4[:], i4[:], u2[:])
 class CutNodes(NamedTuple):
     """The nodes of a cut.
 
@@ -66,6 +70,7 @@ class CutNodes(NamedTuple):
     instance: Any
 
 
+@fields(u4[:, :], i4[:, :], u2[:, :], i4[:, :], i4[:, :], i4[:, :], i4[:, :], i4[:, :], i8[:, :])
 class Slots(NamedTuple):
     """Working memory for nodes that have been visited: of roots, then of the children of each refined node, run by run.
 

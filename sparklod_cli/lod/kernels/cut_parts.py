@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...support.jit import kernel
+from ...support.jit_types import f4, i8, out
 from .collect_cut import collect, finish
 from .cut import FIRST_STEP, find_cut
 from .cut_arrays import (
@@ -27,6 +28,10 @@ from .cut_arrays import (
     ROOM,
     THRESHOLD,
     WAITING,
+    CutNodes,
+    Slots,
+    Stop,
+    Trees,
     from_bits,
     row_of,
     to_bits,
@@ -43,7 +48,7 @@ WHOLE, SOW, PLAN, REFINE, COLLECT, FINISH = range(6)
 DEALT = np.int32((1 << 31) - 1)
 
 
-@kernel(nogil=True)
+@kernel(i8, i8, Trees, Stop, f4, out(Slots), out(f4[:, :]), out(CutNodes), nogil=True)
 def take_step(step, part, trees, stop, guess, slots, wanted, cut):
     """Takes a step of a part, or of all; `slots.tally` of the first part says which step is NEXT.
 

@@ -7,8 +7,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...support.jit import kernel, prefetch
-from .cut_arrays import BUCKET_BITS, BUCKETS, LEAF
-from .pixel_scale import NEAREST, ONE, ZERO
+from ...support.jit_types import f4, f8, fields, i4, i8, out, u2, u4
+from .cut_arrays import BUCKET_BITS, BUCKETS, LEAF, CutNodes
+from .pixel_scale import NEAREST, NODES, ONE, VIEWS, ZERO
 
 #: Columns of the counts of an instance: nodes of each kind; least, sum and largest of their depths; area covered.
 SELECTED, LEAVES, FRONTIER, IN_FRUSTUM, OUTSIDE, BEHIND, DEPTH_MIN, DEPTH_SUM, DEPTH_MAX, AREA = range(10)
@@ -30,6 +31,7 @@ AHEAD = 64
 CLEAR_WORDS = 4
 
 
+@fields(f4, f4, f4, f8)
 class Screen(NamedTuple):
     """A camera's picture.
 
@@ -45,7 +47,7 @@ class Screen(NamedTuple):
     area: Any
 
 
-@kernel(nogil=True)
+@kernel(NODES, i4[:], VIEWS, CutNodes, Screen, out(i8[:, :]), out(f4[:]), out(u2[:]), nogil=True)
 def measure_cut(nodes, depths, views, cut, screen, counts, sizes, owners):
     """Counts the nodes of a cut by where their centres are, and measures those inside the frustum.
 
@@ -151,7 +153,7 @@ def measure_block(x, y, z, size, count, view, screen):
     return inside, behind, area
 
 
-@kernel(nogil=True)
+@kernel(f4[:], i8[:], out(f4[:]), nogil=True)
 def select(values, places, found):
     """The values that would be at some places if all were in ascending order.
 
@@ -184,7 +186,7 @@ def select(values, places, found):
         found[entry] = some[places[entry] - first]
 
 
-@kernel(nogil=True)
+@kernel(out(u4[:]), out(u4[:]), i8[:], u4[:], u2[:], u4[:], u2[:], out(i8[:, :]), nogil=True)
 def replace_drawn(drawn, before, base, node, instance, old_node, old_instance, counts):
     """Counts the nodes of a cut, and those that the cut before it had, too.
 

@@ -7,12 +7,17 @@ import math
 import numpy as np
 
 from ...support.jit import kernel
+from ...support.jit_types import b1, f4, f8, i8, out, u4, u8
 
 #: Bits of a digit.
 DIGIT_BITS = 16
 
 
-@kernel(nogil=True)
+@kernel(
+    (f4[:], u4[:], i8, u4[:], out(i8[:, :]), out(u4[:, :]), out(b1[:, :])),
+    (f8[:], u8[:], i8, u8[:], out(i8[:, :]), out(u8[:, :]), out(b1[:, :])),
+    nogil=True,
+)
 def count_digits(values, bits, shift, prefixes, counts, seen, mixed):
     """Counts a digit of the keys of those finite numbers whose digits before it are given.
 
@@ -62,7 +67,7 @@ def count_digits(values, bits, shift, prefixes, counts, seen, mixed):
     return count, total
 
 
-@kernel(nogil=True)
+@kernel(f4[:, :, :], i8, i8, out(f8[:]), nogil=True)
 def sh_lengths(sh, first, last, out):
     """Root mean squares of the coefficients of splats from `first` up to `last`.
 

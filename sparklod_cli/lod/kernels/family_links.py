@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from ...support.jit import kernel
+from ...support.jit_types import f4, i4
 
 
-@kernel()
+@kernel(i4[:], f4[:])
 def find_limits(parent, size):
     """Depths and limits of the nodes that have children.
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...support.jit import kernel, prange, prefetch
+from ...support.jit_types import f4, f8, i8, out, u2, u4
 
 #: Leaves ahead whose input is fetched, as they lie anywhere in it: then their cache misses overlap. Measured.
 AHEAD = 16
@@ -13,7 +14,7 @@ AHEAD = 16
 LINE = 16
 
 
-@kernel(parallel=True)
+@kernel(u4[:], u4[:], f4[:, :], out(f4[:, :]), parallel=True)
 def fill_leaves(order, index, column, out):
     """Fills the leaves of a column in final order; rows of merged nodes are left as they are.
 
@@ -37,7 +38,11 @@ def fill_leaves(order, index, column, out):
                 out[i, k] = column[j, k]
 
 
-@kernel(parallel=True)
+@kernel(
+    (u4[:], u4[:], u2[:], u4[:], f4[:], out(f4[:, :]), i8),
+    (u4[:], u4[:], u2[:], u4[:], f8[:], out(f4[:, :]), i8),
+    parallel=True,
+)
 def merge_colors(parents, child_start, child_count, order, weight, color, blocks):
     """Fills the colours of nodes with the weighted mean of their children's, which must be filled already.
 

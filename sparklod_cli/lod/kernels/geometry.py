@@ -9,6 +9,7 @@ import numpy as np
 
 from ...model.gaussian import THOMSEN_P
 from ...support.jit import kernel, prange
+from ...support.jit_types import f4, fields, i8
 
 #: The largest float32, world units: centres and scales of merged splats are clamped to it.
 LARGEST = float(np.finfo(np.float32).max)
@@ -19,6 +20,7 @@ AXIS_FLOOR = np.float32(1e-20)
 THOMSEN_P32, THOMSEN_ROOT, THIRD = np.float32(THOMSEN_P), np.float32(1 / THOMSEN_P), np.float32(1 / 3)
 
 
+@fields(f4[:, :], f4[:, :], f4[:, :], f4[:])
 class SplatColumns(NamedTuple):
     """Geometry of N splats, float32 columns as in `Splats`, for a kernel to read.
 
@@ -51,7 +53,7 @@ def ellipsoid_area(a, b, c):
     return 4 * math.pi * np.float64(largest) * np.float64(largest) * np.float64(mean)
 
 
-@kernel(parallel=True)
+@kernel(f4[:, :], f4[:, :], i8, parallel=True)
 def find_bounds(center, scale, blocks):
     """The box of the centres, and the range of sizes.
 

@@ -7,11 +7,12 @@ import math
 import numpy as np
 
 from ...support.jit import kernel, prange
+from ...support.jit_types import f4, f8, i8, u4
 from .pair_cost import CENTER
 from .sort import morton_code
 
 
-@kernel(parallel=True)
+@kernel(f4[:, :], f4[:, :], f8[:], f8, i8[:], i8, parallel=True)
 def level_keys(center, scale, steps, grid, low, cell_bits):
     """Sort keys that order splats by level and, within a level, along a Morton curve.
 
@@ -46,7 +47,7 @@ def level_keys(center, scale, steps, grid, low, cell_bits):
     return keys, levels
 
 
-@kernel()
+@kernel(u4[:], f4[:, :], f4[:], f4[:])
 def split_box(nodes, geometry, below, above):
     """Separates nodes whose centres lie between two corners from the others.
 

@@ -8,8 +8,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...support.jit import kernel, prange, prefetch
+from ...support.jit_types import f4, f8, fields, i8, out, u4
 from .eigen import ROWS, decompose
-from .geometry import LARGEST, ellipsoid_area
+from .geometry import LARGEST, SplatColumns, ellipsoid_area
 from .merge import SCALE_FLOOR, covariance
 from .pair_cost import CENTER, COLOR, COVARIANCE, COVERED, DENSITY, LOG_DET, WEIGHT, log_det
 from .profile import is_needle, profile_of
@@ -32,6 +33,7 @@ MAX_COLOR = np.float32(1e3)
 LEAST = np.float32(1e-30)
 
 
+@fields(f8[:], f8)
 class Space(NamedTuple):
     """The builder's coordinates: (world - middle) / unit.
 
@@ -43,7 +45,7 @@ class Space(NamedTuple):
     unit: Any
 
 
-@kernel(parallel=True)
+@kernel(u4[:], SplatColumns, f4[:, :], Space, out(f4[:, :]), out(f4[:]), parallel=True)
 def fill_leaf_rows(index, splats, rgb, space, rows, size):
     """Fills row i from splat index[i].
 
@@ -93,7 +95,7 @@ def place_on_curve(rows, at, low, step):
     return interleave(x, y, z)
 
 
-@kernel(parallel=True)
+@kernel(f4[:, :], u4[:], f8[:], f8, parallel=True)
 def morton_keys(rows, nodes, low, step):
     """Morton codes of nodes, of CURVE_BITS per axis; centres outside the curve's box are clamped to it.
 
@@ -112,7 +114,7 @@ def morton_keys(rows, nodes, low, step):
     return keys
 
 
-@kernel(parallel=True)
+@kernel(u4[:], i8, u4[:], f4[:, :], Space, out(f4[:, :]), out(f4[:, :]), out(f4[:, :]), out(f4[:]), parallel=True)
 def fill_merged_splats(order, leaves, row, rows, space, center, scale, quat, opacity):
     """Fills the geometry of merged splats in final order; leaves are left as they are.
 

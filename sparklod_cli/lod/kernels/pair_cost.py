@@ -12,6 +12,7 @@ import numpy as np
 
 from ...support.fast_math import log2
 from ...support.jit import kernel, prange
+from ...support.jit_types import f4, i4, i8, u4
 
 f32 = np.float32
 
@@ -101,7 +102,7 @@ def pair_costs(lanes, first, step, count, largest, cost):
         cost[i] = total if mxx + myy + mzz <= largest else NEVER
 
 
-@kernel(parallel=True)
+@kernel(f4[:, :], u4[:], i8, f4, parallel=True)
 def find_partners(rows, nodes, window, largest):
     """The cheapest partner of each node among its neighbours in a list.
 
@@ -161,7 +162,7 @@ def keep_cheaper(cost, count, best, at, here, there):
         at[i] = new if lower else at[i]
 
 
-@kernel()
+@kernel(u4[:], i4[:], f4[:], f4, i8)
 def match_pairs(nodes, partner, cost, limit, made):
     """Pairs of nodes that are each other's cheapest partner, and the list in which merged nodes replace them.
 

@@ -12,6 +12,7 @@ import math
 import numpy as np
 
 from ...support.jit import kernel, prange
+from ...support.jit_types import f4, i8, out, u4
 from .geometry import ellipsoid_area
 from .pair_cost import CENTER, COLOR, COVARIANCE, COVERED, DENSITY, LOG_DET, WEIGHT, WIDTH, log_det
 from .pair_overlap import center_of, covariance_of, overlap_share, overlaps, picture_error
@@ -153,7 +154,7 @@ def without(moment, of_product, hidden, first, second):
     return (moment - hidden * of_product) / left - hidden / (left * left) * first * second
 
 
-@kernel(parallel=True)
+@kernel(u4[:, :], i8, i8, out(f4[:, :]), out(u4[:]), out(u4[:]), out(u4[:, :]), out(f4[:]), out(f4[:]), parallel=True)
 def merge_pairs(pairs, made, leaves, rows, row, spare, children, size, error):
     """Merges each pair of nodes into one, which takes over the row that is to spare in the tree of the first.
 

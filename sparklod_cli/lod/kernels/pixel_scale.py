@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...support.jit import kernel
+from ...support.jit_types import Type
 
 #: A node as the traversal reads it; child indices are relative to its own tree. Siblings are adjacent, so that
 #: a node's children share a few cache lines.
@@ -36,6 +37,9 @@ VIEW = np.dtype(
         ("chunk_base", "<i8"),  # index of its tree's first chunk
     ]
 )
+
+#: Arrays of them, in the signatures of kernels.
+NODES, VIEWS = Type(NODE)[:], Type(VIEW)[:]
 
 #: Kinds of foveation.
 NO_FOVEATION, CONE, FRUSTUM = 0, 1, 2

@@ -13,6 +13,7 @@ import numpy as np
 
 from ...model.lod_tree import MAX_CHILDREN
 from ...support.jit import kernel, prange
+from ...support.jit_types import f4, i4, i8, out, u2, u4
 
 #: Size steps per octave, and octaves: all of float32's, 2^-128 to 2^128. Steps chosen.
 STEPS, OCTAVES = 4, 256
@@ -63,7 +64,7 @@ def size_step(size):
     return min(max(int(STEPS * (math.log2(size) + OCTAVES / 2)), 0), STEPS * OCTAVES - 1)
 
 
-@kernel(parallel=True)
+@kernel(u4[:, :], i8, i8, i8, out(f4[:]), out(f4[:]), out(f4[:]), i8, parallel=True)
 def fill_usefulness_terms(children, leaves, drawn_leaves, top, log_size, lost, weight, blocks):
     """Fills the terms of `usefulness`.
 
@@ -132,7 +133,7 @@ def usefulness_key(useful):
     return (ordered + 0x80000000) >> (32 - KEY_BITS)
 
 
-@kernel(parallel=True)
+@kernel(i8, i8, out(u4[:]), f4[:], out(f4[:]), f4[:], out(i4[:]), i8, parallel=True)
 def drop_nodes(leaves, most, parent, log_size, lost, weight, saved, blocks):
     """Drops the least useful merged nodes until `most` are left, or none can be dropped.
 
@@ -223,7 +224,7 @@ def usefulness(node, leaves, parent, log_size, lost, weight, saved):
     return span * (np.float32(saved[node]) - lost[node]) * weight[node]
 
 
-@kernel()
+@kernel(i8, f4, u4[:], f4[:], i4[:], i4[:])
 def size_ranks(leaves, highest, parent, log_size, saved, latest):
     """The rank of merged nodes in the final order: size steps below the highest, and more than the parent's rank.
 
@@ -257,7 +258,7 @@ def size_ranks(leaves, highest, parent, log_size, saved, latest):
     return rank
 
 
-@kernel()
+@kernel(u4[:], i8, u4[:], i4[:], out(u4[:]), out(u4[:]), out(u2[:]))
 def lay_out_children(inner, leaves, parent, saved, order, child_start, child_count):
     """Assigns final indices: the root is 0, siblings are consecutive, and come in the order of their parents.
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ...model.splats import FloatArray
 from ...support.jit import kernel, prange
+from ...support.jit_types import f4, f8, i8, out, u4, u8
 from .pair_cost import CENTER
 
 Keys = NDArray[np.uint64]
@@ -72,7 +73,7 @@ def morton_code(x, y, z, step, low, shift):
     return interleave(i, j, k)
 
 
-@kernel(parallel=True)
+@kernel(f4[:, :], u4[:], f8, i8[:], i8, parallel=True)
 def cell_words(geometry, nodes, step, low, word):
     """One 63-bit word of the Morton code of each node's cell.
 
@@ -94,7 +95,7 @@ def cell_words(geometry, nodes, step, low, word):
     return out
 
 
-@kernel(parallel=True)
+@kernel(u8[:], u4[:], out(u8[:]), out(u4[:]), i8, i8, i8, parallel=True)
 def sort_pass(keys, values, keys_out, values_out, shift, bits, blocks):
     """One stable pass of a radix sort, by `bits` bits at `shift`; the result is the same for any number of `blocks`."""
     n = len(keys)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...support.jit import kernel
+from ...support.jit_types import b1, f4, f8, i4, i8, out, u2, u4
 from .geometry import ellipsoid_area
 
 #: Links followed per node at most. A tree has fewer than one; in a broken tree nodes may share children, so that links
@@ -18,7 +19,7 @@ LIMIT_BITS = 16
 LEAST_AREA = 1e-300
 
 
-@kernel(nogil=True)
+@kernel(u2[:], u4[:], f4[:], nogil=True)
 def find_depths(child_count, child_start, size):
     """Depths of the nodes that are reachable from the root.
 
@@ -74,7 +75,7 @@ def find_depths(child_count, child_start, size):
     return depth, limit
 
 
-@kernel(nogil=True)
+@kernel(u2[:], u4[:], nogil=True)
 def find_parents(child_count, child_start):
     """Parents of all nodes.
 
@@ -107,7 +108,7 @@ def find_parents(child_count, child_start):
     return parent, references[:count]
 
 
-@kernel()
+@kernel(i4[:], f4[:], f4[:, :], f4[:], out(f8[:]), out(f8[:]))
 def add_child_sizes(parent, size, scale, opacity, sums, weights):
     """Adds some nodes to the sums of their parents' children, weighted with opacity times surface area.
 
@@ -126,7 +127,7 @@ def add_child_sizes(parent, size, scale, opacity, sums, weights):
     add_weighted(parent, size, weight, sums, weights)
 
 
-@kernel(nogil=True)
+@kernel(i4[:], f4[:], f4[:, :], f4[:], out(f8[:]), nogil=True)
 def fill_weights(parent, size, scale, opacity, weight):
     """The weights of `add_child_sizes`: opacity times surface area, -1 of nodes that do not count.
 
@@ -141,7 +142,7 @@ def fill_weights(parent, size, scale, opacity, weight):
             weight[node] = opacity[node] * max(area, LEAST_AREA)
 
 
-@kernel(nogil=True)
+@kernel(i4[:], f4[:], f8[:], out(f8[:]), out(f8[:]), nogil=True)
 def add_weighted(parent, size, weight, sums, weights):
     """The sums of `add_child_sizes`, of n nodes with the weights of `fill_weights`."""
     for node in range(len(parent)):
@@ -150,7 +151,7 @@ def add_weighted(parent, size, weight, sums, weights):
             sums[parent[node]] += weight[node] * size[node]
 
 
-@kernel(nogil=True)
+@kernel(i4[:], i4[:], nogil=True)
 def find_cycles(parent, depth):
     """Nodes on a cycle or below one: parents lead from them neither to the root nor to a node without a parent.
 
@@ -178,7 +179,7 @@ def find_cycles(parent, depth):
     return state == cycle
 
 
-@kernel(nogil=True)
+@kernel(i4[:], u2[:], f4[:], nogil=True)
 def sum_by_depth(depth, child_count, size):
     """Numbers of nodes and sums of their sizes by depth; nodes of depth -1 are left out of both.
 
@@ -206,7 +207,7 @@ def sum_by_depth(depth, child_count, size):
     return nodes, leaves, logs, children
 
 
-@kernel(nogil=True)
+@kernel(u2[:], u4[:], f4[:], i8, out(i8[:]), nogil=True)
 def count_limits(child_count, child_start, limit, chunk_bits, counts):
     """Counts inner nodes by their limits.
 
@@ -230,7 +231,7 @@ def count_limits(child_count, child_start, limit, chunk_bits, counts):
     return split
 
 
-@kernel(nogil=True)
+@kernel(u2[:], u4[:], f4[:], f8, out(b1[:]), nogil=True)
 def mark_small(child_count, child_start, size, ratio, marks):
     """Marks nodes whose size is less than `ratio` times that of one of their children, of finite size.
 

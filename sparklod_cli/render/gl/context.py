@@ -9,11 +9,12 @@ from __future__ import annotations
 import ctypes
 import ctypes.util
 import functools
-import os
 import subprocess
 import sys
 from collections.abc import Callable
 from typing import Any
+
+from ...support.python_process import module_command
 
 #: OpenGL version that the shaders need: 4.2 introduced unpackHalf2x16.
 VERSION = 420
@@ -120,11 +121,9 @@ def create(kind: str) -> Any:
 @functools.cache
 def probe(kind: str) -> str:
     """Why a context over one of `PACKAGES` does not work here, tested in a separate process; empty if it works."""
-    # The child searches the same folders for modules as this process.
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    command = [sys.executable, "-m", __name__, kind]
+    command = module_command(__name__, kind)
     try:
-        child = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, env=environment)
+        child = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE)
     except (OSError, subprocess.SubprocessError) as error:
         return str(error)
     if child.returncode == 0:

@@ -208,7 +208,7 @@ def open_context() -> Any:
     Raises:
         BackendError: OpenGL is not available; names the packages to install.
     """
-    with optional_import("the backend osmesa needs moderngl", "sparklod[render]", BackendError):
+    with optional_import("the backend osmesa needs moderngl", "render", BackendError):
         import moderngl  # noqa: F401
     reasons = []
     for kind in contexts.PACKAGES:

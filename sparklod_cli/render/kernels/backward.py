@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...support.jit import kernel, prange
+from ...support.jit_types import f4, fields, i2, i4, i8, out
 from .falloff import merged_parts, plain
 from .project import ACROSS, ALONG, BLUE, COLUMNS, GREEN, LEAST, LOG, OPACITY, POWER, RED, SHEAR, TILE, X, Y
 from .raster import BLOCKS, LANES, measure
@@ -40,6 +41,7 @@ LEAST_THROUGH = f32(1e-4)
 LN2 = f32(np.log(2))
 
 
+@fields(f4[:, :], i2[:, :], i8[:], i4[:], i8[:], i8)
 class Drawn(NamedTuple):
     """A picture's splats and tiles.
 
@@ -57,7 +59,7 @@ class Drawn(NamedTuple):
     across: Any
 
 
-@kernel()
+@kernel(i2[:, :])
 def first_rows(boxes):
     """(N + 1,) int64 where the rows of each splat begin, one for each tile that its box overlaps."""
     first = np.empty(len(boxes) + 1, np.int64)
@@ -160,7 +162,7 @@ def add_lanes(lanes, out):
         out[k] += ((v[0] + v[1]) + (v[2] + v[3])) + ((v[4] + v[5]) + (v[6] + v[7]))
 
 
-@kernel(parallel=True, contract=True)
+@kernel(Drawn, i8[:], f4, f4[:, :, :], f4[:, :, :], out(f4[:, :]), parallel=True, contract=True)
 def weigh_tiles(drawn, first, least, image, by_image, sums):
     """Sums of each splat over the pixels of each tile that its box overlaps.
 

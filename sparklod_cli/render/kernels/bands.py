@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from ...support.jit import kernel, prange
+from ...support.jit_types import b1, f4, i4, out, u8
 from .falloff import alpha_at
 from .project import HALF_HEIGHT, HALF_WIDTH, LEAST, OPACITY, POWER, X, Y, exponent, index_of
 
@@ -16,7 +17,7 @@ f32 = np.float32
 ROWS = 8
 
 
-@kernel(parallel=True)
+@kernel(f4[:], f4[:], f4[:], f4[:, :], f4, out(f4[:, :, :]), parallel=True)
 def draw_discs(x, y, radius, rgb, alpha, image):
     """Blends discs in their order, each over those before it.
 
@@ -49,7 +50,7 @@ def draw_discs(x, y, radius, rgb, alpha, image):
                     image[line, column, 3] += alpha * (f32(1) - image[line, column, 3])
 
 
-@kernel(parallel=True)
+@kernel(f4[:, :], u8[:], b1, f4, out(i4[:, :]), parallel=True)
 def count_fragments(screen, keys, design, least, counts):
     """Counts the splats that cover each pixel, hidden ones included.
 

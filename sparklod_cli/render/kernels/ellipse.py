@@ -12,6 +12,7 @@ import numpy as np
 from ...model import gaussian
 from ...support.fast_math import log2
 from ...support.jit import kernel
+from ...support.jit_types import f4, fields
 from .falloff import HALF_LOG2E
 
 f32, f64 = np.float32, np.float64
@@ -29,6 +30,7 @@ LEAST_COVARIANCE = f32(1e-3)
 rotation_matrix = kernel(inline=True)(gaussian.rotation_matrix)
 
 
+@fields(f4, f4, f4, f4, f4, f4)
 class Lens(NamedTuple):
     """A camera's picture; pixels, float32.
 
@@ -44,6 +46,7 @@ class Lens(NamedTuple):
     height: Any
 
 
+@fields(f4, f4, f4, f4, f4, f4, f4, f4)
 class Limits(NamedTuple):
     """Limits on what is drawn, float32; see `RasterSettings` and the constants in its module.
 

@@ -9,7 +9,8 @@ import numpy as np
 
 from ...model import gaussian
 from ...support.jit import kernel, prange
-from .ellipse import ellipse, on_screen, shortened
+from ...support.jit_types import b1, f4, fields, i2, out, u8
+from .ellipse import Lens, Limits, ellipse, on_screen, shortened
 
 f32 = np.float32
 
@@ -54,6 +55,7 @@ MAX_INDEX = 0xFFFFFFFF
 linear_opacity_above_1 = kernel(inline=True)(gaussian.linear_opacity_above_1)
 
 
+@fields(f4[:, :], f4[:, :], f4[:, :], f4[:], f4[:, :])
 class ShadedColumns(NamedTuple):
     """Columns of `ShadedSplats`, float32.
 
@@ -148,7 +150,7 @@ def index_of(key):
     return MAX_INDEX - np.int64(key & np.uint64(MAX_INDEX))
 
 
-@kernel(parallel=True)
+@kernel(ShadedColumns, f4[:, :], Lens, Limits, b1, out(f4[:, :]), out(u8[:]), out(i2[:, :]), parallel=True)
 def project(splats, world_to_camera, lens, limits, radial, screen, keys, boxes):
     """Splats on the screen; see `project_splat`, of which this is the same for many splats at once.
 

@@ -11,8 +11,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...support.jit import kernel, prange
+from ...support.jit_types import f4, fields, i8, out
 from .backward import BY_RED, BY_SHAPE, BY_X, BY_XX, BY_XY, BY_Y, BY_YY, SUMS
-from .ellipse import MAX_D, in_camera, jacobian, per_world_unit, rotation_matrix, turned
+from .ellipse import MAX_D, Lens, Limits, in_camera, jacobian, per_world_unit, rotation_matrix, turned
 from .falloff import HALF_LOG2E
 from .project import (
     ACROSS,
@@ -20,6 +21,7 @@ from .project import (
     MAX_COLOR,
     OPACITY,
     SHEAR,
+    ShadedColumns,
 )
 
 f64 = np.float64
@@ -30,6 +32,7 @@ CENTER, LOG_SCALE, TURN, LOD_OPACITY, RGB = 0, 3, 6, 9, 10
 GRADIENT_COLUMNS = 13
 
 
+@fields(f4[:, :], i8[:], f4[:, :])
 class Rows(NamedTuple):
     """Splats on the screen, and their sums, tile by tile.
 
@@ -62,7 +65,7 @@ def weighed(a, u, b, v, c, w):
     return a * u[0] + b * v[0] + c * w[0], a * u[1] + b * v[1] + c * w[1], a * u[2] + b * v[2] + c * w[2]
 
 
-@kernel(parallel=True)
+@kernel(ShadedColumns, f4[:, :], Lens, Limits, Rows, out(f4[:, :]), parallel=True)
 def carry_back(splats, world_to_camera, lens, limits, rows, gradients):
     """Derivatives by the properties of splats; see `SplatGradients`.
 

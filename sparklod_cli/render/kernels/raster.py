@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...support.jit import kernel, prange, prefetch
+from ...support.jit_types import b1, f4, i4, i8, out
 from .falloff import merged, plain, shifted
 from .project import (
     ACROSS,
@@ -235,7 +236,7 @@ def draw_tile(screen, start, splats, tile, across, design, least, image):
     return stop
 
 
-@kernel(parallel=True, contract=True)
+@kernel(f4[:, :], i8[:], i4[:], i8, b1, f4, out(f4[:, :, :]), out(i8[:]), parallel=True, contract=True)
 def draw_tiles(screen, start, splats, across, design, least, image, stop):
     """Blends the splats of each tile, from near to far.
 

@@ -10,7 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...support.jit import kernel, prange
-from .ellipse import Lens
+from ...support.jit_types import f4, f8, i8, out
+from .ellipse import Lens, Limits
 from .project import COLUMNS, TILE, ShadedColumns, project_splat, tiles_of
 from .raster import LANES, draw_tile
 
@@ -37,7 +38,19 @@ class View(NamedTuple):
     limits: Any
 
 
-@kernel(parallel=True, contract=True)
+@kernel(
+    ShadedColumns,
+    f4[:, :, :],
+    i8[:, :, :],
+    f4[:, :, :, :],
+    f4[:, :],
+    i8[:],
+    f4,
+    Limits,
+    out(f8[:, :, :]),
+    parallel=True,
+    contract=True,
+)
 def compare_levels(splats, sh, runs, poses, basis, sizes, focal, limits, differences):
     """Squared differences between pictures of regions at their detail levels and at the first.
 

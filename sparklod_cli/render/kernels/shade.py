@@ -6,6 +6,7 @@ import numpy as np
 
 from ...model.sh import SH_C1, SH_C2, SH_C3
 from ...support.jit import kernel, prange
+from ...support.jit_types import f4, i8, out
 
 f32 = np.float32
 
@@ -38,7 +39,7 @@ def third(x, y, z):
     )
 
 
-@kernel(parallel=True)
+@kernel(f4[:, :], f4[:, :, :], f4[:], i8, out(f4[:, :]), parallel=True)
 def add_sh(center, sh, eye, degree, rgb):
     """Adds the terms of degree 1 and above to colours.
 
@@ -74,7 +75,7 @@ def add_sh(center, sh, eye, degree, rgb):
             rgb[i, c] += value
 
 
-@kernel(parallel=True)
+@kernel(f4[:, :], f4[:], f4[:, :], out(f4[:, :, :]), parallel=True)
 def sh_gradients(center, eye, by_rgb, by_sh):
     """Derivatives by coefficients of degree 1 and above: the basis in a splat's direction, times those by its colour.
 

@@ -5,13 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from ...support.jit import kernel, prange, prefetch
+from ...support.jit_types import i2, i8, u8
 from .project import index_of
 
 #: Splats ahead whose boxes are fetched: with some notice, waits for memory overlap. Chosen.
 AHEAD = 16
 
 
-@kernel(parallel=True)
+@kernel(u8[:], i2[:, :], i8, i8, i8, parallel=True)
 def sort_into_tiles(keys, boxes, across, down, blocks):
     """Lists the splats of each tile, in their order.
 

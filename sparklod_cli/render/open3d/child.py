@@ -22,6 +22,8 @@ from typing import IO, Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from ...support.optional import pip_install
+
 #: Columns of the splats of a request: centre, scale, quaternion w x y z, logit of opacity, first spherical harmonics.
 COLUMNS = 14
 
@@ -103,7 +105,7 @@ class Painter:
             import open3d
         except ModuleNotFoundError as error:
             raise RuntimeError(
-                f"it needs the package {error.name}, which is not installed: pip install 'open3d>={VERSION}'"
+                f"it needs the package {error.name}, which is not installed: {pip_install(f'open3d>={VERSION}')}"
             ) from None
         except (ImportError, OSError) as error:
             reason = " ".join(str(error).split())
@@ -114,7 +116,7 @@ class Painter:
         self._material = open3d.visualization.rendering.MaterialRecord()
         if not hasattr(self._material, "gaussian_splat_antialias"):
             raise RuntimeError(
-                f"Open3D {open3d.__version__} cannot draw splats: pip install --upgrade 'open3d>={VERSION}'"
+                f"Open3D {open3d.__version__} cannot draw splats: {pip_install('--upgrade', f'open3d>={VERSION}')}"
             )
         self._material.shader = "gaussianSplat"
         self._material.gaussian_splat_sh_degree = 0

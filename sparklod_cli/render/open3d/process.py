@@ -4,19 +4,16 @@ from __future__ import annotations
 
 import atexit
 import contextlib
-import os
 import re
 import subprocess
-import sys
 import tempfile
 import threading
 from pathlib import Path
 from typing import Any
 
+from ...support.python_process import module_command
 from ..backends import BackendError
 from .child import PACKAGES, Array, receive, send
-
-COMMAND = [sys.executable, "-m", f"{__package__}.child"]
 
 #: Time limits in seconds for starting the process, and for drawing a piece.
 START_LIMIT, DRAW_LIMIT = 180.0, 300.0
@@ -27,6 +24,11 @@ START_LIMIT, DRAW_LIMIT = 180.0, 300.0
 MOST_ENTRIES, MOST_ENTRIES_OF_OLD_MESA, NEW_MESA = 1 << 25, 1 << 15, 25
 
 
+def command() -> list[str]:
+    """Return the command line of the process in which Open3D draws."""
+    return module_command(f"{__package__}.child")
+
+
 class Child:
     """A process in which Open3D draws; it ends with the parent process.
 
@@ -35,16 +37,12 @@ class Child:
     """
 
     def __init__(self) -> None:
-        # The child searches the same folders for modules as this process.
-        env = {**os.environ, "PYTHONPATH": os.pathsep.join(path or str(Path.cwd()) for path in sys.path)}
         # A file instead of a pipe, which would have to be read while the child writes.
         self._folder = tempfile.TemporaryDirectory(prefix="sparklod-", ignore_cleanup_errors=True)
         self._log = Path(self._folder.name, "log")
         try:
             with self._log.open("wb") as log:
-                self._process = subprocess.Popen(
-                    COMMAND, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, env=env
-                )
+                self._process = subprocess.Popen(command(), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log)
         except OSError as error:
             self._folder.cleanup()
             raise BackendError(f"the process for Open3D does not start: {error}") from None

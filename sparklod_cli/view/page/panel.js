@@ -8,6 +8,11 @@ export function fail(text) {
   element('panel').hidden = true;
 }
 
+/** Says what the page waits for before it can draw. */
+export function starting(text) {
+  element('message-text').textContent = `Starting. ${text}`;
+}
+
 /** Says something at the bottom, until it is closed. */
 export function notice(text) {
   tell(text, true);
@@ -26,6 +31,26 @@ export function clearMessage() {
 
 element('message-close').addEventListener('click', clearMessage);
 
+/** Shows the panel, or hides it behind its button. */
+export function showPanel(shown) {
+  element('panel').hidden = !shown;
+  element('panel-show').hidden = shown;
+}
+
+/** The width and height in pixels that the panel covers: at the side, or below where it is as wide as the window. */
+export function covered() {
+  const { left, top, width } = element('panel').getBoundingClientRect();
+  if (!width) return [0, 0]; // hidden
+  return width > window.innerWidth / 2 ? [0, window.innerHeight - top] : [window.innerWidth - left, 0];
+}
+
+/** Says which files are loading, and how much of them is there. */
+export function listLoading(shown) {
+  const loading = shown.filter((file) => file.loading && file.visible);
+  element('loading').hidden = !loading.length;
+  element('loading').textContent = loading.map((file) => `${file.file.name}: ${file.state}`).join(', ');
+}
+
 /** A row for each file, with a box that shows and hides it; returns what updates a row. */
 export function listFiles(shown, onShow) {
   const rows = shown.map((file) => {
@@ -41,10 +66,23 @@ export function listFiles(shown, onShow) {
   });
   element('files').replaceChildren(...rows.map((row) => row.item));
   return (file) => {
+    listLoading(shown);
     const { state } = rows[shown.indexOf(file)];
     state.textContent = file.state;
     state.classList.toggle('bad', file.bad);
   };
+}
+
+/** Fills the legend of the levels. */
+export function drawLegend({ colors, marks, text }) {
+  const filled = (tag, fill) => (value) => {
+    const field = document.createElement(tag);
+    fill(field, value);
+    return field;
+  };
+  element('legend-bar').replaceChildren(...colors.map(filled('i', (field, color) => (field.style.background = color))));
+  element('legend-marks').replaceChildren(...marks.map(filled('span', (field, mark) => (field.textContent = mark))));
+  element('legend-text').textContent = text;
 }
 
 /** Calls functions by the ids of buttons and boxes, and by keys. */

@@ -4,9 +4,12 @@ import { Matrix4, Quaternion, Vector3 } from 'three';
 const FLIP = new Matrix4().makeScale(1, -1, -1);
 const degrees = (radians) => (radians * 180) / Math.PI;
 
-/** The path of some dropped files: {format, notes, frames: [{matrix, fov, time, name}]}, matrices column by column. */
-export async function readPath(files, server) {
-  return server ? askServer(files, server) : parse(await files[0].text());
+/**
+ * The path of some dropped files: {format, notes, frames: [{matrix, fov, time, name}]}, matrices column by column.
+ * `up` is the up axis of cameras that have none.
+ */
+export async function readPath(files, server, up) {
+  return server ? askServer(files, server) : parse(await files[0].text(), up);
 }
 
 async function askServer(files, address) {
@@ -34,7 +37,7 @@ function base64(file) {
 }
 
 /** Parses a file as far as a page can. */
-export function parse(text) {
+export function parse(text, up) {
   let root;
   try {
     root = JSON.parse(text);
@@ -48,7 +51,7 @@ export function parse(text) {
   }
   const frames = root.frames.map((frame, number) => {
     const time = Number(frame.time ?? number / (root.fps ?? 30));
-    const parsed = own ? ownFrame(frame, root) : transformsFrame(frame, root);
+    const parsed = own ? ownFrame(frame, root, up) : transformsFrame(frame, root);
     const numbers = [...parsed.matrix, parsed.fov, time];
     if (!numbers.every(Number.isFinite)) throw new Error(`camera ${number} of it has a number that is none`);
     return { ...parsed, time, name: String(frame.name ?? '') };
@@ -59,13 +62,13 @@ export function parse(text) {
   return { format: own ? "sparklod's JSON" : 'transforms.json', notes: [], frames };
 }
 
-function ownFrame(frame, root) {
+function ownFrame(frame, root, upOfScene) {
   const axes = root.axes ?? 'opengl-c2w';
   const [, height] = frame.size ?? root.size ?? [];
   const focal = frame.focal ?? root.focal;
   const fov = focal && height ? degrees(2 * Math.atan(height / 2 / focal[1])) : Number(frame.fov ?? root.fov ?? 60);
   if (frame.eye) {
-    const up = new Vector3(...(frame.up ?? [0, -1, 0]));
+    const up = new Vector3(...(frame.up ?? upOfScene));
     const eye = new Vector3(...frame.eye);
     const turned = new Matrix4().lookAt(eye, new Vector3(...frame.target), up).setPosition(eye);
     return { matrix: turned.toArray(), fov };

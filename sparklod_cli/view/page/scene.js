@@ -15,11 +15,13 @@ export class ShownFile {
   /**
    * @param file as view.json has it.
    * @param modifier of Spark, for its splats.
+   * @param group that it is loaded into.
    * @param changed is called when its state changes.
    * @param failed is called with what went wrong.
    */
-  constructor(file, modifier, changed, failed) {
-    Object.assign(this, { file, modifier, changed, failed, visible: true, builds: false, mesh: null, state: '', bad: false });
+  constructor(file, modifier, group, changed, failed) {
+    Object.assign(this, { file, modifier, group, changed, failed, visible: true, builds: false, mesh: null });
+    Object.assign(this, { state: '', loading: false, bad: false });
     this.isTree = file.leaves !== null;
   }
 
@@ -27,25 +29,26 @@ export class ShownFile {
     return Boolean(this.mesh?.paged);
   }
 
-  /** Loads the file into a group; again, if it is there already. */
-  async load(group) {
-    this.unload(group);
+  /** Loads the file; again, if it is there already. */
+  async load() {
+    this.unload();
     const { file } = this;
     const url = new URL(file.url, document.baseURI).href;
+    this.loading = true;
+    this.say(`loading ${size(0)} of ${size(file.bytes)}`);
     const pages = file.paged && (file.chunked || (await hasRanges(url)));
-    const progress = (event) => {
-      if (event.total) this.say(`${whole((100 * event.loaded) / event.total)} % of ${size(file.bytes)}`);
-    };
+    const progress = (event) => this.loading && this.say(`loading ${size(event.loaded)} of ${size(file.bytes)}`);
     const atOnce = { fileType: file.type, extSplats: true, onProgress: progress, lod: this.builds || undefined };
-    this.say('loading');
+    if (pages) this.say(`loading the first chunk, ${size(file.first_bytes)} of ${size(file.bytes)}`);
     const mesh = new SplatMesh({ url, objectModifier: this.modifier, ...(pages ? { paged: true, fileType: 'rad' } : atOnce) });
     this.mesh = mesh;
     mesh.visible = this.visible;
-    group.add(mesh);
+    this.group.add(mesh);
     try {
-      if (pages) this.watch(mesh.paged);
-      await (pages ? mesh.paged.getRadMeta() : mesh.initialized);
-      if (this.mesh === mesh) this.say(this.described(pages));
+      await (pages ? this.firstChunk(mesh.paged) : mesh.initialized);
+      if (this.mesh !== mesh) return;
+      this.loading = false;
+      this.say(this.described(pages));
     } catch (error) {
       if (this.mesh === mesh) this.fail(error);
     }
@@ -54,28 +57,37 @@ export class ShownFile {
   described(pages) {
     const { file } = this;
     const tree = this.isTree ? `tree of ${whole(file.splats)} nodes` : `${whole(file.splats)} splats`;
-    const how = pages ? `, ${whole(file.chunks)} chunks` : file.paged ? ', loaded whole: this host sends no ranges' : '';
+    const how = pages ? `, ${whole(file.chunks)} chunk${file.chunks > 1 ? 's' : ''}` : file.paged ? ', loaded whole: this host sends no ranges' : '';
     return `${file.format}, ${size(file.bytes)}, ${tree}${this.builds ? ', tree built here' : ''}${how}`;
   }
 
-  /** Reports chunks that cannot be fetched, which Spark only writes to the console. */
-  watch(paged) {
+  /** Waits for the first chunk, and reports chunks that cannot be fetched, which Spark only writes to the console. */
+  firstChunk(paged) {
     const fetchChunk = paged.fetchDecodeChunk.bind(paged);
-    paged.fetchDecodeChunk = (chunk) =>
-      fetchChunk(chunk).catch((error) => {
-        if (error.name !== 'AbortError') this.fail(error);
-        throw error;
-      });
+    return new Promise((done, failed) => {
+      paged.fetchDecodeChunk = async (chunk) => {
+        try {
+          const decoded = await fetchChunk(chunk);
+          done();
+          return decoded;
+        } catch (error) {
+          if (error.name !== 'AbortError') this.fail(error);
+          throw error;
+        }
+      };
+      paged.getRadMeta().catch(failed);
+    });
   }
 
   show(visible) {
     this.visible = visible;
     if (this.mesh) this.mesh.visible = visible;
+    this.changed(this);
   }
 
-  unload(group) {
+  unload() {
     if (!this.mesh) return;
-    group.remove(this.mesh);
+    this.group.remove(this.mesh);
     this.mesh.dispose();
     this.mesh = null;
   }
@@ -88,6 +100,7 @@ export class ShownFile {
 
   fail(error) {
     const text = String(error?.message ?? error);
+    this.loading = false;
     this.say(`cannot be shown: ${text}`, true);
     this.failed(`${this.file.name} cannot be shown: ${text}`);
   }

@@ -58,22 +58,10 @@ export class SizeColors {
     });
   }
 
-  /** Fills the legend: a field for each band, coarse to fine, and some sizes. */
-  drawLegend(bar, marks) {
-    bar.replaceChildren(
-      ...this.colors.map((color) => {
-        const field = document.createElement('i');
-        field.style.background = `rgb(${color.join(' ')})`;
-        return field;
-      }),
-    );
+  /** The colours of all bands, coarse to fine, and some of their sizes. */
+  legend() {
     const last = this.colors.length - 1;
-    marks.replaceChildren(
-      ...[0, Math.round(last / 2), last].map((band) => {
-        const mark = document.createElement('span');
-        mark.textContent = short(this.largest.value / 2 ** band);
-        return mark;
-      }),
-    );
+    const marks = [0, Math.round(last / 2), last].map((band) => short(this.largest.value / 2 ** band));
+    return { colors: this.colors.map((color) => `rgb(${color.join(' ')})`), marks };
   }
 }

@@ -1,12 +1,9 @@
-// The page: Spark in a canvas, the camera, and the panel that steers both.
-import { Group, PerspectiveCamera, Quaternion, Scene, Vector3, WebGLRenderer } from 'three';
-import { SparkRenderer } from '@sparkjsdev/spark';
+// The page: a stage, which draws with Spark or PlayCanvas, the camera, and the panel that steers both.
+import { PerspectiveCamera, Quaternion, Vector3 } from 'three';
 import { Controls } from './controls.js';
-import { clearMessage, copyField, element, listFiles, listen, notice, onDrop } from './panel.js';
+import { clearMessage, copyField, covered, drawLegend, element, listFiles, listen, notice, onDrop, showPanel } from './panel.js';
 import { readPath } from './paths.js';
 import { Player } from './player.js';
-import { ShownFile } from './scene.js';
-import { SizeColors } from './sizes.js';
 import { axis, cameraText, direction, whole } from './text.js';
 
 const UP = new Vector3(0, 1, 0);
@@ -22,24 +19,19 @@ function upright(up) {
 }
 
 class View {
-  constructor(settings) {
+  constructor(settings, Stage) {
     this.settings = settings;
     this.canvas = element('canvas');
-    this.renderer = new WebGLRenderer({ canvas: this.canvas, antialias: false });
+    this.stage = new Stage(this.canvas, settings.start);
     this.camera = new PerspectiveCamera(settings.start.fov, 1, 0.01, 1000);
-    // Rounding would show in large scenes: all splats are kept in 32 bytes.
-    this.spark = new SparkRenderer({ renderer: this.renderer, accumExtSplats: true, pagedExtSplats: true });
-    this.group = new Group();
-    this.scene = new Scene();
-    this.scene.add(this.spark, this.group);
+    this.turned = new Quaternion(); // from the splats to what is drawn
     this.radius = settings.start.radius;
-    this.colors = new SizeColors(settings.start.sizes);
-    this.player = new Player(this.camera, this.group.quaternion);
+    this.player = new Player(this.camera, this.turned);
     this.controls = new Controls(this.canvas, this.camera, () => this.leavePath());
     this.controls.radius = this.radius;
     this.camera.near = 1e-3 * this.radius;
     this.camera.far = 1e5 * this.radius;
-    this.files = settings.files.map((file) => new ShownFile(file, this.colors.modifier, (shown) => this.update(shown), notice));
+    this.files = settings.files.map((file) => this.stage.add(file, (shown) => this.update(shown), notice));
     this.update = listFiles(this.files, (shown, visible) => shown.show(visible));
     this.frameTime = null;
     this.up = settings.up;
@@ -50,29 +42,32 @@ class View {
 
   /** Positions in the space of the splats. */
   toSplats(point) {
-    return point.clone().applyQuaternion(this.group.quaternion.clone().invert()).toArray();
+    return point.clone().applyQuaternion(this.turned.clone().invert()).toArray();
   }
 
   toView(values) {
-    return new Vector3(...values).applyQuaternion(this.group.quaternion);
+    return new Vector3(...values).applyQuaternion(this.turned);
   }
 
   setUp(up) {
     const kept = this.cameraNow?.();
     this.up = up;
-    this.group.quaternion.copy(upright(up));
-    this.group.updateMatrixWorld(true);
+    this.turned.copy(upright(up));
+    this.stage.turn(this.turned);
     if (kept) this.controls.place(this.toView(kept.eye), this.toView(kept.target));
   }
 
-  /** The first look; from farther away where the window is narrower than it was chosen for. */
+  /** The first look; from farther away where less of the window is free than it was chosen for. */
   reset() {
     const { eye, target, fov, chosen } = this.settings.start;
     this.leavePath();
     this.camera.fov = fov;
     this.resize();
     const [at, to] = [this.toView(eye), this.toView(target)];
-    if (chosen && this.camera.aspect < FRAMED) at.sub(to).multiplyScalar(FRAMED / this.camera.aspect).add(to);
+    const [right, below] = covered();
+    const [width, height] = [window.innerWidth, window.innerHeight];
+    const share = Math.min(1, (width - right) / (FRAMED * height), (height - below) / height);
+    if (chosen) at.sub(to).divideScalar(share).add(to);
     this.controls.place(at, to);
   }
 
@@ -89,12 +84,13 @@ class View {
     for (const id of ['orbit', 'fly']) element(id).setAttribute('aria-pressed', String(id === mode));
   }
 
+  /** Fills the window, with the middle of the picture in the middle of what the panel leaves free. */
   resize() {
     const ratio = element('pixels').checked ? window.devicePixelRatio : 1;
-    this.renderer.setPixelRatio(ratio);
-    this.renderer.setSize(window.innerWidth, window.innerHeight, false);
-    this.camera.aspect = window.innerWidth / window.innerHeight;
-    this.camera.updateProjectionMatrix();
+    const [width, height] = [window.innerWidth, window.innerHeight];
+    const [right, below] = covered();
+    this.stage.resize(ratio, width, height);
+    this.camera.setViewOffset(width, height, right / 2, below / 2, width, height);
   }
 
   // --- the budget
@@ -115,42 +111,41 @@ class View {
     this.place = Math.max(0, Math.min(1, place));
     const budget = this.budgetAt(this.place);
     // A cut of all leaves needs no more than that, but Spark stops a little before its budget.
-    this.spark.lodSplatCount = all ? 2 * budget : budget;
+    this.stage.budget = all ? 2 * budget : budget;
     element('budget').value = String(BUDGET_STEPS * this.place);
     element('budget').disabled = !trees;
     element('budget-text').textContent = trees ? (all ? `${whole(budget)} (all)` : whole(budget)) : 'no tree';
   }
 
   firstBudget() {
-    const budget = this.settings.budget ?? this.spark.defaultSplatTarget();
+    const budget = this.settings.budget ?? this.stage.defaultBudget;
     const most = this.budgetAt(1);
     this.setBudget(Math.log(budget / LEAST_BUDGET) / Math.log(most / LEAST_BUDGET));
     // As it was given, which the slider's steps might miss.
-    if (budget < most) this.spark.lodSplatCount = budget;
+    if (budget < most) this.stage.budget = budget;
     if (budget < most && this.treeSplats) element('budget-text').textContent = whole(budget);
   }
 
   // --- colours, files
 
   setLevels(on) {
-    this.colors.on = on;
+    this.stage.colorsByLevel = on;
     element('levels').checked = on;
     element('legend').hidden = !on;
-    for (const { mesh } of this.files) mesh?.updateVersion();
   }
 
   async setBuild(on) {
     const plain = this.files.filter((shown) => !shown.isTree);
     for (const shown of plain) shown.builds = on;
     this.setBudget(this.place);
-    await Promise.all(plain.map((shown) => shown.load(this.group)));
+    await Promise.all(plain.map((shown) => shown.load()));
   }
 
   // --- camera paths
 
   async drop(files) {
     try {
-      this.play(await readPath(files, this.settings.cameras), files[0].name);
+      this.play(await readPath(files, this.settings.cameras, this.settings.up), files[0].name);
     } catch (error) {
       notice(`${files[0].name} cannot be played: ${error.message}`);
     }
@@ -192,7 +187,7 @@ class View {
     this.last = now;
     this.player.update(passed / 1000);
     this.controls.update(passed / 1000);
-    this.renderer.render(this.scene, this.camera);
+    this.stage.draw(this.camera);
     if (passed > 0) this.frameTime = this.frameTime === null ? passed : this.frameTime + SMOOTHING * (passed - this.frameTime);
     this.report();
   }
@@ -201,14 +196,11 @@ class View {
     const set = (id, text) => {
       if (element(id).textContent !== text) element(id).textContent = text;
     };
-    set('drawn', whole(this.spark.activeSplats));
+    set('drawn', whole(this.stage.drawn));
     if (this.frameTime) set('frame-time', `${this.frameTime.toFixed(1)} ms, ${Math.round(1000 / this.frameTime)} a second`);
-    const paged = this.files.filter((shown) => shown.paged);
-    element('chunks-row').hidden = !paged.length;
-    if (paged.length) {
-      const resident = this.spark.pager?.pageToSplatsChunk.filter(Boolean).length ?? 0;
-      set('chunks', `${whole(resident)} of ${whole(paged.reduce((sum, { file }) => sum + file.chunks, 0))}`);
-    }
+    const { chunks } = this.stage;
+    element('chunks-row').hidden = !chunks;
+    if (chunks) set('chunks', chunks.map(whole).join(' of '));
     const text = cameraText(this.cameraNow(), this.radius);
     if (element('camera').value !== text) element('camera').value = text;
     if (!this.player.frames) return;
@@ -231,20 +223,22 @@ function listUps(up) {
   element('up').replaceChildren(...options);
 }
 
-export async function view(settings) {
-  const page = new View(settings);
+export async function view(settings, Stage) {
+  const page = new View(settings, Stage);
   const { versions, source } = settings.libraries;
   const names = Object.entries(versions).map(([name, version]) => `${name} ${version}`);
   element('about').textContent = `sparklod ${settings.version}, ${names.join(', ')} from ${source}`;
   element('title').textContent = element('title').title = settings.title;
   element('build-row').hidden = page.files.every((shown) => shown.isTree);
   element('pixels-row').hidden = window.devicePixelRatio === 1;
-  page.colors.drawLegend(element('legend-bar'), element('legend-marks'));
+  drawLegend(page.stage.legend);
   listUps(settings.up);
+  clearMessage();
+  showPanel(true);
   page.reset();
   page.firstBudget();
 
-  const hide = () => (element('panel').hidden = !element('panel').hidden);
+  const hide = () => showPanel(element('panel').hidden);
   const help = () => element('help').showModal();
   const clicks = {
     orbit: () => page.setMode('orbit'),
@@ -254,6 +248,8 @@ export async function view(settings) {
     play: () => page.togglePlay(),
     'path-close': () => page.leavePath(),
     'help-open': help,
+    'panel-hide': hide,
+    'panel-show': hide,
   };
   const changes = {
     budget: ({ value }) => page.setBudget(value / BUDGET_STEPS),
@@ -267,7 +263,7 @@ export async function view(settings) {
     o: clicks.orbit,
     f: clicks.fly,
     0: clicks.reset,
-    l: () => page.setLevels(!page.colors.on),
+    l: () => page.setLevels(!page.stage.colorsByLevel),
     '[': () => page.setBudget(page.place - 0.05),
     ']': () => page.setBudget(page.place + 0.05),
     c: clicks.copy,
@@ -278,11 +274,10 @@ export async function view(settings) {
   listen(clicks, changes, keys, (event, isDown) => page.controls.key(event, isDown));
   onDrop((files) => page.drop(files));
   window.addEventListener('resize', () => page.resize());
+  new ResizeObserver(() => page.resize()).observe(element('panel'));
 
-  clearMessage();
-  element('panel').hidden = false;
-  page.renderer.setAnimationLoop((now) => page.frame(now));
+  page.stage.loop((now) => page.frame(now));
   if (settings.path) page.play(settings.path, settings.path.format);
   window.sparklod = page; // for whoever looks closer, in the console or in a test
-  await Promise.all(page.files.map((shown) => shown.load(page.group)));
+  await Promise.all(page.files.map((shown) => shown.load()));
 }

@@ -68,7 +68,7 @@ def test_damage_is_found(store: AddressStore) -> None:
 
 
 def test_what_is_missing_is_said(store: AddressStore) -> None:
-    with pytest.raises(ScratchError, match=r"cannot read in the scratch folder memory://.*: no such file; choose"):
+    with pytest.raises(ScratchError, match=r"stage/1 is missing in .* memory://.*; begin anew with --overwrite"):
         store.get("stage/1")
 
 

@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 
+pytest.importorskip("cryptography")
 pytest.importorskip("distributed")
 
 import distributed

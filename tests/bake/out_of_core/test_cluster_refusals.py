@@ -12,6 +12,7 @@ import pytest
 
 pytest.importorskip("distributed")
 
+import dask
 import distributed
 
 from sparklod_cli.bake.out_of_core import cluster as module
@@ -30,9 +31,9 @@ def scheduler() -> Any:
         yield from _scheduler()
 
 
-def _scheduler() -> Any:
+def _scheduler(**how: Any) -> Any:
     own = distributed.LocalCluster(
-        n_workers=1, threads_per_worker=1, processes=False, protocol="tcp", dashboard_address=None
+        n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None, **(how or {"protocol": "tcp"})
     )
     try:
         yield own
@@ -49,7 +50,31 @@ def test_a_scheduler_that_runs_is_used_and_left_alone(scheduler: Any, tmp_path: 
         with cluster(ClusterSettings(scheduler=address), say=said.append) as engine:
             engine.run("building", tasks, job, silent)
         assert job.store.has(tasks[-1].name)
-    assert len(said) == 2 and "dashboard" in said[0]
+    assert len(said) == 4 and "dashboard" in said[0]
+    assert said[1].startswith(f"tcp://{address} asks for no credentials: anybody who reaches it can run programs")
+
+
+def test_a_scheduler_with_certificates_is_used_with_those_of_dask_s_settings(tmp_path: Path) -> None:
+    pytest.importorskip("cryptography")
+    own, job, said = distributed.Security.temporary(), Job(FolderStore(tmp_path)), list[str]()
+    of_dask = "distributed.comm.tls"
+    names = {
+        f"{of_dask}.ca-file": own.tls_ca_file,
+        f"{of_dask}.client.cert": own.tls_client_cert,
+        f"{of_dask}.client.key": own.tls_client_key,
+    }
+    with module._quiet(), contextlib.contextmanager(_scheduler)(protocol="tls", security=own) as running:
+        settings = ClusterSettings(scheduler=running.scheduler_address)
+        with pytest.raises(SparklodError, match=r"^tls://.* asks for a certificate; set DASK_"), cluster(settings):
+            pass
+        lost = dask.config.set({f"{of_dask}.ca-file": "lost.pem", f"{of_dask}.client.cert": "lost.pem"})
+        with lost, pytest.raises(SparklodError, match=r"^a file that DASK_.* name cannot be read"), cluster(settings):
+            pass
+        tasks = tree_of(4)
+        with dask.config.set(names), cluster(settings, say=said.append) as engine:
+            engine.run("building", tasks, job, silent)
+    assert job.store.has(tasks[-1].name)
+    assert len(said) == 1 and "dashboard" in said[0]
 
 
 def test_a_scheduler_that_goes_away_keeps_what_is_done(scheduler: Any, tmp_path: Path) -> None:

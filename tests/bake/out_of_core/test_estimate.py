@@ -37,6 +37,11 @@ def test_more_splats_and_more_coefficients_take_more(method: str, splats: int, d
     assert estimate.block_splats_within(None, method, splats, degree) == estimate.MOST_BLOCK_SPLATS
 
 
+@pytest.mark.parametrize("method", METHODS)
+def test_five_million_splats_are_baked_in_600_mb(method: str) -> None:
+    assert estimate.block_splats_within(600_000_000, method, 5_000_000, 0, in_chunks=True, threads=2) is not None
+
+
 def test_by_default_a_bake_takes_a_share_of_what_is_available(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(machine, "available_memory", lambda: 8_000_000_000)
     assert estimate.default_memory() == 6_000_000_000

@@ -20,6 +20,7 @@ from sparklod_cli.cameras.formats.table import FORMATS
 from sparklod_cli.cameras.frame import Settings
 from sparklod_cli.cameras.path import read
 from sparklod_cli.support.errors import CameraPathError
+from sparklod_cli.support.optional import install_hint
 from tests.cameras.formats.test_same_cameras import CASES
 from tests.cameras.known import FOLDER, files_at, text_file
 
@@ -325,7 +326,9 @@ def test_broken_files_do_not_reach_open3d(name: str, content: str, said: str) ->
 
 def test_a_missing_open3d_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setitem(sys.modules, "open3d", None)
-    with pytest.raises(CameraPathError, match=r"the package open3d, which is not installed; pip install 'sparklod\["):
+    with pytest.raises(
+        CameraPathError, match=f"the package open3d, which is not installed: {re.escape(install_hint('render'))}"
+    ):
         read(files_at(FOLDER / "open3d.json"))
     broken = tmp_path / "open3d"
     broken.mkdir()

@@ -304,7 +304,7 @@ def test_sh_of_a_degree_that_is_missing_are_refused() -> None:
         ({"rgb_min": 1}, "rgb_min is 1, which is not below rgb_max, 1"),
         ({"ln_scale_max": -12}, "ln_scale_min is -12, which is not below ln_scale_max, -12"),
         ({"sh2_max": 0}, "sh2_max is 0; give a number above 0"),
-        ({"rgb_max": float("nan")}, "rgb_max is nan; give a finite number that float32 can hold"),
+        ({"rgb_max": float("nan")}, "rgb_max is nan; give a number whose magnitude is at most"),
     ],
 )
 def test_an_encoding_with_an_empty_range_is_refused(options: dict[str, float], told: str) -> None:

@@ -22,7 +22,7 @@ from sparklod_cli.model.gaussian import normalized_quat
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.sh import COEFFICIENTS
 from sparklod_cli.model.splats import COLUMNS, Splats
-from sparklod_cli.support.errors import FormatError
+from sparklod_cli.support.errors import FormatError, InvalidSplatsError
 from tests.conftest import FIXTURES
 from tests.scenes import random_splats
 
@@ -217,7 +217,7 @@ REFUSED = {
 @pytest.mark.parametrize("what", REFUSED)
 def test_what_sog_cannot_hold_is_refused_before_a_byte_is_written(what: str) -> None:
     scene, message = REFUSED[what]
-    with pytest.raises(FormatError, match=message):
+    with pytest.raises((FormatError, InvalidSplatsError), match=message):
         next(sog.encode(scene))
 
 

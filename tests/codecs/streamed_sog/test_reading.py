@@ -205,7 +205,11 @@ REFUSED_LEVELS: dict[str, tuple[Callable[[Any], object], str]] = {
     "a node with both": (lambda meta: meta["tree"].update(lods={}), "tree has 2 children and lods; a node has two"),
     "no bound": (
         lambda meta: first_leaf(meta).pop("bound"),
-        r"tree\.children\[0\] has no bound of six finite numbers",
+        r"tree\.children\[0\] has no bound of six numbers that are finite in float32",
+    ),
+    "a bound beyond float32": (
+        lambda meta: first_leaf(meta)["bound"]["max"].__setitem__(0, 1e39),
+        r"tree\.children\[0\] has no bound of six numbers that are finite in float32",
     ),
     "three children": (
         lambda meta: meta["tree"]["children"].append({"bound": meta["tree"]["bound"], "lods": {}}),

@@ -72,14 +72,14 @@ def test_each_chunk_is_the_sog_of_its_runs_side_by_side() -> None:
             seen.add(folder + other)
         assert len({level for *_, level in runs}) == 1
     assert scene.environment is not None
-    around = {f"env/{name}": data for name, data in sog.encode_files(Scene(scene.environment))}
+    around = {"env/env.sog": b"".join(sog.encode(Scene(scene.environment)))}
     assert {name: files[name] for name in around} == around
     assert files.keys() == seen | around.keys() | {"lod-meta.json"}
 
 
 def test_a_chunk_is_closed_when_it_has_more_splats_than_wanted() -> None:
     assert [name for name in files_of(detail_scene()) if name.endswith("meta.json")] == [
-        *("0_0/meta.json", "0_1/meta.json", "1_0/meta.json", "2_0/meta.json", "env/meta.json", "lod-meta.json")
+        *("0_0/meta.json", "0_1/meta.json", "1_0/meta.json", "2_0/meta.json", "lod-meta.json")
     ]  # of 40 + 1 + 30, 25, 22 and 18 splats
 
 

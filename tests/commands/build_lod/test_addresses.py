@@ -111,7 +111,7 @@ def test_what_cannot_be_is_said(scan: Address, folder: Address, capsys: pytest.C
     for arguments, said in (
         ([folder / "none.ply"], f"{folder}/none.ply: cannot be read: no such file"),
         ([SMALL, "-o", "https://host/x.spz?secret=1"], "cannot write https://host/x.spz?***: https:// is for reading"),
-        (["s4://bucket/scan.ply"], "nothing is known that opens addresses of s4://"),
+        (["s4://bucket/scan.ply"], "addresses of s4:// cannot be opened"),
         ([scan, "-o", scan.parent / "scan.png"], "trees are written as SPZ, RAD or Streamed SOG, not as .png"),
     ):
         assert build(*(each.url if isinstance(each, Address) else each for each in arguments)) != 0

@@ -159,7 +159,10 @@ def test_what_an_instance_says_to_viewers_is_said_to_be_left_out(
         (["a.ply", "--merge", "-o", "x.spz", "--rgba", "c.npy"], "--rgba cannot be used with --merge"),
         (["a.ply", "--scene", "b.json", "-o", "x.spz"], "INPUT cannot be used with --scene, which names the files"),
         (["--merge", "-o", "x.spz"], "Missing argument 'INPUT...'"),
-        (["a.ply", "b.ply", "-o", "x.spz"], "--output takes one input, not 2; use --output-dir"),
+        (
+            ["a.ply", "b.ply", "-o", "x.spz"],
+            "--output takes one input, not 2; add --merge to bake them as one scene, or name a folder",
+        ),
     ],
 )
 def test_contradictions_are_refused(arguments: list[str], text: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -109,6 +109,30 @@ def test_a_tree_is_the_same_in_the_other_format(
     np.testing.assert_array_equal(rows(read_scene(tmp_path / "many.rad")), rows(there))
 
 
+@pytest.mark.parametrize("foreign", [False, True])
+def test_only_another_container_keeps_every_byte_of_the_chunks(large: Path, tmp_path: Path, foreign: bool) -> None:
+    whole, many, back = (tmp_path / name / "x.rad" for name in ("whole", "many", "back"))
+    if foreign:  # other encodings and ranges than ours, and a palette
+        shutil.copytree(FIXTURES / "golden" / "sh3-rad", many.parent)
+        many = many.with_name("sh3.rad")
+        assert build(many, "--format", "rad", "-o", whole) == 0
+    else:
+        assert build(large, "--cluster-sh", 100, "--rad-scales", "f32", "-o", whole) == 0
+        assert build(whole, "--format", "rad-chunked", "-o", many) == 0
+    chunks = [path.read_bytes() for path in sorted(many.parent.glob("*.radc"))]
+    assert whole.read_bytes().endswith(b"".join(chunks))
+    assert build(many, "--format", "rad", "-o", back) == 0
+    assert back.read_bytes() == whole.read_bytes()
+    assert np.array_equal(rows(read_scene(many)), rows(read_scene(whole)))
+
+
+def test_other_encodings_can_be_chosen_with_another_container(large: Path, tmp_path: Path) -> None:
+    assert build(large, "-o", tmp_path / "x.rad") == 0
+    assert build(tmp_path / "x.rad", "--format", "rad-chunked", "--rad-scales", "f32", "-o", tmp_path / "y.rad") == 0
+    one, other = (read_scene(tmp_path / name) for name in ("x.rad", "y.rad"))
+    assert (one.coding.scales[0].name, other.coding.scales[0].name) == ("ln_0r8", "")
+
+
 def test_a_converted_tree_keeps_its_opacities(large: Path, tmp_path: Path) -> None:
     """Scales are rounded to other codes; those of opacities are the same in both formats."""
     assert build(large, "-o", tmp_path / "there.rad") == 0
@@ -154,7 +178,7 @@ def test_a_tree_is_refused_where_nothing_is_to_be_converted(tmp_path: Path, caps
     ]
     capsys.readouterr()
     for source, options, hint in refused:
-        assert build(source, "-o", tmp_path / "out", *options) == 1
+        assert build(source, "--output-dir", tmp_path / "out", *options) == 1
         said = (
             f"it is a Level-of-Detail file already; --unlod writes its splats back out, and --format {hint}; --refine"
         )
@@ -212,17 +236,13 @@ def test_the_splats_of_a_rad_are_written_back_out(
     capsys.readouterr()
 
 
-def test_what_is_clamped_is_said_with_the_range_of_the_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_centres_that_float16_does_not_reach_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     splats = random_splats(40)
     splats.center[3] = 1e6
     source = tmp_path / "far.rad"
     source.write_bytes(b"".join(rad.encode(Scene(splats), WriteOptions())))
-    assert build(source, "-o", tmp_path / "out.rad", "--rad-center", "f16", "--json") == 0
-    out, err = capsys.readouterr()
-    record = json.loads(out)
-    assert record["clamped"]["center"] > 0
-    assert ("center", True, 65504.0) in {(each["column"], each["above"], each["end"]) for each in record["clamps"]}
-    assert "are beyond ±6.55e+04, up to 1e+06, and are clamped to what RAD holds: --rad-center f32_lebytes keeps" in err
+    assert build(source, "-o", tmp_path / "out.rad", "--rad-center", "f16") == 1
+    assert "coordinates reach 1e+06, and f16 holds less than 65504" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("value", "encoding"), [(5e4, "f16"), (1e6, "f32")])
@@ -234,10 +254,10 @@ def test_the_encoding_that_is_advised_holds_the_values(
     getattr(splats, column)[3] = value
     source = tmp_path / "bright.rad"
     source.write_bytes(b"".join(rad.encode(Scene(splats), WriteOptions(rad=RadOptions(rgb="f32", sh="f32")))))
-    assert build(source, "-o", tmp_path / "out.rad", "--rad-rgb", "r8", "--rad-sh", "s8") == 0
+    assert build(source, "-o", tmp_path / "out.rad", "--rad-rgb", "r8", "--rad-sh", "s8", "-v") == 0
     assert f"--rad-{column} {encoding} keeps them" in capsys.readouterr().err
     advised = ("--rad-rgb", encoding, "--rad-sh", encoding)
-    assert build(source, "-o", tmp_path / "out.rad", "-f", *advised) == 0
+    assert build(source, "-o", tmp_path / "out.rad", "-f", "-v", *advised) == 0
     assert "keeps them" not in capsys.readouterr().err
 
 

@@ -11,7 +11,8 @@ import pytest
 
 from sparklod_cli.bake.out_of_core import estimate
 from sparklod_cli.bake.out_of_core.manifest import SUFFIX
-from tests.commands.build_lod.runs import build
+from sparklod_cli.io import read_scene
+from tests.commands.build_lod.runs import SMALL, build
 from tests.conftest import FIXTURES
 
 DEMO = FIXTURES / "demo.ply"
@@ -32,10 +33,11 @@ def test_what_does_not_fit_goes_out_of_core_and_gives_the_same_bytes(
     tmp_path: Path, suffix: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     whole, pieces, scratch = (tmp_path / name for name in (f"a{suffix}", f"b{suffix}", "scratch"))
-    assert build(DEMO, "-o", whole, "--json") == 0
+    assert build(DEMO, "-o", whole, "--json", "--up", "-y") == 0
     record = json.loads(capsys.readouterr().out)
     assert (record["blocks"], record["scratch_bytes_written"], record["scratch_bytes_read"]) == (None, None, None)
-    assert build(DEMO, "-o", pieces, "--memory", "3.2M", "--scratch-dir", scratch, "--json", "-v") == 0
+    options = ("--up", "-y", "--memory", "3.2M", "--scratch-dir", scratch, "--json", "-v")
+    assert build(DEMO, "-o", pieces, *options) == 0
     out, err = capsys.readouterr()
     record = json.loads(out)
     assert record["blocks"] > 1
@@ -49,7 +51,8 @@ def test_what_does_not_fit_goes_out_of_core_and_gives_the_same_bytes(
     )
     assert re.search(rf"out of core in {record['blocks']} blocks; scratch: .* MB written, .* MB read", err)
     assert whole.read_bytes() == pieces.read_bytes()
-    assert list(scratch.iterdir()) == []
+    assert read_scene(pieces).up == "y"
+    assert not scratch.exists()
 
 
 @pytest.mark.usefixtures("small_blocks")
@@ -93,14 +96,16 @@ def test_standard_input_is_baked_out_of_core(
     out, err = capsysbinary.readouterr()
     assert b"standard input: goes out of core" in err
     assert out == (tmp_path / "a.spz").read_bytes()
-    assert list((tmp_path / "scratch").iterdir()) == []
+    assert not (tmp_path / "scratch").exists()
 
 
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
         (["--memory", "much"], "'much' is not a size"),
-        (["--memory", "0"], "'0' is no memory to work in"),
+        (["--memory", "0B"], "'0B' is no memory to work in"),
+        (["--memory", "4"], "'4' has no unit; write 4G or 4MB"),
+        (["--memory", "600000000"], "'600000000' has no unit"),
         (["--unlod", "--memory", "1G"], "--memory cannot be used with --unlod"),
         (["--unlod", "--resume"], "--resume cannot be used with --unlod"),
         (["--unlod", "--skip-existing"], "--skip-existing cannot be used with --unlod"),
@@ -136,3 +141,16 @@ def test_scenes_that_are_there_are_skipped(tmp_path: Path, capsys: pytest.Captur
     assert second["sh_degree"] == 3
     assert f"{scenes[0]}  ->  {tmp_path / 'web' / 'a-lod.spz'}  is there already" in err
     assert not list(tmp_path.rglob(f"*{SUFFIX}"))
+
+
+def test_a_value_of_skip_existing_follows_after_an_equals_sign_only(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    target = tmp_path / "a.spz"
+    assert build("--skip-existing", SMALL, "-o", target) == 0
+    first = target.stat().st_mtime_ns
+    for option in ("--skip-existing", "--skip-existing=verify"):
+        assert build(option, "-o", target, "--", SMALL) == 0
+        assert target.stat().st_mtime_ns == first
+    assert build("--skip-existing=dates", SMALL, "-o", target) == 2
+    assert "'dates' is not one of 'date', 'verify'" in capsys.readouterr().err

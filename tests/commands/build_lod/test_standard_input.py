@@ -77,7 +77,7 @@ def test_errors_name_standard_input(
 def test_standard_input_without_an_output_is_wrong_usage(capsys: pytest.CaptureFixture[str]) -> None:
     for arguments in (["-"], ["-", "--output-dir", "web"], ["-", SMALL]):
         assert build(*arguments) == 2
-        assert "standard input has no name to derive one from; give --output" in capsys.readouterr().err
+        assert "standard input has no name to derive one from; name the output file" in capsys.readouterr().err
 
 
 def test_a_terminal_as_standard_input_is_refused(

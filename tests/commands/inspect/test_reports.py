@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from sparklod_cli.cli import run
-from sparklod_cli.figures import tree_plot
+from sparklod_cli.figures import pyvista_scene, tree_plot
 from tests.commands.inspect.runs import BROKEN, CORRUPT, MISSING, NOTED, PLAIN, TREE, WARNED, Said, inspect, records
 from tests.conftest import FIXTURES, ROOT
 
@@ -173,6 +173,7 @@ def test_the_paths_of_page_and_picture_are_printed(
         return tree_plot.Picture(b"\x89PNG" * 100, "all leaves: 6 nodes; coloured by level")
 
     monkeypatch.setattr(tree_plot, "plot", drawn)
+    monkeypatch.setattr(pyvista_scene, "load_pyvista", lambda: None)  # which may be missing
     page, picture = tmp_path / "page.html", tmp_path / "picture.png"
     assert inspect(TREE, "--plot", picture, "--html", page) == 0
     first, second = capsys.readouterr().err.splitlines()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -59,7 +60,7 @@ from tests.commands.render.runs import CAMERAS, FAULTS, PLAIN, SIZE, TREE, Said,
         ([TREE, "--through", "ply"], "--through"),
         ([TREE, "--backend", "cuda"], "--backend"),
         ([TREE, "-o", "x.tif"], "--output x.tif does not end in .png, .jpg, .webp, .npy, .gif, .mp4 or .webm"),
-        ([TREE, "-o", "x"], "--output x does not end in .png"),
+        ([TREE, "-o", "x"], "--output x has no suffix to tell the format; end it in .png"),
         ([TREE, "--orbit", "3", "-o", "x.png"], "there are 3 cameras: write frames (x.%04d.png)"),
         ([TREE, "--orbit", "3", "-o", "-"], "standard output takes one picture, not 3"),
         ([TREE, "--orbit", "3", "-o", "%d.%d.png"], "does not name frames"),
@@ -168,6 +169,19 @@ def test_cameras_that_see_nothing_give_a_warning(tmp_path: Path, capsys: Said) -
     assert capsys.readouterr().err == ""
 
 
-def test_a_budget_for_files_without_a_tree_gives_a_warning(tmp_path: Path, capsys: Said) -> None:
-    assert render(PLAIN, *SIZE, "--budget", 50, "-o", tmp_path / "x.png") == 0
-    assert "no file has levels to choose, so all splats are drawn" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    "options",
+    [
+        ("--budget", "50"),
+        ("--preset", "quest"),
+        ("--lod-multiplier", "3"),
+        ("--bandwidth", "20Mbit", "--latency", "60ms", "--after", "1s"),
+    ],
+)
+def test_options_of_levels_are_refused_for_files_without(
+    options: tuple[str, ...], tmp_path: Path, capsys: Said
+) -> None:
+    assert render(PLAIN, *SIZE, *options, "-o", tmp_path / "x.png") == 2
+    err = capsys.readouterr().err
+    assert re.search(f"error: ({'|'.join(options)}) is for Level-of-Detail files, and no file is one", err)
+    assert not any(tmp_path.iterdir())

@@ -12,6 +12,7 @@ from PIL import Image
 
 from sparklod_cli.images.contact_sheet import cells
 from sparklod_cli.render.renderer import Renderer
+from sparklod_cli.support.optional import install_hint
 from tests.commands.render.runs import CAMERAS, DEMO, SIZE, TOWN, TREE, Said, pixels, render
 
 
@@ -82,7 +83,7 @@ def test_mp4_without_imageio_is_an_error_before_the_work(
     monkeypatch.setitem(sys.modules, "imageio", None)
     monkeypatch.setattr(Renderer, "draw", None)
     assert render(DEMO, "--orbit", 3, "-o", tmp_path / "x.mp4") == 1
-    assert "pip install 'sparklod[video]'" in capsys.readouterr().err
+    assert install_hint("video") in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
 

@@ -87,7 +87,7 @@ def test_views_are_of_visitors_of_their_own(town: Path, capsys: pytest.CaptureFi
         ((*SLOW, "--after", "1s", "--full"), "--full cannot be used with --after"),
         ((*SLOW, "--after", "1s", "--continuous"), "--continuous cannot be used with --after"),
         ((*SLOW, "--after", "1s", "--compare"), "--compare cannot be used with --after"),
-        ((*SLOW, "--after", "1"), "'1' is not a latency"),
+        ((*SLOW, "--after", "1"), "'1' is not a time"),
     ],
 )
 def test_what_does_not_go_together_is_refused(

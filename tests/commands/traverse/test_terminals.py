@@ -23,15 +23,21 @@ def test_a_terminal_gets_the_summary(monkeypatch: pytest.MonkeyPatch, capsys: Sa
         assert "splats drawn" not in err  # once is enough
 
 
-@pytest.mark.parametrize(
-    "asked", [("-o", "-"), ("--format", "csv"), ("--per-instance",), ("--no-timing",), ("--no-summary",)], ids=str
-)
-def test_a_terminal_gets_the_table_that_was_asked_for(
-    asked: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: Said
+@pytest.mark.parametrize("option", [("--format", "csv"), ("--per-instance",), ("--no-timing",)], ids=str)
+def test_a_terminal_gets_the_table_by_output_alone(
+    option: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: Said
 ) -> None:
     at_a_terminal(monkeypatch)
-    assert traverse(TOWN, *ORBIT, *asked) == 0
+    assert traverse(TOWN, *ORBIT, *option) == 2
+    assert f"{option[0]} is of the table, and a terminal gets the summary; redirect" in capsys.readouterr().err
+    assert traverse(TOWN, *ORBIT, *option, "-o", "-") == 0
     assert len({row["frame"] for row in table(capsys.readouterr().out)}) == 3
+
+
+def test_a_terminal_gets_no_summary_that_nobody_wants(monkeypatch: pytest.MonkeyPatch, capsys: Said) -> None:
+    at_a_terminal(monkeypatch)
+    assert traverse(TOWN, *ORBIT, "--no-summary") == 0
+    assert capsys.readouterr() == ("", "")
 
 
 def test_a_pipe_gets_the_table(capsys: Said) -> None:

@@ -1,4 +1,4 @@
-"""Shows scenes in the pages of docs/playcanvas.md, in headless Chromium."""
+"""Shows scenes in the pages of docs/playcanvas.md and docs/spark.md, in headless Chromium."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from sparklod_cli.cameras.camera import Camera
 from tests.interop.engines import recipes
@@ -114,6 +115,14 @@ class Browser:
         else:
             html = recipes.babylon_of_one_file(file.name)
         return self._show(recipes.replaced(html, changes or {}), "babylon.js", file, camera, view)
+
+    def still(self, html: str, folder: Path, size: tuple[int, int]) -> NDArray[np.float64]:
+        """(height, width, 3) what a page shows by itself of the files of a folder, 0..1."""
+        width, height = size
+        self._node.ask({"do": "open", "html": html, "folder": str(folder), "width": width, "height": height})
+        self._node.ask({"do": "still", "out": f"{self._out}.png"})
+        with Image.open(f"{self._out}.png") as image:
+            return np.asarray(image.convert("RGB"), np.float64) / 255
 
     def _show(self, html: str, driver: str, file: Path, camera: Camera, view: dict[str, Any]) -> Shown:
         size = {"width": camera.width, "height": camera.height}

@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+import dataclasses
+import functools
 import json
 import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import sparklod_cli
+from fixtures import demo_scene
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.codecs.streamed_sog import codec
 from sparklod_cli.io import detail_sink, read_scene
 from sparklod_cli.lod import detail_levels, quality
 from sparklod_cli.lod.detail_settings import DetailSettings
+from sparklod_cli.model.detail import DetailScene
 from sparklod_cli.model.splats import Splats
 from tests.conftest import FIXTURES
 from tests.interop import npm
@@ -34,7 +39,7 @@ class Shot:
 
     Attributes:
         file: lod-meta.json of three levels in several chunks and regions.
-        splats: of level 0.
+        splats: of level 0 and the environment.
         camera: sees all of them from the side, upright where -y of the file is up.
     """
 
@@ -81,12 +86,41 @@ def splat_transform(engines_dir: Path, tmp_path_factory: pytest.TempPathFactory)
 @pytest.fixture(scope="session")
 def shot(tmp_path_factory: pytest.TempPathFactory) -> Shot:
     """The demo scene, in which up, left and front differ, as Streamed SOG."""
-    file = tmp_path_factory.mktemp("web") / recipes.MANIFEST
-    settings = DetailSettings((0.25, 0.05), chunk_splats=8_000, extent=4, min_splats=2_000)
-    scene = detail_levels.make(*quality.build(read_scene(FIXTURES / "demo.ply").splats, 2.0), settings)
-    detail_sink(file, overwrite=False)(codec.encode_files(scene, WriteOptions(), settings))
-    splats = read_scene(file).splats
-    return Shot(file, splats, cameras_around(splats.center, *SIZE)[1])
+    return written(detailed(), tmp_path_factory.mktemp("web"))
+
+
+@pytest.fixture(scope="session")
+def shot_with_sky(tmp_path_factory: pytest.TempPathFactory) -> Shot:
+    """The same scene with an environment, which is in its splats."""
+    return written(dataclasses.replace(detailed(), environment=sky()), tmp_path_factory.mktemp("web"))
+
+
+#: How the demo scene is divided into levels, regions and chunks.
+DETAIL = DetailSettings((0.25, 0.05), chunk_splats=8_000, extent=4, min_splats=2_000)
+
+
+@functools.cache
+def detailed() -> DetailScene:
+    """Return the demo scene at several detail levels, which notes the axis that points up."""
+    scene = detail_levels.make(*quality.build(read_scene(FIXTURES / "demo.ply").splats, 2.0), DETAIL)
+    return dataclasses.replace(scene, up="-y")
+
+
+def sky() -> Splats:
+    """Return the far sky of the demo scene."""
+    made = demo_scene.sky()
+    quat_xyzw = made["quat_wxyz"][:, [1, 2, 3, 0]]
+    no_sh = np.empty((len(quat_xyzw), 0, 3))
+    columns = made["center"], np.exp(made["log_scale"]), quat_xyzw, made["opacity"], made["rgb"], no_sh
+    return Splats(*(np.array(column, np.float32, order="C") for column in columns))
+
+
+def written(scene: DetailScene, folder: Path, size: tuple[int, int] = SIZE) -> Shot:
+    """Write a scene as Streamed SOG, and return it with a camera that sees the demo scene."""
+    file = folder / recipes.MANIFEST
+    detail_sink(file, overwrite=False)(codec.encode_files(scene, WriteOptions(), DETAIL))
+    level = slice(0, int(scene.counts[:, 0].sum()))
+    return Shot(file, read_scene(file).splats, cameras_around(scene.splats.center[level], *size)[1])
 
 
 @pytest.fixture(scope="session")

@@ -3,12 +3,13 @@
 //
 // A request a line on stdin, an answer a line on stdout:
 //   {do: 'open', html, driver, folder, width, height}
-//                       a new page, which is `html` with this folder's script `driver` behind it; what it loads comes
+//                       a new page, which is `html` with this folder's script `driver`, if any, behind it; what it loads comes
 //                       from `folder` or from node_modules: {}
 //   {do: 'draw', camera, out}
 //                       waits until the page has loaded everything, and draws what `camera` sees, which the driver
 //                       understands, to the file `out`: RGBA, a byte each, the lower row first. {frames, ...}, what the
 //                       driver says of the frames until then
+//   {do: 'still', out}  writes a PNG of a page without a driver, once it shows something and that stays as it is: {}
 //   {do: 'requests'}    {requests}: the files of `folder` that the page asked for since it was opened, in order:
 //                       {name, bytes, milliseconds}, since the first one
 // and {error} where it fails.
@@ -46,8 +47,11 @@ const server = createServer((request, response) => {
   if (!path.startsWith('/node_modules/') && !path.startsWith('/drivers/'))
     requests.push({ name: path.slice(1), bytes: size, at: performance.now() });
   response.setHeader('content-type', TYPES[extname(file)] ?? 'application/octet-stream');
-  response.setHeader('content-length', size);
-  createReadStream(file).pipe(response);
+  const range = /^bytes=(\d+)-(\d*)$/.exec(request.headers.range ?? '');
+  const [start, end] = range ? [Number(range[1]), Math.min(Number(range[2] || size), size - 1)] : [0, size - 1];
+  if (range) response.writeHead(206, { 'content-range': `bytes ${start}-${end}/${size}` });
+  else response.setHeader('content-length', size);
+  createReadStream(file, { start, end }).pipe(response);
 });
 await new Promise((done) => server.listen(0, '127.0.0.1', done));
 
@@ -58,19 +62,29 @@ let tab;
 const actions = {
   async open({ html: page, driver, folder: from, width, height }) {
     await tab?.close();
-    html = `${page}<script type="module" src="/drivers/${driver}"></script>`;
+    html = driver ? `${page}<script type="module" src="/drivers/${driver}"></script>` : page;
     [folder, requests, failures] = [from, [], []];
     tab = await browser.newPage({ viewport: { width, height } });
     tab.on('console', (message) => console.error(message.text()));
     tab.on('pageerror', (error) => failures.push(String(error?.stack ?? error)));
     await tab.goto(`http://127.0.0.1:${server.address().port}`);
-    await tab.waitForFunction('window.draw');
+    if (driver) await tab.waitForFunction('window.draw');
     return {};
   },
   async draw({ camera, out }) {
     const { pixels, ...found } = await tab.evaluate((given) => window.draw(given), camera);
     writeFileSync(out, Buffer.from(pixels, 'base64'));
     return found;
+  },
+  async still({ out }) {
+    const empty = await tab.screenshot();
+    for (let before = empty; ; ) {
+      await tab.waitForTimeout(1000);
+      const now = await tab.screenshot({ path: out });
+      if (failures.length) throw new Error('the page failed');
+      if (now.equals(before) && !now.equals(empty)) return {};
+      before = now;
+    }
   },
   async requests() {
     return { requests: requests.map(({ name, bytes, at }) => ({ name, bytes, milliseconds: at - requests[0].at })) };

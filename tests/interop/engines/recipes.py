@@ -1,4 +1,4 @@
-"""The pages that docs/playcanvas.md gives its readers."""
+"""The pages that docs/playcanvas.md and docs/spark.md give their readers."""
 
 from __future__ import annotations
 
@@ -10,14 +10,16 @@ from tests.conftest import ROOT
 
 #: Headings of the engines' sections.
 PLAYCANVAS, SUPERSPLAT, BABYLON = "PlayCanvas", "SuperSplat's viewer", "Babylon.js"
+#: Headings in docs/spark.md: of its page, and of the lines that change where a tree is streamed.
+SPARK, STREAMED = "A page", "Streamed"
 #: Names of the scene in the pages.
-MANIFEST, SOG = "lod-meta.json", "scene.sog"
+MANIFEST, SOG, TREE, RAD = "lod-meta.json", "scene.sog", "scene-lod.spz", "scene-lod.rad"
 
 
 @cache
-def blocks(heading: str, language: str) -> tuple[str, ...]:
-    """The blocks of code of a language in a section."""
-    text = (ROOT / "docs" / "playcanvas.md").read_text(encoding="utf-8")
+def blocks(heading: str, language: str, document: str = "playcanvas.md") -> tuple[str, ...]:
+    """The blocks of code of a language in a section of a document."""
+    text = (ROOT / "docs" / document).read_text(encoding="utf-8")
     (section,) = re.findall(rf"^## {re.escape(heading)}\n(.*?)(?=^## |\Z)", text, re.DOTALL | re.MULTILINE)
     return tuple(re.findall(rf"^```{language}\n(.*?)^```", section, re.DOTALL | re.MULTILINE))
 
@@ -33,6 +35,17 @@ def babylon_of_one_file(name: str = SOG) -> str:
     html = page(BABYLON)
     (lines,) = blocks(BABYLON, "js")
     return replaced(html[: html.index("  const metadata")] + lines + "</script>", {SOG: name})
+
+
+def spark(*, streamed: bool) -> str:
+    """The page of Spark, for a tree that is loaded as a whole or streamed."""
+    (html,) = blocks(SPARK, "html", "spark.md")
+    if not streamed:
+        return html
+    (lines,) = blocks(STREAMED, "js", "spark.md")
+    first = next(line for line in html.splitlines() if "new SparkRenderer(" in line)
+    second = next(line for line in html.splitlines() if "new SplatMesh(" in line)
+    return replaced(html, {f"{first}\n{second}\n": lines})
 
 
 def replaced(html: str, changes: Mapping[str, str]) -> str:

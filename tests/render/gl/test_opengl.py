@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -15,6 +16,7 @@ from sparklod_cli.render.backends import BackendError
 from sparklod_cli.render.gl import context, osmesa
 from sparklod_cli.render.settings import RasterSettings
 from sparklod_cli.support.errors import SparklodError
+from sparklod_cli.support.optional import install_hint
 from tests.render.gl.test_osmesa import CAMERAS, SPLATS, needs_opengl, opengl
 
 __all__ = ["opengl"]  # a fixture
@@ -69,7 +71,7 @@ def test_missing_libraries_are_named(tmp_path: Path) -> None:
 
 def test_the_extra_that_brings_moderngl_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "moderngl", None)
-    with pytest.raises(BackendError, match=r"pip install 'sparklod\[render\]'"):
+    with pytest.raises(BackendError, match=re.escape(install_hint("render"))):
         osmesa.open_context.__wrapped__()
 
 

@@ -1,26 +1,30 @@
-"""Whether splats are beyond doubt valid and visible, in one pass over their columns."""
+"""Whether splats are beyond doubt valid, and visible, in one pass over their columns."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from ...support.jit import kernel
+from ...support.jit_types import f4
 
 #: The largest finite float32.
 LARGEST = np.finfo(np.float32).max
 
 
-@kernel(nogil=True)
+@kernel(f4[:], f4[:], f4[:], f4[:], f4[:], f4[:], f4, nogil=True)
 def count_doubtful(center, scale, quat, opacity, rgb, sh, tolerance):
-    """How many tests fail of those that a splat passes which is valid and visible; 0 if all are.
+    """Count the tests of validity that splats fail, and the invisible ones; no test fails only if all are valid.
 
     Comparisons are written so that a NaN fails them; sums of their results are vectorized by LLVM.
 
     Args:
         center, scale, quat, opacity, rgb, sh: float32 columns as in `Splats`, each in one dimension.
         tolerance: of a rotation's squared length.
+
+    Returns:
+        failed tests, and splats without opacity or scale.
     """
-    doubtful = 0
+    doubtful = invisible = 0
     for column in (center, rgb, sh):
         for i in range(len(column)):
             doubtful += not abs(column[i]) <= LARGEST
@@ -28,6 +32,7 @@ def count_doubtful(center, scale, quat, opacity, rgb, sh, tolerance):
         x, y, z, w = quat[4 * i], quat[4 * i + 1], quat[4 * i + 2], quat[4 * i + 3]
         doubtful += not abs(x * x + y * y + z * z + w * w - np.float32(1)) <= tolerance
         a, b, c = scale[3 * i], scale[3 * i + 1], scale[3 * i + 2]
-        doubtful += not ((a >= 0) & (b >= 0) & (c >= 0) & (max(a, b, c) > 0) & (max(a, b, c) <= LARGEST))
-        doubtful += not ((opacity[i] > 0) & (opacity[i] <= LARGEST))
-    return doubtful
+        doubtful += not ((a >= 0) & (b >= 0) & (c >= 0) & (max(a, b, c) <= LARGEST))
+        doubtful += not ((opacity[i] >= 0) & (opacity[i] <= LARGEST))
+        invisible += (max(a, b, c) == 0) | (opacity[i] == 0)
+    return doubtful, invisible

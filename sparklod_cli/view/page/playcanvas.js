@@ -1,0 +1,123 @@
+// PlayCanvas in a canvas: what view.js draws Streamed SOG with. The members of Stage are those of spark.js.
+import * as pc from 'playcanvas';
+import { size, whole } from './text.js';
+
+/** The colours that PlayCanvas gives to detail levels, the finest first; it repeats them. */
+const COLORS = ['#f00', '#0f0', '#00f', '#ff0', '#f0f', '#0ff', '#ff8000', '#8000ff'];
+const UNDERFILL = 10; // coarser levels are drawn while finer ones load
+const REQUESTS = 100_000; // that the browser keeps the sizes of
+
+class ShownFile {
+  constructor(app, file, changed, failed) {
+    Object.assign(this, { file, changed, failed, visible: true, builds: false, isTree: true, loading: true, bad: false, state: '' });
+    const { href } = new URL(file.url, document.baseURI);
+    this.folder = href.slice(0, href.lastIndexOf('/') + 1);
+    this.asset = new pc.Asset(file.name, 'gsplat', { url: href });
+    this.asset.on('error', (error) => this.fail(error));
+    this.entity = new pc.Entity(file.name, app);
+    this.app = app;
+  }
+
+  load() {
+    this.entity.addComponent('gsplat', { asset: this.asset, unified: true });
+    this.app.assets.add(this.asset);
+    this.app.root.addChild(this.entity);
+    this.report();
+  }
+
+  /** Says what it is, and how much of it has arrived. */
+  report() {
+    if (this.bad) return;
+    const { bytes, format, levels, leaves } = this.file;
+    const arrived = performance.getEntriesByType('resource').filter(({ name }) => name.startsWith(this.folder));
+    const loaded = `${size(arrived.reduce((sum, entry) => sum + entry.encodedBodySize, 0))} of ${size(bytes)}`;
+    const state = this.loading ? `loading ${loaded}` : `${format}, ${loaded} loaded, ${levels} levels of ${whole(leaves)} splats`;
+    if (state === this.state) return;
+    this.state = state;
+    this.changed(this);
+  }
+
+  show(visible) {
+    this.visible = this.entity.enabled = visible;
+    this.changed(this);
+  }
+
+  fail(error) {
+    const text = String(error?.message ?? error);
+    Object.assign(this, { loading: false, bad: true, state: `cannot be shown: ${text}` });
+    this.changed(this);
+    this.failed(`${this.file.name} ${this.state}`);
+  }
+}
+
+export class Stage {
+  constructor(canvas) {
+    this.app = new pc.Application(canvas, { graphicsDeviceOptions: { antialias: false } });
+    this.app.setCanvasFillMode(pc.FILLMODE_NONE);
+    this.app.setCanvasResolution(pc.RESOLUTION_AUTO);
+    this.defaultBudget = this.app.scene.gsplat.splatBudget;
+    // As Spark draws: small splats are fainter rather than left out, and turning the camera changes no order.
+    const alike = { antiAlias: true, minPixelSize: 0, radialSorting: true };
+    Object.assign(this.app.scene.gsplat, alike, { lodUnderfillLimit: UNDERFILL });
+    this.camera = new pc.Entity('camera', this.app);
+    this.camera.addComponent('camera', { clearColor: pc.Color.BLACK });
+    this.app.root.addChild(this.camera);
+    this.chunks = null;
+    this.files = [];
+    performance.setResourceTimingBufferSize(REQUESTS);
+  }
+
+  add(file, changed, failed) {
+    this.files.push(new ShownFile(this.app, file, changed, failed));
+    return this.files.at(-1);
+  }
+
+  turn({ x, y, z, w }) {
+    for (const { entity } of this.files) entity.setLocalRotation(x, y, z, w);
+  }
+
+  resize(ratio, width, height) {
+    this.app.graphicsDevice.maxPixelRatio = ratio;
+    this.app.resizeCanvas(width, height);
+  }
+
+  loop(act) {
+    this.app.systems.gsplat.on('frame:ready', (_camera, _layer, ready, count) => {
+      if (ready && !count && this.drawn) for (const shown of this.files) shown.loading = false;
+      for (const shown of this.files) shown.report();
+    });
+    this.app.on('update', () => act(performance.now()));
+    this.app.start();
+  }
+
+  /** Places the camera of the frame that PlayCanvas is about to draw. */
+  draw({ position, quaternion, projectionMatrix, fov, near, far }) {
+    this.camera.setPosition(position.x, position.y, position.z);
+    this.camera.setRotation(quaternion.x, quaternion.y, quaternion.z, quaternion.w);
+    Object.assign(this.camera.camera, { fov, nearClip: near, farClip: far });
+    this.camera.camera.calculateProjection = (matrix) => matrix.data.set(projectionMatrix.elements);
+  }
+
+  get drawn() {
+    return this.app.stats.frame.gsplats;
+  }
+
+  set budget(splats) {
+    this.app.scene.gsplat.splatBudget = splats;
+  }
+
+  get colorsByLevel() {
+    return this.app.scene.gsplat.colorizeLod;
+  }
+
+  set colorsByLevel(on) {
+    this.app.scene.gsplat.colorizeLod = on;
+  }
+
+  get legend() {
+    const count = Math.max(...this.files.map(({ file }) => file.levels));
+    const levels = Array.from({ length: count }, (_, level) => level);
+    const colors = levels.map((level) => COLORS[level % COLORS.length]);
+    return { colors, marks: levels.map(String), text: 'Detail level of each region; 0 is full detail.' };
+  }
+}

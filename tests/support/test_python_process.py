@@ -1,0 +1,108 @@
+"""Processes of Python import what this process imports, and nothing from the current folder."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+import sparklod_cli
+from sparklod_cli import doctor
+from sparklod_cli.support.python_process import module_command, program_command
+from tests.conftest import ROOT
+
+#: Modules of each kind that a process may import: of the package, of the standard library, and of others.
+PLANTED = ("sparklod_cli", "json", "runpy", "numpy", "numba", "moderngl", "open3d", "vtkmodules", "imageio_ffmpeg")
+
+
+def probe_opengl() -> None:
+    pytest.importorskip("moderngl")
+    from sparklod_cli.render.gl import context
+
+    context.probe.__wrapped__("osmesa")
+
+
+def probe_pyvista() -> None:
+    pytest.importorskip("pyvista")
+    from sparklod_cli.figures import pyvista_scene
+
+    pyvista_scene.load_pyvista.__wrapped__()
+
+
+def start_open3d() -> None:
+    pytest.importorskip("open3d")
+    from sparklod_cli.render.open3d import process
+
+    process.Child().close()
+
+
+def find_ffmpeg() -> None:
+    pytest.importorskip("imageio_ffmpeg")
+    (check,) = doctor._ffmpeg()
+    assert check.state == "ok"
+
+
+def check_kernels() -> None:
+    assert all(check.state != "problem" for check in doctor._kernels())
+
+
+def start_warmup() -> None:
+    line = module_command("sparklod_cli", "--version")
+    assert (
+        subprocess.run(line, capture_output=True, text=True, check=True).stdout.split()[-1] == sparklod_cli.__version__
+    )
+
+
+#: All that starts a process of Python, by the module that does.
+STARTED: dict[str, list[Callable[[], object]]] = {
+    "doctor": [check_kernels, find_ffmpeg],
+    "figures/pyvista_scene": [probe_pyvista],
+    "render/gl/context": [probe_opengl],
+    "render/open3d/process": [start_open3d],
+    "warmup": [start_warmup],
+}
+
+
+@pytest.mark.parametrize("start", [start for each in STARTED.values() for start in each])
+def test_nothing_in_the_current_folder_is_executed(
+    start: Callable[[], object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in PLANTED:
+        (tmp_path / name).mkdir()
+        for file in ("__init__.py", "__main__.py"):
+            (tmp_path / name / file).write_text(f"open({str(tmp_path / 'executed')!r}, 'a').write({name!r} + ' ')")
+    monkeypatch.chdir(tmp_path)
+    start()
+    assert not (tmp_path / "executed").exists(), (tmp_path / "executed").read_text()
+
+
+def test_every_process_of_python_is_started_in_this_way() -> None:
+    package = ROOT / "sparklod_cli"
+    texts = {
+        path.relative_to(package).with_suffix("").as_posix(): path.read_text(encoding="utf-8")
+        for path in package.rglob("*.py")
+    }
+    helper = "support/python_process"
+    users = {name for name, text in texts.items() if "support.python_process import" in text}
+    assert users == set(STARTED)
+    shown = {"doctor", "support/optional"}  # which show the interpreter, and start nothing by it
+    assert {name for name, text in texts.items() if "sys.executable" in text} == {helper, *shown}
+
+
+def test_a_process_finds_what_this_process_finds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    package = tmp_path / "known \udcff'" / "known"
+    package.mkdir(parents=True)
+    (package / "__init__.py").touch()
+    (package / "part.py").write_text("import sys; print(__name__, __package__, sys.argv[1:])")
+    (tmp_path / "relative.py").touch()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [str(package.parent), "", *sys.path])
+    for line, output in [
+        (module_command("known.part", "a", "b c"), "__main__ known ['a', 'b c']"),
+        (program_command("import known.part, relative, sys; print(sys.path[1])"), f"known.part known []\n{tmp_path}"),
+    ]:
+        done = subprocess.run(line, capture_output=True, text=True, check=False, cwd="/")
+        assert (done.returncode, done.stdout.strip(), done.stderr) == (0, output, "")
