@@ -20,6 +20,8 @@ from sparklod_cli.model.nodes import Nodes
 from tests.lod.forests import Case, cases, check, drawn, links, random_tree, transform, views
 from tests.lod.test_traversal import large_case
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(autouse=True, scope="module")
 def always_together() -> Iterator[None]:
