@@ -113,9 +113,9 @@ def build_lod(
         InvalidSplatsError: some splats are invalid and `selection` does not drop them, or none is left.
         ValueError: there is no such method, or an option is out of its range.
     """
-    from ..bake import BakeSettings
-    from ..lod.band_order import banded
-    from ..lod.check import select
+    from ..bake.in_memory import build_tree
+    from ..bake.selecting import select
+    from ..bake.settings import BakeSettings
     from ..model.selection import Selection
     from .refining import asked_for, refined_tree
 
@@ -127,13 +127,11 @@ def build_lod(
     within("growth", growth, MIN_GROWTH, MAX_GROWTH)
     whole_within("max_sh", max_sh, 0, MAX_SH_DEGREE)
     fitting = asked_for(refine)
-    build, setting = BakeSettings(method=method, base=base, growth=growth).builder()
+    settings = BakeSettings(method, base, growth, max_sh, selection or Selection())
     with on_threads(threads), telling(progress) as told, memory_errors_translated():
-        kept, _ = select(selection or Selection(), scene.splats.with_max_sh(max_sh), thread_count(threads))
-        # A builder frees its input as it goes where nobody else holds it.
-        built = build(kept, setting, progress=told)
-        nodes, links = banded([built]) if BUILDERS[method].in_bands else built
-        made = Tree(nodes, links, scene.antialiased, up=scene.up)
+        leaves, tally = select(scene.splats, settings, threads=thread_count(threads))
+        settings.selection.check(tally)
+        made = Tree(*build_tree([leaves], settings, in_chunks=False, progress=told), scene.antialiased, up=scene.up)
         return made if fitting is None else refined_tree(made, fitting, thread_count(threads), told, None)[0]
 
 

@@ -158,7 +158,7 @@ def write(
 def _write_levels(
     path: Path, scene: Scene, environment: Scene | None, output: DetailOutput, threads: int, progress: Progress
 ) -> Written:
-    from ..bake.clock import Clock
+    from ..bake.records import Clock
 
     if scene.tree is None:
         raise FormatError(f"{path}: detail levels are cuts of a tree; build_lod makes one, best by method='quality'")
@@ -167,7 +167,7 @@ def _write_levels(
     if environment is not None and not len(environment.splats):
         raise InvalidSplatsError(f"{path}: the environment has no splats to write")
     always = None if environment is None else environment.splats
-    return Written(path, "Streamed SOG", output.write(scene, always, Clock(), threads, progress).bytes)
+    return Written(path, "Streamed SOG", output.write_levels(scene, always, Clock(), threads, progress).bytes)
 
 
 def _write_arrays(path: Path, scene: Scene, encoding: str, *, overwrite: bool, threads: int) -> Written:

@@ -7,19 +7,16 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 from ..codecs.options import WriteOptions
-from ..codecs.statistics import Statistics
 from ..codecs.streamed_sog.names import ENVIRONMENT, folders_of
-from ..io import SinkTogether
-from ..io.together import Files
+from ..io.together import Files, SinkTogether
 from ..lod.detail_settings import DetailSettings
 from ..model.detail import DetailScene
 from ..model.scene import Scene
 from ..model.splats import Splats
 from ..support.progress import Progress
 from ..support.threads import on_threads
-from .clock import Clock
-from .whole_output import WholeOutput
-from .written import WrittenDetail, WrittenLevel, WrittenTree
+from .output import Encode, WholeOutput
+from .records import BuiltTree, Clock, WrittenDetail, WrittenLevel, WrittenTree
 
 
 def detail_levels(
@@ -68,18 +65,14 @@ class DetailOutput(WholeOutput):
     options: WriteOptions
     sink: SinkTogether
 
-    made = "detail levels are made"
+    def write(self, tree: BuiltTree, encode: Encode, clock: Clock, threads: int, progress: Progress) -> WrittenTree:
+        """Make the levels of a tree and write them."""
+        return self.write_levels(tree.scene, tree.environment, clock, threads, progress)
 
-    def write(
-        self,
-        scene: Scene,
-        environment: Splats | None,
-        clock: Clock,
-        threads: int,
-        progress: Progress,
-        counted: Statistics | None = None,
+    def write_levels(
+        self, scene: Scene, environment: Splats | None, clock: Clock, threads: int, progress: Progress
     ) -> WrittenTree:
-        """Makes its levels and writes them."""
+        """Make the levels of a tree and write them, with the splats of an environment."""
         from ..codecs.streamed_sog.codec import encode_files
 
         made = detail_levels(scene, environment, self.settings, clock, threads=threads, progress=progress)

@@ -1,20 +1,18 @@
-"""`BakeSettings`, how to bake."""
+"""Settings of a bake, and the resources that it may use."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from ..codecs.options import WriteOptions
 from ..fitting.settings import FitSettings
-from ..lod.builders import BUILDERS, METHODS
+from ..lod.builders import METHODS
 from ..lod.detail_settings import DetailSettings
-from ..model.lod_tree import LodTree
 from ..model.selection import Selection
-from ..model.splats import Splats
 from ..model.transforms import Transform
 from ..model.up_axis import rotated
+from ..support.addresses import Place
 from ..support.defaults import DEFAULT_BASE, DEFAULT_GROWTH, MAX_SH_DEGREE
 
 #: Suffix of the format that is written unless another one is chosen.
@@ -23,7 +21,7 @@ SPZ = ".spz"
 
 @dataclass(frozen=True)
 class BakeSettings:
-    """How to bake.
+    """Settings of a bake.
 
     Attributes:
         method: of `lod.builders.BUILDERS`.
@@ -74,10 +72,20 @@ class BakeSettings:
         """Return the axis of the output that points up, for the axis that the input notes."""
         return rotated(self.up or noted, self.transform.rotation)
 
-    def builder(self) -> tuple[Callable[..., tuple[Splats, LodTree]], float]:
-        """What makes `(nodes, tree)` of splats and its setting; takes `progress`, too.
 
-        Not a `functools.partial`, which would hold the splats until it returns, when the builder wants to free them.
-        """
-        row = BUILDERS[self.method]
-        return row.load().build, getattr(self, row.setting)
+@dataclass(frozen=True)
+class Resources:
+    """Resources that a bake may use.
+
+    Attributes:
+        memory: bytes; None for `estimate.MEMORY_SHARE` of what is available.
+        scratch_dir: folder for the scratch folder of a bake out of core; None for that of the output.
+        resume: go on with what an interrupted bake left there.
+        block_splats: splats of a block, out of core; None for as many as the memory allows, at most
+            `estimate.MOST_BLOCK_SPLATS`.
+    """
+
+    memory: int | None = None
+    scratch_dir: Place | None = None
+    resume: bool = False
+    block_splats: int | None = None

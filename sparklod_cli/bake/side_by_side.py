@@ -10,12 +10,12 @@ from typing import Any
 from ..support.addresses import Place, absolute
 from ..support.errors import SparklodError
 from ..support.progress import Progress, silent
-from .baking import Baked, bake
+from .fingerprint import FILES
+from .flow import bake
 from .out_of_core.cluster_engine import ClusterEngine
-from .recipe import FILES
-from .resources import Resources
-from .scaling import fits_in_memory
-from .settings import BakeSettings
+from .out_of_core.planning import fits_in_memory
+from .records import Baked
+from .settings import BakeSettings, Resources
 from .sources import Source, absolute_source, places_of
 
 

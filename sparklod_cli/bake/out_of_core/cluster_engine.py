@@ -18,7 +18,8 @@ from ...support.errors import SparklodError
 from ...support.progress import Progress
 from .cluster_pool import Connection, Pool
 from .cluster_worker import PROBE, Probed, probe, run_call, run_task
-from .contracts import Store, Task
+from .store import FileStore
+from .tasks import Task
 
 _INSTALL = f"install sparklod {__version__} with its extra cluster there, and start it again"
 
@@ -41,7 +42,7 @@ class ClusterEngine:
 
     def run(self, stage: str, tasks: Sequence[Task], job: Any, progress: Progress) -> None:
         """See `Engine.run`."""
-        store: Store = job.store
+        store: FileStore = job.store
         left = {task.name: (place, task) for place, task in enumerate(tasks) if not store.has(task.name)}
         total = sum(task.weight for task in tasks)
         done = total - sum(task.weight for _, task in left.values())
@@ -112,7 +113,7 @@ class ClusterEngine:
                 outcomes[name] = result if error is None else error
             yield outcomes.pop(str(place))
 
-    def check(self, store: Store | None, files: Sequence[Place] = ()) -> None:
+    def check(self, store: FileStore | None, files: Sequence[Place] = ()) -> None:
         """Raises a `SparklodError` where a worker cannot do its share: another sparklod, or a folder it does not see.
 
         Args:
@@ -140,7 +141,7 @@ class ClusterEngine:
                 self._connection.client.run(shutil.rmtree, folder, ignore_errors=True)
 
 
-def _check_answer(worker: str, answer: Any, store: Store | None) -> None:
+def _check_answer(worker: str, answer: Any, store: FileStore | None) -> None:
     """Raises a `SparklodError` for what a worker said of itself."""
     if not isinstance(answer, Probed):  # an error: it has no sparklod, or one that knows no such question
         raise SparklodError(f"worker {worker} does not run sparklod {__version__} ({answer}): {_INSTALL}")

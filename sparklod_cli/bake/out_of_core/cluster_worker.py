@@ -18,7 +18,8 @@ from ... import __version__
 from ...support import machine
 from ...support.errors import memory_errors_translated
 from ...support.progress import silent
-from .contracts import Store, Task
+from .store import FileStore
+from .tasks import Task
 
 #: What a probe has.
 PROBE = "probe"
@@ -43,7 +44,7 @@ class Probed:
     missing: tuple[str, ...]
 
 
-def probe(store: Store | None, name: str, files: Sequence[Path]) -> Probed:
+def probe(store: FileStore | None, name: str, files: Sequence[Path]) -> Probed:
     """Tries whether this worker can do its share: read what others wrote, and write what they read.
 
     Args:

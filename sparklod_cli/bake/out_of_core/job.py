@@ -12,7 +12,7 @@ from ...lod.stages.records import StagedBuilder
 from ...model.streams import SceneStream
 from ..settings import BakeSettings
 from .blocks import Blocks
-from .contracts import Store
+from .store import FileStore
 
 #: Those of a scene that is not cut yet.
 NO_BLOCKS = Blocks((), ())
@@ -28,7 +28,7 @@ class Job:
         settings: how to bake.
         needed: statistics by which the output is settled.
         in_chunks: the output has the order for streaming.
-        parts: where each part of the input begins, and at last the count.
+        parts: where each part of the input begins, and at last the count; none before that is known.
         blocks: that the scene is cut into; none before that is known.
         round: how often it was cut before.
         kept: how many splats of the parts before each part are kept; empty before that is known.
@@ -37,12 +37,12 @@ class Job:
         encoder: of the output; None before the statistics of all nodes are known.
     """
 
-    store: Store
+    store: FileStore
     stream: SceneStream
     settings: BakeSettings
     needed: frozenset[str]
     in_chunks: bool
-    parts: tuple[int, ...]
+    parts: tuple[int, ...] = ()
     blocks: Blocks = NO_BLOCKS
     round: int = 0
     kept: tuple[int, ...] = ()
@@ -103,7 +103,7 @@ def clean_of(group: int) -> str:
 ROOT, ORDER, PUBLISHED = "root", "order", "published"
 
 
-def forget(store: Store, damaged: Collection[str]) -> None:
+def forget(store: FileStore, damaged: Collection[str]) -> None:
     """Removes results that are damaged, and whatever has to be made again for them; stages that are whole are kept."""
     names = set(damaged)
     if any(name.startswith("order") for name in damaged):
@@ -118,6 +118,6 @@ def forget(store: Store, damaged: Collection[str]) -> None:
         store.remove(name)
 
 
-def _numbers(store: Store, prefix: str) -> list[int]:
+def _numbers(store: FileStore, prefix: str) -> list[int]:
     """The numbers of the results whose names begin like this."""
     return [int(name.removeprefix(prefix)) for name in store.names() if name.startswith(prefix)]

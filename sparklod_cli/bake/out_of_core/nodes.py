@@ -14,10 +14,10 @@ from ...model.splats import Splats
 from ...model.streams import NodeStream
 from ...support.parallel import ordered_map
 from ...support.progress import Progress
-from .contracts import Store
 from .job import ROOT, Job, encoded_of, families_of, window_of
 from .order import WINDOW_NODES
 from .rows import Rows, splats_of, width_of
+from .store import FileStore
 
 #: Rows that are not wanted and read with those around them, rather than in another go. Chosen: some 10 KB.
 GAP = 128
@@ -54,14 +54,14 @@ def encode(job: Job, window: int, *, threads: int, progress: Progress) -> None:
     job.store.put(encoded_of(window), arrays)
 
 
-def encoded_chunk(store: Store, number: int, name: str) -> NDArray[np.generic]:
+def encoded_chunk(store: FileStore, number: int, name: str) -> NDArray[np.generic]:
     """What `encode` made of a chunk: the array of this name."""
     window, place = divmod(number, len(windows_of(WINDOW_NODES)))
     key = f"{place}.{name}"
     return store.get(encoded_of(window), [key])[key]
 
 
-def _read(store: Store, width: int, start: int, stop: int, threads: int = 1) -> tuple[Splats, LodTree]:
+def _read(store: FileStore, width: int, start: int, stop: int, threads: int = 1) -> tuple[Splats, LodTree]:
     """As `NodeStream.read`, of nodes whose rows have this width."""
     parts = []
     for window in range(start // WINDOW_NODES, -(-stop // WINDOW_NODES)):
@@ -73,7 +73,7 @@ def _read(store: Store, width: int, start: int, stop: int, threads: int = 1) -> 
     return splats_of(rows, threads), LodTree(count.copy(), child_start.copy())
 
 
-def _read_window(store: Store, width: int, window: int) -> tuple[Rows, LodTree]:
+def _read_window(store: FileStore, width: int, window: int) -> tuple[Rows, LodTree]:
     """The nodes of a window, see `order.put_order`."""
     plan = store.get(window_of(window))
     count = plan["count"].astype(np.int64)
@@ -93,7 +93,7 @@ def _read_window(store: Store, width: int, window: int) -> tuple[Rows, LodTree]:
 
 
 def _fill(
-    store: Store, name: str, row: NDArray[np.int64], count: NDArray[np.int64], target: NDArray[np.int64], rows: Rows
+    store: FileStore, name: str, row: NDArray[np.int64], count: NDArray[np.int64], target: NDArray[np.int64], rows: Rows
 ) -> None:
     """Fills rows with the children of some families of a stage: of each `count` of them, from `row` on, at `target`."""
     cuts = np.flatnonzero(row[1:] > row[:-1] + count[:-1] + GAP) + 1

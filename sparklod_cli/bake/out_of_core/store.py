@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from ...support import atomic
 from ...support.addresses import Address, Place
 from ...support.errors import ScratchError
-from .contracts import Arrays, Traffic
-from .results import HEAD, DamagedError, Entry, Table, check, decode_table, encode, table_bytes
+from .result_file import HEAD, Arrays, DamagedError, Entry, Table, check, decode_table, encode, table_bytes
 
 #: Suffix of the files of results, so that a result may have the name of a folder of others.
 SUFFIX = ".result"
@@ -37,11 +36,29 @@ FULL = {errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC)}
 _File = FileIO | BufferedReader
 
 
-class FileStore(ABC):
-    """A file for each result.
+class Traffic:
+    """Bytes of results that a store has written and read in this process; a copy in another one begins at 0."""
 
-    A checksum of each array, in its file, tells what was damaged. `get` compares it, `rows` does not; `is_sound` reads
-    all of a result for that, as a bake does that resumes.
+    def __init__(self) -> None:
+        self.written = self.read = 0
+        self._lock = threading.Lock()
+
+    def add(self, *, written: int = 0, read: int = 0) -> None:
+        """Count bytes; may be called by several threads at once."""
+        with self._lock:
+            self.written += written
+            self.read += read
+
+    def __reduce__(self) -> tuple[type[Traffic], tuple[()]]:
+        return Traffic, ()
+
+
+class FileStore(ABC):
+    """Results of tasks by name, each a file that appears whole or not at all, with arrays by key.
+
+    Small, so that it can be pickled. Methods may be called by several threads at once, and raise `ScratchError` where
+    results cannot be read or written. A checksum of each array, in its file, tells what was damaged. `get` compares it,
+    `rows` does not; `is_sound` reads all of a result for that, as a bake does that resumes.
 
     Attributes:
         folder: of the files; made when the first result is put.

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sparklod_cli.bake.out_of_core.contracts import Store, Task
+from sparklod_cli.bake.out_of_core.store import FileStore
+from sparklod_cli.bake.out_of_core.tasks import Task
 from sparklod_cli.support.progress import Progress
 
 COUNT = 6
@@ -22,7 +23,7 @@ class SumJob:
         error: that it raises.
     """
 
-    store: Store
+    store: FileStore
     fails: int = -1
     error: type[BaseException] = KeyboardInterrupt
 

@@ -11,8 +11,8 @@ import pytest
 
 pytest.importorskip("fsspec")
 
-from sparklod_cli.bake.out_of_core.engine import LocalEngine
 from sparklod_cli.bake.out_of_core.store import AddressStore, FolderStore, store_of
+from sparklod_cli.bake.out_of_core.tasks import LocalEngine
 from sparklod_cli.support.addresses import Address
 from sparklod_cli.support.errors import ScratchError
 from sparklod_cli.support.progress import silent

@@ -17,8 +17,8 @@ pytest.importorskip("distributed")
 from sparklod_cli.bake.out_of_core import cluster_engine, cluster_pool, cluster_worker
 from sparklod_cli.bake.out_of_core.cluster import ClusterSettings, cluster
 from sparklod_cli.bake.out_of_core.cluster_engine import ClusterEngine
-from sparklod_cli.bake.out_of_core.contracts import Task
 from sparklod_cli.bake.out_of_core.store import FolderStore
+from sparklod_cli.bake.out_of_core.tasks import Task
 from sparklod_cli.support.errors import OutOfMemoryError, ScratchError, SparklodError
 from sparklod_cli.support.progress import silent
 

@@ -11,15 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sparklod_cli.bake.out_of_core.lock import LOCK
-from sparklod_cli.bake.out_of_core.manifest import RECIPE, SUFFIX, at_work, scratch_folder
+from sparklod_cli.bake.fingerprint import Fingerprint
+from sparklod_cli.bake.out_of_core.scratch_folder import LOCK, RECIPE, SUFFIX, at_work, scratch_folder
 from sparklod_cli.bake.out_of_core.store import FolderStore
-from sparklod_cli.bake.recipe import Recipe
 from sparklod_cli.support.errors import FormatError, ScratchError, UnreadableError
 from sparklod_cli.support.stdin import DASH
 from tests.conftest import ROOT
 
-A = Recipe(("content a",), ("a.ply",), {"method": "quick", "base": 1.5})
+A = Fingerprint(("content a",), ("a.ply",), {"method": "quick", "base": 1.5})
 VALUE = {"value": np.arange(5)}
 
 
@@ -34,19 +33,17 @@ class Run:
     def __init__(self, store: FolderStore) -> None:
         self.store = FolderStore(store.folder)
         self.said: list[str] = []
-        self.lost: list[str] = []
 
     @contextlib.contextmanager
     def begun(
-        self, *, resume: bool = False, overwrite: bool = False, recipe: Recipe = A, block_splats: int = 100
+        self, *, resume: bool = False, overwrite: bool = False, fingerprint: Fingerprint = A, block_splats: int = 100
     ) -> Iterator[int]:
         with at_work(
             self.store,
-            recipe,
+            fingerprint,
             block_splats,
             resume=resume,
             overwrite=overwrite,
-            forget=lambda store, names: self.lost.extend(names),
             say=self.said.append,
         ) as found:
             yield found
@@ -122,20 +119,20 @@ def test_resume_without_results_begins(store: FolderStore) -> None:
 @pytest.mark.parametrize(
     ("other", "words"),
     [
-        (Recipe(("content b",), ("b.ply",), A.settings), r"b\.ply changed since"),
-        (Recipe(A.inputs, A.names, {"method": "quality", "base": 1.5}), "method was 'quick' and is 'quality'"),
-        (Recipe((*A.inputs, "more"), ("a.ply", "c.ply"), A.settings), "it had 1 input files and has 2"),
-        (Recipe(A.inputs, A.names, {"method": "quick"}), "base was 1.5 and is None"),
+        (Fingerprint(("content b",), ("b.ply",), A.settings), r"b\.ply changed since"),
+        (Fingerprint(A.inputs, A.names, {"method": "quality", "base": 1.5}), "method was 'quick' and is 'quality'"),
+        (Fingerprint((*A.inputs, "more"), ("a.ply", "c.ply"), A.settings), "it had 1 input files and has 2"),
+        (Fingerprint(A.inputs, A.names, {"method": "quick"}), "base was 1.5 and is None"),
     ],
 )
 @pytest.mark.parametrize("overwrite", [False, True])
-def test_another_recipe_is_refused_with_what_differs(
-    store: FolderStore, other: Recipe, words: str, overwrite: bool
+def test_another_fingerprint_is_refused_with_what_differs(
+    store: FolderStore, other: Fingerprint, words: str, overwrite: bool
 ) -> None:
     Run(store).interrupted()
     with (
         pytest.raises(ScratchError, match=f"results of another bake: {words}"),
-        Run(store).begun(resume=True, overwrite=overwrite, recipe=other),
+        Run(store).begun(resume=True, overwrite=overwrite, fingerprint=other),
     ):
         pass
     assert store.names() == ["first", RECIPE, "second"]
@@ -153,13 +150,12 @@ def test_damaged_results_are_removed_and_told(store: FolderStore, damage: Callab
     damage(store.folder / "second.result")
     run = Run(store)
     with run.begun(resume=True):
-        assert run.lost == ["second"]
         assert not run.store.has("second")
         assert run.store.has("first")
     assert run.said == [f"goes on with 1 result in {store}; 1 other that a failure damaged will be made again"]
 
 
-def test_a_damaged_recipe_is_refused(store: FolderStore) -> None:
+def test_a_damaged_fingerprint_is_refused(store: FolderStore) -> None:
     Run(store).interrupted()
     flip(store.folder / f"{RECIPE}.result")
     with pytest.raises(ScratchError, match="nothing tells what the results"), Run(store).begun(resume=True):
@@ -178,7 +174,7 @@ def test_a_folder_of_somebody_else_is_refused(store: FolderStore) -> None:
 HOLDER = """
 import sys
 from pathlib import Path
-from sparklod_cli.bake.out_of_core.lock import locked
+from sparklod_cli.bake.out_of_core.scratch_folder import locked
 with locked(Path(sys.argv[1])):
     print("at work", flush=True)
     sys.stdin.read()

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from sparklod_cli.bake.out_of_core.engine import LocalEngine
 from sparklod_cli.bake.out_of_core.store import FolderStore
+from sparklod_cli.bake.out_of_core.tasks import LocalEngine
 from sparklod_cli.support.progress import silent
 from tests.bake.out_of_core.jobs import COUNT, SumJob, tasks
 

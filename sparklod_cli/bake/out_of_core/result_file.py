@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .contracts import Arrays
+#: Arrays of a result by name, empty or of any shape.
+Arrays = Mapping[str, NDArray[Any]]
 
 #: How a file begins; the digit is the version of its layout.
 MAGIC = b"slresul1"
