@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .. import io
+from ..io import rad_file
 from ..model.scene import Scene, Tree
 from ..model.splats import FloatArray
 from ..support.errors import FormatError, memory_errors_translated
@@ -32,7 +32,7 @@ def read_rad_header(path: Path | str) -> RadHeader:
     """
     path = Path(path)
     with naming(path):
-        return io.read_rad_header(path)
+        return rad_file.read_rad_header(path)
 
 
 def read_rad_chunk(path: Path | str, number: int, *, palette: FloatArray | None = None) -> RadChunk:
@@ -53,7 +53,7 @@ def read_rad_chunk(path: Path | str, number: int, *, palette: FloatArray | None 
     if isinstance(number, bool) or not isinstance(number, (int, np.integer)):
         raise TypeError(f"number is {number!r}; give a whole number, which counts chunks from 0")
     with naming(path), memory_errors_translated():
-        return io.read_rad_chunk(path, number, palette=palette)
+        return rad_file.read_rad_chunk(path, number, palette=palette)
 
 
 def arrange_chunks(tree: Scene, *, threads: int | None = None, progress: Told = None) -> Tree:

@@ -9,7 +9,8 @@ from types import NoneType
 from typing import TYPE_CHECKING
 
 from ..codecs.streamed_sog.names import MANIFEST
-from ..io import detail_sink, scene_sink, write_whole
+from ..io import scene_sink, write_whole
+from ..io.details import detail_sink
 from ..model.scene import Scene
 from ..support.defaults import (
     DEFAULT_COMPRESSION,

@@ -7,8 +7,7 @@ import dataclasses
 import numpy as np
 
 from ..codecs.sound import is_valid_and_visible
-from ..io.reading import read_scene
-from ..io.texts import read_rgba
+from ..io.reading import read_rgba, read_scene
 from ..model.selection import Selection, Tally
 from ..model.splats import Splats
 from ..model.transforms import Transform

@@ -14,7 +14,7 @@ from ..support.addresses import Place
 from ..support.errors import FormatError, UnreadableError
 from ..support.stdin import DASH
 from ..support.untrusted import quoted_value
-from .names import leads_away, reason_of
+from .paths import leads_away, reason_of
 
 #: The splat file that a folder stands for: the first of these that is there.
 IN_FOLDERS = (MANIFEST, META)

@@ -13,7 +13,7 @@ from ..support.addresses import Address, Place
 from ..support.errors import UnreadableError
 from ..support.stdin import DASH, name_of, spooled
 from .beside import companions
-from .names import reason_unreadable
+from .paths import reason_unreadable
 
 #: Places of a file that are looked at, and bytes at each: 4 MB of a large one, which takes milliseconds. Chosen.
 PLACES, PLACE_BYTES = 64, 1 << 16

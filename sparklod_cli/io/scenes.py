@@ -13,8 +13,7 @@ from ..codecs.options import WriteOptions
 from ..model.scene import Scene
 from ..support.addresses import Address, Place
 from ..support.progress import Progress, silent
-from .together import SinkTogether, sink_together
-from .writing import Sink, sink
+from .writing import Sink, SinkTogether, sink, sink_together
 
 if TYPE_CHECKING:
     from ..codecs.rad.repacking import PackedChunks

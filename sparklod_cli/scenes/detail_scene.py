@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from ..io import LevelFiles
+from ..io.details import LevelFiles
 from ..lod.detail_loading import DetailFiles
 from ..model.detail import DetailScene
 from ..model.scene import Scene

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cameras.framing import SAMPLE
-from ..io import RadFile
+from ..io.rad_file import RadFile
 from ..model.balls import USED, Balls, balls_of
 from ..model.instances import Instance
 from ..model.lod_tree import LodTree

@@ -10,7 +10,7 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ..io import RadFile
+from ..io.rad_file import RadFile
 from ..lod.kernels.pixel_scale import NODE
 from ..model.coding import FileCoding
 from ..model.lod_tree import LodTree

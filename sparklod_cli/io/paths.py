@@ -1,10 +1,12 @@
-"""Names of files, which of them belong together, and why one cannot be opened, in words."""
+"""Names of files, plain files, and why a file cannot be opened, in words."""
 
 from __future__ import annotations
 
 import itertools
 import os
+import stat
 from pathlib import Path, PurePath
+from typing import BinaryIO
 
 from ..codecs.rad import names as rad_names
 from ..codecs.sog import names as sog_names
@@ -59,3 +61,18 @@ def reason_unreadable(error: OSError) -> str:
 def reason_of(error: OSError) -> str:
     """What the system says of an error, to stand after a colon."""
     return (error.strerror or str(error)).lower()
+
+
+#: For reading; neither follows a link nor waits for the other end of a pipe.
+_FLAGS = os.O_RDONLY
+for _name in ("O_BINARY", "O_CLOEXEC", "O_NOFOLLOW", "O_NONBLOCK"):
+    _FLAGS |= getattr(os, _name, 0)
+
+
+def open_plain(path: Path) -> BinaryIO:
+    """Opens a file for reading; `OSError` where it is a link, a folder, a pipe or a device, or does not exist."""
+    descriptor = os.open(path, _FLAGS)
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise OSError(f"{path} is not a plain file")
+    return os.fdopen(descriptor, "rb")
