@@ -7,20 +7,20 @@ __version__: str
 if TYPE_CHECKING:  # mypy then resolves the modules first, which import this one
     from .api.cameras import orbit as orbit
     from .api.cameras import read_cameras as read_cameras
-    from .api.files import build_lod as build_lod
-    from .api.files import extract_leaves as extract_leaves
     from .api.files import inspect as inspect
     from .api.files import pack as pack
     from .api.files import read as read
+    from .api.files import read_rad_chunk as read_rad_chunk
+    from .api.files import read_rad_header as read_rad_header
     from .api.files import unpack as unpack
-    from .api.rad import arrange_chunks as arrange_chunks
-    from .api.rad import read_rad_chunk as read_rad_chunk
-    from .api.rad import read_rad_header as read_rad_header
-    from .api.refining import refine as refine
     from .api.results import ComparisonTable as ComparisonTable
     from .api.results import Frames as Frames
     from .api.results import Picture as Picture
     from .api.results import show as show
+    from .api.trees import arrange_chunks as arrange_chunks
+    from .api.trees import build_lod as build_lod
+    from .api.trees import extract_leaves as extract_leaves
+    from .api.trees import refine as refine
     from .api.views import compare as compare
     from .api.views import cut as cut
     from .api.views import psnr as psnr

@@ -1,10 +1,11 @@
-"""Arguments of the API, checked before they reach a loop or a kernel; errors say the value, and what to give."""
+"""Arguments of the API, checked before they reach a loop or a kernel: errors say the value, and what to give."""
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from ..cameras.camera import Camera
 from ..cameras.path import CameraPath
 from ..model.scene import Scene
 from ..support.errors import OutputError
+from ..support.progress import Progress, silent
 
 
 def scene_like(value: Any) -> Scene:
@@ -102,3 +104,41 @@ _SCENES = "read reads a file, Scene.from_arrays takes arrays"
 
 def _kind(value: Any) -> str:
     return repr(value) if isinstance(value, str) else f"a {type(value).__name__}" if value is not None else "None"
+
+
+#: A callback `(stage, done, total, unit)`, a class of bars that is called as `tqdm.tqdm` is, or None.
+Told = Progress | type[Any] | None
+
+
+class _Bars:
+    """One bar for each stage, of a class that makes bars."""
+
+    def __init__(self, kind: type[Any]) -> None:
+        self._kind, self._stage = kind, ""
+        self._bar: Any = None
+
+    def __call__(self, stage: str, done: int, total: int, unit: str) -> None:
+        if self._bar is None or stage != self._stage:
+            self.close()
+            self._stage, self._bar = stage, self._kind(total=total, desc=stage, unit=f" {unit}s", leave=False)
+        self._bar.update(done - self._bar.n)
+
+    def close(self) -> None:
+        """Ends the bar of the last stage."""
+        if self._bar is not None:
+            self._bar.close()
+
+
+@contextlib.contextmanager
+def telling(progress: Told) -> Iterator[Progress]:
+    """The callback for work inside; bars are closed at its end."""
+    if progress is None:
+        yield silent
+    elif isinstance(progress, type):
+        bars = _Bars(progress)
+        try:
+            yield bars
+        finally:
+            bars.close()
+    else:
+        yield progress

@@ -31,8 +31,7 @@ from ..support.defaults import BLEND
 from ..support.errors import FormatError, memory_errors_translated
 from ..support.threads import on_threads, thread_count
 from ..tables.comparison import COLUMNS as OF_COMPARISON
-from .arguments import camera_like, path_like, viewed_like
-from .progress import Told, telling
+from .arguments import Told, camera_like, path_like, telling, viewed_like
 from .results import ComparisonTable, Frames
 
 if TYPE_CHECKING:

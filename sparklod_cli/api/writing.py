@@ -22,9 +22,8 @@ from ..support.defaults import (
 )
 from ..support.errors import FormatError, InvalidSplatsError, memory_errors_translated
 from ..support.threads import thread_count
-from .arguments import file_path, scene_like, whole_within
+from .arguments import Told, file_path, scene_like, telling, whole_within
 from .files import naming, pack
-from .progress import Told, telling
 
 if TYPE_CHECKING:
     from ..bake.detail_output import DetailOutput

@@ -182,7 +182,7 @@ def _started(workers: int, threads: int, memory: int | None, scratch: Path | Non
                 memory_limit=_memory_limit(workers, memory),
                 local_directory=folder,
                 env={"NUMBA_NUM_THREADS": str(threads)},
-                preload=["sparklod_cli.bake.out_of_core.cluster_worker"],
+                preload=["sparklod_cli.bake.out_of_core.cluster_engine"],
                 scheduler_kwargs={"allowed_failures": LOSSES},
                 silence_logs=SILENT,
             )

@@ -68,35 +68,11 @@ class Job:
         return f"{self.part(part)}/{group}"
 
 
-def stage_of(number: int | str) -> str:
-    """The name of what is known of a stage, all of whose results are there then."""
-    return f"stage/{number}"
-
-
-def families_of(number: int) -> str:
-    """The name of the families of a stage."""
-    return f"families/{number}"
-
-
-def pending_of(number: int) -> str:
-    """The name of the nodes that a stage hands on."""
-    return f"pending/{number}"
-
-
-def window_of(number: int) -> str:
-    """The name of what a window of nodes is gathered by."""
-    return f"order/{number}"
-
-
-def encoded_of(number: int) -> str:
-    """The name of a window of nodes as it is written."""
-    return f"encoded/{number}"
-
-
-def clean_of(group: int) -> str:
-    """The name of the mark that the splats of a group of blocks were removed."""
-    return f"clean/{group}"
-
+#: Names of results by number: what is known of a stage, all of whose results are there then; its families; the nodes
+#: that it hands on; what a window of nodes is gathered by; that window as it is written; and the mark that the splats
+#: of a group of blocks were removed.
+stage_of, families_of, pending_of = "stage/{}".format, "families/{}".format, "pending/{}".format
+window_of, encoded_of, clean_of = "order/{}".format, "encoded/{}".format, "clean/{}".format
 
 #: Names of the root, of what is known of all nodes when they are in order, and of the mark that the output is published
 #: from then on.

@@ -1,23 +1,80 @@
-"""The nodes of a tree in their final order, gathered from the results of the stages."""
+"""Nodes of a tree in their final order, gathered from the results of the stages, and rows that these hold splats as."""
 
 from __future__ import annotations
 
 import functools
+import math
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...codecs.encoder import rows_of, windows_of
+from ...codecs import encoder as codec_encoder
+from ...codecs.encoder import windows_of
 from ...codecs.sound import check_valid
 from ...model.lod_tree import LodTree
-from ...model.splats import Splats
+from ...model.sh import COEFFICIENTS, degree_of
+from ...model.splats import COLUMNS, Splats
 from ...model.streams import NodeStream
-from ...support.parallel import ordered_map
+from ...support.parallel import for_blocks, ordered_map
 from ...support.progress import Progress
 from .job import ROOT, Job, encoded_of, families_of, window_of
 from .order import WINDOW_NODES
-from .rows import Rows, splats_of, width_of
 from .store import FileStore
+
+#: (N, `width_of`) float32: centre, scale, rotation, opacity, rgb and SH of a splat, in the order of `COLUMNS`.
+Rows = NDArray[np.float32]
+
+
+def width_of(sh_degree: int) -> int:
+    """Numbers of a row."""
+    return 14 + 3 * COEFFICIENTS[sh_degree]
+
+
+def rows_of(splats: Splats, threads: int = 1) -> Rows:
+    """The rows of splats."""
+    rows = np.empty((len(splats), width_of(splats.sh_degree)), np.float32)
+    fill_rows(splats, rows, threads)
+    return rows
+
+
+def fill_rows(splats: Splats, rows: Rows, threads: int = 1) -> None:
+    """Fills rows with splats."""
+    places = _places(splats)
+
+    def fill(block: slice) -> None:
+        for part, column in places:
+            rows[block, part] = column[block]
+
+    for_blocks(fill, len(rows), threads, _nothing)
+
+
+def splats_of(rows: Rows, threads: int = 1) -> Splats:
+    """The splats of rows."""
+    splats = Splats.empty(len(rows), degree_of((rows.shape[1] - width_of(0)) // 3))
+    places = _places(splats)
+
+    def fill(block: slice) -> None:
+        for part, column in places:
+            column[block] = rows[block, part]
+
+    for_blocks(fill, len(rows), threads, _nothing)
+    return splats
+
+
+def _nothing(done: int) -> None:
+    """Nobody is told."""
+
+
+def _places(splats: Splats) -> list[tuple[slice, Rows]]:
+    """Each column as a matrix, a view of it, and where it is in a row."""
+    places, at = [], 0
+    for name in COLUMNS:
+        column = getattr(splats, name)
+        numbers = math.prod(column.shape[1:])
+        places.append((slice(at, at + numbers), column.reshape(len(splats), numbers)))
+        at += numbers
+    return places
+
 
 #: Rows that are not wanted and read with those around them, rather than in another go. Chosen: some 10 KB.
 GAP = 128
@@ -46,7 +103,7 @@ def encode(job: Job, window: int, *, threads: int, progress: Progress) -> None:
     check_valid(splats, threads)
 
     def encoded(part: slice) -> dict[str, NDArray[np.generic]]:
-        return encoder.encode(*rows_of(splats, tree, part), start + part.start)
+        return encoder.encode(*codec_encoder.rows_of(splats, tree, part), start + part.start)
 
     arrays: dict[str, NDArray[np.generic]] = {}
     for number, found in enumerate(ordered_map(encoded, windows_of(stop - start), threads)):

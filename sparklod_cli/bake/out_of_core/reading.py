@@ -21,8 +21,8 @@ from ...support.threads import on_threads
 from ..selecting import check_transformed, select, transform
 from ..settings import BakeSettings
 from .job import Job
-from .result_file import Arrays
-from .rows import Rows, fill_rows, rows_of, splats_of, width_of
+from .nodes import Rows, fill_rows, rows_of, splats_of, width_of
+from .store import Arrays
 
 #: Splats of a part, unless blocks are smaller, and the most parts: their splats of all blocks are pieces of files, of
 #: which there should not be too many. Chosen.

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from sparklod_cli.bake.out_of_core.result_file import Arrays
+from sparklod_cli.bake.out_of_core.store import Arrays
 from sparklod_cli.bake.out_of_core.tasks import Task
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats

@@ -14,7 +14,7 @@ import pytest
 pytest.importorskip("cryptography")
 pytest.importorskip("distributed")
 
-from sparklod_cli.bake.out_of_core import cluster_engine, cluster_pool, cluster_worker
+from sparklod_cli.bake.out_of_core import cluster_engine, cluster_pool
 from sparklod_cli.bake.out_of_core.cluster import ClusterSettings, cluster
 from sparklod_cli.bake.out_of_core.cluster_engine import ClusterEngine
 from sparklod_cli.bake.out_of_core.store import FolderStore
@@ -111,7 +111,7 @@ def test_calls_side_by_side_give_results_and_failures_in_order(engine: ClusterEn
 
 def test_a_result_that_is_lost_with_its_worker_is_waited_for(engine: ClusterEngine) -> None:
     with cluster_pool.Pool(engine._connection, "baking") as pool:
-        pool.submit("twice", 0, cluster_worker.run_call, made_up.twice, (21,), 1)
+        pool.submit("twice", 0, cluster_engine.run_call, made_up.twice, (21,), 1)
         future = pool._futures["twice"]
         future.result(timeout=60)
         loop, lost = engine._connection.client.loop, threading.Event()
@@ -156,12 +156,12 @@ class _Elsewhere(FolderStore):
 def test_a_worker_without_sparklod_is_told_what_to_do(engine: ClusterEngine, job: Job) -> None:
     client = engine._connection.client
     client.wait_for_workers(2, timeout=60)  # one that another test killed may only now be replaced
-    client.run(_hide, cluster_worker.__name__)
+    client.run(_hide, cluster_engine.__name__)
     try:
         with pytest.raises(SparklodError, match=r"does not run sparklod .*: install sparklod .* extra cluster there"):
             engine.check(job.store)
     finally:
-        client.run(_show, cluster_worker.__name__)
+        client.run(_show, cluster_engine.__name__)
 
 
 def _hide(module: str) -> None:
