@@ -19,7 +19,7 @@ from ..support.progress import Progress, silent
 
 
 def scene_like(value: Any) -> Scene:
-    """A scene or a tree.
+    """Return a scene or a tree.
 
     Raises:
         TypeError: it is anything else.
@@ -30,7 +30,7 @@ def scene_like(value: Any) -> Scene:
 
 
 def camera_like(value: Any) -> Camera:
-    """One camera, all of whose numbers are finite.
+    """Return one camera, all of whose numbers are finite.
 
     Raises:
         TypeError: it is anything else.
@@ -46,7 +46,7 @@ def camera_like(value: Any) -> Camera:
 
 
 def path_like(cameras: CameraPath | Iterable[Camera]) -> CameraPath:
-    """Cameras one after the other.
+    """Return cameras one after the other.
 
     Raises:
         TypeError: one is no camera.
@@ -78,7 +78,7 @@ def file_path(path: Path | str) -> Path:
 
 
 def within(name: str, value: Any, least: float, most: float) -> None:
-    """Raises ValueError unless a number is from `least` to `most`, and TypeError unless it is a number."""
+    """Raise ValueError unless a number is from `least` to `most`, and TypeError unless it is a number."""
     if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
         raise TypeError(f"{name} is {value!r}; give a number from {least} to {most}")
     if not least <= value <= most:
@@ -86,14 +86,14 @@ def within(name: str, value: Any, least: float, most: float) -> None:
 
 
 def whole_within(name: str, value: Any, least: int, most: int) -> None:
-    """`within` for whole numbers."""
+    """Check a whole number as `within`."""
     if isinstance(value, (float, np.floating)):
         raise TypeError(f"{name} is {value!r}; give a whole number from {least} to {most}")
     within(name, value, least, most)
 
 
 def viewed_like(value: Any) -> None:
-    """Raises TypeError for what cannot be looked at, though Python could iterate over it or fail within it."""
+    """Raise TypeError for what cannot be looked at, though Python could iterate over it or fail within it."""
     if isinstance(value, (str, bytes)) or not hasattr(value, "__iter__"):
         raise TypeError(f"it takes scenes, trees or instances, not {_kind(value)}; {_SCENES}")
 
@@ -124,14 +124,14 @@ class _Bars:
         self._bar.update(done - self._bar.n)
 
     def close(self) -> None:
-        """Ends the bar of the last stage."""
+        """End the bar of the last stage."""
         if self._bar is not None:
             self._bar.close()
 
 
 @contextlib.contextmanager
 def telling(progress: Told) -> Iterator[Progress]:
-    """The callback for work inside; bars are closed at its end."""
+    """Yield the callback for work inside; bars are closed at its end."""
     if progress is None:
         yield silent
     elif isinstance(progress, type):

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 def read(
     path: Path | str, *, columns: Collection[str] | None = None, threads: int | None = None, progress: Told = None
 ) -> Scene:
-    """Reads a splat file; its content tells the format. The scene is a `Tree` if the file has a Level-of-Detail tree.
+    """Read a splat file; its content tells the format. The scene is a `Tree` if the file has a Level-of-Detail tree.
 
     Args:
         path: of a file, or of a folder that holds an unpacked SOG or a Streamed SOG, of which level 0 is read.
@@ -59,7 +59,7 @@ def read(
 
 @contextlib.contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Puts the file before what is wrong with it: Python, unlike a command, says nothing before it."""
+    """Put the file before what is wrong with it: Python, unlike a command, says nothing before it."""
     try:
         yield
     except (FormatError, InvalidSplatsError, TreeError) as error:
@@ -67,14 +67,14 @@ def naming(path: Path) -> Iterator[None]:
 
 
 def as_tree(scene: Scene) -> Scene:
-    """A scene as a `Tree` where it has one."""
+    """Return a scene as a `Tree` where it has one."""
     if scene.tree is None or isinstance(scene, Tree):
         return scene
     return Tree(**{each.name: getattr(scene, each.name) for each in fields(Scene)})
 
 
 def pack(scene: Scene, encoding: str, *, threads: int | None = None) -> dict[str, NDArray[np.uint32]]:
-    """A scene in the layout of a viewer's memory, as `build-lod --encoding` writes it; docs/formats.md has the words.
+    """Return a scene in the layout of a viewer's memory, as `build-lod --encoding` writes it (docs/formats.md).
 
     Args:
         scene: a scene or a tree.
@@ -100,7 +100,7 @@ def pack(scene: Scene, encoding: str, *, threads: int | None = None) -> dict[str
 
 
 def unpack(arrays: Mapping[str, NDArray[np.uint32]], *, threads: int | None = None) -> Scene:
-    """The scene that arrays of `pack`, or of a viewer, hold; a `Tree` where the words of a LodTree are among them.
+    """Return the scene in arrays of `pack`, or of a viewer; a `Tree` where the words of a LodTree are among them.
 
     Args:
         arrays: those of "packed" or of "ext", and of "lodtree" where there is a tree.
@@ -137,7 +137,7 @@ def inspect(
     threads: int | None = None,
     progress: Told = None,
 ) -> Report:
-    """What is in a file and, if asked for, what is wrong with it; `Report.as_dict` is what `inspect --json` prints.
+    """Report what is in a file, and what is wrong with it; `Report.as_dict` is what `inspect --json` prints.
 
     Args:
         path: of a splat file, or of a folder that holds an unpacked SOG.
@@ -156,7 +156,7 @@ def inspect(
 
 
 def read_rad_header(path: Path | str) -> RadHeader:
-    """Reads the header of a RAD file and nothing else; the chunks need not be there.
+    """Read the header of a RAD file and nothing else; the chunks need not be there.
 
     Args:
         path: of a .rad file, whole or with chunks in files of their own.
@@ -170,7 +170,7 @@ def read_rad_header(path: Path | str) -> RadHeader:
 
 
 def read_rad_chunk(path: Path | str, number: int, *, palette: FloatArray | None = None) -> RadChunk:
-    """Reads the header of a RAD file and the bytes of one chunk, as a viewer does that streams it.
+    """Read the header of a RAD file and the bytes of one chunk, as a viewer does that streams it.
 
     Args:
         path: of a .rad file, whole or with chunks in files of their own.

@@ -41,7 +41,7 @@ def build_lod(
     threads: int | None = None,
     progress: Told = None,
 ) -> Tree:
-    """Builds the Level-of-Detail tree of a scene; the same scene and options give the same tree.
+    """Build the Level-of-Detail tree of a scene; the same scene and options give the same tree.
 
     Args:
         scene: without a tree.
@@ -86,7 +86,7 @@ def refine(
     progress: Told = None,
     say: Callable[[str], None] | None = None,
 ) -> tuple[Tree, Refined]:
-    """Fits the merged splats of a tree to pictures of full detail, as `build-lod --refine` does.
+    """Fit the merged splats of a tree to pictures of full detail, as `build-lod --refine` does.
 
     The links of the tree, the order of its nodes and its leaves stay as they are, bit for bit. The same tree and
     arguments give the same result for any number of threads.
@@ -117,7 +117,7 @@ def refine(
 
 
 def asked_for(refine: bool | int | FitSettings) -> FitSettings | None:
-    """The settings that an argument `refine` stands for; None for not at all.
+    """Return the settings that an argument `refine` stands for; None for not at all.
 
     Raises:
         TypeError, ValueError: it stands for none.
@@ -131,7 +131,7 @@ def asked_for(refine: bool | int | FitSettings) -> FitSettings | None:
 
 
 def checked(settings: FitSettings) -> FitSettings:
-    """Settings whose numbers are in their ranges; `ValueError` or `TypeError` otherwise."""
+    """Return settings whose numbers are in their ranges; `ValueError` or `TypeError` otherwise."""
     if settings.steps is not None:
         whole_within("steps", settings.steps, 1, MOST_STEPS)
     whole_within("seed", settings.seed, 0, MOST_SEED)
@@ -141,14 +141,14 @@ def checked(settings: FitSettings) -> FitSettings:
 def refined_tree(
     tree: Scene, settings: FitSettings, threads: int, progress: Progress, say: Callable[[str], None] | None
 ) -> tuple[Tree, Refined]:
-    """A tree whose merged splats are fitted, and what that brought."""
+    """Return a tree whose merged splats are fitted, and what that brought."""
     found, report = refined(tree, settings, threads=threads, progress=progress, say=say or (lambda text: None))
     assert found.tree is not None
     return Tree(found.splats, found.tree, found.antialiased, up=found.up), report
 
 
 def arrange_chunks(tree: Scene, *, threads: int | None = None, progress: Told = None) -> Tree:
-    """A tree with its nodes in the order for streaming: `write` and other formats keep the order that nodes have.
+    """Return a tree with its nodes in the order for streaming; `write` keeps the order that nodes have.
 
     A chunk of a RAD is the next 65,536 nodes, so this order decides how many chunks a viewer fetches. docs/streaming.md
     compares it with others; `build-lod --format rad` writes trees in it.
@@ -174,7 +174,7 @@ def arrange_chunks(tree: Scene, *, threads: int | None = None, progress: Told = 
 
 
 def extract_leaves(tree: Scene) -> Scene:
-    """The splats that a tree was built of, in the order of its leaves.
+    """Return the splats that a tree was built of, in the order of its leaves.
 
     Raises:
         FormatError: the scene has no tree.

@@ -28,15 +28,13 @@ def detail_levels(
     threads: int,
     progress: Progress,
 ) -> DetailScene:
-    """Regions of a tree at several detail levels, with their errors.
+    """Return regions of a tree at several detail levels, with their errors.
 
     Args:
         scene: a tree.
         environment: splats beside it; None without.
         settings: of levels and regions.
-        clock: told of the stages.
         threads: to work on; the result does not depend on it.
-        progress: told of the stages.
     """
     from ..lod.detail_levels import make
     from .region_errors import measured
@@ -84,14 +82,14 @@ class DetailOutput(WholeOutput):
 
 
 def _noted(files: Files, names: list[str]) -> Iterator[tuple[str, Iterable[bytes]]]:
-    """The same files; their names are added to a list."""
+    """Yield the same files; their names are added to a list."""
     for name, pieces in files:
         names.append(name)
         yield name, pieces
 
 
 def _told(made: DetailScene, names: list[str]) -> WrittenDetail:
-    """What is said of a scene that was written to files of these names."""
+    """Return what is said of a scene that was written to files of these names."""
     assert made.errors is not None
     splats, errors = made.counts.sum(axis=0).tolist(), made.errors.max(axis=0).tolist()
     return WrittenDetail(

@@ -16,7 +16,7 @@ from ..cameras.formats.table import NAMES
 from ..io.identity import Identity, files_of, identity_of
 from ..support.addresses import Place
 from ..support.errors import UnreadableError
-from ..support.untrusted import parse_json, quoted_value
+from ..support.untrusted import quoted_value
 from .settings import BakeSettings
 from .sources import Source, placement_of, places_of
 
@@ -51,7 +51,7 @@ class Fingerprint:
         return hashlib.blake2b(whole.encode(), digest_size=16).hexdigest()
 
     def differences(self, former: Fingerprint) -> list[str]:
-        """In what it differs from a former one, in words; empty where it does not."""
+        """Return in what it differs from a former one, in words; empty where it does not."""
         found = []
         if len(self.inputs) != len(former.inputs):
             found.append(f"it had {len(former.inputs)} input files and has {len(self.inputs)}")
@@ -64,26 +64,17 @@ class Fingerprint:
                 found.append(f"{name} was {quoted_value(before)} and is {quoted_value(now)}")
         return found
 
-    def to_record(self) -> dict[str, Any]:
-        """As values that JSON has, of which `from_record` makes it again."""
-        return dataclasses.asdict(self)
+    def to_json(self) -> bytes:
+        """Return the text of which `from_record` makes it again, parsed."""
+        return json.dumps(dataclasses.asdict(self), sort_keys=True).encode()
 
     @classmethod
-    def from_record(cls, found: Any) -> Fingerprint:
-        """The recipe of `to_record`; `ValueError` where the values are of none."""
+    def from_record(cls, record: Any) -> Fingerprint:
+        """Return the fingerprint of its fields by name; raise `ValueError` where the values are of none."""
         try:
-            return cls(tuple(found["inputs"]), tuple(found["names"]), dict(found["settings"]))
+            return cls(tuple(record["inputs"]), tuple(record["names"]), dict(record["settings"]))
         except (KeyError, TypeError) as error:
             raise ValueError(f"it is no fingerprint: {error!r}") from None
-
-    def to_json(self) -> bytes:
-        """The text of which `from_json` makes it again."""
-        return json.dumps(self.to_record(), sort_keys=True).encode()
-
-    @classmethod
-    def from_json(cls, text: bytes) -> Fingerprint:
-        """The recipe of `to_json`; `ValueError` where the text is none."""
-        return cls.from_record(parse_json(text))
 
 
 def source_fingerprint(source: Source, settings: BakeSettings) -> Fingerprint:
@@ -91,7 +82,6 @@ def source_fingerprint(source: Source, settings: BakeSettings) -> Fingerprint:
 
     Args:
         source: the input; - is standard input.
-        settings: of the bake.
 
     Raises:
         UnreadableError: an input cannot be read.
@@ -103,14 +93,14 @@ def source_fingerprint(source: Source, settings: BakeSettings) -> Fingerprint:
 
 
 def files_named_in(settings: BakeSettings) -> list[Place]:
-    """The files that settings name, and those that belong to these."""
+    """Return the files that settings name, and those that belong to these."""
     named = {name: path for name in FILES if (path := getattr(settings, name)) is not None}
     sets = {"camera_path": NAMES}
     return [file for name, path in named.items() for file in files_of(path, sets.get(name, ()))]
 
 
 def _identity_of_named(file: Place) -> Identity:
-    """What a file is like; an error names it, as it is none of the inputs."""
+    """Return what a file is like; an error names it, as it is none of the inputs."""
     try:
         return identity_of(file)
     except UnreadableError as error:

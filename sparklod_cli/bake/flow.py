@@ -61,7 +61,7 @@ def bake(
 
     Raises:
         FormatError, InvalidSplatsError, OutputError: see `read_source`, `Selection.check`, `sound.check_scene` and
-            `io.scenes.scene_sink`; or the input has a tree, and the settings do not keep it.
+            `io.writing.scene_sink`; or the input has a tree, and the settings do not keep it.
         ScratchError: the scratch folder is full, in use, or has the results of another bake.
         OutOfMemoryError: it does not fit into memory.
         CameraPathError: the training cameras cannot be read.

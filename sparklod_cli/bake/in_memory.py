@@ -115,7 +115,6 @@ def build_tree(
         leaves: a list of these splats.
         settings: method and its setting.
         in_chunks: the nodes are put into the order for streaming later.
-        progress: told of the stages.
     """
     row = BUILDERS[settings.method]
     built = [row.load().build(leaves.pop(), getattr(settings, row.setting), progress=progress)]

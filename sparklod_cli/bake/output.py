@@ -15,8 +15,7 @@ from ..codecs.rad.layout import OPTIONS
 from ..codecs.rad.names import SUFFIX as RAD
 from ..codecs.statistics import Statistics
 from ..io.reading import opened, read_stored
-from ..io.scenes import SceneSink, scene_sink
-from ..io.writing import Sink, sink
+from ..io.writing import SceneSink, Sink, scene_sink, sink
 from ..model.nodes import CHUNK_NODES
 from ..model.scene import Scene
 from ..model.splats import Splats, same_rows
@@ -53,7 +52,7 @@ def output_of(target: Place, settings: BakeSettings, *, overwrite: bool) -> Outp
     """Return the output that settings ask for; fail now if it cannot be written later.
 
     Raises:
-        OutputError: see `io.scenes.scene_sink` and `io.details.detail_sink`.
+        OutputError: see `io.writing.scene_sink` and `io.details.detail_sink`.
     """
     if settings.detail is not None:
         from ..io.details import detail_sink  # what most bakes do without
@@ -78,7 +77,6 @@ def output_of_kept(output: Output, source: Source, scene: Scene, settings: BakeS
         output: of an input without a tree.
         source: the input.
         scene: its content.
-        settings: of the bake.
 
     Raises:
         FormatError: nobody asked for another format than that of the scene, or for merged splats to be fitted; or for

@@ -23,9 +23,7 @@ def select(
 
     Args:
         splats: of an input, all or some.
-        settings: of the bake.
         start, total: number of the first one, and of all splats of the input; by default these are all.
-        threads: to work on.
     """
     if settings.rgba is not None:  # SH stay, as where Spark is given new colours
         values = read_rgba(settings.rgba, len(splats) if total is None else total, slice(start, start + len(splats)))

@@ -31,10 +31,9 @@ SUFFIX, MAX_BYTES = ".sparklod.json", 1 << 24
 def bake_unless_there(
     source: Source, target: Place, settings: BakeSettings, *, verify: bool = False, overwrite: bool = False, **how: Any
 ) -> Baked | None:
-    """Bakes as `bake` does, and notes of what; None where the output of the same fingerprint is there.
+    """Bake as `bake` does, and notes of what; None where the output of the same fingerprint is there.
 
     Args:
-        source, target, settings, overwrite: as for `bake`; the output is no standard output.
         verify: read all of the inputs and of the output, also where size and date are those of the last bake.
         how: further arguments of `bake`.
 
@@ -63,7 +62,7 @@ def bake_unless_there(
         return baked  # another run would get farther
     inputs = [dataclasses.asdict(each) for each in seen]
     note = {
-        "recipe": fingerprint.to_record(),
+        "recipe": dataclasses.asdict(fingerprint),
         "inputs": inputs,
         "output": {_within(target, file): _record_of(file) for file in files_of(target)},
     }
@@ -72,7 +71,7 @@ def bake_unless_there(
 
 
 def _former(beside: Place) -> dict[str, Any]:
-    """What the file beside an output says; empty where there is none that can be understood."""
+    """Return what the file beside an output says; empty where there is none that can be understood."""
     try:
         if size_of(beside) > MAX_BYTES:
             return {}
@@ -90,7 +89,7 @@ def _former(beside: Place) -> dict[str, Any]:
 def _fingerprint(
     source: Source, settings: BakeSettings, files: list[Place], seen: list[Identity], former: dict[str, Any]
 ) -> Fingerprint:
-    """The fingerprint of an output; inputs that are as they were last time are not read again."""
+    """Return the fingerprint of an output; inputs that are as they were last time are not read again."""
     known = {}
     if former and len(former["recipe"].inputs) == len(former["inputs"]):
         known = dict(zip(former["inputs"], former["recipe"].inputs, strict=True))
@@ -99,7 +98,7 @@ def _fingerprint(
 
 
 def _differences(fingerprint: Fingerprint, target: Place, former: dict[str, Any], *, verify: bool) -> list[str]:
-    """Why an output that is there is not that of a recipe; empty where it is."""
+    """Return why an output that is there is not that of a recipe; empty where it is."""
     if not former:
         return ["nothing tells of what it was made"]
     found = fingerprint.differences(former["recipe"])
@@ -112,7 +111,7 @@ def _differences(fingerprint: Fingerprint, target: Place, former: dict[str, Any]
 
 
 def _record_of(file: Place) -> dict[str, str]:
-    """Size and date of a file of an output, and a digest of all of it; at an address, its version."""
+    """Return size and date of a file of an output, and a digest of all of it; at an address, its version."""
     stamp = stamp_of(file)
     return {"stamp": stamp, "content": stamp if isinstance(file, Address) else content_of(file)}
 
@@ -130,7 +129,7 @@ def _is_same(file: Place | None, record: Any, *, verify: bool) -> bool:
 
 
 def _within(target: Place, file: Place) -> str:
-    """The name of a file of an output, with the folder that it has beside it."""
+    """Return the name of a file of an output, with the folder that it has beside it."""
     if isinstance(target, Path) and isinstance(file, Path) and file.is_relative_to(target.parent):
         return file.relative_to(target.parent).as_posix()
     return file.name

@@ -19,13 +19,14 @@ from .reading import (
     read_together,
     size_of_input,
 )
-from .scenes import SceneSink, scene_sink
 from .streams import PlacedFile, open_stream, open_streams
 from .writing import (
+    SceneSink,
     Sink,
     SinkTogether,
     check_writable,
     chunk_files,
+    scene_sink,
     sink,
     sink_together,
     write_stdout,

@@ -27,7 +27,7 @@ FIRST = chunk_name(0, 0)
 
 
 def detail_sink(path: Place, *, overwrite: bool) -> SinkTogether:
-    """The function that writes a manifest and the files of its chunks. Fails now if they cannot be written later.
+    """Return the function that writes a manifest and its chunk files. Fail now if they cannot be written later.
 
     It is given names, with their folders, and contents, the manifest last, and returns the size of all. With
     `overwrite`, the chunks of the output that was there before are replaced or removed: those files that its manifest
@@ -50,7 +50,7 @@ def detail_sink(path: Place, *, overwrite: bool) -> SinkTogether:
 
 
 def detail_files(path: Path) -> list[Path]:
-    """The files beside a manifest that are called as those of an output there, whether it names them or not.
+    """Return the files beside a manifest that are called as those of an output there, whether it names them or not.
 
     Args:
         path: of the manifest, which need not exist.
@@ -97,7 +97,7 @@ def _target(path: Place) -> Place:
 
 
 def _check_folder(target: Place, folder: str, former: Iterable[str]) -> None:
-    """Raises `OutputError` where a folder is not empty, and not one of the former output."""
+    """Raise `OutputError` where a folder is not empty, and not one of the former output."""
     if folder in folders_of(list(former)):
         return
     place = target.parent / folder
@@ -115,7 +115,7 @@ def _check_folder(target: Place, folder: str, former: Iterable[str]) -> None:
 
 
 def _former(target: Place) -> list[str]:
-    """The files of the output that is there, as far as its manifest and its chunks name them and they are called so."""
+    """Return the files of a former output that its manifest and its chunks name, and that have names of ours."""
     found = list[str]()
     with contextlib.suppress(OSError, FormatError):
         metas = parse(_content(target, MAX_MANIFEST)).names()
@@ -136,7 +136,7 @@ def _content(path: Place, most: int) -> bytes:
 
 
 def _standing(target: Place) -> list[str]:
-    """The files in folders beside a manifest that are called as those of an output."""
+    """Return the files in folders beside a manifest that are called as those of an output."""
     if isinstance(target, Address):
         return sorted(name for name in target.parent.files() if is_ours(name))
     found = list[str]()
@@ -163,7 +163,7 @@ class LevelFiles:
 
 
 def has_levels(path: Path) -> bool:
-    """Whether a file, or what a folder stands for, has a scene at several detail levels.
+    """Return whether a file, or what a folder stands for, has a scene at several detail levels.
 
     Raises:
         FormatError: it cannot be read, or is of no known format.
@@ -175,7 +175,7 @@ def has_levels(path: Path) -> bool:
 
 
 def read_level_files(path: Path) -> LevelFiles:
-    """The files of a lod-meta.json, or of the folder that holds it.
+    """Return the files of a lod-meta.json, or of the folder that holds it.
 
     Raises:
         FormatError: it cannot be read, or is no such manifest.

@@ -51,7 +51,7 @@ class RadFile:
 
     @classmethod
     def open(cls, path: Path) -> RadFile | None:
-        """Reads the header of a file, and its palette; None where the file is of another format.
+        """Read the header of a file, and its palette; None where the file is of another format.
 
         Raises:
             FormatError: it cannot be read, or breaks a promise without which its chunks cannot be.
@@ -81,12 +81,11 @@ class RadFile:
     def chunks(
         self, columns: Collection[str], *, thorough: bool, threads: int
     ) -> Iterator[tuple[int, Splats, LodTree | None]]:
-        """All chunks in order: the index of the first splat of each, its splats, and its nodes where there is a tree.
+        """Yield all chunks in order: the index of the first splat of each, its splats, and its nodes if it has a tree.
 
         Args:
             columns: of `Splats`; the others are 0.
             thorough: unpack the others, too, which finds what is corrupt.
-            threads: to decode with.
 
         Raises:
             FormatError: a chunk is damaged.
@@ -96,7 +95,7 @@ class RadFile:
             yield from self._chunks.read_all(*found, columns, thorough=thorough, threads=threads)
 
     def chunk(self, number: int, columns: Collection[str]) -> tuple[Splats, LodTree | None, FileCoding]:
-        """One chunk and its coding; only these columns are unpacked. Several threads may ask.
+        """Return one chunk and its coding; only these columns are unpacked. Several threads may ask.
 
         Raises:
             FormatError: it is damaged.
@@ -108,13 +107,13 @@ class RadFile:
 
 @contextlib.contextmanager
 def _opened(path: Path) -> Iterator[tuple[BinaryIO, Any] | None]:
-    """A RAD file and what opens the files beside it; None for a file of another format."""
+    """Yield a RAD file and what opens the files beside it; None for a file of another format."""
     with opened(path) as (file, form, more):
         yield (file, more["beside"]) if form.name == FORMAT else None
 
 
 def read_rad_header(path: Path) -> RadHeader:
-    """Reads the header of a RAD file; its chunks need not be there.
+    """Read the header of a RAD file; its chunks need not be there.
 
     Raises:
         FormatError: it cannot be read, is no such header, or promises what cannot be.
@@ -124,7 +123,7 @@ def read_rad_header(path: Path) -> RadHeader:
 
 
 def read_rad_chunk(path: Path, number: int, *, palette: FloatArray | None = None) -> RadChunk:
-    """Reads the header of a RAD file, and one chunk of it.
+    """Read the header of a RAD file, and one chunk of it.
 
     Args:
         path: of the file, or of the header whose chunks are files beside it.

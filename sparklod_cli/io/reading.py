@@ -33,12 +33,10 @@ ZIP = b"PK\x03\x04"
 
 
 def read_scene(path: Place, *, threads: int = 1, progress: Progress = silent) -> Scene:
-    """Reads a splat file of any known format, told by its content, or else by its suffix.
+    """Read a splat file of any known format, told by its content, or else by its suffix.
 
     Args:
         path: of a file, or of a folder that holds an unpacked SOG or a Streamed SOG; - is standard input.
-        threads: to decode with.
-        progress: is told how much is done.
 
     Raises:
         FormatError: it is not a file, empty, of no known format, or broken.
@@ -49,7 +47,7 @@ def read_scene(path: Place, *, threads: int = 1, progress: Progress = silent) ->
 
 
 def read_stored(path: Place) -> Stored:
-    """The codes of a Level-of-Detail file as they stand in it, so that its leaves can be written again bit for bit.
+    """Return the codes of a Level-of-Detail file, so that its leaves can be written again bit for bit.
 
     Args:
         path: of a file whose format can be written with a tree; - is standard input.
@@ -63,12 +61,10 @@ def read_stored(path: Place) -> Stored:
 
 
 def read_levels(path: Place, *, threads: int = 1, progress: Progress = silent) -> DetailScene:
-    """Reads a scene at all its detail levels.
+    """Read a scene at all its detail levels.
 
     Args:
         path: of the lod-meta.json of a Streamed SOG, or of the folder that holds it.
-        threads: to decode with.
-        progress: is told how much is done.
 
     Raises:
         UnknownFormatError: its format has no detail levels.
@@ -85,13 +81,10 @@ def read_levels(path: Place, *, threads: int = 1, progress: Progress = silent) -
 def examine_scene(
     path: Place, *, columns: Collection[str] = COLUMNS, threads: int = 1, progress: Progress = silent
 ) -> Scene:
-    """Reads a splat file for a report on it: its tree may be broken, and columns that are not asked for may be 0.
+    """Read a splat file for a report on it: its tree may be broken, and columns that are not asked for may be 0.
 
     Args:
-        path: as for `read_scene`.
         columns: of `Splats`.
-        threads: to decode with.
-        progress: is told how much is done.
 
     Raises:
         FormatError: as `read_scene`, but for the tree.
@@ -113,10 +106,9 @@ def read_coded(
     threads: int = 1,
     progress: Progress = silent,
 ) -> CodedSpz | None:
-    """The codes of an SPZ file, for a report on it; None where a file is of another format.
+    """Return the codes of an SPZ file, for a report on it; None where a file is of another format.
 
     Args:
-        path, columns, threads, progress: as for `examine_scene`.
         watch: sees the codes of some columns, which need not be kept.
 
     Raises:
@@ -133,7 +125,7 @@ def read_coded(
 
 @contextlib.contextmanager
 def opened(path: Place) -> Iterator[tuple[BinaryIO, Format, dict[str, Any]]]:
-    """A splat file of any known format, the format, and what else its codec takes.
+    """Yield a splat file of any known format, the format, and what else its codec takes.
 
     Raises:
         FormatError: it is not a file, empty, or of no known format; an `OSError` of the body becomes one.
@@ -166,7 +158,7 @@ def opened(path: Place) -> Iterator[tuple[BinaryIO, Format, dict[str, Any]]]:
 
 @contextlib.contextmanager
 def readable() -> Iterator[None]:
-    """An `OSError` of the body, which reads a file, becomes an `UnreadableError`."""
+    """Yield an `OSError` of the body, which reads a file, becomes an `UnreadableError`."""
     try:
         yield
     except OSError as error:
@@ -174,7 +166,7 @@ def readable() -> Iterator[None]:
 
 
 def read_arrays(path: Path) -> dump.Arrays | None:
-    """The arrays of a .npz file; None where a file is something else, or cannot be opened.
+    """Return the arrays of a .npz file; None where a file is something else, or cannot be opened.
 
     Raises:
         FormatError: an array is damaged, or of no plain numbers.
@@ -193,12 +185,12 @@ def read_arrays(path: Path) -> dump.Arrays | None:
 
 
 def _file_of(path: Place) -> contextlib.AbstractContextManager[BinaryIO]:
-    """A file that is closed at the end, or standard input, which is not."""
+    """Return a file that is closed at the end, or standard input, which is not."""
     return contextlib.nullcontext(spooled()) if path == DASH else path.open("rb")
 
 
 def size_of_input(path: Place) -> int | None:
-    """Bytes of a file, or of standard input; None where that cannot be told."""
+    """Return bytes of a file, or of standard input; None where that cannot be told."""
     try:
         if path == DASH:
             return spooled().seek(0, os.SEEK_END)
@@ -214,7 +206,7 @@ MAX_TEXT = 1 << 24
 
 
 def read_text(path: Path) -> str:
-    """A text file of at most `MAX_TEXT` bytes; `UnreadableError`, naming it, where that cannot be."""
+    """Return a text file of at most `MAX_TEXT` bytes; `UnreadableError`, naming it, where that cannot be."""
     try:
         return str(_read_up_to(path, MAX_TEXT), "utf-8-sig")
     except (OSError, ValueError) as error:
@@ -223,7 +215,7 @@ def read_text(path: Path) -> str:
 
 
 def read_together(path: Path, sets: Collection[Collection[str]], limit: int) -> dict[str, bytes]:
-    """Files that belong together, by name, the one that `path` names first.
+    """Return files that belong together, by name, the one that `path` names first.
 
     Args:
         path: of a file, or of a folder that holds one of the sets.
@@ -250,7 +242,7 @@ def read_together(path: Path, sets: Collection[Collection[str]], limit: int) -> 
 
 
 def read_rgba(path: Path, count: int, rows: slice | None = None) -> FloatArray:
-    """Colours and opacities for the `count` splats of a scene, or for a range of them, see `rgba.decode`.
+    """Return colours and opacities for the `count` splats of a scene, or for a range of them, see `rgba.decode`.
 
     Raises:
         FormatError: it cannot be read or is not such a file; names it.

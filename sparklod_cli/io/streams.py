@@ -40,19 +40,16 @@ def open_stream(
     threads: int = 1,
     progress: Progress = silent,
 ) -> Iterator[SceneStream]:
-    """The splats of a file of any known format without a tree, block by block.
+    """Yield the splats of a file of any known format without a tree, block by block.
 
     Only its header is read now. Each read of the stream has the file for itself, so that several threads may read.
     Columns that lie one after the other (SPZ, SOG), and text, are unpacked once, when splats are first read; see
     docs/formats.md for the room that takes.
 
     Args:
-        path: as for `io.read_scene`.
         scratch: folder for what is unpacked; None for one of the system's temporary files.
         keep: leave what is unpacked in `scratch`, where the same file is found unpacked the next time, by other
             processes, too; whoever owns the folder removes it. The stream can be pickled then, if `progress` can.
-        threads: to decode with.
-        progress: told of what is unpacked.
 
     Raises:
         HasTreeError: the file is a tree.
@@ -95,13 +92,12 @@ def open_streams(
     threads: int = 1,
     progress: Progress = silent,
 ) -> Iterator[SceneStream]:
-    """The splats of several files, each where it stands, as those of one scene; see `model.merged`.
+    """Yield the splats of several files, each where it stands, as those of one scene; see `model.merged`.
 
     Nothing is kept open between reads, and the header of a file that is named twice is read once.
 
     Args:
         files: at least one.
-        scratch, keep, threads, progress: as for `open_stream`. Unless `keep` is set, a file is unpacked for each read.
 
     Raises:
         HasTreeError, FormatError, ValueError: as `open_stream`; names the file.
@@ -112,7 +108,7 @@ def open_streams(
 
 
 def _again(file: Place, scratch: Path | None, keep: bool, threads: int, progress: Progress) -> SceneStream:
-    """The stream of a file that need not stay open."""
+    """Return the stream of a file that need not stay open."""
     try:
         with open_stream(file, scratch=scratch, keep=keep, threads=threads, progress=progress) as stream:
             once = functools.partial(_read_once, file, scratch, threads, progress)
@@ -139,10 +135,10 @@ class _Store(Protocol):
     def name(self) -> Hashable: ...
 
     def file(self, path: Place, pieces: Pieces) -> contextlib.AbstractContextManager[BinaryIO]:
-        """What has been unpacked of a file; `pieces` are written first if they have not been."""
+        """Return what has been unpacked of a file; `pieces` are written first if they have not been."""
 
     def close(self) -> None:
-        """Removes it, unless it is to stay."""
+        """Remove it, unless it is to stay."""
 
 
 @dataclass
@@ -201,7 +197,7 @@ class _Folder:
 
 
 def _digest(path: Place) -> str:
-    """A name for this version of a file."""
+    """Return a name for this version of a file."""
     if isinstance(path, Address):
         parts: tuple[Any, ...] = (path.url, path.version())
     else:
@@ -212,7 +208,7 @@ def _digest(path: Place) -> str:
 
 @contextlib.contextmanager
 def _room(folder: Path | None) -> Iterator[None]:
-    """An `OSError` of the body becomes an `OutputError`."""
+    """Yield an `OSError` of the body becomes an `OutputError`."""
     try:
         yield
     except OSError as error:
@@ -241,7 +237,7 @@ class _Source:
 
     @contextlib.contextmanager
     def borrowed(self) -> Iterator[SceneStream]:
-        """The stream of the file, which nobody else reads as long as the body runs."""
+        """Yield the stream of the file, which nobody else reads as long as the body runs."""
         with readable():
             key = _Key(self.store.name, self.path, _digest(self.path), self.threads, self.progress)
             with borrowed(key, self._opened) as stream:
@@ -298,7 +294,7 @@ _IDLE: list[tuple[Hashable, Opened]] = []
 
 @contextlib.contextmanager
 def borrowed(key: Hashable, opened: Callable[[], Opened]) -> Iterator[SceneStream]:
-    """A stream that nobody else reads meanwhile: one that waits, or else a new one. It waits afterwards.
+    """Yield a stream that nobody else reads meanwhile: one that waits, or else a new one. It waits afterwards.
 
     Args:
         key: tells a file, its version and how it is read from others.
@@ -320,7 +316,7 @@ def borrowed(key: Hashable, opened: Callable[[], Opened]) -> Iterator[SceneStrea
 
 
 def close_idle(matches: Callable[[Hashable], bool] = lambda key: True) -> None:
-    """Closes the files that wait, or those whose keys match."""
+    """Close the files that wait, or those whose keys match."""
     with _LOCK:
         closing = [item for item in _IDLE if matches(item[0])]
         _IDLE[:] = [item for item in _IDLE if not matches(item[0])]

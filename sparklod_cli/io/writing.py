@@ -7,15 +7,25 @@ import functools
 import os
 import sys
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
+from ..codecs.encoder import Encoder, Get
+from ..codecs.formats import Format
+from ..codecs.options import WriteOptions
+from ..model.scene import Scene
 from ..support import atomic, atomic_set, folders
 from ..support.addresses import Address, Place
 from ..support.errors import OutputError, StdoutError
+from ..support.progress import Progress, silent
 from ..support.stdin import DASH
 from ..support.stdout import ReaderGoneError, guarded
 from .paths import number_of, reason_of
+
+if TYPE_CHECKING:
+    from ..codecs.rad.repacking import PackedChunks
+
 
 #: Path or address of a header.
 _Header = TypeVar("_Header", Path, Address)
@@ -145,7 +155,6 @@ def write_together(path: Place, files: Files, *, overwrite: bool) -> int:
         path: of the header; where it is a symbolic link, all files go to where that leads.
         files: names in the folder of the header, and their content; the last is the header, whose name is that of
             `path`.
-        overwrite: replace existing files.
 
     Raises:
         OutputError: a file exists and `overwrite` is not set, or the file system, or the service, refused something.
@@ -221,7 +230,6 @@ def send_together(address: Address, files: Files, *, former: Sequence[Address], 
         address: of the file that names the others.
         files: names, with the folders that they are in there, and contents; the last is that of `address`.
         former: files of a former output, which are removed where no new one has their name.
-        overwrite: replace the file at `address`.
 
     Raises:
         OutputError: the header exists and `overwrite` is not set, or a file cannot be sent.
@@ -245,3 +253,79 @@ def send_together(address: Address, files: Files, *, former: Sequence[Address], 
             raise OutputError(f"cannot write {address}: {reason_of(error)}") from None
         raise
     return size
+
+
+@dataclass(frozen=True)
+class SceneSink:
+    """Writes a scene.
+
+    Attributes:
+        form: that is written.
+        whole: writes one file; None for several.
+        together: writes a header and the files that it names; None for one file.
+        stem: of the names of chunks.
+    """
+
+    form: Format
+    whole: Sink | None
+    together: SinkTogether | None
+    stem: str
+
+    def __call__(self, scene: Scene, options: WriteOptions, *, threads: int = 1, progress: Progress = silent) -> int:
+        """Write a scene and return how many bytes it wrote.
+
+        Raises:
+            OutputError: see `scene_sink`; and what the codec raises.
+        """
+        codec = self.form.codec()
+        if self.whole is not None:
+            return self.whole(codec.encode(scene, options, threads=threads, progress=progress))
+        assert self.together is not None
+        if self.form.unbundled is not None:
+            files = codec.encode_files(scene, options, threads=threads, progress=progress)
+            return self.together((name, (content,)) for name, content in files)
+        return self.together(codec.encode_chunked(scene, options, self.stem, threads=threads, progress=progress))
+
+    def repack(self, chunks: PackedChunks) -> int:
+        """Write the chunks of a RAD file as they stand, and return how many bytes were written.
+
+        Raises:
+            OutputError: see `scene_sink`.
+        """
+        if self.whole is not None:
+            return self.whole(chunks.in_one_file())
+        assert self.together is not None
+        return self.together(chunks.in_files(self.stem))
+
+    def assemble(self, encoder: Encoder, get: Get, *, threads: int = 1, progress: Progress = silent) -> int:
+        """Write a tree whose windows are encoded, and return how many bytes it wrote.
+
+        Args:
+            encoder: of the tree, in the format of this sink.
+            get: reads the results of the windows.
+
+        Raises:
+            OutputError: see `scene_sink`.
+        """
+        if self.whole is not None:
+            return self.whole(encoder.pieces(get, threads=threads, progress=progress))
+        assert self.together is not None
+        return self.together(self.form.codec().assemble_chunked(encoder, get, self.stem, progress=progress))
+
+
+def scene_sink(path: Place, form: Format, *, chunked: bool = False, overwrite: bool) -> SceneSink:
+    """Return what writes a scene in a format. Fails now if the output cannot be written later.
+
+    Args:
+        path: of the file, or of the header where `chunked`; - is standard output, for one file. One that is called as
+            the `unbundled` of the format has the other files beside it.
+        form: that is written.
+        chunked: with each chunk in a file of its own, beside the header; of RAD.
+
+    Raises:
+        OutputError: see `sink` and `sink_together`. Writing raises that, too, and what the codec raises.
+    """
+    stem = path.stem if isinstance(path, Address) else Path(os.path.realpath(path)).stem
+    if chunked or path.name.lower() == form.unbundled:
+        return SceneSink(form, None, sink_together(path, overwrite=overwrite), stem)
+    return SceneSink(form, sink(path, overwrite=overwrite), None, stem)

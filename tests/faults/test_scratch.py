@@ -18,7 +18,7 @@ from sparklod_cli.bake.flow import bake
 from sparklod_cli.bake.out_of_core import scratch_folder
 from sparklod_cli.bake.out_of_core.job import PUBLISHED
 from sparklod_cli.bake.out_of_core.scratch_folder import SUFFIX
-from sparklod_cli.bake.out_of_core.store import FolderStore
+from sparklod_cli.bake.out_of_core.store import Store
 from sparklod_cli.bake.settings import BakeSettings, Resources
 from sparklod_cli.bake.skipping import bake_unless_there
 from sparklod_cli.support.errors import InvalidSplatsError, OutputError, ScratchError
@@ -36,11 +36,11 @@ import os, signal, sys, time
 from pathlib import Path
 from sparklod_cli.bake.flow import bake
 from sparklod_cli.bake.settings import BakeSettings, Resources
-from sparklod_cli.bake.out_of_core.store import FolderStore
+from sparklod_cli.bake.out_of_core.store import Store
 from sparklod_cli.support import interrupts
 
 source, target, scratch, method, suffix, moment, how = sys.argv[1:]
-left, write = int(moment), FolderStore._write
+left, write = int(moment), Store._write
 
 def end():
     if how == "kill":
@@ -59,7 +59,7 @@ def failing(self, name, pieces):
     left -= 1
     return write(self, name, halfway(pieces) if left == 0 else pieces)
 
-FolderStore._write = failing
+Store._write = failing
 interrupts.handle()
 try:
     bake(Path(source), Path(target), BakeSettings(method=method, suffix=suffix), say=print,
@@ -152,7 +152,7 @@ def stop_at_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
     """Interrupts bakes when their output is in place, and nothing of their scratch is removed."""
     clear = scratch_folder._clear
 
-    def interrupted(store: FolderStore) -> None:
+    def interrupted(store: Store) -> None:
         if store.has(PUBLISHED):
             raise KeyboardInterrupt
         clear(store)

@@ -22,7 +22,7 @@ from ...support.addresses import Place
 from ...support.errors import SparklodError, memory_errors_translated
 from ...support.progress import Progress, silent
 from .cluster_pool import Connection, Pool
-from .store import FileStore
+from .store import Store
 from .tasks import Task
 
 _INSTALL = f"install sparklod {__version__} with its extra cluster there, and start it again"
@@ -40,13 +40,13 @@ class ClusterEngine:
     """
 
     def __init__(self, connection: Connection, *, threads: int, memory: int | None = None) -> None:
-        """Takes the connection to a cluster, and what `threads` and `memory` say."""
+        """Take the connection to a cluster, and what `threads` and `memory` say."""
         self._connection, self.threads, self.memory = connection, threads, memory
         self._checked: tuple[str, frozenset[str]] | None = None
 
     def run(self, stage: str, tasks: Sequence[Task], job: Any, progress: Progress) -> None:
         """See `Engine.run`."""
-        store: FileStore = job.store
+        store: Store = job.store
         left = {task.name: (place, task) for place, task in enumerate(tasks) if not store.has(task.name)}
         total = sum(task.weight for task in tasks)
         done = total - sum(task.weight for _, task in left.values())
@@ -89,13 +89,12 @@ class ClusterEngine:
     def each(
         self, stage: str, call: Callable[..., Any], arguments: Sequence[tuple[Any, ...]], progress: Progress, unit: str
     ) -> Iterator[Iterator[Any]]:
-        """Calls a function with each tuple of arguments, side by side, until the context ends.
+        """Call a function with each tuple of arguments, side by side, until the context ends.
 
         Args:
             stage: word for what is done.
             call: a function of a module that takes `threads` besides, and returns something small.
             arguments: small, and can be pickled.
-            progress: told how many calls ended.
             unit: what a call is called.
 
         Yields:
@@ -117,8 +116,8 @@ class ClusterEngine:
                 outcomes[name] = result if error is None else error
             yield outcomes.pop(str(place))
 
-    def check(self, store: FileStore | None, files: Sequence[Place] = ()) -> None:
-        """Raises a `SparklodError` where a worker cannot do its share: another sparklod, or a folder it does not see.
+    def check(self, store: Store | None, files: Sequence[Place] = ()) -> None:
+        """Raise a `SparklodError` where a worker cannot do its share: another sparklod, or a folder it does not see.
 
         Args:
             store: of the bake, if it has one.
@@ -138,15 +137,15 @@ class ClusterEngine:
             _check_answer(worker, answer, store)
 
     def remove(self, folder: Path) -> None:
-        """Removes a folder on the machines of all workers, and on this one."""
+        """Remove a folder on the machines of all workers, and on this one."""
         shutil.rmtree(folder, ignore_errors=True)
         if self._connection.alive:
             with contextlib.suppress(SparklodError), self._connection.guarded():
                 self._connection.client.run(shutil.rmtree, folder, ignore_errors=True)
 
 
-def _check_answer(worker: str, answer: Any, store: FileStore | None) -> None:
-    """Raises a `SparklodError` for what a worker said of itself."""
+def _check_answer(worker: str, answer: Any, store: Store | None) -> None:
+    """Raise a `SparklodError` for what a worker said of itself."""
     if not isinstance(answer, Probed):  # an error: it has no sparklod, or one that knows no such question
         raise SparklodError(f"worker {worker} does not run sparklod {__version__} ({answer}): {_INSTALL}")
     place = f"worker {worker} on {answer.host}"
@@ -189,8 +188,8 @@ class Probed:
     missing: tuple[str, ...]
 
 
-def probe(store: FileStore | None, name: str, files: Sequence[Path]) -> Probed:
-    """Tries whether this worker can do its share: read what others wrote, and write what they read.
+def probe(store: Store | None, name: str, files: Sequence[Path]) -> Probed:
+    """Try whether this worker can do its share: read what others wrote, and write what they read.
 
     Args:
         store: of the bake, if it has one.
@@ -214,12 +213,11 @@ def probe(store: FileStore | None, name: str, files: Sequence[Path]) -> Probed:
 
 
 def run_task(packed: bytes, task: Task, threads: int) -> tuple[int, int]:
-    """Runs a task, unless its result is there: a worker may have been lost after it had put that.
+    """Run a task, unless its result is there: a worker may have been lost after it had put that.
 
     Args:
         packed: the job, pickled; a copy for each task, so that each counts its own bytes.
         task: to be run.
-        threads: to work on.
 
     Returns:
         bytes that it wrote to the store, and read there.
@@ -233,12 +231,12 @@ def run_task(packed: bytes, task: Task, threads: int) -> tuple[int, int]:
 
 
 def run_call(call: Callable[..., Any], arguments: tuple[Any, ...], threads: int) -> Any:
-    """Calls a function that returns something small."""
+    """Call a function that returns something small."""
     return call(*arguments, threads=threads)
 
 
 def dask_setup(worker: Any) -> None:
-    """Prepares a worker process that sparklod started: it has no dashboard, and the client ends it, no Ctrl-C."""
+    """Prepare a worker process that sparklod started: it has no dashboard, and the client ends it, no Ctrl-C."""
     worker.http_server.stop()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.environ.setdefault("NUMBA_NUM_THREADS", "1")

@@ -32,13 +32,13 @@ FAMILIES, OF_FAMILY = 0.4, 40
 
 
 def default_memory() -> int | None:
-    """Bytes that a bake may take unless told otherwise; None where the system does not say what is available."""
+    """Return bytes that a bake may take unless told otherwise; None where the system does not say what is available."""
     available = machine.available_memory()
     return None if available is None else int(MEMORY_SHARE * available)
 
 
 def in_memory_bytes(method: str, splats: int, sh_degree: int) -> int:
-    """Bytes that a bake in memory takes at its peak.
+    """Return bytes that a bake in memory takes at its peak.
 
     Args:
         method: of `lod.builders.BUILDERS`.
@@ -50,14 +50,13 @@ def in_memory_bytes(method: str, splats: int, sh_degree: int) -> int:
 def out_of_core_bytes(
     method: str, splats: int, sh_degree: int, block_splats: int, *, in_chunks: bool = False, threads: int = 1
 ) -> int:
-    """Bytes that a bake out of core takes at its peak.
+    """Return bytes that a bake out of core takes at its peak.
 
     Args:
         method: of `lod.builders.BUILDERS`.
         splats, sh_degree: of the input; `sh_degree` as far as it is kept.
         block_splats: of a block.
         in_chunks: families are put in an order for streaming at the end.
-        threads: to work on.
     """
     from ...lod.chunk_order import MOST_FAMILIES, family_bytes  # takes long to load, and this is asked out of core only
 
@@ -69,7 +68,7 @@ def out_of_core_bytes(
 
 
 def scratch_bytes(method: str, splats: int, sh_degree: int) -> int:
-    """Bytes that the scratch folder takes at its peak, without what is unpacked of the input.
+    """Return bytes that the scratch folder takes at its peak, without what is unpacked of the input.
 
     Args:
         method: of `lod.builders.BUILDERS`.
@@ -81,11 +80,10 @@ def scratch_bytes(method: str, splats: int, sh_degree: int) -> int:
 def block_splats_within(
     memory: int | None, method: str, splats: int, sh_degree: int, *, in_chunks: bool = False, threads: int = 1
 ) -> int | None:
-    """The splats of a block, a power of two, so that nearly the same memory gives the same blocks.
+    """Return the splats of a block, a power of two, so that nearly the same memory gives the same blocks.
 
     Args:
         memory: bytes that a bake may take; None for any number.
-        method, splats, sh_degree, in_chunks, threads: as for `out_of_core_bytes`.
 
     Returns:
         None where the memory is too little for blocks of `LEAST_BLOCK_SPLATS`.

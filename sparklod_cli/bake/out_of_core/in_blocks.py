@@ -155,8 +155,11 @@ def _stages(job: Job) -> Iterator[Task]:
 
 
 def build_stage(job: Job, number: int, *, threads: int, progress: Progress) -> None:
-    """A task. Results: families, whose nodes are `rows`; nodes without a parent, or the root of the last stage; at last
-    what is to be known of the nodes."""
+    """Run a stage of the build; a task.
+
+    Results: families, whose nodes are `rows`; nodes without a parent, or the root of the last stage; at last numbers
+    and statistics of the nodes.
+    """
     stage, builder = job.blocks.stages[number], job.builder()
     with on_threads(threads):
         pending = _begun(job, stage, threads)
@@ -175,14 +178,14 @@ def build_stage(job: Job, number: int, *, threads: int, progress: Progress) -> N
 
 
 def clean(job: Job, group: int, *, threads: int, progress: Progress) -> None:
-    """A task: removes the splats of a group of blocks, whose stages are done."""
+    """Remove the splats of a group of blocks whose stages are done; a task."""
     for part in range(len(job.parts) - 1):
         job.store.remove(job.splats(part, group))
     job.store.put(clean_of(group), {})
 
 
 def _begun(job: Job, stage: Stage, threads: int) -> Pending:
-    """The nodes that a stage begins with."""
+    """Return the nodes that a stage begins with."""
     if stage.block is None:
         return Pending.concat([Pending(job.store.get(pending_of(child))) for child in stage.children])
     splats, index = block_of(job, stage.block, threads)
@@ -190,7 +193,7 @@ def _begun(job: Job, stage: Stage, threads: int) -> Pending:
 
 
 def block_of(job: Job, block: int, threads: int) -> tuple[Splats, NDArray[np.int64]]:
-    """The splats of a block, and the place of each among all that are kept."""
+    """Return the splats of a block, and the place of each among all that are kept."""
     group = next(number for number, blocks in enumerate(job.blocks.groups) if block in blocks)
     begin = job.blocks.groups[group].start
     ranges = []

@@ -12,7 +12,7 @@ from ...lod.stages.records import StagedBuilder
 from ...model.streams import SceneStream
 from ..settings import BakeSettings
 from .blocks import Blocks
-from .store import FileStore
+from .store import Store
 
 #: Those of a scene that is not cut yet.
 NO_BLOCKS = Blocks((), ())
@@ -37,7 +37,7 @@ class Job:
         encoder: of the output; None before the statistics of all nodes are known.
     """
 
-    store: FileStore
+    store: Store
     stream: SceneStream
     settings: BakeSettings
     needed: frozenset[str]
@@ -56,15 +56,15 @@ class Job:
         return min(self.stream.sh_degree, self.settings.max_sh)
 
     def builder(self) -> StagedBuilder:
-        """The builder of the tree."""
+        """Return the builder of the tree."""
         return BUILDERS[self.settings.method].load_stages()
 
     def part(self, number: int) -> str:
-        """The name of what is known of a part of the input, whose splats are in blocks then."""
+        """Return the name of what is known of a part of the input, whose splats are in blocks then."""
         return f"scatter-{self.round}/{number}"
 
     def splats(self, part: int, group: int) -> str:
-        """The name of the splats of a part that are in a group of blocks."""
+        """Return the name of the splats of a part that are in a group of blocks."""
         return f"{self.part(part)}/{group}"
 
 
@@ -79,8 +79,8 @@ window_of, encoded_of, clean_of = "order/{}".format, "encoded/{}".format, "clean
 ROOT, ORDER, PUBLISHED = "root", "order", "published"
 
 
-def forget(store: FileStore, damaged: Collection[str]) -> None:
-    """Removes results that are damaged, and whatever has to be made again for them; stages that are whole are kept."""
+def forget(store: Store, damaged: Collection[str]) -> None:
+    """Remove results that are damaged, and whatever has to be made again for them; stages that are whole are kept."""
     names = set(damaged)
     if any(name.startswith("order") for name in damaged):
         names |= {ORDER}
@@ -94,6 +94,6 @@ def forget(store: FileStore, damaged: Collection[str]) -> None:
         store.remove(name)
 
 
-def _numbers(store: FileStore, prefix: str) -> list[int]:
-    """The numbers of the results whose names begin like this."""
+def _numbers(store: Store, prefix: str) -> list[int]:
+    """Return the numbers of the results whose names begin like this."""
     return [int(name.removeprefix(prefix)) for name in store.names() if name.startswith(prefix)]

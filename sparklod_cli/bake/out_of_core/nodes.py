@@ -19,26 +19,26 @@ from ...support.parallel import for_blocks, ordered_map
 from ...support.progress import Progress
 from .job import ROOT, Job, encoded_of, families_of, window_of
 from .order import WINDOW_NODES
-from .store import FileStore
+from .store import Store
 
 #: (N, `width_of`) float32: centre, scale, rotation, opacity, rgb and SH of a splat, in the order of `COLUMNS`.
 Rows = NDArray[np.float32]
 
 
 def width_of(sh_degree: int) -> int:
-    """Numbers of a row."""
+    """Return numbers of a row."""
     return 14 + 3 * COEFFICIENTS[sh_degree]
 
 
 def rows_of(splats: Splats, threads: int = 1) -> Rows:
-    """The rows of splats."""
+    """Return the rows of splats."""
     rows = np.empty((len(splats), width_of(splats.sh_degree)), np.float32)
     fill_rows(splats, rows, threads)
     return rows
 
 
 def fill_rows(splats: Splats, rows: Rows, threads: int = 1) -> None:
-    """Fills rows with splats."""
+    """Fill rows with splats."""
     places = _places(splats)
 
     def fill(block: slice) -> None:
@@ -49,7 +49,7 @@ def fill_rows(splats: Splats, rows: Rows, threads: int = 1) -> None:
 
 
 def splats_of(rows: Rows, threads: int = 1) -> Splats:
-    """The splats of rows."""
+    """Return the splats of rows."""
     splats = Splats.empty(len(rows), degree_of((rows.shape[1] - width_of(0)) // 3))
     places = _places(splats)
 
@@ -62,11 +62,11 @@ def splats_of(rows: Rows, threads: int = 1) -> Splats:
 
 
 def _nothing(done: int) -> None:
-    """Nobody is told."""
+    """Report no progress."""
 
 
 def _places(splats: Splats) -> list[tuple[slice, Rows]]:
-    """Each column as a matrix, a view of it, and where it is in a row."""
+    """Return each column as a matrix, a view of it, and where it is in a row."""
     places, at = [], 0
     for name in COLUMNS:
         column = getattr(splats, name)
@@ -81,10 +81,9 @@ GAP = 128
 
 
 def node_stream(job: Job, count: int, leaves: int) -> NodeStream:
-    """The nodes of a tree that is in order.
+    """Return the nodes of a tree that is in order.
 
     Args:
-        job: the job.
         count: of the nodes.
         leaves: of these.
     """
@@ -94,7 +93,7 @@ def node_stream(job: Job, count: int, leaves: int) -> NodeStream:
 
 
 def encode(job: Job, window: int, *, threads: int, progress: Progress) -> None:
-    """A task. Result: what the encoder of the output makes of the chunks of a window, by their numbers."""
+    """Encode a window; a task. Result: what the encoder of the output makes of its chunks, by their numbers."""
     assert job.encoder is not None
     encoder = job.encoder
     start = window * WINDOW_NODES
@@ -111,14 +110,14 @@ def encode(job: Job, window: int, *, threads: int, progress: Progress) -> None:
     job.store.put(encoded_of(window), arrays)
 
 
-def encoded_chunk(store: FileStore, number: int, name: str) -> NDArray[np.generic]:
-    """What `encode` made of a chunk: the array of this name."""
+def encoded_chunk(store: Store, number: int, name: str) -> NDArray[np.generic]:
+    """Return what `encode` made of a chunk: the array of this name."""
     window, place = divmod(number, len(windows_of(WINDOW_NODES)))
     key = f"{place}.{name}"
     return store.get(encoded_of(window), [key])[key]
 
 
-def _read(store: FileStore, width: int, start: int, stop: int, threads: int = 1) -> tuple[Splats, LodTree]:
+def _read(store: Store, width: int, start: int, stop: int, threads: int = 1) -> tuple[Splats, LodTree]:
     """As `NodeStream.read`, of nodes whose rows have this width."""
     parts = []
     for window in range(start // WINDOW_NODES, -(-stop // WINDOW_NODES)):
@@ -130,8 +129,8 @@ def _read(store: FileStore, width: int, start: int, stop: int, threads: int = 1)
     return splats_of(rows, threads), LodTree(count.copy(), child_start.copy())
 
 
-def _read_window(store: FileStore, width: int, window: int) -> tuple[Rows, LodTree]:
-    """The nodes of a window, see `order.put_order`."""
+def _read_window(store: Store, width: int, window: int) -> tuple[Rows, LodTree]:
+    """Return the nodes of a window, see `order.put_order`."""
     plan = store.get(window_of(window))
     count = plan["count"].astype(np.int64)
     total = int(count.sum()) + (window == 0)
@@ -150,9 +149,9 @@ def _read_window(store: FileStore, width: int, window: int) -> tuple[Rows, LodTr
 
 
 def _fill(
-    store: FileStore, name: str, row: NDArray[np.int64], count: NDArray[np.int64], target: NDArray[np.int64], rows: Rows
+    store: Store, name: str, row: NDArray[np.int64], count: NDArray[np.int64], target: NDArray[np.int64], rows: Rows
 ) -> None:
-    """Fills rows with the children of some families of a stage: of each `count` of them, from `row` on, at `target`."""
+    """Fill rows with the children of some families of a stage: of each `count` of them, from `row` on, at `target`."""
     cuts = np.flatnonzero(row[1:] > row[:-1] + count[:-1] + GAP) + 1
     for first, last in zip([0, *cuts.tolist()], [*cuts.tolist(), len(row)], strict=True):
         begin, end, some = row[first], row[last - 1] + count[last - 1], count[first:last]

@@ -26,7 +26,7 @@ from ..sources import Merged, Source, absolute_source, opened_source
 from . import estimate
 from .job import PUBLISHED, Job
 from .scratch_folder import at_work, scratch_folder
-from .store import store_of
+from .store import Store
 from .tasks import Engine, LocalEngine
 
 if TYPE_CHECKING:
@@ -54,7 +54,6 @@ def blocks_for(
     """Open the workspace of a bake that goes out of core, if that is needed or requested; None for one in memory.
 
     Args:
-        source, target, settings, overwrite, threads, progress, resources, engine, say: as for `flow.bake`.
         output: of the bake.
         clock: of its stages.
 
@@ -74,7 +73,7 @@ def blocks_for(
     folder = scratch_folder(target, fingerprint, resources.scratch_dir)
     if engine is not None:
         folder = absolute(folder)  # other processes work in folders of their own
-    store = store_of(folder)
+    store = Store(folder)
     is_left = bool(store.names())
     why = _reason(header, settings, memory, resources, engine, is_left=is_left)
     whole = _as_a_whole(settings)
@@ -111,22 +110,17 @@ def blocks_for(
 
 
 def has_published(source: Source, target: Place, settings: BakeSettings, resources: Resources) -> bool:
-    """Return True if a bake resumes one that was interrupted when its output, or a part of it, may have been in place.
-
-    Args:
-        source, target, settings, resources: as for `flow.bake`.
-    """
+    """Return whether a bake resumes one that was interrupted when its output, or a part of it, may have been there."""
     if not resources.resume:
         return False
     fingerprint = functools.partial(source_fingerprint, source, settings)
-    return store_of(scratch_folder(target, fingerprint, resources.scratch_dir)).has(PUBLISHED)
+    return Store(scratch_folder(target, fingerprint, resources.scratch_dir)).has(PUBLISHED)
 
 
 def fits_in_memory(source: Source, settings: BakeSettings, memory: int | None) -> bool:
     """Return whether an input can be baked in so much memory; an unreadable one fits: whoever bakes it will say why.
 
     Args:
-        source, settings: as for `flow.bake`.
         memory: bytes; None for any number.
     """
     try:

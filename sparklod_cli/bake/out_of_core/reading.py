@@ -59,11 +59,10 @@ def leaves_of(
 
 
 def first_look(stream: SceneStream, settings: BakeSettings, blocks: int) -> tuple[FloatArray, float]:
-    """(n, 3) centres of splats that are kept, from ranges all over the input, and the share of splats that are kept.
+    """Return (n, 3) centres of selected splats, from ranges all over the input, and the share of selected splats.
 
     Args:
         stream: the input.
-        settings: of the bake.
         blocks: that the scene will be cut into, about; for a single one nothing is read.
     """
     if blocks == 1:
@@ -112,7 +111,7 @@ class Findings:
 
     @classmethod
     def merged(cls, parts: Sequence[Findings]) -> Findings:
-        """Those of one part or more, in the order of the parts."""
+        """Return those of one part or more, in the order of the parts."""
         tally = Tally()
         for part in parts:
             tally = tally.then(part.tally)
@@ -140,7 +139,7 @@ class Findings:
 
     @classmethod
     def from_arrays(cls, arrays: Arrays) -> Findings:
-        """The findings of `arrays`."""
+        """Return the findings of `arrays`."""
         beyond, count, first, *dropped = arrays["counts"].tolist()
         reasons = {reason: number for reason, number in zip(REASONS, dropped, strict=True) if number}
         return cls(
@@ -153,7 +152,7 @@ class Findings:
         )
 
     def survey(self) -> Survey:
-        """What the builder has to know."""
+        """Return what the builder has to know."""
         sample = splats_of(self.sample)
         low, high = (tuple(corner) for corner in self.box.tolist())
         smallest, largest = self.sizes.tolist()
@@ -161,7 +160,7 @@ class Findings:
 
 
 def check_findings(findings: Findings, settings: BakeSettings) -> None:
-    """Checks that a tree can be made of a whole scene.
+    """Check that a tree can be made of a whole scene.
 
     Raises:
         InvalidSplatsError: as `bake`.

@@ -19,9 +19,10 @@ from ...support.errors import FormatError, InvalidSplatsError, ScratchError, Unr
 from ...support.parallel import ordered_map
 from ...support.stdin import DASH
 from ...support.units import count_of
+from ...support.untrusted import parse_json
 from ..fingerprint import Fingerprint
 from .job import forget
-from .store import FileStore
+from .store import Store
 
 #: How the names of scratch folders end.
 SUFFIX = ".sparklod-scratch"
@@ -43,7 +44,7 @@ HOPELESS = (FormatError, InvalidSplatsError)
 
 
 def scratch_folder(target: Place, fingerprint: Callable[[], Fingerprint], parent: Place | None) -> Place:
-    """The scratch folder of a bake: beside its output, or in a folder for those of several bakes.
+    """Return the scratch folder of a bake: beside its output, or in a folder for those of several bakes.
 
     Args:
         target: the output. That of standard output (-) is among the system's temporary files.
@@ -59,7 +60,7 @@ def scratch_folder(target: Place, fingerprint: Callable[[], Fingerprint], parent
 
 
 def _shortened(name: str) -> str:
-    """A name to which more can be added: file systems allow 255 bytes."""
+    """Return a name to which more can be added: file systems allow 255 bytes."""
     return name if len(os.fsencode(name)) <= NAME_BYTES else f"output-{_digest(name)}"
 
 
@@ -79,27 +80,28 @@ class _Manifest:
     fingerprint: Fingerprint
     block_splats: int
 
-    def put(self, store: FileStore) -> None:
-        """Writes it as a result."""
+    def put(self, store: Store) -> None:
+        """Write it as a result."""
         text = np.frombuffer(self.fingerprint.to_json(), np.uint8)
         store.put(RECIPE, {"recipe": text, "numbers": np.array([LAYOUT, self.block_splats], np.int64)})
 
     @classmethod
-    def get(cls, store: FileStore) -> _Manifest | None:
-        """The one of a store; None where it has none that this version understands."""
+    def get(cls, store: Store) -> _Manifest | None:
+        """Return the one of a store; None where it has none that this version understands."""
         try:
             if not store.is_sound(RECIPE):
                 return None
             found = store.get(RECIPE)
             layout, block_splats = found["numbers"].tolist()
-            return cls(Fingerprint.from_json(found["recipe"].tobytes()), block_splats) if layout == LAYOUT else None
+            fingerprint = Fingerprint.from_record(parse_json(found["recipe"].tobytes()))
+            return cls(fingerprint, block_splats) if layout == LAYOUT else None
         except (KeyError, ValueError):
             return None
 
 
 @contextlib.contextmanager
 def at_work(
-    store: FileStore,
+    store: Store,
     fingerprint: Fingerprint,
     block_splats: int,
     *,
@@ -107,12 +109,11 @@ def at_work(
     overwrite: bool,
     say: Callable[[str], None],
 ) -> Iterator[int]:
-    """A context in which a bake puts its results into a store, which is empty at the end if all went well.
+    """Yield a context in which a bake puts its results into a store, which is empty at the end if all went well.
 
     After an error that another run need not meet, or an interrupt, the results stay.
 
     Args:
-        store: of the results.
         fingerprint: of the output.
         block_splats: of the blocks that the scene is cut into, unless that was done before.
         resume: go on with the results that are there.
@@ -150,8 +151,8 @@ def at_work(
         _clear(store)
 
 
-def _clear(store: FileStore) -> None:
-    """Removes all that is there but the lock; last the files that tell what it is, for a run that is killed here."""
+def _clear(store: Store) -> None:
+    """Remove all that is there but the lock; last the files that tell what it is, for a run that is killed here."""
     folder = _folder_of(store)
     if folder is not None:
         for path in sorted(folder.iterdir(), key=lambda path: (path.is_file(), path.name)):
@@ -164,13 +165,13 @@ def _clear(store: FileStore) -> None:
 
 
 def _resumed(
-    store: FileStore,
+    store: Store,
     fingerprint: Fingerprint,
     former: _Manifest | None,
     names: list[str],
     say: Callable[[str], None],
 ) -> int:
-    """Checks that the results are those of the fingerprint, and removes damaged ones; the splats of a block."""
+    """Check that the results are those of the fingerprint, and remove damaged ones; return the splats of a block."""
     if former is None:
         raise ScratchError(
             f"nothing tells what the results in {store} are of; begin anew with --overwrite, without --resume"
@@ -192,8 +193,8 @@ def _resumed(
     return former.block_splats
 
 
-def _folder_of(store: FileStore) -> Path | None:
-    """The folder of a store on this machine."""
+def _folder_of(store: Store) -> Path | None:
+    """Return the folder of a store on this machine."""
     return store.folder if isinstance(store.folder, Path) else None
 
 
@@ -203,8 +204,7 @@ def _is_hopeless(error: BaseException) -> bool:
 
 @contextlib.contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """A context in which no other run works in a folder; it is made if need be, and removed if nothing is left in it,
-    as are those of its parents that were made.
+    """Lock a folder for one run; it is made if need be, and removed if empty, as are its parents that were made.
 
     Raises:
         ScratchError: another run is at work there, it is nobody's scratch folder, or it cannot be made.
@@ -230,7 +230,7 @@ def locked(folder: Path) -> Iterator[None]:
 
 
 def _opened_lock(path: Path) -> int:
-    """Opens and locks the file for that, in a folder that is ours; raises `ScratchError` where it is taken."""
+    """Open and lock the file for that, in a folder that is ours; raises `ScratchError` where it is taken."""
     folder = path.parent
     with contextlib.suppress(FileNotFoundError):
         if not path.exists() and any(folder.iterdir()):
@@ -251,7 +251,7 @@ def _opened_lock(path: Path) -> int:
 
 
 def _remove_empty(path: Path) -> None:
-    """Removes a folder that has nothing but the file that is locked."""
+    """Remove a folder that has nothing but the file that is locked."""
     with contextlib.suppress(OSError):
         if [*path.parent.iterdir()] == [path]:
             path.unlink()

@@ -39,7 +39,6 @@ class Engine(Protocol):
             stage: word for the progress ("building").
             tasks: in an order in which they could run one after the other.
             job: the first argument of all of them; can be pickled, and has a `store`.
-            progress: called with the weights that are done.
 
         Raises:
             SparklodError: a task failed, after it was tried again where that could help; the text says what to do.

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sparklod_cli.bake.out_of_core.store import FileStore
+from sparklod_cli.bake.out_of_core.store import Store
 from sparklod_cli.bake.out_of_core.tasks import Task
 from sparklod_cli.support.progress import Progress
 
@@ -23,7 +23,7 @@ class SumJob:
         error: that it raises.
     """
 
-    store: FileStore
+    store: Store
     fails: int = -1
     error: type[BaseException] = KeyboardInterrupt
 

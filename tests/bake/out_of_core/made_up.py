@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from sparklod_cli.bake.out_of_core.store import FileStore
+from sparklod_cli.bake.out_of_core.store import Store
 from sparklod_cli.bake.out_of_core.tasks import Task
 from sparklod_cli.support.errors import ScratchError
 
@@ -19,7 +19,7 @@ from sparklod_cli.support.errors import ScratchError
 class Job:
     """A job that has nothing but a store."""
 
-    store: FileStore
+    store: Store
 
 
 def add_up(job: Job, name: str, needs: tuple[str, ...], seconds: float, **_: Any) -> None:

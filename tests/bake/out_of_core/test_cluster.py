@@ -17,7 +17,7 @@ pytest.importorskip("distributed")
 from sparklod_cli.bake.out_of_core import cluster_engine, cluster_pool
 from sparklod_cli.bake.out_of_core.cluster import ClusterSettings, cluster
 from sparklod_cli.bake.out_of_core.cluster_engine import ClusterEngine
-from sparklod_cli.bake.out_of_core.store import FolderStore
+from sparklod_cli.bake.out_of_core.store import Store
 from sparklod_cli.bake.out_of_core.tasks import Task
 from sparklod_cli.support.errors import OutOfMemoryError, ScratchError, SparklodError
 from sparklod_cli.support.progress import silent
@@ -40,7 +40,7 @@ def engine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ClusterEngine]:
 @pytest.fixture
 def job(tmp_path: Path) -> Job:
     SAID.clear()
-    return Job(FolderStore(tmp_path / "store"))
+    return Job(Store(tmp_path / "store"))
 
 
 @pytest.fixture(autouse=True)
@@ -146,11 +146,11 @@ def test_workers_that_do_not_fit_are_refused(
     assert not list(tmp_path.rglob("*.result"))
 
 
-class _Elsewhere(FolderStore):
+class _Elsewhere(Store):
     """A folder of this machine alone: a copy of the store in another process is another one."""
 
     def __reduce__(self) -> Any:
-        return FolderStore, (self.folder / "there",)
+        return Store, (self.folder / "there",)
 
 
 def test_a_worker_without_sparklod_is_told_what_to_do(engine: ClusterEngine, job: Job) -> None:
@@ -184,7 +184,7 @@ def _show(module: str) -> None:
 def test_a_block_that_does_not_fit_into_memory_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sparklod_cli.bake.out_of_core.cluster.LOSSES", 0)
     monkeypatch.setattr("sparklod_cli.bake.out_of_core.cluster._memory_limit", lambda workers, memory: 400_000_000)
-    job = Job(FolderStore(tmp_path / "store"))
+    job = Job(Store(tmp_path / "store"))
     with cluster(ClusterSettings(workers=1)) as started:
         with pytest.raises(
             OutOfMemoryError, match=r"^stage/7 does not fit into the memory of a worker; give a smaller"
