@@ -42,7 +42,7 @@ if TYPE_CHECKING:  # mypy then resolves the modules first, which import this one
     from .fitting.settings import FitSettings as FitSettings
     from .inspection.report import Report as Report
     from .lod.detail_rule import DetailRule as DetailRule
-    from .lod.detail_settings import DetailSettings as DetailSettings
+    from .lod.detail_rule import DetailSettings as DetailSettings
     from .lod.settings import LodSettings as LodSettings
     from .model.foveation import Cones as Cones
     from .model.foveation import Frustum as Frustum

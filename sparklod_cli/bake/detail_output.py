@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from ..codecs.options import WriteOptions
 from ..codecs.streamed_sog.names import ENVIRONMENT, folders_of
 from ..io.writing import Files, SinkTogether
-from ..lod.detail_settings import DetailSettings
+from ..lod.detail_rule import DetailSettings
 from ..model.detail import DetailScene
 from ..model.scene import Scene
 from ..model.splats import Splats

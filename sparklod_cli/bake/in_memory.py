@@ -87,13 +87,13 @@ class InMemory:
         if output.in_chunks and not tree.is_ordered:
             with on_threads(self.threads):
                 from ..lod.chunk_order import chunk_order
-                from ..lod.families import taken
+                from ..lod.families import reordered
 
                 order, child_start = chunk_order(scene.splats, scene.tree, progress=self.progress)
                 built, antialiased, up = [(scene.splats, scene.tree)], scene.antialiased, scene.up
                 tree.nodes = None
-                del scene  # `taken` frees the nodes as it goes
-                tree.nodes = scene = Scene(*taken(built, order, child_start), antialiased=antialiased, up=up)
+                del scene  # `reordered` frees the nodes as it goes
+                tree.nodes = scene = Scene(*reordered(built, order, child_start), antialiased=antialiased, up=up)
             self.clock.end("arrange")
         if isinstance(output, FileOutput) and self._leaves is not None:
             tree.statistics = Statistics.of_tree(scene, self._leaves, output.needed, threads=self.threads)
@@ -119,7 +119,7 @@ def build_tree(
     row = BUILDERS[settings.method]
     built = [row.load().build(leaves.pop(), getattr(settings, row.setting), progress=progress)]
     if row.in_bands and not in_chunks:
-        from ..lod.band_order import banded
+        from ..lod.families import banded
 
         return banded(built)
     return built.pop()

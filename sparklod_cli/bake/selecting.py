@@ -67,7 +67,7 @@ def split_environment(splats: Splats, settings: BakeSettings) -> tuple[Splats, S
     """
     if settings.environment_beyond is None:
         return splats, None
-    from ..lod.environment import beyond
+    from ..lod.regions import beyond
 
     far = beyond(splats, settings.environment_beyond)
     return (splats.take(~far), splats.take(far)) if far.any() else (splats, None)

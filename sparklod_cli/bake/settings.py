@@ -8,7 +8,7 @@ from pathlib import Path
 from ..codecs.options import WriteOptions
 from ..fitting.settings import FitSettings
 from ..lod.builders import METHODS
-from ..lod.detail_settings import DetailSettings
+from ..lod.detail_rule import DetailSettings
 from ..model.selection import Selection
 from ..model.transforms import Transform
 from ..model.up_axis import rotated
@@ -40,7 +40,7 @@ class BakeSettings:
         detail: of regions and detail levels, to write a Streamed SOG instead.
         environment: of a Streamed SOG, a file whose splats are always drawn; turned and moved as the scene.
         environment_beyond: of a Streamed SOG, splats of the input farther out than this become its environment, see
-            `lod.environment.beyond`; in the input's units. None for none.
+            `lod.regions.beyond`; in the input's units. None for none.
         refine: how merged splats are fitted to pictures of full detail, its cameras left out; None for not at all.
         camera_path: a file of training cameras, in the coordinates of the output; None for cameras that are placed
             around and inside the scene.
