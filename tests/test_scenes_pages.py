@@ -34,6 +34,8 @@ from tests.lod.forests import transform
 from tests.scenes import random_splats
 from tests.simulation.paths import SPARK, around, camera, rows_of, without
 
+pytestmark = pytest.mark.slow
+
 HAND = FIXTURES / "golden" / "hand-tree-v3.spz"
 NEAR = camera((0.05, -0.05, -0.3), (0.3, 0.1, 0))
 

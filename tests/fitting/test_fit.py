@@ -26,6 +26,8 @@ from sparklod_cli.render.settings import RasterSettings
 from tests.conftest import FIXTURES
 from tests.scenes import random_splats
 
+pytestmark = pytest.mark.slow
+
 #: Steps of quick tests.
 STEPS = 160
 

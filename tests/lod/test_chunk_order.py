@@ -202,6 +202,7 @@ def test_an_order_does_not_depend_on_the_one_before(built: tuple[Splats, LodTree
     assert np.array_equal(once[0].center, twice[0].center)
 
 
+@pytest.mark.slow
 def test_views_touch_fewer_chunks_than_in_spark_s_order() -> None:
     """A ring of clusters, seen from among them: an example; docs/streaming.md has the measurements."""
     rng = np.random.default_rng(5)

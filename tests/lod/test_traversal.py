@@ -25,6 +25,7 @@ LIMITS = (0.0, 0.02, 0.3)
 
 @given(cases())
 @settings(max_examples=400)
+@pytest.mark.slow
 def test_the_cut_is_that_of_one_queue(case: Case) -> None:
     check(case, case.find())
 
@@ -114,6 +115,7 @@ def large_case(seed: int, *, nodes: int = 150_000, instances: int = 3) -> Case:
 
 
 @pytest.mark.parametrize("seed", range(4))
+@pytest.mark.slow
 def test_the_cut_of_large_trees_is_that_of_one_queue(seed: int) -> None:
     case = large_case(seed)
     found = case.traversal()

@@ -20,6 +20,7 @@ def here(cache: ChunkCache) -> set[int]:
 
 @settings(max_examples=400)  # what goes wrong here takes several steps that suit each other
 @given(st.data())
+@pytest.mark.slow
 def test_the_least_recently_used_chunk_is_evicted(data: st.DataObject) -> None:
     trees = data.draw(st.lists(st.integers(1, 5), min_size=1, max_size=3))
     chunks = Chunks([np.ones(count, np.int64) for count in trees])

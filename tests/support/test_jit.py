@@ -129,6 +129,7 @@ def test_kernels_run_without_compilation() -> None:
     assert float(done.stdout) == pytest.approx(12.566, abs=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("content", [b"a: [b\n", b"- a\n", b"\xff\xfe"])
 def test_malformed_settings_of_numba_are_an_error_that_names_them(content: bytes, tmp_path: Path) -> None:
     pytest.importorskip("yaml")  # without which numba reads no settings

@@ -17,6 +17,8 @@ from sparklod_cli.lod.traversal import View
 from tests.interop.node import Node
 from tests.lod.details import Regions, random_regions, random_view
 
+pytestmark = pytest.mark.slow
+
 #: By name: the rule, and the share of runs that are empty.
 RULES = {
     "defaults": (DetailRule(), 0.0),

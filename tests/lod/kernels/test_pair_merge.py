@@ -68,6 +68,7 @@ def test_the_overlap_is_that_of_integrals(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(2))
+@pytest.mark.slow
 def test_the_error_of_a_picture_is_an_integral(seed: int) -> None:
     a, b, merged = twin.random_rows(3, seed + 20, spread=0.7)
     total = 0.0

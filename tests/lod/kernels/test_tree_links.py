@@ -175,6 +175,7 @@ def test_a_tree_that_is_a_chain_is_followed_to_its_end() -> None:
     assert (nodes_of == 1).all()
 
 
+@pytest.mark.slow
 def test_the_kernels_give_the_same_without_compilation() -> None:
     """A kernel that is debugged wraps no integers that the compiled one does not."""
     twins = (
