@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from .cameras.path import CameraPath
     from .codecs.options import RadOptions, SogOptions
     from .codecs.rad.codec import RadChunk
-    from .codecs.rad.records import RadChunkEntry, RadChunkHeader, RadHeader
+    from .codecs.rad.rad_header import RadChunkEntry, RadChunkHeader, RadHeader
     from .codecs.splat_encoding import SplatEncoding
     from .fitting.settings import FitSettings
     from .inspection.report import Report
@@ -75,7 +75,7 @@ _MODULES = {
     "cameras.path": ("CameraPath",),
     "codecs.options": ("RadOptions", "SogOptions"),
     "codecs.rad.codec": ("RadChunk",),
-    "codecs.rad.records": ("RadChunkEntry", "RadChunkHeader", "RadHeader"),
+    "codecs.rad.rad_header": ("RadChunkEntry", "RadChunkHeader", "RadHeader"),
     "codecs.splat_encoding": ("SplatEncoding",),
     "fitting.settings": ("FitSettings",),
     "inspection.report": ("Report",),

@@ -18,7 +18,7 @@ from .progress import Told, telling
 
 if TYPE_CHECKING:
     from ..codecs.rad.codec import RadChunk
-    from ..codecs.rad.records import RadHeader
+    from ..codecs.rad.rad_header import RadHeader
 
 
 def read_rad_header(path: Path | str) -> RadHeader:

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from ..codecs.sound import check_scene
 from ..codecs.statistics import Statistics
+from ..codecs.validation import check_scene
 from ..io import read_rgba, read_stored
 from ..lod.builders import BUILDERS
 from ..lod.check import select

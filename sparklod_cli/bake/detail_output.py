@@ -6,9 +6,9 @@ import dataclasses
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
+from ..codecs.file_names import ENVIRONMENT, folders_of
 from ..codecs.options import WriteOptions
 from ..codecs.statistics import Statistics
-from ..codecs.streamed_sog.names import ENVIRONMENT, folders_of
 from ..io import SinkTogether
 from ..io.together import Files
 from ..lod.detail_settings import DetailSettings

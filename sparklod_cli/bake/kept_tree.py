@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from ..codecs.file_names import RAD_SUFFIX as RAD
 from ..codecs.formats import WRITABLE
-from ..codecs.rad.names import SUFFIX as RAD
 from ..model.scene import Scene
 from ..support.errors import FormatError
 from .settings import SPZ, BakeSettings

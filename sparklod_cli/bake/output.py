@@ -10,10 +10,10 @@ from typing import Protocol
 from ..codecs import clamps
 from ..codecs.clamps import Range
 from ..codecs.encoder import CLAMPED, Encoder, Get, Kept, Stored, results, windows_of
+from ..codecs.file_names import RAD_SUFFIX as RAD
 from ..codecs.formats import WRITABLE, Format
 from ..codecs.options import DEFAULTS, WriteOptions
-from ..codecs.rad.layout import OPTIONS
-from ..codecs.rad.names import SUFFIX as RAD
+from ..codecs.rad.rad_layout import OPTIONS
 from ..codecs.statistics import Statistics
 from ..io import SceneSink, Sink, scene_sink, sink
 from ..model.nodes import CHUNK_NODES
@@ -132,7 +132,7 @@ class _Arrays(WholeOutput):
     """Arrays in the layout of a viewer's memory.
 
     Attributes:
-        encoding: of `codecs.gpu.table.ENCODINGS`.
+        encoding: of `codecs.formats.ENCODINGS`.
         raw: their words alone, rather than a .npz.
         sink: writes them.
     """

@@ -40,7 +40,7 @@ class Repacked(WholeOutput):
     ) -> WrittenTree:
         """Copies the chunks."""
         with opened(self.source) as (file, form, more):
-            chunks = form.codec().PackedChunks.of(file, **more)
+            chunks = form.codec().RadReader.open(file, **more)
             size = self.sink.repack(chunks)
         clock.end("write")
         return WrittenTree(

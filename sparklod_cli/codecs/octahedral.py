@@ -34,17 +34,17 @@ ALMOST_HALF = np.nextafter(np.float32(0.5), np.float32(0))
 
 
 def round_half_away(values: FloatArray) -> FloatArray:
-    """float32 numbers rounded to whole ones, ties away from zero, as Rust's `round` does and numpy's does not."""
+    """Round float32 to whole numbers, ties away from zero, as Rust's `round` does and numpy's does not."""
     return np.trunc(values + np.copysign(ALMOST_HALF, values))
 
 
 def to_code(values: FloatArray, most: int) -> NDArray[np.uint32]:
-    """float32 numbers in units of codes to whole codes, clamped to 0..most, ties up."""
+    """Round float32 numbers in units of codes to whole codes, clamped to 0..most, ties up."""
     return (np.clip(values, 0, np.float32(most)) + ALMOST_HALF).astype(np.uint32)
 
 
 def encode_axis_angle(quat_xyzw: FloatArray, steps: tuple[int, int]) -> tuple[Words, Words, Words]:
-    """(N, 4) unit quaternions to three codes, (N,) each: u and v of the axis, 0..steps[0], and the angle, 0..steps[1].
+    """Encode (N, 4) unit quaternions as (N,) u and v of the axis, 0..steps[0], and the angle, 0..steps[1].
 
     The axis is that of the rotation by 0..pi. It is projected onto the octahedron |x| + |y| + |z| = 1, whose lower half
     is folded outward into the corners of the square that the upper half covers in x and y: u and v are x and y of the
@@ -75,7 +75,7 @@ def encode_axis_angle(quat_xyzw: FloatArray, steps: tuple[int, int]) -> tuple[Wo
 
 
 def decode_axis_angle(u: NDArray[Any], v: NDArray[Any], angle: NDArray[Any], steps: tuple[int, int]) -> FloatArray:
-    """Three codes, (N,) each, to (N, 4) unit quaternions x y z w with w >= 0.
+    """Decode three codes, (N,) each, to (N, 4) unit quaternions x y z w with w >= 0.
 
     Largest error: 1.94 degrees of rotation for `STEPS_8_8_8`, 0.476 for `STEPS_10_10_12`. x and y of the axis lie
     within 1 / steps[0], which is sqrt(6) / steps[0] along a face of the octahedron and sqrt(18) / steps[0] radians
@@ -93,23 +93,23 @@ def decode_axis_angle(u: NDArray[Any], v: NDArray[Any], angle: NDArray[Any], ste
 
 
 def encode_lod_alpha(opacity: FloatArray) -> FloatArray:
-    """Linear opacity A to Spark's alpha: A up to 1; above, (D + 3) / 4, which maps D = 1..5 to 1..2."""
+    """Encode linear opacity A as Spark's alpha: A up to 1; above, (D + 3) / 4, which maps D = 1..5 to 1..2."""
     d = lod_opacity(opacity)
     return np.where(d > 1, (d + 3) * np.float32(0.25), d)
 
 
 def decode_lod_alpha(alpha: FloatArray) -> FloatArray:
-    """Spark's alpha to linear opacity A; above 1, D is 4 * alpha - 3. Largest error: that of float32."""
+    """Decode Spark's alpha to linear opacity A; above 1, D is 4 * alpha - 3. Largest error: that of float32."""
     return linear_opacity(lod_opacity_of_alpha(alpha))
 
 
 def lod_opacity_of_alpha(alpha: FloatArray) -> FloatArray:
-    """Spark's alpha to LoD opacity D: alpha up to 1, 4 * alpha - 3 above."""
+    """Return the LoD opacity D of Spark's alpha: alpha up to 1, 4 * alpha - 3 above."""
     return np.where(alpha > 1, 4 * alpha - 3, alpha)
 
 
 def stored_lod_alpha(opacity: FloatArray) -> FloatArray:
-    """The alpha that linear opacity A was decoded from, to the last bit.
+    """Return the alpha that linear opacity A was decoded from, to the last bit.
 
     `encode_lod_alpha` may miss it by some units of the last place, and then another number nearby decodes to A. Where
     none does, A was not decoded from an alpha, and has that of `encode_lod_alpha`.
@@ -127,7 +127,7 @@ def stored_lod_alpha(opacity: FloatArray) -> FloatArray:
 
 
 def checked_words(arrays: Mapping[str, NDArray[Any]], columns: Mapping[str, int]) -> dict[str, Words]:
-    """The arrays of these names, each (N, columns) uint32 with the same N, C-contiguous.
+    """Return the arrays of these names, each (N, columns) uint32 with the same N, C-contiguous.
 
     Raises:
         FormatError: an array is missing, or has another shape or type.

@@ -41,7 +41,7 @@ _SUBNORMAL = 25
 
 @np.errstate(over="ignore", under="ignore", invalid="ignore")
 def exp(values: FloatArray) -> FloatArray:
-    """e ** values, float32; infinity above 88.7, 0 below -104."""
+    """Compute e ** values, float32; infinity above 88.7, 0 below -104."""
     values = np.clip(values, *_BEYOND)
     magnitude = np.abs(values)
     one_or_none = np.where(magnitude > _NO_MULTIPLE, np.copysign(_ONE, values), np.float32(0))
@@ -59,7 +59,7 @@ def exp(values: FloatArray) -> FloatArray:
 
 @np.errstate(over="ignore", divide="ignore", invalid="ignore")
 def log(values: FloatArray) -> FloatArray:
-    """Natural logarithms, float32; minus infinity for 0, NaN below it."""
+    """Compute natural logarithms, float32; minus infinity for 0, NaN below it."""
     subnormal = values < np.finfo(np.float32).tiny
     scaled = np.where(subnormal, values * np.float32(2**_SUBNORMAL), values)
     bits = scaled.view(np.int32) + np.int32(_ONE_BITS - _SQRT_HALF)

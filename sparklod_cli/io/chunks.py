@@ -8,12 +8,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
-from ..codecs.promises import check
-from ..codecs.rad import promises
+from ..codecs.rad import rad_rules
 from ..codecs.rad.codec import RadChunk, read_chunk
-from ..codecs.rad.header import read_header
-from ..codecs.rad.places import file_of
-from ..codecs.rad.records import RadHeader
+from ..codecs.rad.rad_header import RadHeader, read_header
+from ..codecs.rad.rad_reader import file_of
+from ..codecs.validation import check_rules
 from ..model.splats import FloatArray
 from ..support.errors import UnreadableError
 from .beside import open_beside
@@ -64,5 +63,5 @@ def _opened(path: Path) -> Iterator[BinaryIO]:
 
 def _header(file: BinaryIO) -> RadHeader:
     header = read_header(file)
-    check(promises.violations(header))
+    check_rules(rad_rules.violations(header))
     return header

@@ -8,10 +8,9 @@ import os
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from ..codecs.sog.files import MAX_META, names_beside
-from ..codecs.sog.names import META
+from ..codecs.file_names import META, chunk_folder, folders_of, is_chunk_folder, is_in_manifest, is_of_streamed_sog
+from ..codecs.sog.sog_container import MAX_META, names_beside
 from ..codecs.streamed_sog.manifest import MAX_MANIFEST, parse
-from ..codecs.streamed_sog.names import chunk_name, folders_of, is_folder, is_named, is_ours
 from ..support import atomic_set, folders
 from ..support.addresses import Address, Place
 from ..support.errors import FormatError, OutputError
@@ -20,7 +19,7 @@ from .together import Files, SinkTogether, check_header
 from .uploads import check_address, send_together
 
 #: The folder that every output has.
-FIRST = chunk_name(0, 0)
+FIRST = chunk_folder(0, 0)
 
 
 def detail_sink(path: Place, *, overwrite: bool) -> SinkTogether:
@@ -121,11 +120,15 @@ def _former(target: Place) -> list[str]:
         metas = parse(_content(target, MAX_MANIFEST)).names()
         for meta in metas:
             folder = target.parent / meta.partition("/")[0]
-            if is_named(meta) and not (isinstance(folder, Path) and folder.is_symlink()):
+            if is_in_manifest(meta) and not (isinstance(folder, Path) and folder.is_symlink()):
                 found.append(meta)
                 with contextlib.suppress(OSError):
                     images = names_beside(_content(target.parent / meta, MAX_META))
-                    found += [name for name in (meta.removesuffix(META) + image for image in images) if is_ours(name)]
+                    found += [
+                        name
+                        for name in (meta.removesuffix(META) + image for image in images)
+                        if is_of_streamed_sog(name)
+                    ]
     standing = set(_standing(target))
     return [name for name in dict.fromkeys(found) if name in standing]
 
@@ -138,10 +141,10 @@ def _content(path: Place, most: int) -> bytes:
 def _standing(target: Place) -> list[str]:
     """The files in folders beside a manifest that are called as those of an output."""
     if isinstance(target, Address):
-        return sorted(name for name in target.parent.files() if is_ours(name))
+        return sorted(name for name in target.parent.files() if is_of_streamed_sog(name))
     found = list[str]()
     with contextlib.suppress(OSError):
         for folder in target.parent.iterdir():
-            if is_folder(folder.name) and folder.is_dir() and not folder.is_symlink():
+            if is_chunk_folder(folder.name) and folder.is_dir() and not folder.is_symlink():
                 found += [f"{folder.name}/{file.name}" for file in folder.iterdir()]
-    return sorted(name for name in found if is_ours(name))
+    return sorted(name for name in found if is_of_streamed_sog(name))

@@ -8,9 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from ..codecs.rad.by_chunk import ByChunk, bytes_decoded
-from ..codecs.rad.codec import name_of
-from ..codecs.rad.records import RadHeader
+from ..codecs.rad.rad_header import RadHeader
+from ..codecs.rad.rad_reader import RadReader, decoded_bytes
 from ..model.coding import FileCoding
 from ..model.lod_tree import LodTree
 from ..model.splats import Splats
@@ -39,7 +38,7 @@ class RadFile:
     path: Path
     header: RadHeader
     about: Mapping[str, int]
-    _chunks: ByChunk = field(repr=False)
+    _reader: RadReader = field(repr=False)
 
     @classmethod
     def open(cls, path: Path) -> RadFile | None:
@@ -51,13 +50,13 @@ class RadFile:
         with _opened(path) as found:
             if found is None:
                 return None
-            chunks = ByChunk.of(*found)
-        return cls(path, chunks.header, chunks.facts, chunks)
+            reader = RadReader.open(*found)
+        return cls(path, reader.header, reader.facts, reader)
 
     @property
     def format(self) -> str:
         """As `Scene.format`."""
-        return name_of(self.header)
+        return self.header.format
 
     @property
     def chunk_bytes(self) -> tuple[int, ...]:
@@ -68,7 +67,7 @@ class RadFile:
     def fits(self) -> bool:
         """Whether it is small enough to be read at once."""
         free = available_memory()
-        return bytes_decoded(self.header) <= (AT_ONCE if free is None else min(AT_ONCE, SHARE * free))
+        return decoded_bytes(self.header) <= (AT_ONCE if free is None else min(AT_ONCE, SHARE * free))
 
     def chunks(
         self, columns: Collection[str], *, thorough: bool, threads: int
@@ -85,7 +84,7 @@ class RadFile:
         """
         with _opened(self.path) as found:
             assert found is not None
-            yield from self._chunks.read_all(*found, columns, thorough=thorough, threads=threads)
+            yield from self._reader.reopened(*found).chunks(columns, thorough=thorough, threads=threads)
 
     def chunk(self, number: int, columns: Collection[str]) -> tuple[Splats, LodTree | None, FileCoding]:
         """One chunk and its coding; only these columns are unpacked. Several threads may ask.
@@ -95,7 +94,7 @@ class RadFile:
         """
         with _opened(self.path) as found:
             assert found is not None
-            return self._chunks.read(number, *found, columns, thorough=False)
+            return self._reader.reopened(*found).chunk(number, columns)
 
 
 @contextlib.contextmanager

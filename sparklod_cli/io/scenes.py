@@ -17,7 +17,7 @@ from .together import SinkTogether, sink_together
 from .writing import Sink, sink
 
 if TYPE_CHECKING:
-    from ..codecs.rad.repacking import PackedChunks
+    from ..codecs.rad.rad_reader import RadReader
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class SceneSink:
             return self.together((name, (content,)) for name, content in files)
         return self.together(codec.encode_chunked(scene, options, self.stem, threads=threads, progress=progress))
 
-    def repack(self, chunks: PackedChunks) -> int:
+    def repack(self, chunks: RadReader) -> int:
         """Write the chunks of a RAD file as they stand, and return how many bytes were written.
 
         Raises:

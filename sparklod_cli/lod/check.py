@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..codecs.sound import check_valid, is_valid_and_visible
+from ..codecs.validation import check_valid, is_valid_and_visible
 from ..model.selection import Selection
 from ..model.splats import Splats
 from ..support.errors import InvalidSplatsError

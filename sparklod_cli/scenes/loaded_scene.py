@@ -125,7 +125,7 @@ def depth_of(loaded: LoadedScene) -> NDArray[np.int32]:
 
 
 def nodes_of(splats: Splats, tree: LodTree, coding: FileCoding, *, precision: str, threads: int) -> Nodes:
-    """Nodes as a traversal reads them, in one of `gpu.table.PRECISIONS`."""
+    """Nodes as a traversal reads them, in one of `codecs.formats.PRECISIONS`."""
     if precision == "float32":
         return Nodes.of(splats, tree)
     if precision == "float16":

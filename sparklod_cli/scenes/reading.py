@@ -7,7 +7,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from ..codecs.gpu.table import PRECISIONS
+from ..codecs.formats import PRECISIONS
 from ..codecs.rounding import after
 from ..io import RadFile, examine_scene, has_levels, read_level_files, read_levels, size_of_input
 from ..model.detail import DetailScene

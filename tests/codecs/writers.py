@@ -24,14 +24,14 @@ from fixtures import (
 from sparklod_cli.codecs import octahedral, ply, quantize, sh_palette, splat, spz
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import codec as rad
-from sparklod_cli.codecs.rad.encodings import LARGEST_F16
-from sparklod_cli.codecs.rad.header import ENCODING_KEYS
-from sparklod_cli.codecs.rad.layout import choices
-from sparklod_cli.codecs.rad.options import HALF
+from sparklod_cli.codecs.rad.property_codings import LARGEST_F16
+from sparklod_cli.codecs.rad.rad_header import ENCODING_KEYS
+from sparklod_cli.codecs.rad.rad_layout import choices
+from sparklod_cli.codecs.rad.rad_options import HALF
 from sparklod_cli.codecs.sog import codec as sog
-from sparklod_cli.codecs.sog import codings
-from sparklod_cli.codecs.sog.codebook import codebook
-from sparklod_cli.codecs.sog.writing import LARGE, SEEN
+from sparklod_cli.codecs.sog import texel_codings as codings
+from sparklod_cli.codecs.sog.sog_writer import LARGE, SEEN
+from sparklod_cli.codecs.sog.texel_codings import codebook
 from sparklod_cli.codecs.splat_encoding import SplatEncoding
 from sparklod_cli.model import morton
 from sparklod_cli.model.scene import Scene

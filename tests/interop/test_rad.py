@@ -21,9 +21,8 @@ from sparklod_cli.codecs.gpu import packed_splats
 from sparklod_cli.codecs.octahedral import encode_lod_alpha
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import codec as rad
-from sparklod_cli.codecs.rad.header import read_chunk_header, read_header
-from sparklod_cli.codecs.rad.layout import choices
-from sparklod_cli.codecs.rad.records import RadHeader
+from sparklod_cli.codecs.rad.rad_header import RadHeader, read_chunk_header, read_header
+from sparklod_cli.codecs.rad.rad_layout import choices
 from sparklod_cli.codecs.splat_encoding import SplatEncoding
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod import quick

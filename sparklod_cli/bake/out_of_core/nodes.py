@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...codecs.encoder import rows_of, windows_of
-from ...codecs.sound import check_valid
+from ...codecs.validation import check_valid
 from ...model.lod_tree import LodTree
 from ...model.splats import Splats
 from ...model.streams import NodeStream

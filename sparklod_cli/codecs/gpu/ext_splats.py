@@ -46,7 +46,7 @@ _EXPONENT = np.uint32(27)
 
 
 def pack(splats: Splats, *, threads: int = 1) -> dict[str, Words]:
-    """Splats in Spark's layout: "ext0" and "ext1" (N, 4) uint32, and by SH degree "sh1", "sh2", "sh3a" and "sh3b".
+    """Pack splats in Spark's layout: "ext0", "ext1" (N, 4) uint32, and by SH degree "sh1", "sh2", "sh3a", "sh3b".
 
     A colour of 65520 or more becomes infinite, as in Spark. The formulas are those of Spark's `encode_ext_splat` and
     `encode_ext_rgb`.
@@ -74,12 +74,12 @@ def pack(splats: Splats, *, threads: int = 1) -> dict[str, Words]:
 
 
 def dump(scene: Scene, *, threads: int = 1) -> dict[str, Words]:
-    """The arrays of a scene, with or without a tree."""
+    """Return the arrays of a scene, with or without a tree."""
     return pack(scene.splats, threads=threads)
 
 
 def unpack(arrays: Mapping[str, NDArray[Any]], *, threads: int = 1) -> Splats:
-    """Splats of the arrays of `pack`; the SH arrays present determine the degree.
+    """Return the splats of the arrays of `pack`; the SH arrays present determine the degree.
 
     Largest errors, apart from that of float32:
 
@@ -121,7 +121,7 @@ def _sh_names(degree: int) -> list[str]:
 
 
 def encode_sh(sh: FloatArray) -> Words:
-    """(N, K, 3) SH coefficients to (N, K) words: a byte of magnitude and a sign per channel, and a shared exponent.
+    """Encode (N, K, 3) SH as (N, K) words: a byte of magnitude and a sign per channel, and a shared exponent.
 
     The exponent is that of the largest channel rounded down, between -15 and 16, and the bytes are 0..2 ** exponent in
     255 steps. So a magnitude above that power of two is clamped to it, which loses up to half of the largest channel.
@@ -141,7 +141,7 @@ def encode_sh(sh: FloatArray) -> Words:
 
 
 def decode_sh(words: Words) -> FloatArray:
-    """(N, K) words to (N, K, 3) SH coefficients.
+    """Decode (N, K) words to (N, K, 3) SH coefficients.
 
     Largest error: let m be the largest channel of a coefficient, between 2 ** -15 and 2 ** 17, and p the power of two
     not above it. A channel up to p is off by at most p / 510; one above p becomes p, which is off by less than m / 2.

@@ -35,24 +35,19 @@ _SAME = np.float32(2**-20)
 
 
 class Layout(NamedTuple):
-    """What splats in memory keep of numbers.
-
-    Attributes:
-        alpha: of alphas, 0..2.
-        scale: of linear scales.
-    """
+    """What splats in memory keep of numbers: of alphas, 0..2, and of linear scales."""
 
     alpha: Recode
     scale: Recode
 
 
 def nodes(splats: Splats, tree: LodTree, layout: str, coding: FileCoding = PLAIN, *, threads: int = 1) -> Nodes:
-    """The nodes of a tree as Spark's traversal reads them.
+    """Return the nodes of a tree as Spark's traversal reads them.
 
     Args:
         splats: N, as they were decoded; their centres, scales and opacities matter.
         tree: of them.
-        layout: one of `table.LOADED`.
+        layout: one of `formats.LOADED`.
         coding: of the file that they were read from. Scales that do not come from its codes, or of splats that were not
             read from a file, are taken to be those that Spark has.
         threads: to work on.
@@ -76,7 +71,7 @@ def nodes(splats: Splats, tree: LodTree, layout: str, coding: FileCoding = PLAIN
 
 
 def _layout(name: str, packed_range: tuple[float, float] | None) -> Layout:
-    """What one of `table.LOADED` keeps, with the range of logarithms that a file sets for PackedSplats."""
+    """Return one of `formats.LOADED`, with the range of logarithms that a file sets for PackedSplats."""
     if name == "ext":
         scales = spark_math.exp(_HALVES.astype(np.float32))
         return Layout(
@@ -101,13 +96,7 @@ def _layout(name: str, packed_range: tuple[float, float] | None) -> Layout:
 
 
 class _Codes(NamedTuple):
-    """The codes of a file's scales.
-
-    Attributes:
-        of: whole numbers from 0 on, of scales.
-        ours: the scale of each, as `Splats` has it.
-        theirs: the same as Spark has it.
-    """
+    """Codes of a file's scales: whole numbers from 0 on, and the scale of each in `Splats` and in Spark."""
 
     of: Callable[[FloatArray], NDArray[np.unsignedinteger[Any]]]
     ours: FloatArray
@@ -116,7 +105,7 @@ class _Codes(NamedTuple):
 
 @np.errstate(over="ignore", invalid="ignore")
 def _codes(coding: ScaleCoding) -> _Codes | None:
-    """Those of a coding; None for plain numbers."""
+    """Return the codes of a coding; None for plain numbers."""
     if coding.name == "ln_0r8":
         low, high = coding.low, coding.high
         ours = splat_encoding.log_scale_table(low, high)
@@ -137,12 +126,7 @@ def _half_log(scale: FloatArray) -> NDArray[np.uint16]:
 
 
 def _recoded(coding: ScaleCoding, held: Recode) -> Recode:
-    """What a layout keeps of scales that come from codes: the last bits of those are others in Spark.
-
-    Args:
-        coding: of the scales in the file.
-        held: what the layout keeps of numbers.
-    """
+    """Return what a layout keeps (`held`) of scales that come from codes, whose last bits are others in Spark."""
     codes = _codes(coding)
     if codes is None:
         return held

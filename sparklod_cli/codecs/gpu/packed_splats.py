@@ -41,12 +41,12 @@ SH_BITS = {1: 7, 2: 8, 3: 6}
 
 
 def of_scene(scene: Scene) -> SplatEncoding:
-    """The encoding that Spark sets up for a scene: an LoD tree has LoD opacities."""
+    """Return the encoding that Spark sets up for a scene: an LoD tree has LoD opacities."""
     return SplatEncoding(lod_opacity=scene.tree is not None)
 
 
 def pack(splats: Splats, encoding: SplatEncoding = DEFAULT, *, threads: int = 1) -> dict[str, Words]:
-    """Splats in Spark's layout: "packed" (N, 4) uint32, and by degree "sh1" (N, 2), "sh2" (N, 4) and "sh3" (N, 4).
+    """Pack splats in Spark's layout: "packed" (N, 4) uint32, and by degree "sh1" (N, 2), "sh2" and "sh3" (N, 4).
 
     Values are clamped to the ranges of their codes; a coordinate of 65520 or more becomes infinite, as in Spark. The
     formulas are those of Spark's `encode_packed_splat` and `encode_sh1` to `encode_sh3`, described on its page about
@@ -77,12 +77,12 @@ def pack(splats: Splats, encoding: SplatEncoding = DEFAULT, *, threads: int = 1)
 
 
 def dump(scene: Scene, *, threads: int = 1) -> dict[str, Words]:
-    """The arrays of a scene, in the encoding of `of_scene`."""
+    """Return the arrays of a scene, in the encoding of `of_scene`."""
     return pack(scene.splats, of_scene(scene), threads=threads)
 
 
 def unpack(arrays: Mapping[str, NDArray[Any]], encoding: SplatEncoding = DEFAULT, *, threads: int = 1) -> Splats:
-    """Splats of the arrays of `pack`; arrays of SH may be missing from the highest degree down.
+    """Return the splats of the arrays of `pack`; arrays of SH may be missing from the highest degree down.
 
     Largest errors inside the ranges, apart from that of float32:
 
@@ -122,7 +122,7 @@ def unpack(arrays: Mapping[str, NDArray[Any]], encoding: SplatEncoding = DEFAULT
 
 
 def encode_sh(values: FloatArray, bits: int, most: np.float32) -> Words:
-    """(N, numbers) SH coefficients, clamped to -most..most, to (N, words) with `bits` bits each in two's complement."""
+    """Encode (N, numbers) SH, clamped to -most..most, as (N, words), `bits` bits each in two's complement."""
     top = np.float32(2 ** (bits - 1) - 1)
     steps = np.clip(values * (top / most), -top, top)
     codes = octahedral.round_half_away(steps).astype(np.int32).view(np.uint32) & np.uint32(2**bits - 1)
@@ -136,7 +136,7 @@ def encode_sh(values: FloatArray, bits: int, most: np.float32) -> Words:
 
 
 def decode_sh(words: Words, bits: int, most: np.float32, numbers: int) -> FloatArray:
-    """(N, words) to (N, numbers), the inverse of `encode_sh`. Largest error: most / (2 ** bits - 2)."""
+    """Decode (N, words) to (N, numbers), the inverse of `encode_sh`. Largest error: most / (2 ** bits - 2)."""
     columns = np.ascontiguousarray(words.T)
     codes = np.empty((numbers, len(words)), np.uint32)
     for index in range(numbers):

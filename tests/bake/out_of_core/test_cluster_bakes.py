@@ -25,7 +25,7 @@ from sparklod_cli.bake.out_of_core.cluster import ClusterSettings, cluster
 from sparklod_cli.bake.out_of_core.cluster_engine import ClusterEngine
 from sparklod_cli.bake.out_of_core.contracts import Engine
 from sparklod_cli.bake.resources import Resources
-from sparklod_cli.codecs.rad.names import SUFFIX as RAD
+from sparklod_cli.codecs.file_names import RAD_SUFFIX as RAD
 from sparklod_cli.support.addresses import Address, Place
 from sparklod_cli.support.errors import SparklodError
 from sparklod_cli.support.progress import Progress, silent

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from sparklod_cli.codecs import quantize, spark_math
+from sparklod_cli.codecs.formats import LOADED
 from sparklod_cli.codecs.gpu import ext_splats, loaded_nodes, lod_tree, packed_splats
-from sparklod_cli.codecs.gpu.table import LOADED
 from sparklod_cli.codecs.splat_encoding import SplatEncoding, log_scale_table
 from sparklod_cli.lod import quick
 from sparklod_cli.model.coding import PLAIN, FileCoding, ScaleCoding
