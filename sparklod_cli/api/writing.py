@@ -28,7 +28,7 @@ from .progress import Told, telling
 if TYPE_CHECKING:
     from ..bake.detail_output import DetailOutput
     from ..codecs.options import RadOptions, SogOptions
-    from ..lod.detail_settings import DetailSettings
+    from ..lod.detail_rule import DetailSettings
     from ..support.progress import Progress
 
 #: Binary digits after the point of the smallest number of float32.
@@ -102,7 +102,7 @@ def write(
     from ..codecs.options import RadOptions, SogOptions, WriteOptions
     from ..codecs.splat_encoding import SplatEncoding
     from ..codecs.validation import check_scene
-    from ..lod.detail_settings import DetailSettings
+    from ..lod.detail_rule import DetailSettings
 
     path, count = file_path(path), thread_count(threads)
     form = None if encoding is not None else WRITABLE.get(ending_of(path.name))

@@ -27,7 +27,7 @@ TOGETHER = 2
 
 
 class Divided(Protocol):
-    """Division of a scene into regions, for the manifest; `lod.detail_settings.DetailSettings` is one."""
+    """Division of a scene into regions, for the manifest; `lod.detail_rule.DetailSettings` is one."""
 
     @property
     def chunk_splats(self) -> int:
