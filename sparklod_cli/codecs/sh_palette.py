@@ -35,8 +35,8 @@ PASSES = 6
 #: The passes, from 0, before which the neighbours of all codes are found anew.
 FRESH = (0, 3)
 
-#: Neighbours of a code among which the codes of its rows are looked for, a multiple of `nearest.LANES`; and the groups
-#: of `nearest.GROUP` codes that are searched for them. Measured.
+#: Neighbours of a code among which the codes of its rows are looked for, a multiple of `sh_clustering.LANES`; and the
+#: groups of `sh_clustering.GROUP` codes that are searched for them. Measured.
 NEIGHBOURS, SEARCH = 48, 16
 
 #: Cells are halved together whose gain is at least this share of the largest. Measured: 0.8 takes three times as many
@@ -142,7 +142,7 @@ def _weights(weight: ArrayLike | None, count: int) -> Weights:
 
 def _distinct(rows: FloatArray) -> tuple[Indices, Indices]:
     """Return the first of each set of equal rows, ascending, and for each row its place among these."""
-    from .kernels.row_hash import hash_rows
+    from .kernels.sh_clustering import hash_rows
 
     key = hash_rows((rows + np.float32(0)).view(np.uint32))  # -0 becomes 0
     order = np.argsort(key, kind="stable")
@@ -171,8 +171,7 @@ class _Clustering:
 
     def run(self, codes: int) -> tuple[FloatArray, Indices]:
         """Return (C, D) codes, and the (M,) labels of the rows."""
-        from .kernels.cells import average_cells
-        from .kernels.nearest import choose_codes
+        from .kernels.sh_clustering import average_cells, choose_codes
 
         members, begin = self._bisect(codes)
         table = np.empty((len(begin) - 1, self._rows.shape[1]), np.float32)
@@ -203,7 +202,7 @@ class _Clustering:
         are replaced by theirs. Returns (M,) rows, cell after cell, neighbours near each other, and (C + 1,) where each
         begins.
         """
-        from .kernels.cells import halve_cells
+        from .kernels.sh_clustering import halve_cells
 
         members, places = self._first.copy(), np.empty(len(self._first))
         begin, end = np.zeros(1, np.int64), np.array([len(members)])
@@ -244,7 +243,7 @@ class _Clustering:
 
 def _neighbours(table: FloatArray) -> tuple[NDArray[np.int32], FloatArray]:
     """Return the (C, NEIGHBOURS) nearest codes of each code, nearest first, and their squared distances."""
-    from .kernels.nearest import GROUP, find_neighbours
+    from .kernels.sh_clustering import GROUP, find_neighbours
 
     count, width = table.shape
     starts = np.arange(0, count, GROUP)
