@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..model.splats import FloatArray
 from . import quantize
-from .octahedral import Words, to_code
+from .spark_codings import Words, to_code
 
 #: Scales below this are encoded as 0: e ** -30.
 SCALE_ZERO = np.float32(np.exp(-30))
@@ -106,7 +106,7 @@ def encode_log_scale(
     Args:
         scale: of any shape.
         low, high: ends of the range.
-        log: of Spark's worker, `spark_math.log`, or rounded once.
+        log: of Spark's worker, `spark_codings.log`, or rounded once.
         least: scales below it are 0.
     """
     first = np.float32(low)

@@ -15,7 +15,7 @@ from ...model.splats import FloatArray, Splats
 from ...support.errors import FormatError
 from ...support.parallel import for_blocks
 from .. import quantize
-from ..octahedral import Words
+from ..spark_codings import Words
 
 WIDTH = 2048
 SPLATS_A_ROW = WIDTH // 2

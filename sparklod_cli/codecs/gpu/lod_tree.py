@@ -15,7 +15,7 @@ from ...model.scene import Scene
 from ...model.splats import FloatArray, Splats
 from ...support.errors import FormatError
 from ...support.parallel import for_blocks
-from ..octahedral import Words, checked_words
+from ..spark_codings import Words, checked_words
 
 NODE = np.dtype(
     [

@@ -15,7 +15,7 @@ from ...model.lod_tree import LodTree
 from ...model.sh import COEFFICIENTS
 from ...model.splats import FloatArray, Splats
 from ...support.errors import FormatError, TooLongError, TruncatedError
-from .. import octahedral
+from .. import spark_codings
 from ..inflate import ERRORS, raw_unpacker
 from ..quantize import Bytes, quat_of_xyz
 from ..validation import check_rules, error_of
@@ -170,7 +170,7 @@ def _fill_column(splats: Splats, row: Row, values: NDArray[Any]) -> None:
     if row.column == "sh":
         fill_sh(splats.sh, row.degree, values)
     elif row.column == "opacity":
-        splats.opacity[:] = octahedral.decode_lod_alpha(values[:, 0].astype(np.float32))
+        splats.opacity[:] = spark_codings.decode_lod_alpha(values[:, 0].astype(np.float32))
     elif row.column == "quat_xyzw" and values.shape[1] == 3:
         splats.quat_xyzw[:] = quat_of_xyz(values.astype(np.float32))
     else:

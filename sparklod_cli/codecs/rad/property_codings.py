@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from ...model.splats import FloatArray
 from ...support.parallel import blocks_of
-from .. import octahedral, splat_encoding
-from ..octahedral import STEPS_8_8_8
+from .. import spark_codings, splat_encoding
 from ..quantize import Bytes
+from ..spark_codings import STEPS_8_8_8
 
 #: Largest finite float16. Larger values are clamped to it: rounded they would be infinite.
 LARGEST_F16 = np.float32(65504)
@@ -112,7 +112,7 @@ def _encode_signed(values: FloatArray, low: float, high: float) -> NDArray[Any]:
     steps = values / np.float32(high)
     steps *= np.float32(127)
     np.clip(steps, -127, 127, out=steps)
-    steps += np.copysign(octahedral.ALMOST_HALF, steps)
+    steps += np.copysign(spark_codings.ALMOST_HALF, steps)
     return steps.astype(np.int8).view(np.uint8)
 
 
@@ -133,14 +133,14 @@ def _decode_log_f16(codes: Bytes, count: int, numbers: int, low: float, high: fl
 def _encode_octahedral(quat_xyzw: NDArray[Any], low: float, high: float) -> NDArray[Any]:
     codes = np.empty((len(quat_xyzw), 3), np.uint8)
     for part in blocks_of(len(quat_xyzw), BLOCK):
-        for number, found in enumerate(octahedral.encode_axis_angle(quat_xyzw[part], STEPS_8_8_8)):
+        for number, found in enumerate(spark_codings.encode_axis_angle(quat_xyzw[part], STEPS_8_8_8)):
             codes[part, number] = found
     return codes
 
 
 def _decode_octahedral(codes: Bytes, count: int, numbers: int, low: float, high: float) -> NDArray[Any]:
     u, v, angle = codes.reshape(count, 3).T
-    return octahedral.decode_axis_angle(u, v, angle, STEPS_8_8_8)
+    return spark_codings.decode_axis_angle(u, v, angle, STEPS_8_8_8)
 
 
 _F32, _F16 = _plain("<f4"), _plain("<f2", LARGEST_F16)

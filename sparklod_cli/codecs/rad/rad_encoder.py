@@ -18,7 +18,7 @@ from ...model.splats import COLUMNS, FloatArray, Splats
 from ...model.streams import NodeStream
 from ...support.parallel import blocks_of
 from ...support.progress import Progress, silent
-from .. import clamps, coverage, octahedral, sh_palette
+from .. import clamps, coverage, sh_palette, spark_codings
 from ..clamps import Range
 from ..encoder import CLAMPED, Encoded, Get, windows_of
 from ..file_notes import comment_of
@@ -289,5 +289,5 @@ def _alpha(opacity: FloatArray, encoding: str, ranges: SplatEncoding) -> FloatAr
 
     As a code, 1 of 0..2 lies between two of them; it must not become the upper one, which is that of a merged splat.
     """
-    alpha = octahedral.encode_lod_alpha(opacity)
+    alpha = spark_codings.encode_lod_alpha(opacity)
     return np.where(alpha == 1, _BELOW_1, alpha) if encoding == "r8" and ranges.lod_opacity else alpha
