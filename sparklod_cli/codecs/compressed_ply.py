@@ -16,7 +16,7 @@ from ..support.progress import Progress
 from ..support.units import count_of
 from . import quantize
 from .content import Content, Source, Target, decoder
-from .ply_header import Header, read_header
+from .ply_header import PlyHeader, read_header
 from .stream import Positioned, Rows, decode_rows, rows_between, size_of
 
 #: Splats of a chunk, which share bounds.
@@ -87,14 +87,14 @@ def _within(bounds: FloatArray | None, part: slice, unit: FloatArray) -> FloatAr
     return quantize.between(unit, low, high)
 
 
-def _rows(file: Positioned, header: Header, name: str, start: int, stop: int) -> Iterator[Rows]:
+def _rows(file: Positioned, header: PlyHeader, name: str, start: int, stop: int) -> Iterator[Rows]:
     offset, row_type = header.offset(name), header.row_type(name)
     if offset is None or row_type is None:
         raise FormatError("compressed PLY cannot have list properties")
     return rows_between(file, offset, row_type, start, stop, header.count(name))
 
 
-def _read_bounds(file: Positioned, header: Header, chunks: int) -> dict[str, FloatArray | None]:
+def _read_bounds(file: Positioned, header: PlyHeader, chunks: int) -> dict[str, FloatArray | None]:
     rows = np.concatenate([rows for _, rows in _rows(file, header, "chunk", 0, chunks)] or [np.empty(0)])
     have = rows.dtype.names or ()
     return {
@@ -103,7 +103,7 @@ def _read_bounds(file: Positioned, header: Header, chunks: int) -> dict[str, Flo
     }
 
 
-def _checked(header: Header) -> tuple[int, int]:
+def _checked(header: PlyHeader) -> tuple[int, int]:
     """Check the elements, and return the number of splats and of SH coefficients per channel."""
     if header.text:
         raise FormatError("an ascii compressed PLY, but the format is binary")
@@ -128,7 +128,7 @@ def _checked(header: Header) -> tuple[int, int]:
     return count, len(names) // 3
 
 
-def _check_types(header: Header, element: str, names: tuple[str, ...], kind: type[np.generic]) -> tuple[str, ...]:
+def _check_types(header: PlyHeader, element: str, names: tuple[str, ...], kind: type[np.generic]) -> tuple[str, ...]:
     """Return the names of an element's properties, after a check that `names` are among them and of a type."""
     row_type = header.row_type(element) if element in header.elements else None
     have: tuple[str, ...] = (row_type.names or ()) if row_type else ()

@@ -49,7 +49,7 @@ TRUSTED_SIZE, MAX_RATIO = 1 << 26, 200
 _RAW = -zlib_ng.MAX_WBITS
 
 
-class Run(NamedTuple):
+class DataRun(NamedTuple):
     """Bytes of data of one kind, and the ways to deflate them."""
 
     size: int
@@ -58,7 +58,7 @@ class Run(NamedTuple):
 
 def gzip_member(
     pieces: Iterable[Any],
-    runs: Sequence[Run],
+    runs: Sequence[DataRun],
     level: int,
     threads: int,
     progress: Progress,
@@ -99,16 +99,16 @@ def gzip_member(
     yield struct.pack("<II", check, total & 0xFFFFFFFF)
 
 
-def _parts_of(runs: Sequence[Run], level: int) -> Iterator[Run]:
+def _parts_of(runs: Sequence[DataRun], level: int) -> Iterator[DataRun]:
     """Return the blocks of a member, one at least, and the ways to deflate each at a level."""
     total = sum(run.size for run in runs)
     if total <= BLOCK:
-        yield Run(total, (Way(level),))
+        yield DataRun(total, (Way(level),))
         return
     for run in runs:
         ways = tuple(dict.fromkeys(_at_level(way, level) for way in run.ways))
         for start in range(0, run.size, BLOCK):
-            yield Run(min(BLOCK, run.size - start), ways)
+            yield DataRun(min(BLOCK, run.size - start), ways)
 
 
 def _at_level(way: Way, level: int) -> Way:

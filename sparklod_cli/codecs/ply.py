@@ -29,7 +29,7 @@ from .clamps import Range
 from .content import Content, Scratch, Source, Target, decoder
 from .file_notes import comment_of, read_comment
 from .options import DEFAULTS, WriteOptions
-from .ply_header import Header, offset_of, read_header
+from .ply_header import PlyHeader, offset_of, read_header
 from .stream import Positioned, Rows, decode_rows, encode_rows, rows_between, size_of
 
 Coding = Callable[[FloatArray], FloatArray]
@@ -110,7 +110,7 @@ def _run(places: list[int]) -> slice | list[int]:
     return run if places == list(range(run.start, run.stop)) else places
 
 
-def _checked_coefficients(header: Header) -> int:
+def _checked_coefficients(header: PlyHeader) -> int:
     """Check that the vertices are splats, and return the number of SH coefficients per channel."""
     if "vertex" not in header.elements:
         raise NotSplatsError("its PLY header has no element vertex")
@@ -126,14 +126,14 @@ def _checked_coefficients(header: Header) -> int:
     return rest // 3
 
 
-def _row_type(header: Header) -> np.dtype[Any]:
+def _row_type(header: PlyHeader) -> np.dtype[Any]:
     row_type = header.row_type("vertex")
     if row_type is None:
         raise NotSplatsError("its vertices have list properties, which splats do not have")
     return row_type
 
 
-def _rows(file: BinaryIO, header: Header, scratch: Scratch | None) -> Callable[[int, int], Iterator[Rows]]:
+def _rows(file: BinaryIO, header: PlyHeader, scratch: Scratch | None) -> Callable[[int, int], Iterator[Rows]]:
     """Return the function that reads the vertices from a number to another."""
     row_type, count = _row_type(header), header.count("vertex")
 
@@ -154,7 +154,7 @@ def _rows(file: BinaryIO, header: Header, scratch: Scratch | None) -> Callable[[
     return between
 
 
-def _text_rows(file: BinaryIO, header: Header) -> Iterator[Rows]:
+def _text_rows(file: BinaryIO, header: PlyHeader) -> Iterator[Rows]:
     """Read the vertices of an ascii file in blocks; plyfile's own reader takes value by value in Python."""
     row_type, vertices = _row_type(header), header.count("vertex")
     file.seek(header.size)

@@ -20,7 +20,7 @@ MAX_DIGITS = 100
 
 
 @dataclass(frozen=True)
-class Header:
+class PlyHeader:
     """A PLY header.
 
     Attributes:
@@ -81,7 +81,7 @@ class Header:
         return 0 if self.text or any(self.row_type(name) is None for name in self.elements) else -missing
 
 
-def read_header(file: BinaryIO) -> Header:
+def read_header(file: BinaryIO) -> PlyHeader:
     """Read a header, up to the line end_header, after which the file is left.
 
     Raises:
@@ -115,10 +115,10 @@ def read_header(file: BinaryIO) -> Header:
     except (PlyParseError, ValueError) as error:
         raise FormatError(f"bad PLY header: {quoted(error)}") from None
     elements = {element.name: (element, count) for element, count in zip(parsed, counts, strict=True)}
-    return Header(elements, parsed.text, parsed.byte_order, len(text), note)
+    return PlyHeader(elements, parsed.text, parsed.byte_order, len(text), note)
 
 
-def offset_of(file: BinaryIO, header: Header, name: str) -> int:
+def offset_of(file: BinaryIO, header: PlyHeader, name: str) -> int:
     """Return where rows of an element begin in a binary file; lists before them are read for their sizes.
 
     Raises:

@@ -20,7 +20,7 @@ from ..support.parallel import blocks_of
 from ..support.progress import Progress, silent
 from . import clamps, compression, coverage, quantize
 from .clamps import Range
-from .compression import Run
+from .compression import DataRun
 from .encoder import CLAMPED, Encoded, Get, rows_of, windows_of
 from .file_notes import comment_of
 from .options import WriteOptions
@@ -184,7 +184,7 @@ class SpzEncoder:
                     yield get(number, stream.name)
 
         runs = [
-            Run(stream.size * layout.count, WAYS.get(stream.name, compression.MIXED)) for stream in layout.streams()
+            DataRun(stream.size * layout.count, WAYS.get(stream.name, compression.MIXED)) for stream in layout.streams()
         ]
         runs[0] = runs[0]._replace(size=runs[0].size + HEADER.size)
         comment = "" if self.up is None else comment_of(up=self.up)

@@ -34,7 +34,7 @@ _LEAST = np.finfo(np.float32).smallest_subnormal
 _SAME = np.float32(2**-20)
 
 
-class Layout(NamedTuple):
+class LoadedPrecision(NamedTuple):
     """What splats in memory keep of numbers: of alphas, 0..2, and of linear scales."""
 
     alpha: Recode
@@ -70,11 +70,11 @@ def nodes(splats: Splats, tree: LodTree, layout: str, coding: FileCoding = PLAIN
     return found
 
 
-def _layout(name: str, packed_range: tuple[float, float] | None) -> Layout:
+def _layout(name: str, packed_range: tuple[float, float] | None) -> LoadedPrecision:
     """Return one of `formats.LOADED`, with the range of logarithms that a file sets for PackedSplats."""
     if name == "ext":
         scales = spark_codings.exp(_HALVES.astype(np.float32))
-        return Layout(
+        return LoadedPrecision(
             lambda alpha: alpha.astype(np.float16).astype(np.float32),
             lambda scale: scales[spark_codings.log(scale).astype(np.float16).view(np.uint16)],
         )
@@ -92,7 +92,7 @@ def _layout(name: str, packed_range: tuple[float, float] | None) -> Layout:
         known = np.where(np.isnan(scale), _LEAST, scale)
         return table[splat_encoding.encode_log_scale(known, low, high, log=spark_codings.log, least=_LEAST)]
 
-    return Layout(alpha_held, scale_held)
+    return LoadedPrecision(alpha_held, scale_held)
 
 
 class _Codes(NamedTuple):
