@@ -16,9 +16,8 @@ from ..codecs.file_names import MANIFEST, META
 from ..codecs.formats import FORMATS, HEAD, sniff
 from ..codecs.rad.rad_header import MAGIC, RadHeader, read_header
 from ..io.beside import companions, in_folder, path_beside
-from ..io.level_files import read_level_files
-from ..io.names import reason_unreadable
-from ..io.plain import open_plain
+from ..io.details import read_level_files
+from ..io.paths import open_plain, reason_unreadable
 from ..model.nodes import CHUNK_NODES
 from ..support.errors import FormatError, NotSplatsError, UnknownFormatError, UnreadableError
 from ..support.printable import printable
