@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from .render.settings import RasterSettings, RenderSettings
     from .scenes.instances_file import InstancesFileError, read_instances
     from .scenes.loaded import Cut
-    from .simulation.streaming import Network, StreamingSettings
+    from .simulation.streaming_settings import Network, StreamingSettings
     from .support.errors import (
         CameraPathError,
         FormatError,
@@ -93,7 +93,7 @@ _MODULES = {
     "render.settings": ("RasterSettings", "RenderSettings"),
     "scenes.instances_file": ("InstancesFileError", "read_instances"),
     "scenes.loaded": ("Cut",),
-    "simulation.streaming": ("Network", "StreamingSettings"),
+    "simulation.streaming_settings": ("Network", "StreamingSettings"),
     "support.errors": (
         *("CameraPathError", "FormatError", "InvalidSplatsError", "OutOfMemoryError", "OutputError"),
         *("SparklodError", "TreeError"),

@@ -28,7 +28,7 @@ from sparklod_cli.scenes.loaded import Scenes
 from sparklod_cli.scenes.paged_forest import PagedForest
 from sparklod_cli.scenes.paged_scene import PagedScene
 from sparklod_cli.scenes.reading import read_scenes
-from sparklod_cli.simulation.streaming import Network, StreamingSettings
+from sparklod_cli.simulation.streaming_settings import Network, StreamingSettings
 from sparklod_cli.support.errors import FormatError, TreeError
 from tests.conftest import FIXTURES
 from tests.lod.forests import transform

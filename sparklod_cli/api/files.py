@@ -22,8 +22,9 @@ from ..support.defaults import (
     MIN_GROWTH,
 )
 from ..support.errors import FormatError, InvalidSplatsError, TreeError, memory_errors_translated
+from ..support.setting_fields import Range, whole
 from ..support.threads import on_threads, thread_count
-from .arguments import scene_like, whole_within, within
+from .arguments import scene_like
 from .progress import Told, telling
 
 if TYPE_CHECKING:
@@ -123,9 +124,9 @@ def build_lod(
         raise FormatError("the scene has a Level-of-Detail tree already; extract_leaves gives its splats")
     if method not in BUILDERS:
         raise ValueError(f"there is no method {method!r}; give one of {', '.join(BUILDERS)}")
-    within("base", base, MIN_BASE, MAX_BASE)
-    within("growth", growth, MIN_GROWTH, MAX_GROWTH)
-    whole_within("max_sh", max_sh, 0, MAX_SH_DEGREE)
+    Range(MIN_BASE, MAX_BASE).check("base", base)
+    Range(MIN_GROWTH, MAX_GROWTH).check("growth", growth)
+    whole(0, MAX_SH_DEGREE).check("max_sh", max_sh)
     fitting = asked_for(refine)
     build, setting = BakeSettings(method=method, base=base, growth=growth).builder()
     with on_threads(threads), telling(progress) as told, memory_errors_translated():

@@ -7,12 +7,12 @@ from collections.abc import Callable, Iterable
 from ..bake.refining import Refined, refined
 from ..cameras.camera import Camera
 from ..cameras.path import CameraPath
-from ..fitting.settings import MOST_SEED, MOST_STEPS, FitSettings
+from ..fitting.settings import STEPS, FitSettings
 from ..model.scene import Scene, Tree
 from ..support.errors import FormatError, memory_errors_translated
 from ..support.progress import Progress
 from ..support.threads import thread_count
-from .arguments import path_like, scene_like, whole_within
+from .arguments import path_like, scene_like
 from .progress import Told, telling
 
 
@@ -51,7 +51,7 @@ def refine(
     """
     if scene_like(tree).tree is None:
         raise FormatError("the scene has no Level-of-Detail tree; build_lod makes one")
-    settings = checked(FitSettings(steps, seed, None if cameras is None else path_like(cameras)))
+    settings = FitSettings(steps, seed, None if cameras is None else path_like(cameras))
     with telling(progress) as told, memory_errors_translated():
         return refined_tree(tree, settings, thread_count(threads), told, say)
 
@@ -65,17 +65,9 @@ def asked_for(refine: bool | int | FitSettings) -> FitSettings | None:
     if isinstance(refine, bool):
         return FitSettings() if refine else None
     if isinstance(refine, FitSettings):
-        return checked(refine)
-    whole_within("refine", refine, 1, MOST_STEPS)
+        return refine
+    STEPS.check("refine", refine)
     return FitSettings(steps=int(refine))
-
-
-def checked(settings: FitSettings) -> FitSettings:
-    """Settings whose numbers are in their ranges; `ValueError` or `TypeError` otherwise."""
-    if settings.steps is not None:
-        whole_within("steps", settings.steps, 1, MOST_STEPS)
-    whole_within("seed", settings.seed, 0, MOST_SEED)
-    return settings
 
 
 def refined_tree(

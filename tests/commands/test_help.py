@@ -10,7 +10,8 @@ import click
 import pytest
 
 from sparklod_cli.cli import COMMANDS, cli, run
-from sparklod_cli.commands.command import ALIASES, COMMON, GENERAL, Command
+from sparklod_cli.commands.command import ALIASES, Command
+from sparklod_cli.commands.option_groups import COMMON, GENERAL
 
 COMMAND_NAMES = [name for name in COMMANDS if name != "help"]
 
