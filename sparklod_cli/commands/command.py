@@ -4,11 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from .option_groups import COMMON, GENERAL, Option
+if TYPE_CHECKING:
+    from ..support.setting_fields import Setting
+
+
+#: Headings that several commands have: of what most people need, and of what every command has.
+COMMON, GENERAL = "Common options", "General"
 
 #: What else people type, and what they mean by it.
 ALIASES = {
@@ -32,6 +37,22 @@ ALIASES = {
     "show": "view",
     "open": "view",
 }
+
+
+class Option(click.Option):
+    """An option that stands under a heading of `--help`.
+
+    Args:
+        declared: its declaration.
+        heading: of `--help`.
+        bare: its value where it stands alone; another one follows after "=", never as the next argument.
+    """
+
+    def __init__(
+        self, *arguments: Any, declared: Setting, heading: str = GENERAL, bare: str | None = None, **attributes: Any
+    ) -> None:
+        super().__init__(*arguments, **attributes)
+        self.declared, self.heading, self.bare = declared, heading, bare
 
 
 class Command(click.Command):

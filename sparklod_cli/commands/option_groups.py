@@ -8,30 +8,13 @@ from typing import Any, TypeVar
 import click
 
 from .. import __version__
-from ..support.setting_fields import Setting, setting, settings_in
+from ..support.setting_fields import setting, settings_in
+from .command import COMMON as COMMON
+from .command import GENERAL, Option
 from .parameter_types import click_type
 
 Group = TypeVar("Group")
 Decorated = TypeVar("Decorated", bound=Callable[..., Any])
-
-#: Headings that several commands have: of what most people need, and of what every command has.
-COMMON, GENERAL = "Common options", "General"
-
-
-class Option(click.Option):
-    """An option that stands under a heading of `--help`.
-
-    Args:
-        declared: its declaration.
-        heading: of `--help`.
-        bare: its value where it stands alone; another one follows after "=", never as the next argument.
-    """
-
-    def __init__(
-        self, *arguments: Any, declared: Setting, heading: str = GENERAL, bare: str | None = None, **attributes: Any
-    ) -> None:
-        super().__init__(*arguments, **attributes)
-        self.declared, self.heading, self.bare = declared, heading, bare
 
 
 def option(help: str, kind: Any = None, default: Any = None, **attributes: Any) -> Any:

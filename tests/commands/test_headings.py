@@ -7,8 +7,7 @@ import re
 import click
 import pytest
 
-from sparklod_cli.commands.command import Command
-from sparklod_cli.commands.option_groups import COMMON, GENERAL
+from sparklod_cli.commands.command import COMMON, GENERAL, Command
 from sparklod_cli.commands.render import render
 from sparklod_cli.commands.traverse import traverse
 

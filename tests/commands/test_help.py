@@ -10,8 +10,7 @@ import click
 import pytest
 
 from sparklod_cli.cli import COMMANDS, cli, run
-from sparklod_cli.commands.command import ALIASES, Command
-from sparklod_cli.commands.option_groups import COMMON, GENERAL
+from sparklod_cli.commands.command import ALIASES, COMMON, GENERAL, Command
 
 COMMAND_NAMES = [name for name in COMMANDS if name != "help"]
 
