@@ -33,8 +33,7 @@ if TYPE_CHECKING:
     from .codecs.splat_encoding import SplatEncoding
     from .fitting.settings import FitSettings
     from .inspection.report import Report
-    from .lod.detail_rule import DetailRule
-    from .lod.detail_settings import DetailSettings
+    from .lod.detail_rule import DetailRule, DetailSettings
     from .lod.settings import LodSettings
     from .model.foveation import Cones, Frustum
     from .model.instances import Instance
@@ -79,8 +78,7 @@ _MODULES = {
     "codecs.splat_encoding": ("SplatEncoding",),
     "fitting.settings": ("FitSettings",),
     "inspection.report": ("Report",),
-    "lod.detail_settings": ("DetailSettings",),
-    "lod.detail_rule": ("DetailRule",),
+    "lod.detail_rule": ("DetailRule", "DetailSettings"),
     "lod.settings": ("LodSettings",),
     "model.foveation": ("Cones", "Frustum"),
     "model.instances": ("Instance",),

@@ -115,8 +115,8 @@ def build_lod(
         ValueError: there is no such method, or an option is out of its range.
     """
     from ..bake import BakeSettings
-    from ..lod.band_order import banded
     from ..lod.check import select
+    from ..lod.families import banded
     from ..model.selection import Selection
     from .refining import asked_for, refined_tree
 

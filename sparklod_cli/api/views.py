@@ -69,7 +69,7 @@ def cut(
         precision: of the centres and sizes of a tree: "float32", or their half floats, "float16"; or what Spark has of
             it, for the same cut to the last node: "ext" with `extSplats`, else "packed", or "packed-pages" where Spark
             streams a RAD file. Of a tree that was not read from a file, Spark's are taken to be its own numbers.
-        threads: to prepare the trees on, and to find a large cut; None for all processors.
+        threads: to prepare the trees on; None for all processors.
 
     Raises:
         ValueError: the budget is out of its range, or less than one splat for each instance; `continuous` is not
@@ -78,7 +78,7 @@ def cut(
     camera_like(camera)
     with on_threads(threads) as count, memory_errors_translated():
         scenes = scenes_of(viewed, count, precision)
-        return CutFinder(scenes, _lod(scenes, budget, settings, continuous), threads=count).cut(camera)
+        return CutFinder(scenes, _lod(scenes, budget, settings, continuous)).cut(camera)
 
 
 def render(

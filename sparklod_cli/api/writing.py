@@ -21,7 +21,7 @@ from .progress import Told, telling
 if TYPE_CHECKING:
     from ..bake.detail_output import DetailOutput
     from ..codecs.options import RadOptions, SogOptions
-    from ..lod.detail_settings import DetailSettings
+    from ..lod.detail_rule import DetailSettings
     from ..support.progress import Progress
 
 
@@ -92,7 +92,7 @@ def write(
     from ..codecs.options import RadOptions, SogOptions, WriteOptions
     from ..codecs.sound import check_scene
     from ..codecs.splat_encoding import SplatEncoding
-    from ..lod.detail_settings import DetailSettings
+    from ..lod.detail_rule import DetailSettings
 
     path, count = file_path(path), thread_count(threads)
     form = None if encoding is not None else WRITABLE.get(ending_of(path.name))

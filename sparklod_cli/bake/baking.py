@@ -167,12 +167,12 @@ def bake(
         if made.output.in_chunks and not made.is_ordered:
             with on_threads(threads):
                 from ..lod.chunk_order import chunk_order
-                from ..lod.families import taken
+                from ..lod.families import reordered
 
                 order, child_start = chunk_order(nodes, tree, progress=progress)
                 built = [(nodes, tree)]
                 del nodes, tree
-                nodes, tree = taken(built, order, child_start)
+                nodes, tree = reordered(built, order, child_start)
             clock.end("arrange")
         environment = made.environment if environment is None else environment
         counted = made.counted if fitting is None else None
@@ -252,7 +252,7 @@ def _built(
         build, setting = settings.builder()
         built = [build(handed_over.pop(), setting, progress=progress)]
         if BUILDERS[settings.method].in_bands and not output.in_chunks:
-            from ..lod.band_order import banded
+            from ..lod.families import banded
 
             built = [banded(built)]
     clock.end("build")

@@ -11,7 +11,7 @@ from ..codecs.statistics import Statistics
 from ..codecs.streamed_sog.names import ENVIRONMENT, folders_of
 from ..io import SinkTogether
 from ..io.together import Files
-from ..lod.detail_settings import DetailSettings
+from ..lod.detail_rule import DetailSettings
 from ..model.detail import DetailScene
 from ..model.scene import Scene
 from ..model.splats import Splats

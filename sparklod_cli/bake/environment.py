@@ -39,7 +39,7 @@ def divided(splats: Splats, settings: BakeSettings) -> tuple[Splats, Splats | No
     """
     if settings.environment_beyond is None:
         return splats, None
-    from ..lod.environment import beyond
+    from ..lod.regions import beyond
 
     far = beyond(splats, settings.environment_beyond)
     return (splats.take(~far), splats.take(far)) if far.any() else (splats, None)

@@ -9,7 +9,7 @@ from pathlib import Path
 from ..codecs.options import WriteOptions
 from ..fitting.settings import FitSettings
 from ..lod.builders import BUILDERS, METHODS
-from ..lod.detail_settings import DetailSettings
+from ..lod.detail_rule import DetailSettings
 from ..model.lod_tree import LodTree
 from ..model.selection import Selection
 from ..model.splats import Splats

@@ -14,7 +14,7 @@ from ..codecs.gpu.table import ENCODINGS, NPZ, RAW_SUFFIXES
 from ..codecs.options import RadOptions
 from ..codecs.rad.names import SUFFIX as RAD
 from ..codecs.streamed_sog.names import MANIFEST
-from ..lod.detail_settings import DetailSettings
+from ..lod.detail_rule import DetailSettings
 from ..support.addresses import Place
 from ..support.stdin import DASH
 from .option_groups import COMMON, argument, exclude, flag, is_set, option, parameters_of, refuse

@@ -1,4 +1,4 @@
-"""What can be chosen about fitting a tree, and what is reported of it. Imports nothing heavy."""
+"""Settings of fitting a tree, and its report. Imports nothing heavy."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SHARES = (0.02, 0.05, 0.1, 0.25, 0.5)
 
 @dataclass(frozen=True)
 class FitSettings(CheckedSettings):
-    """How the merged splats of a tree are fitted.
+    """Settings of fitting the merged splats of a tree.
 
     Attributes:
         path: training cameras; None for cameras that are placed around and inside the scene.
@@ -37,7 +37,7 @@ class FitSettings(CheckedSettings):
 
 @dataclass(frozen=True)
 class FitStage:
-    """What one stage brought.
+    """Result of a stage.
 
     Attributes:
         name: for display.
@@ -53,7 +53,7 @@ class FitStage:
 
 @dataclass(frozen=True)
 class FitReport:
-    """What fitting a tree brought.
+    """Result of fitting a tree.
 
     Attributes:
         steps: that were done.

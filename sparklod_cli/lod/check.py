@@ -31,7 +31,7 @@ class Bounds:
 
 
 def check_setting(name: str, value: float, least: float, most: float) -> None:
-    """Raises a `ValueError` where the setting of a builder is out of its range."""
+    """Raise a `ValueError` where the setting of a builder is out of its range."""
     if not least <= value <= most:
         raise ValueError(f"{name} {value} is not within {least} to {most}")
 
@@ -45,7 +45,7 @@ def select(selection: Selection, splats: Splats, threads: int) -> tuple[Splats, 
 
 
 def check(splats: Splats) -> Bounds:
-    """Checks that a tree can be built of splats, and returns their bounds.
+    """Check that a tree can be built of splats, and returns their bounds.
 
     Raises:
         InvalidSplatsError: there is no splat, or one is invalid or cannot be seen.
@@ -60,6 +60,6 @@ def check(splats: Splats) -> Bounds:
 
 
 def check_visible(smallest: float, faintest: float = 1.0) -> None:
-    """Raises `InvalidSplatsError` where the least size, or the least opacity, of splats is 0."""
+    """Raise `InvalidSplatsError` where the least size, or the least opacity, of splats is 0."""
     if not (smallest > 0 and faintest > 0):
         raise InvalidSplatsError("a splat is without opacity or scale: see Selection.apply")

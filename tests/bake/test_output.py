@@ -15,7 +15,7 @@ from sparklod_cli.codecs import encoder
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
 from sparklod_cli.codecs.statistics import Statistics
 from sparklod_cli.lod import quick
-from sparklod_cli.lod.detail_settings import DetailSettings
+from sparklod_cli.lod.detail_rule import DetailSettings
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.support.errors import FormatError, OutputError
 from sparklod_cli.support.progress import silent

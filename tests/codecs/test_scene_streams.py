@@ -35,6 +35,7 @@ def assert_rows(blocks: list[Splats], expected: Splats) -> None:
 
 @pytest.mark.parametrize("threads", [1, 2])
 @pytest.mark.parametrize(("form", "way"), CASES)
+@pytest.mark.slow
 def test_the_blocks_of_any_range_are_the_rows_of_the_scene(
     form: str, way: str, threads: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -23,7 +23,7 @@ from sparklod_cli.support.errors import InvalidSplatsError, OutputError, Scratch
 from tests.faults.runs import DEMO, ENVIRONMENT, mounted
 from tests.signals import heed_signals
 
-pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="there is no kill -9 on Windows")
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(sys.platform == "win32", reason="there is no kill -9 on Windows")]
 
 #: Small enough for the demo to be several blocks.
 BLOCK_SPLATS = 5000

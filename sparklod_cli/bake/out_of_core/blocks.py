@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ...lod.stages.records import Region
+from ...lod.stage_records import Region
 from ...model.splats import FloatArray
 
 #: The most regions that a join takes: three splits in two.

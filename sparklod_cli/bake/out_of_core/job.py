@@ -8,7 +8,7 @@ from typing import Any
 
 from ...codecs.encoder import Encoder
 from ...lod.builders import BUILDERS
-from ...lod.stages.records import StagedBuilder
+from ...lod.stage_records import StagedBuilder
 from ...model.streams import SceneStream
 from ..settings import BakeSettings
 from .blocks import Blocks
@@ -57,7 +57,7 @@ class Job:
 
     def builder(self) -> StagedBuilder:
         """The builder of the tree."""
-        return BUILDERS[self.settings.method].load_stages()
+        return BUILDERS[self.settings.method].load()
 
     def part(self, number: int) -> str:
         """The name of what is known of a part of the input, whose splats are in blocks then."""

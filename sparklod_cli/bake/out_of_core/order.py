@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ...lod.band_order import band_order
 from ...lod.builders import BUILDERS
 from ...lod.chunk_order import MOST_FAMILIES, family_order
-from ...lod.kernels.family_links import find_limits
-from ...lod.stages.records import NO_FAMILY, STAGE_BITS
+from ...lod.families import band_order
+from ...lod.kernels.tree_links import find_limits
+from ...lod.stage_records import NO_FAMILY, STAGE_BITS
 from ...model.nodes import CHUNK_NODES
 from ...model.splats import FloatArray
 from ...support.parallel import blocks_of

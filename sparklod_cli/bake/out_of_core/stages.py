@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...codecs.statistics import Statistics
-from ...lod.stages.records import NO_FAMILY, Families, Pending
+from ...lod.stage_records import NO_FAMILY, Families, Pending
 from ...model.splats import Splats
 from ...support.progress import Progress
 from ...support.threads import on_threads
@@ -26,7 +26,7 @@ def build_stage(job: Job, number: int, *, threads: int, progress: Progress) -> N
         _put_families(job, number, families, threads)
         statistics = [Statistics.of(families.nodes, families.family == NO_FAMILY, job.needed)]
         if stage.region is None:
-            root, family = builder.root(left)
+            root, family = left.root()
             job.store.put(ROOT, {"rows": rows_of(root), "family": np.array([family], np.int64)})
             statistics.append(Statistics.of(root, np.array([family == NO_FAMILY]), job.needed))
         else:

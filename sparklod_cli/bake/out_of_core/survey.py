@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ...codecs.statistics import Statistics
 from ...lod.check import check_visible
 from ...lod.kernels.geometry import find_bounds
-from ...lod.stages.records import Survey
+from ...lod.stage_records import Survey
 from ...model.selection import REASONS, Tally
 from ...model.splats import FloatArray
 from ...model.streams import SceneStream

@@ -13,7 +13,7 @@ import click
 from ...codecs.options import SH_CODES
 from ...fitting.settings import STEPS, FitSettings
 from ...lod.builders import BUILDERS, METHODS
-from ...lod.detail_settings import DetailSettings
+from ...lod.detail_rule import DetailSettings
 from ...support import defaults
 from ...support.addresses import Place
 from ...support.setting_fields import Quantity, Range, setting_of, whole

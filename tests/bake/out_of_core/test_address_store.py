@@ -19,6 +19,8 @@ from sparklod_cli.support.progress import silent
 
 from .made_up import Job, tree_of
 
+pytestmark = pytest.mark.slow
+
 ARRAYS = {"rows": np.arange(300_000, dtype=np.float32).reshape(-1, 3), "none": np.empty((0, 4), np.int64)}
 
 

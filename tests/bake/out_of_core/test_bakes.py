@@ -22,6 +22,8 @@ from tests.bake.out_of_core.plain import Loop
 from tests.conftest import FIXTURES, real_scene
 from tests.scenes import random_splats
 
+pytestmark = pytest.mark.slow
+
 #: What differs by nature: how long it took, and what was in the scratch folder.
 OWN = {"seconds", "blocks", "scratch_bytes_written", "scratch_bytes_read"}
 

@@ -25,6 +25,8 @@ from sparklod_cli.support.progress import silent
 from . import made_up
 from .made_up import Job, tree_of
 
+pytestmark = pytest.mark.slow
+
 SAID: list[str] = []
 
 

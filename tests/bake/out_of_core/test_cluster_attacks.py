@@ -26,6 +26,8 @@ from sparklod_cli.support.progress import silent
 
 from .made_up import Job, tree_of
 
+pytestmark = pytest.mark.slow
+
 #: Seconds that somebody who has the credentials waits on a busy machine, and for how long others try.
 PATIENCE, TRIES = 60, 2
 

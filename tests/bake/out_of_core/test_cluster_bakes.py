@@ -31,6 +31,8 @@ from sparklod_cli.support.errors import SparklodError
 from sparklod_cli.support.progress import Progress, silent
 from tests.conftest import FIXTURES
 
+pytestmark = pytest.mark.slow
+
 DEMO = FIXTURES / "demo.ply"
 
 #: What was said of the two processes.

@@ -23,6 +23,8 @@ from sparklod_cli.support.progress import silent
 
 from .made_up import Job, tree_of
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def scheduler() -> Any:

@@ -18,7 +18,7 @@ from sparklod_cli.bake.out_of_core.flow import Built
 from sparklod_cli.bake.out_of_core.job import Job
 from sparklod_cli.bake.out_of_core.parts import parts_of
 from sparklod_cli.codecs.statistics import ALL
-from sparklod_cli.lod import band_order, quick
+from sparklod_cli.lod import families, quick
 from sparklod_cli.lod.chunk_order import arrange
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
@@ -40,7 +40,7 @@ def _small_windows() -> Iterator[None]:
         patch.setattr(order, "WINDOW_NODES", 64)
         patch.setattr(nodes, "WINDOW_NODES", 64)
         patch.setattr(nodes, "GAP", 5)
-        patch.setattr(band_order, "FIRST_BAND", 16)
+        patch.setattr(families, "FIRST_BAND", 16)
         patch.setattr(merging, "MERGED", 20)
         patch.setattr(merging, "PROBES", 5)
         yield

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sparklod_cli.lod.stages.records import Pending, Region, StagedBuilder
+from sparklod_cli.lod.stage_records import Pending, Region, StagedBuilder
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.splats import Splats
-from tests.lod.stages.assembled import EVERYWHERE, Stages, assemble, survey_of
+from tests.lod.assembled import EVERYWHERE, Stages, assemble, survey_of
 
 
 @dataclass(frozen=True)
@@ -72,4 +72,4 @@ def build_divided(
 
     left = run(division, None)
     assert len(left) == 1
-    return *assemble(stages.families, *builder.root(left)), stages
+    return *assemble(stages.families, *left.root()), stages

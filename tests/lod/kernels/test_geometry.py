@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sparklod_cli.lod.kernels.eigen import CONVERGED, ROWS, decompose
+from sparklod_cli.lod.kernels.geometry import CONVERGED, ROWS, decompose
 from tests.references import gaussians
 
 

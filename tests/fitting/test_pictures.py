@@ -7,10 +7,8 @@ import itertools
 import numpy as np
 
 from sparklod_cli.fitting.cameras import Place, placed
-from sparklod_cli.fitting.held_out import scores_of
-from sparklod_cli.fitting.laws import keep_gains, keep_sizes
 from sparklod_cli.fitting.nodes import FittedNodes
-from sparklod_cli.fitting.pictures import pictures
+from sparklod_cli.fitting.pictures import keep_gains, keep_sizes, pictures, scores_of
 from sparklod_cli.fitting.settings import SHARES
 from sparklod_cli.inspection.tree import examine
 from sparklod_cli.lod import quality

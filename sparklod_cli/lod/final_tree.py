@@ -7,16 +7,15 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from ...model.lod_tree import LodTree
-from ...model.sh import degree_of
-from ...model.splats import COLUMNS, FloatArray, Splats
-from ...support.jit import threads_for, threads_in_use
-from ...support.progress import Progress
-from ..kernels import node_rows, pair_cost, prune
-from ..kernels.final_order import fill_leaves, merge_colors
-from ..kernels.sort import Keys, Nodes, sort_by_key
-from .binary import BinaryTree
-from .curve import Curve
+from ..model.lod_tree import LodTree
+from ..model.sh import degree_of
+from ..model.splats import COLUMNS, FloatArray, Splats
+from ..support.jit import threads_for, threads_in_use
+from ..support.progress import Progress
+from .kernels import node_rows, pair_cost, prune
+from .kernels.node_rows import fill_leaves, merge_colors
+from .kernels.sort import Keys, Nodes, sort_by_key
+from .pair_tree import BinaryTree, Curve
 
 #: Columns of splats that merged ones have of their node rows, and those that they have of their children.
 GEOMETRY = ("center", "scale", "quat_xyzw", "opacity")
@@ -24,8 +23,8 @@ COLORS = tuple(name for name in COLUMNS if name not in GEOMETRY)
 
 
 @dataclass(frozen=True)
-class Wanted:
-    """What is to be kept of a binary tree, and in which order.
+class PruningGoal:
+    """Bounds of the nodes of a pruned tree, and their order.
 
     Attributes:
         most: number of merged nodes.
@@ -45,7 +44,7 @@ class Wanted:
 
 @dataclass(frozen=True, eq=False)
 class FinalTree:
-    """The nodes that are kept, in final order.
+    """Pruned tree in final order.
 
     If the tree is not whole, node 0 stands for what the nodes without a parent will be under, and is not to be drawn.
 
@@ -74,21 +73,26 @@ class FinalTree:
 
 
 def in_final_order(
-    binary: BinaryTree, index: Nodes, columns: dict[str, FloatArray], wanted: Wanted, curve: Curve, progress: Progress
+    binary: BinaryTree,
+    index: Nodes,
+    columns: dict[str, FloatArray],
+    goal: PruningGoal,
+    curve: Curve,
+    progress: Progress,
 ) -> FinalTree:
-    """Prunes a tree, and writes its nodes and their colours in final order. The binary tree is of no use afterwards.
+    """Prune a tree, and writes its nodes and their colours in final order. The binary tree is of no use afterwards.
 
     Args:
         binary: the tree.
         index: (N,) splat of each of its leaves.
         columns: of the splats as the leaves are drawn; emptied, so that they are freed one by one where nobody else
             holds them.
-        wanted: of the nodes.
+        goal: bounds and order of its nodes.
         curve: for the order of nodes of one rank.
         progress: told of the nodes.
     """
-    n, hidden = binary.leaves, 0 if wanted.is_whole else 1
-    parent, saved, rank = _prune(binary, wanted, progress)
+    n, hidden = binary.leaves, 0 if goal.is_whole else 1
+    parent, saved, rank = _prune(binary, goal, progress)
     inner, ranks, keys = _by_rank(binary, rank[: len(rank) - hidden], curve)
     del rank
     slots = inner - np.uint32(n)
@@ -112,7 +116,7 @@ def in_final_order(
     places = (getattr(out, name)[hidden:] for name in GEOMETRY)
     node_rows.fill_merged_splats(order[hidden:], n, binary.row, binary.rows, curve.space, *places)
     weight = binary.rows[binary.row[slots], pair_cost.WEIGHT]
-    binary.rows = rows = binary.rows[binary.row[slots[:0] if wanted.is_whole else slots]]  # frees what is not returned
+    binary.rows = rows = binary.rows[binary.row[slots[:0] if goal.is_whole else slots]]  # frees what is not returned
     weights = np.empty(binary.used, np.float32)
     weights[:n], weights[inner] = binary.weight, weight
     for name in COLORS:
@@ -127,30 +131,30 @@ def in_final_order(
 
 
 def _prune(
-    binary: BinaryTree, wanted: Wanted, progress: Progress
+    binary: BinaryTree, goal: PruningGoal, progress: Progress
 ) -> tuple[Nodes, NDArray[np.int32], NDArray[np.int32]]:
-    """Parents of all nodes, `saved` of `prune.drop_nodes`, and ranks; frees what only pruning needs."""
-    n, top, blocks = binary.leaves, binary.used - wanted.is_whole, threads_in_use()
+    """Return parents of all nodes, `saved` of `prune.drop_nodes`, and ranks; frees what only pruning needs."""
+    n, top, blocks = binary.leaves, binary.used - goal.is_whole, threads_in_use()
     progress("pruning", 0, binary.used, "node")
     log_size, lost, weight = binary.size[: top + 1], binary.error[: top + 1 - n], np.empty(top + 1 - n, np.float32)
     children = binary.children[: binary.used - n]
-    parent = prune.fill_usefulness_terms(children, n, wanted.splats, top, log_size, lost, weight, blocks)
+    parent = prune.fill_usefulness_terms(children, n, goal.splats, top, log_size, lost, weight, blocks)
     binary.children = children = np.empty((0, 2), np.uint32)
     saved = np.ones(top + 1 - n, np.int32)
-    if not wanted.is_whole:
+    if not goal.is_whole:
         saved[-1] = np.count_nonzero(parent[:-1] == top) - 1 - prune.ROOM
     # A root that is only to be is one node more.
-    prune.drop_nodes(n, wanted.most + (not wanted.is_whole), parent, log_size, lost, weight, saved, blocks)
-    if not wanted.is_whole:
+    prune.drop_nodes(n, goal.most + (not goal.is_whole), parent, log_size, lost, weight, saved, blocks)
+    if not goal.is_whole:
         saved[-1] += prune.ROOM
-    highest = log_size[top] if wanted.highest is None else np.float32(wanted.highest)
-    rank = prune.size_ranks(n, highest, parent, log_size, saved, wanted.latest)
+    highest = log_size[top] if goal.highest is None else np.float32(goal.highest)
+    rank = prune.size_ranks(n, highest, parent, log_size, saved, goal.latest)
     binary.size = binary.error = np.empty(0, np.float32)
     return parent, saved, rank
 
 
 def _by_rank(binary: BinaryTree, rank: NDArray[np.int32], curve: Curve) -> tuple[Nodes, NDArray[np.int32], Keys]:
-    """The remaining merged nodes, by rank and then along the curve, with both."""
+    """Return the remaining merged nodes, by rank and then along the curve, with both."""
     slots = np.flatnonzero(rank != prune.NO_RANK).astype(np.uint32)
     own = rank[slots].astype(np.int64)
     first = int(own.min(initial=0))

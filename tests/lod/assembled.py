@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from sparklod_cli.lod.check import check
-from sparklod_cli.lod.stages.records import NO_FAMILY, STAGE_BITS, Families, Pending, Region, StagedBuilder, Survey
+from sparklod_cli.lod.stage_records import NO_FAMILY, STAGE_BITS, Families, Pending, Region, StagedBuilder, Survey
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.support.progress import silent
@@ -112,7 +112,7 @@ def run_stages(
     stages = Stages(builder, builder.plan(survey_of(splats, step), setting))
     left = stages.run(splats, np.arange(len(splats)), EVERYWHERE, splits, is_root=True)
     assert len(left) == 1
-    return *assemble(stages.families, *builder.root(left)), stages
+    return *assemble(stages.families, *left.root()), stages
 
 
 def assemble(families: Sequence[Families], root: Splats, family: int) -> tuple[Splats, LodTree]:

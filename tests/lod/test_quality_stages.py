@@ -1,4 +1,4 @@
-"""Laws of the quality builder in stages."""
+"""Laws of the quality builder in quality."""
 
 from __future__ import annotations
 
@@ -12,12 +12,11 @@ from hypothesis import strategies as st
 from sparklod_cli.lod import quality
 from sparklod_cli.lod.builders import BUILDERS
 from sparklod_cli.lod.kernels.prune import MOST_CHILDREN
-from sparklod_cli.lod.stages import quality as stages
-from sparklod_cli.lod.stages.records import Pending, Region
+from sparklod_cli.lod.stage_records import Pending, Region
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.support.progress import silent
-from tests.lod.stages.assembled import Splits, build_in_stages, check_families, run_stages, survey_of
+from tests.lod.assembled import Splits, build_in_stages, check_families, run_stages, survey_of
 from tests.lod.trees import check_colours, check_threads, check_tree, coincident, hard_cases
 from tests.scenes import random_splats
 
@@ -29,7 +28,7 @@ SPLITS: list[Splits] = [[(2, 1, 1)], [(3, 3, 3)], [(2, 2, 1), (2, 2, 1)]]
 
 def check(splats: Splats, growth: float, splits: Splits) -> tuple[Splats, LodTree]:
     """What holds for every scene."""
-    nodes, tree, built = run_stages(stages, splats, growth, splits)
+    nodes, tree, built = run_stages(quality, splats, growth, splits)
     check_tree(splats, nodes, tree)
     for stage, families in enumerate(built.families):
         check_families(families, stage)
@@ -43,13 +42,13 @@ def same(a: tuple[Splats, LodTree], b: tuple[Splats, LodTree]) -> bool:
 
 
 def test_the_builder_is_found_by_its_method() -> None:
-    assert BUILDERS["quality"].load_stages() is stages
+    assert BUILDERS["quality"].load() is quality
 
 
 @pytest.mark.parametrize("growth", GROWTHS)
 def test_one_stage_makes_the_tree_in_memory(growth: float) -> None:
     splats = random_splats(2_000, sh_degree=1, seed=1)
-    assert same(build_in_stages(stages, splats, growth, []), quality.build(splats, growth))
+    assert same(build_in_stages(quality, splats, growth, []), quality.build(splats, growth))
 
 
 @given(
@@ -90,22 +89,22 @@ def test_blocks_use_what_the_growth_allows(growth: float, splits: Splits) -> Non
 
 def test_blocks_hand_on_few_of_their_nodes() -> None:
     splats = small_splats(40_000)
-    _, _, built = run_stages(stages, splats, 1.4, [(2, 2, 1)])
+    _, _, built = run_stages(quality, splats, 1.4, [(2, 2, 1)])
     assert sum(built.pending[:4]) < 0.15 * len(splats)
 
 
 def test_threads_do_not_change_a_bit() -> None:
-    check_threads(lambda: build_in_stages(stages, random_splats(20_000, sh_degree=1, seed=3), 1.4, SPLITS[0]))
+    check_threads(lambda: build_in_stages(quality, random_splats(20_000, sh_degree=1, seed=3), 1.4, SPLITS[0]))
 
 
 def test_the_order_of_tasks_does_not_change_a_bit() -> None:
     """Stages share nothing but what they hand on, and numbers of stages are only in the numbers of families."""
     splats = random_splats(3_000, seed=4)
-    plan = stages.plan(survey_of(splats), 1.4)
+    plan = quality.plan(survey_of(splats), 1.4)
     index = np.flatnonzero(splats.center[:, 0] < 0)
     region = Region((-np.inf,) * 3, (0.0, np.inf, np.inf))
     first, again = (
-        stages.advance(stages.leaves(splats.take(index), index, plan), region, stage, plan, progress=silent)
+        quality.advance(quality.leaves(splats.take(index), index, plan), region, stage, plan, progress=silent)
         for stage in (0, 7)
     )
     for name, column in first[1].columns.items():
@@ -119,18 +118,18 @@ def test_the_order_of_tasks_does_not_change_a_bit() -> None:
 
 @pytest.mark.parametrize("splits", SPLITS)
 def test_colours_are_means_of_the_leaves_by_what_they_cover(splits: Splits) -> None:
-    nodes, tree = build_in_stages(stages, random_splats(2_000, sh_degree=1, seed=8), 1.4, splits)
+    nodes, tree = build_in_stages(quality, random_splats(2_000, sh_degree=1, seed=8), 1.4, splits)
     check_colours(nodes, tree)
 
 
 def test_empty_blocks_hand_on_nothing() -> None:
     splats = random_splats(50, sh_degree=1, seed=2)
-    plan = stages.plan(survey_of(splats), 1.4)
-    nothing = stages.leaves(splats.take(slice(0, 0)), np.arange(0), plan)
-    families, left = stages.advance(nothing, Region((0.0,) * 3, (1.0,) * 3), 0, plan, progress=silent)
+    plan = quality.plan(survey_of(splats), 1.4)
+    nothing = quality.leaves(splats.take(slice(0, 0)), np.arange(0), plan)
+    families, left = quality.advance(nothing, Region((0.0,) * 3, (1.0,) * 3), 0, plan, progress=silent)
     assert len(families) == len(families.nodes) == len(left) == 0
-    some = stages.leaves(splats.take(slice(1)), np.arange(1), plan)
-    _, one = stages.advance(some, Region((-np.inf,) * 3, (np.inf,) * 3), 1, plan, progress=silent)
+    some = quality.leaves(splats.take(slice(1)), np.arange(1), plan)
+    _, one = quality.advance(some, Region((-np.inf,) * 3, (np.inf,) * 3), 1, plan, progress=silent)
     joined = Pending.concat([left, one])
     assert len(joined) == 1 and joined.columns["sh"].shape == (1, 3, 3)
 
@@ -138,7 +137,7 @@ def test_empty_blocks_hand_on_nothing() -> None:
 @pytest.mark.parametrize("growth", [1.0, 2.01, np.nan])
 def test_a_growth_out_of_range_is_an_error(growth: float) -> None:
     with pytest.raises(ValueError, match="growth"):
-        stages.plan(survey_of(random_splats(2)), growth)
+        quality.plan(survey_of(random_splats(2)), growth)
 
 
 def small_splats(count: int) -> Splats:

@@ -1,4 +1,4 @@
-"""What the stages of a build hand to one another.
+"""Records of builds in stages, which make a tree block by block where a scene does not fit into memory.
 
 A stage takes the nodes of a region that have no parent yet, gives as many of them parents as it can know without the
 rest of the scene, and hands on what is left: first for each block of splats, then for regions that join several, and
@@ -14,8 +14,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ...model.splats import FloatArray, Splats
-from ...support.progress import Progress
+from ..model.splats import COLUMNS, FloatArray, Splats
+from ..support.progress import Progress
 
 #: Number of the family of a leaf, which has no children.
 NO_FAMILY = -1
@@ -38,7 +38,7 @@ class Region:
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """What the stages need to know of the whole scene before any of it is built.
+    """Facts about the whole scene that stages need before any of it is built.
 
     Attributes:
         count: N splats that are kept.
@@ -62,17 +62,31 @@ class Pending:
     """Nodes without a parent.
 
     Attributes:
-        columns: (n, ...) arrays by name, which only their builder knows; all have the same length.
+        columns: (n, ...) arrays by name: those of `Splats` as the nodes are drawn, and others of their builder.
     """
 
     columns: Mapping[str, NDArray[Any]]
 
+    @classmethod
+    def of(cls, splats: Splats, **columns: NDArray[Any]) -> Pending:
+        """Return nodes by how they are drawn, and their other columns."""
+        return cls({**{name: getattr(splats, name) for name in COLUMNS}, **columns})
+
     def __len__(self) -> int:
         return len(next(iter(self.columns.values())))
 
+    @property
+    def splats(self) -> Splats:
+        """Nodes as they are drawn."""
+        return Splats(**{name: self.columns[name] for name in COLUMNS})
+
+    def root(self) -> tuple[Splats, int]:
+        """Return the one node that is left at the end, as it is drawn, and the number of its family."""
+        return self.splats, int(self.columns["family"][0])
+
     @classmethod
     def concat(cls, parts: list[Pending]) -> Pending:
-        """All parts in order."""
+        """Return all parts in order."""
         return cls({name: np.concatenate([part.columns[name] for part in parts]) for name in parts[0].columns})
 
 
@@ -112,7 +126,7 @@ class StagedBuilder(Protocol):
     """
 
     def plan(self, survey: Survey, setting: float) -> Any:
-        """What all stages share.
+        """Return what all stages share.
 
         Args:
             survey: of the whole scene.
@@ -123,7 +137,7 @@ class StagedBuilder(Protocol):
         """
 
     def leaves(self, splats: Splats, index: NDArray[np.int64], plan: Any) -> Pending:
-        """Splats as nodes without a parent.
+        """Return splats as nodes without a parent.
 
         Args:
             splats: n splats, valid and visible.
@@ -134,7 +148,7 @@ class StagedBuilder(Protocol):
     def advance(
         self, pending: Pending, region: Region | None, stage: int, plan: Any, *, progress: Progress
     ) -> tuple[Families, Pending]:
-        """Gives nodes parents as far as the rest of the scene cannot matter.
+        """Give nodes parents as far as the rest of the scene cannot matter.
 
         Args:
             pending: all nodes without a parent whose centres lie in the region, from blocks in ascending order.
@@ -143,6 +157,3 @@ class StagedBuilder(Protocol):
             plan: of `plan`.
             progress: told of the splats or nodes.
         """
-
-    def root(self, pending: Pending) -> tuple[Splats, int]:
-        """The one node that is left at the end, as it is drawn, and the number of its family."""
