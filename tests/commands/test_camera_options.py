@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -251,10 +249,3 @@ def test_the_help_lists_formats_and_axes() -> None:
     text = " ".join(run("--help")[0].output.split())
     for said in ("EYE:TARGET", "'EYE:TARGET ...'", "WxH", "auto|sparklod|csv|nerfstudio", "opengl-c2w|opencv-c2w"):
         assert said in text
-
-
-def test_help_needs_nothing_heavy() -> None:
-    module = "sparklod_cli.commands.options.cameras"
-    code = f"import sys, {module}; print([m for m in ('numpy', 'numba') if m in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout == "[]\n"
