@@ -12,8 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sparklod_cli.io import companions, detail_files, detail_sink, files_of, read_levels, read_scene
-from sparklod_cli.io.names import leads_away
+from sparklod_cli.io import companions, read_levels, read_scene
+from sparklod_cli.io.details import detail_files, detail_sink
+from sparklod_cli.io.identity import files_of
+from sparklod_cli.io.paths import leads_away
 from sparklod_cli.support import leftovers
 from sparklod_cli.support.addresses import Address
 from sparklod_cli.support.errors import OutputError

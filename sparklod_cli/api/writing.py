@@ -9,14 +9,14 @@ from types import NoneType
 from typing import TYPE_CHECKING
 
 from ..codecs.streamed_sog.names import MANIFEST
-from ..io import detail_sink, scene_sink, write_whole
+from ..io import scene_sink, write_whole
+from ..io.details import detail_sink
 from ..model.scene import Scene
 from ..support.defaults import DEFAULT_COMPRESSION
 from ..support.errors import FormatError, InvalidSplatsError, memory_errors_translated
 from ..support.threads import thread_count
-from .arguments import file_path, scene_like
+from .arguments import Told, file_path, scene_like, telling
 from .files import naming, pack
-from .progress import Told, telling
 
 if TYPE_CHECKING:
     from ..bake.detail_output import DetailOutput
@@ -57,7 +57,7 @@ def write(
     threads: int | None = None,
     progress: Told = None,
 ) -> Written:
-    """Writes a scene, or a tree, whole or not at all. Nodes keep their order, see `arrange_chunks`.
+    """Write a scene, or a tree, whole or not at all. Nodes keep their order, see `arrange_chunks`.
 
     Args:
         path: of the file, whose suffix tells the format: .spz or .rad; for a scene without a tree, .ply, .sog or
@@ -106,14 +106,15 @@ def write(
         raise ValueError(f"{path}: sog is of SOG; leave it out, or write a .sog")
     if (detail is not None or environment is not None) and not streamed:
         raise ValueError(f"{path}: detail and environment are of Streamed SOG; leave them out, or write a {MANIFEST}")
-    if not isinstance(detail, (DetailSettings, NoneType)):
-        raise TypeError(f"detail is {detail!r}; give DetailSettings")
-    if not isinstance(rad, (RadOptions, NoneType)):
-        raise TypeError(f"rad is {rad!r}; give RadOptions")
-    if not isinstance(sog, (SogOptions, NoneType)):
-        raise TypeError(f"sog is {sog!r}; give SogOptions")
-    if rad is not None and not isinstance(rad.ranges, (SplatEncoding, NoneType)):
-        raise TypeError(f"ranges is {rad.ranges!r}; give a SplatEncoding")
+    ranges = rad.ranges if isinstance(rad, RadOptions) else None
+    for name, value, kind in (
+        ("detail", detail, DetailSettings),
+        ("rad", rad, RadOptions),
+        ("sog", sog, SogOptions),
+        ("ranges", ranges, SplatEncoding),
+    ):
+        if not isinstance(value, (kind, NoneType)):
+            raise TypeError(f"{name} is {value!r}; give {'a ' if name == 'ranges' else ''}{kind.__name__}")
     rad = dataclasses.replace(rad or RadOptions(), chunked=chunked or (rad is not None and rad.chunked))
     options = WriteOptions(spz_version, fractional_bits, compression_level, rad, sog or SogOptions())
     if not len(scene_like(scene).splats):
@@ -137,7 +138,7 @@ def write(
 def _write_levels(
     path: Path, scene: Scene, environment: Scene | None, output: DetailOutput, threads: int, progress: Progress
 ) -> Written:
-    from ..bake.clock import Clock
+    from ..bake.records import Clock
 
     if scene.tree is None:
         raise FormatError(f"{path}: detail levels are cuts of a tree; build_lod makes one, best by method='quality'")
@@ -146,7 +147,7 @@ def _write_levels(
     if environment is not None and not len(environment.splats):
         raise InvalidSplatsError(f"{path}: the environment has no splats to write")
     always = None if environment is None else environment.splats
-    return Written(path, "Streamed SOG", output.write(scene, always, Clock(), threads, progress).bytes)
+    return Written(path, "Streamed SOG", output.write_levels(scene, always, Clock(), threads, progress).bytes)
 
 
 def _write_arrays(path: Path, scene: Scene, encoding: str, *, overwrite: bool, threads: int) -> Written:

@@ -37,7 +37,11 @@ from .options.common import General
 from .paths import NAMELESS, Folder, claim_stdout, is_same_place, keep_apart, with_chunks
 
 if TYPE_CHECKING:
-    from ..api.bake_jobs import Baked, BakeSettings, ClusterEngine, Extracted, Source
+    from ..bake.out_of_core.cluster_engine import ClusterEngine
+    from ..bake.records import Baked
+    from ..bake.settings import BakeSettings
+    from ..bake.sources import Source
+    from ..extract_leaves import Extracted
 
     #: Result of a job; None where the output was there already.
     Outcome = Baked | Extracted | None
@@ -92,7 +96,7 @@ class BuildLodOptions:
 
     def bake_settings(self, ctx: click.Context) -> BakeSettings:
         """Return the settings of bakes; loads numpy."""
-        from ..api.bake_jobs import BakeSettings
+        from ..bake.settings import BakeSettings
 
         files = self.files
         return BakeSettings(
@@ -225,18 +229,22 @@ def _job_of(
     ctx: click.Context, options: BuildLodOptions, console: Console, engine: ClusterEngine | None
 ) -> tuple[Make, Callable[..., None]]:
     """Return a function that makes the outputs of inputs, and one that reports an output; loads numpy."""
-    from ..api import bake_jobs
-
     console.announce_compiling()
     files, threads = options.files, options.general.threads
     shared: dict[str, Any] = {"overwrite": files.overwrite, "progress": console.progress}
     if files.unlod:
+        from ..extract_leaves import extract_leaves
+
         how: dict[str, Any] = {"suffix": files.suffix, "options": options.write_options(), "threads": threads}
-        return _one_by_one(functools.partial(bake_jobs.extract_leaves, **how, **shared)), report_extracted
+        return _one_by_one(functools.partial(extract_leaves, **how, **shared)), report_extracted
+    from ..bake.flow import bake
+
     settings = options.bake_settings(ctx)
-    make: Callable[..., Baked | None] = bake_jobs.bake
+    make: Callable[..., Baked | None] = bake
     if files.skip_existing is not None:
-        make = functools.partial(bake_jobs.bake_unless_there, verify=files.skip_existing == VERIFY)
+        from ..bake.skipping import bake_unless_there
+
+        make = functools.partial(bake_unless_there, verify=files.skip_existing == VERIFY)
     resources = options.resources.resources()
     if engine is not None:
         resources = dataclasses.replace(resources, memory=engine.memory)
@@ -246,8 +254,10 @@ def _job_of(
     alone = _one_by_one(here)
     if engine is None:
         return alone, report_baked
+    from ..bake.side_by_side import bake_side_by_side
+
     side_by_side: Make = functools.partial(
-        bake_jobs.bake_side_by_side,
+        bake_side_by_side,
         make=make,
         settings=settings,
         engine=engine,

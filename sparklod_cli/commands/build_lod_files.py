@@ -23,7 +23,7 @@ from .options.common import output_option, overwrite_flag
 from .paths import InputPath, OutputPath, require_suffix, stem_of
 
 if TYPE_CHECKING:
-    from ..api.bake_jobs import Source
+    from ..bake.sources import Source
     from ..model.instances import Instance
 
 #: Suffixes of the formats in which a tree can be written, and what they are called; the first one is the default.
@@ -138,7 +138,7 @@ class BakedFiles:
 
     def jobs(self, instances: Sequence[Instance], say: Callable[[str], None]) -> list[tuple[Source, Place]]:
         """Return pairs of an input and its output; `say` gets a line on attributes of instances that are ignored."""
-        from ..api.bake_jobs import Merged
+        from ..bake.sources import Merged
 
         if not self.is_merged:
             return [(place, self.target(place)) for place in self.inputs]
@@ -244,7 +244,7 @@ def check_inputs(ctx: click.Context, files: BakedFiles) -> None:
 
 def record_of(source: Source) -> dict[str, Any]:
     """Return the input as a line of JSON has it: "input", or "inputs" where several are one scene."""
-    from ..api.bake_jobs import Merged
+    from ..bake.sources import Merged
 
     if isinstance(source, Merged):
         return {"inputs": [str(each.file) for each in source.files]}

@@ -169,7 +169,8 @@ def keep_apart(ctx: click.Context, stands_for: Mapping[str, Iterable[Place]] | N
 
 def with_chunks(headers: Iterable[Place]) -> list[Place]:
     """Return outputs of several files, and the files beside them that are replaced or removed with them."""
-    from ..io import chunk_files, detail_files
+    from ..io import chunk_files
+    from ..io.details import detail_files
 
     chunks: list[Place] = []
     for header in headers:

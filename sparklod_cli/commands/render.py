@@ -24,8 +24,7 @@ from .options.pictures import Appearance, Comparison, PictureFiles, check_sizes
 from .paths import claim_stdout, keep_apart, name_outputs
 
 if TYPE_CHECKING:
-    from ..api.jobs import Drawn
-    from ..api.viewed_files import ViewedFiles
+    from ..api.jobs import Drawn, ViewedFiles
     from ..cameras.path import CameraPath
     from ..images.output import Output
     from ..images.sequence import Pictures, PictureSettings
@@ -160,7 +159,7 @@ def _draw(ctx: click.Context, options: RenderOptions) -> None:
 
 def viewed_files(options: RenderOptions, instances: list[Instance], console: Console) -> ViewedFiles:
     """Return the files and the cameras that look at them."""
-    from ..api.viewed_files import ViewedFiles
+    from ..api.jobs import ViewedFiles
 
     return ViewedFiles(
         instances,

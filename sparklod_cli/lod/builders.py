@@ -4,7 +4,23 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from importlib import import_module
-from typing import Any
+from typing import Any, NamedTuple
+
+from ..model.sh import COEFFICIENTS
+
+
+class SplatBytes(NamedTuple):
+    """Bytes that a splat takes at the peak of a bake: without spherical harmonics, and for each of their coefficients.
+
+    Peaks of processes (VmHWM), as `benchmarks/bench_memory.py` measures them, with some room to spare.
+    """
+
+    fixed: int
+    coefficient: int
+
+    def of(self, splats: int, sh_degree: int) -> int:
+        """Return the bytes of so many splats."""
+        return splats * (self.fixed + self.coefficient * COEFFICIENTS[sh_degree])
 
 
 @dataclass(frozen=True)
@@ -18,12 +34,19 @@ class Builder:
         summary: a phrase for help texts.
         in_bands: its trees are put in the order of `band_order` for files that are read whole. That saves 3 to 4 % of
             a file of quality, and 1 to 2 % of one of quick, which is not worth the time.
+        in_memory: bytes of a splat of the input, in memory.
+        in_block: bytes of a splat of a block, out of core.
+        in_scratch: bytes of a splat of the input in the scratch folder, out of core. Those of blocks are removed when
+            their nodes are made.
     """
 
     module: str
     setting: str
     summary: str
     in_bands: bool
+    in_memory: SplatBytes
+    in_block: SplatBytes
+    in_scratch: SplatBytes
 
     def load(self) -> Any:
         """Import and return the module."""
@@ -32,7 +55,23 @@ class Builder:
 
 #: Builders by the name of the method; the first is the default.
 BUILDERS = {
-    "quick": Builder("quick", "base", "pairs in cells of a voxel grid, in seconds", in_bands=False),
-    "quality": Builder("quality", "growth", "the pairs that cost least, in all", in_bands=True),
+    "quick": Builder(
+        "quick",
+        "base",
+        "pairs in cells of a voxel grid, in seconds",
+        in_bands=False,
+        in_memory=SplatBytes(220, 27),
+        in_block=SplatBytes(300, 50),
+        in_scratch=SplatBytes(190, 32),
+    ),
+    "quality": Builder(
+        "quality",
+        "growth",
+        "the pairs that cost least, in all",
+        in_bands=True,
+        in_memory=SplatBytes(250, 30),
+        in_block=SplatBytes(350, 50),
+        in_scratch=SplatBytes(200, 34),
+    ),
 }
 METHODS = tuple(BUILDERS)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..codecs.gpu import loaded_nodes, lod_tree
-from ..io import LevelFiles
+from ..io.details import LevelFiles
 from ..lod.detail_traversal import DetailFiles
 from ..model.coding import FileCoding
 from ..model.detail import DetailScene

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cameras.framing import SAMPLE
-from ..io import RadFile
+from ..io.rad_file import RadFile
 from ..lod.kernels.pixel_scale import NODE
 from ..lod.traversal import Forest, fill_nodes
 from ..model.balls import USED, Balls, balls_of

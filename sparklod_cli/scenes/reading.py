@@ -9,7 +9,9 @@ from pathlib import Path
 
 from ..codecs.gpu.table import PRECISIONS
 from ..codecs.rounding import after
-from ..io import RadFile, examine_scene, has_levels, read_level_files, read_levels, size_of_input
+from ..io import examine_scene, read_levels, size_of_input
+from ..io.details import has_levels, read_level_files
+from ..io.rad_file import RadFile
 from ..model.detail import DetailScene
 from ..model.instances import Instance
 from ..model.nodes import CHUNK_NODES

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 import sparklod_cli as sparklod
-from sparklod_cli.bake import BakeSettings, bake
+from sparklod_cli.bake.flow import bake
+from sparklod_cli.bake.settings import BakeSettings
 from sparklod_cli.codecs.formats import WRITABLE
 from sparklod_cli.codecs.gpu.table import ENCODINGS
 from sparklod_cli.codecs.options import RadOptions, WriteOptions

@@ -20,7 +20,8 @@ from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.codecs.streamed_sog import codec
 from sparklod_cli.codecs.streamed_sog.promises import ERRORS, WARNINGS
 from sparklod_cli.inspection.report import Report, ReportSettings, inspect
-from sparklod_cli.io import detail_sink, read_levels
+from sparklod_cli.io import read_levels
+from sparklod_cli.io.details import detail_sink
 from sparklod_cli.lod import detail_levels, quick
 from sparklod_cli.lod.detail_rule import DetailSettings
 from sparklod_cli.support.errors import FormatError

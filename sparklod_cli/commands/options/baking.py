@@ -24,7 +24,8 @@ from ..paths import InputPath, OutputPath
 from .common import General
 
 if TYPE_CHECKING:
-    from ...api.bake_jobs import ClusterEngine, Resources
+    from ...bake.out_of_core.cluster_engine import ClusterEngine
+    from ...bake.settings import Resources
     from ...model.selection import Selection
     from ...model.transforms import Transform
     from ..console import Console
@@ -264,7 +265,7 @@ class ResourceOptions:
 
     def resources(self) -> Resources:
         """Return what the bakes may use."""
-        from ...api.bake_jobs import Resources
+        from ...bake.settings import Resources
 
         return Resources(memory=self.memory, scratch_dir=self.scratch_dir, resume=self.resume)
 
@@ -290,7 +291,7 @@ class ClusterOptions:
         if self.workers is None and self.scheduler is None:
             yield None
             return
-        from ...api.bake_jobs import ClusterSettings, cluster
+        from ...bake.out_of_core.cluster import ClusterSettings, cluster
 
         threads = general.threads if self.scheduler is None or is_set(ctx, "threads") else None
         with cluster(

@@ -1,4 +1,4 @@
-"""What an output is made of: its inputs, the settings and the version of the program."""
+"""Fingerprint of an output: its inputs, the settings and the version of the program."""
 
 from __future__ import annotations
 
@@ -13,24 +13,25 @@ import numpy as np
 
 from .. import __version__
 from ..cameras.formats.table import NAMES
-from ..io import Identity, files_of, identity_of
+from ..io.identity import Identity, files_of, identity_of
 from ..support.addresses import Place
 from ..support.errors import UnreadableError
-from ..support.untrusted import parse_json, quoted_value
+from ..support.untrusted import quoted_value
 from .settings import BakeSettings
+from .sources import Source, placement_of, places_of
 
 #: Settings that name a file whose content is one of the inputs.
 FILES = ("rgba", "environment", "camera_path")
 
-#: Settings that are no part of a recipe: a message, and files whose names do not matter.
+#: Settings that are no part of a fingerprint: a message, and files whose names do not matter.
 NO_PART = ("unused", *FILES)
 
-#: How the version of the program is called in a recipe.
+#: How the version of the program is called in a fingerprint.
 PROGRAM = "sparklod"
 
 
 @dataclass(frozen=True)
-class Recipe:
+class Fingerprint:
     """All that determines the bytes of an output.
 
     Attributes:
@@ -45,12 +46,12 @@ class Recipe:
 
     @property
     def digest(self) -> str:
-        """32 characters that no other recipe has."""
+        """32 characters that no other fingerprint has."""
         whole = json.dumps([self.inputs, self.settings], sort_keys=True)
         return hashlib.blake2b(whole.encode(), digest_size=16).hexdigest()
 
-    def differences(self, former: Recipe) -> list[str]:
-        """In what it differs from a former one, in words; empty where it does not."""
+    def differences(self, former: Fingerprint) -> list[str]:
+        """Return in what it differs from a former one, in words; empty where it does not."""
         found = []
         if len(self.inputs) != len(former.inputs):
             found.append(f"it had {len(former.inputs)} input files and has {len(self.inputs)}")
@@ -63,54 +64,43 @@ class Recipe:
                 found.append(f"{name} was {quoted_value(before)} and is {quoted_value(now)}")
         return found
 
-    def to_record(self) -> dict[str, Any]:
-        """As values that JSON has, of which `from_record` makes it again."""
-        return dataclasses.asdict(self)
-
-    @classmethod
-    def from_record(cls, found: Any) -> Recipe:
-        """The recipe of `to_record`; `ValueError` where the values are of none."""
-        try:
-            return cls(tuple(found["inputs"]), tuple(found["names"]), dict(found["settings"]))
-        except (KeyError, TypeError) as error:
-            raise ValueError(f"it is no recipe: {error!r}") from None
-
     def to_json(self) -> bytes:
-        """The text of which `from_json` makes it again."""
-        return json.dumps(self.to_record(), sort_keys=True).encode()
+        """Return the text of which `from_record` makes it again, parsed."""
+        return json.dumps(dataclasses.asdict(self), sort_keys=True).encode()
 
     @classmethod
-    def from_json(cls, text: bytes) -> Recipe:
-        """The recipe of `to_json`; `ValueError` where the text is none."""
-        return cls.from_record(parse_json(text))
+    def from_record(cls, record: Any) -> Fingerprint:
+        """Return the fingerprint of its fields by name; raise `ValueError` where the values are of none."""
+        try:
+            return cls(tuple(record["inputs"]), tuple(record["names"]), dict(record["settings"]))
+        except (KeyError, TypeError) as error:
+            raise ValueError(f"it is no fingerprint: {error!r}") from None
 
 
-def recipe_of(sources: Iterable[Place], settings: BakeSettings, **more: Any) -> Recipe:
-    """The recipe of a bake that may go on later; files are told apart by size, time and a sample of their bytes.
+def source_fingerprint(source: Source, settings: BakeSettings) -> Fingerprint:
+    """Return the fingerprint of a bake that may go on later; size, time and a sample of its bytes tell a file.
 
     Args:
-        sources: the inputs; - is standard input.
-        settings: how it is baked.
-        more: numbers and texts that matter besides.
+        source: the input; - is standard input.
 
     Raises:
         UnreadableError: an input cannot be read.
     """
-    found = [identity_of(file) for source in sources for file in files_of(source)]
-    found += map(_identity_of_named, files_named_in(settings))
-    inputs = tuple(f"{each.bytes} {each.modified} {each.sample}" for each in found)
-    return Recipe(inputs, tuple(each.name for each in found), settings_of(settings) | more)
+    seen = [identity_of(file) for place in places_of(source) for file in files_of(place)]
+    seen += map(_identity_of_named, files_named_in(settings))
+    inputs = tuple(f"{each.bytes} {each.modified} {each.sample}" for each in seen)
+    return Fingerprint(inputs, tuple(each.name for each in seen), settings_of(settings) | placement_of(source))
 
 
 def files_named_in(settings: BakeSettings) -> list[Place]:
-    """The files that settings name, and those that belong to these."""
+    """Return the files that settings name, and those that belong to these."""
     named = {name: path for name in FILES if (path := getattr(settings, name)) is not None}
     sets = {"camera_path": NAMES}
     return [file for name, path in named.items() for file in files_of(path, sets.get(name, ()))]
 
 
 def _identity_of_named(file: Place) -> Identity:
-    """What a file is like; an error names it, as it is none of the inputs."""
+    """Return what a file is like; an error names it, as it is none of the inputs."""
     try:
         return identity_of(file)
     except UnreadableError as error:
@@ -118,7 +108,7 @@ def _identity_of_named(file: Place) -> Identity:
 
 
 def settings_of(settings: BakeSettings) -> dict[str, Any]:
-    """Settings as a recipe has them."""
+    """Return settings as a fingerprint has them."""
     values = {name: value for name, value in _flat("", settings) if name not in NO_PART}
     return {PROGRAM: __version__, **values}
 

@@ -13,45 +13,46 @@ from pathlib import Path
 
 import numpy as np
 
+from ...support import folders, leftovers
 from ...support.addresses import Place
 from ...support.errors import FormatError, InvalidSplatsError, ScratchError, UnreadableError
 from ...support.parallel import ordered_map
 from ...support.stdin import DASH
 from ...support.units import count_of
-from ..recipe import Recipe
-from .contracts import Store
-from .lock import LOCK, locked
-from .store import FileStore
+from ...support.untrusted import parse_json
+from ..fingerprint import Fingerprint
+from .job import forget
+from .store import Store
 
 #: How the names of scratch folders end.
 SUFFIX = ".sparklod-scratch"
 
+#: The file that the run at work has locked.
+LOCK = "lock"
+
 #: Bytes of an output's name up to which that of its scratch folder has it.
 NAME_BYTES = 200
 
-#: The name of the result that has the recipe.
+#: The name of the result that has the fingerprint.
 RECIPE = "recipe"
 
 #: Version of what results have and are called; one that differs cannot be gone on with.
 LAYOUT = 1
 
-#: Errors that another run of the same recipe would meet again.
+#: Errors that another run of the same fingerprint would meet again.
 HOPELESS = (FormatError, InvalidSplatsError)
 
-#: Removes the marks of tasks that must be done again, as results that they made are lost.
-Forget = Callable[[Store, list[str]], None]
 
-
-def scratch_folder(target: Place, recipe: Callable[[], Recipe], parent: Place | None) -> Place:
-    """The scratch folder of a bake: beside its output, or in a folder for those of several bakes.
+def scratch_folder(target: Place, fingerprint: Callable[[], Fingerprint], parent: Place | None) -> Place:
+    """Return the scratch folder of a bake: beside its output, or in a folder for those of several bakes.
 
     Args:
         target: the output. That of standard output (-) is among the system's temporary files.
-        recipe: makes that of the output, where it is needed.
+        fingerprint: makes that of the output, where it is needed.
         parent: the folder for several; None for that of the output.
     """
     if target == DASH:
-        return (parent or Path(tempfile.gettempdir())) / f"standard-output-{recipe().digest[:8]}{SUFFIX}"
+        return (parent or Path(tempfile.gettempdir())) / f"standard-output-{fingerprint().digest[:8]}{SUFFIX}"
     if parent is None:
         return target.parent / f"{_shortened(target.name)}{SUFFIX}"
     name = os.path.realpath(target) if isinstance(target, Path) else target.url
@@ -59,7 +60,7 @@ def scratch_folder(target: Place, recipe: Callable[[], Recipe], parent: Place | 
 
 
 def _shortened(name: str) -> str:
-    """A name to which more can be added: file systems allow 255 bytes."""
+    """Return a name to which more can be added: file systems allow 255 bytes."""
     return name if len(os.fsencode(name)) <= NAME_BYTES else f"output-{_digest(name)}"
 
 
@@ -72,27 +73,28 @@ class _Manifest:
     """Whose results a store has.
 
     Attributes:
-        recipe: of the output.
+        fingerprint: of the output.
         block_splats: of the blocks that the scene was cut into.
     """
 
-    recipe: Recipe
+    fingerprint: Fingerprint
     block_splats: int
 
     def put(self, store: Store) -> None:
-        """Writes it as a result."""
-        text = np.frombuffer(self.recipe.to_json(), np.uint8)
+        """Write it as a result."""
+        text = np.frombuffer(self.fingerprint.to_json(), np.uint8)
         store.put(RECIPE, {"recipe": text, "numbers": np.array([LAYOUT, self.block_splats], np.int64)})
 
     @classmethod
     def get(cls, store: Store) -> _Manifest | None:
-        """The one of a store; None where it has none that this version understands."""
+        """Return the one of a store; None where it has none that this version understands."""
         try:
             if not store.is_sound(RECIPE):
                 return None
             found = store.get(RECIPE)
             layout, block_splats = found["numbers"].tolist()
-            return cls(Recipe.from_json(found["recipe"].tobytes()), block_splats) if layout == LAYOUT else None
+            fingerprint = Fingerprint.from_record(parse_json(found["recipe"].tobytes()))
+            return cls(fingerprint, block_splats) if layout == LAYOUT else None
         except (KeyError, ValueError):
             return None
 
@@ -100,25 +102,22 @@ class _Manifest:
 @contextlib.contextmanager
 def at_work(
     store: Store,
-    recipe: Recipe,
+    fingerprint: Fingerprint,
     block_splats: int,
     *,
     resume: bool,
     overwrite: bool,
-    forget: Forget,
     say: Callable[[str], None],
 ) -> Iterator[int]:
-    """A context in which a bake puts its results into a store, which is empty at the end if all went well.
+    """Yield a context in which a bake puts its results into a store, which is empty at the end if all went well.
 
     After an error that another run need not meet, or an interrupt, the results stay.
 
     Args:
-        store: of the results.
-        recipe: of the output.
+        fingerprint: of the output.
         block_splats: of the blocks that the scene is cut into, unless that was done before.
         resume: go on with the results that are there.
         overwrite: remove them, unless `resume` is set.
-        forget: called with the names of results that are damaged, after they were removed.
         say: told what was found, and what is left.
 
     Yields:
@@ -126,7 +125,7 @@ def at_work(
 
     Raises:
         ScratchError: a run is at work there; there are results and neither `resume` nor `overwrite` is set, or they are
-            of another recipe; or the store cannot be written.
+            of another fingerprint; or the store cannot be written.
     """
     folder = _folder_of(store)
     with contextlib.nullcontext() if folder is None else locked(folder):  # an address cannot be locked
@@ -137,10 +136,10 @@ def at_work(
                 f"an interrupted bake left {store}; go on with it by --resume, or begin anew with --overwrite"
             )
         if names and resume:
-            block_splats = _resumed(store, recipe, former, names, forget, say)
+            block_splats = _resumed(store, fingerprint, former, names, say)
         else:
             _clear(store)
-            _Manifest(recipe, block_splats).put(store)
+            _Manifest(fingerprint, block_splats).put(store)
         try:
             yield block_splats
         except BaseException as error:
@@ -153,7 +152,7 @@ def at_work(
 
 
 def _clear(store: Store) -> None:
-    """Removes all that is there but the lock; last the files that tell what it is, for a run that is killed here."""
+    """Remove all that is there but the lock; last the files that tell what it is, for a run that is killed here."""
     folder = _folder_of(store)
     if folder is not None:
         for path in sorted(folder.iterdir(), key=lambda path: (path.is_file(), path.name)):
@@ -167,18 +166,17 @@ def _clear(store: Store) -> None:
 
 def _resumed(
     store: Store,
-    recipe: Recipe,
+    fingerprint: Fingerprint,
     former: _Manifest | None,
     names: list[str],
-    forget: Forget,
     say: Callable[[str], None],
 ) -> int:
-    """Checks that the results are those of the recipe, and removes damaged ones; the splats of a block."""
+    """Check that the results are those of the fingerprint, and remove damaged ones; return the splats of a block."""
     if former is None:
         raise ScratchError(
             f"nothing tells what the results in {store} are of; begin anew with --overwrite, without --resume"
         )
-    differences = recipe.differences(former.recipe)
+    differences = fingerprint.differences(former.fingerprint)
     if differences:
         raise ScratchError(
             f"{store} has the results of another bake: {'; '.join(differences)}. Begin anew with --overwrite, without"
@@ -196,10 +194,65 @@ def _resumed(
 
 
 def _folder_of(store: Store) -> Path | None:
-    """The folder of a store on this machine."""
-    place = store.folder if isinstance(store, FileStore) else None
-    return place if isinstance(place, Path) else None
+    """Return the folder of a store on this machine."""
+    return store.folder if isinstance(store.folder, Path) else None
 
 
 def _is_hopeless(error: BaseException) -> bool:
     return isinstance(error, HOPELESS) and not isinstance(error, UnreadableError)
+
+
+@contextlib.contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Lock a folder for one run; it is made if need be, and removed if empty, as are its parents that were made.
+
+    Raises:
+        ScratchError: another run is at work there, it is nobody's scratch folder, or it cannot be made.
+    """
+    path = folder / LOCK
+    with contextlib.ExitStack() as stack:
+        try:
+            stack.enter_context(folders.created(folder.parent))
+            descriptor = _opened_lock(path)
+        except OSError as error:
+            raise ScratchError(
+                f"cannot write in the scratch folder {folder}: {(error.strerror or str(error)).lower()}; choose another"
+                " one with --scratch-dir"
+            ) from None
+        try:
+            yield
+        finally:
+            if leftovers.HAS_LOCKS:
+                _remove_empty(path)
+            os.close(descriptor)
+            if not leftovers.HAS_LOCKS:  # Windows cannot remove a file that is open
+                _remove_empty(path)
+
+
+def _opened_lock(path: Path) -> int:
+    """Open and lock the file for that, in a folder that is ours; raises `ScratchError` where it is taken."""
+    folder = path.parent
+    with contextlib.suppress(FileNotFoundError):
+        if not path.exists() and any(folder.iterdir()):
+            raise ScratchError(f"{folder} is no scratch folder of sparklod; move it, or choose another --scratch-dir")
+    while True:
+        folder.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_CLOEXEC", 0), 0o666)
+        is_free = leftovers.try_lock(descriptor)
+        with contextlib.suppress(FileNotFoundError):  # the run that had it was done, and removed it
+            if os.path.samestat(os.fstat(descriptor), path.stat()):
+                if is_free:
+                    return descriptor
+                os.close(descriptor)
+                raise ScratchError(
+                    f"another run is at work in {folder}; wait for it, or give this one another output or --scratch-dir"
+                )
+        os.close(descriptor)
+
+
+def _remove_empty(path: Path) -> None:
+    """Remove a folder that has nothing but the file that is locked."""
+    with contextlib.suppress(OSError):
+        if [*path.parent.iterdir()] == [path]:
+            path.unlink()
+            path.parent.rmdir()

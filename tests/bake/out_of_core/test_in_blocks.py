@@ -11,12 +11,12 @@ import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
-from sparklod_cli.bake import BakeSettings
-from sparklod_cli.bake.clock import Clock
-from sparklod_cli.bake.out_of_core import flow, merging, nodes, order
-from sparklod_cli.bake.out_of_core.flow import Built
+from sparklod_cli.bake.out_of_core import nodes, order
+from sparklod_cli.bake.out_of_core.in_blocks import InBlocks
 from sparklod_cli.bake.out_of_core.job import Job
-from sparklod_cli.bake.out_of_core.parts import parts_of
+from sparklod_cli.bake.output import WholeOutput
+from sparklod_cli.bake.records import BuiltTree, Clock
+from sparklod_cli.bake.settings import BakeSettings
 from sparklod_cli.codecs.statistics import ALL
 from sparklod_cli.lod import families, quick
 from sparklod_cli.lod.chunk_order import arrange
@@ -41,16 +41,18 @@ def _small_windows() -> Iterator[None]:
         patch.setattr(nodes, "WINDOW_NODES", 64)
         patch.setattr(nodes, "GAP", 5)
         patch.setattr(families, "FIRST_BAND", 16)
-        patch.setattr(merging, "MERGED", 20)
-        patch.setattr(merging, "PROBES", 5)
+        patch.setattr(order, "MERGED", 20)
+        patch.setattr(order, "PROBES", 5)
         yield
 
 
-def built(folder: str, splats: Splats, how: BakeSettings, block: int, engine: Loop, *, in_chunks: bool) -> Built:
+def built(folder: str, splats: Splats, how: BakeSettings, block: int, engine: Loop, *, in_chunks: bool) -> BuiltTree:
     """A tree in a store, of blocks of about so many splats."""
-    stream = stream_of(Scene(splats))
-    job = Job(PlainStore(Path(folder)), stream, how, ALL, in_chunks, parts_of(len(splats), block))
-    return flow.build(*flow.scattered(job, engine, block, silent), engine, Clock(), silent)
+    job = Job(PlainStore(Path(folder)), stream_of(Scene(splats)), how, ALL, in_chunks)
+    blocks = InBlocks(job, WholeOutput(), Clock(), engine, block, silent)
+    tree = blocks.build()
+    blocks.order(tree)
+    return tree
 
 
 def same(found: tuple[Splats, LodTree], expected: tuple[Splats, LodTree]) -> None:

@@ -11,42 +11,39 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sparklod_cli.bake.out_of_core.lock import LOCK
-from sparklod_cli.bake.out_of_core.manifest import RECIPE, SUFFIX, at_work, scratch_folder
-from sparklod_cli.bake.out_of_core.store import FolderStore
-from sparklod_cli.bake.recipe import Recipe
+from sparklod_cli.bake.fingerprint import Fingerprint
+from sparklod_cli.bake.out_of_core.scratch_folder import LOCK, RECIPE, SUFFIX, at_work, scratch_folder
+from sparklod_cli.bake.out_of_core.store import Store
 from sparklod_cli.support.errors import FormatError, ScratchError, UnreadableError
 from sparklod_cli.support.stdin import DASH
 from tests.conftest import ROOT
 
-A = Recipe(("content a",), ("a.ply",), {"method": "quick", "base": 1.5})
+A = Fingerprint(("content a",), ("a.ply",), {"method": "quick", "base": 1.5})
 VALUE = {"value": np.arange(5)}
 
 
 @pytest.fixture
-def store(tmp_path: Path) -> FolderStore:
-    return FolderStore(tmp_path / f"a.spz{SUFFIX}")
+def store(tmp_path: Path) -> Store:
+    return Store(tmp_path / f"a.spz{SUFFIX}")
 
 
 class Run:
     """A bake of two tasks, and what it heard."""
 
-    def __init__(self, store: FolderStore) -> None:
-        self.store = FolderStore(store.folder)
+    def __init__(self, store: Store) -> None:
+        self.store = Store(store.folder)
         self.said: list[str] = []
-        self.lost: list[str] = []
 
     @contextlib.contextmanager
     def begun(
-        self, *, resume: bool = False, overwrite: bool = False, recipe: Recipe = A, block_splats: int = 100
+        self, *, resume: bool = False, overwrite: bool = False, fingerprint: Fingerprint = A, block_splats: int = 100
     ) -> Iterator[int]:
         with at_work(
             self.store,
-            recipe,
+            fingerprint,
             block_splats,
             resume=resume,
             overwrite=overwrite,
-            forget=lambda store, names: self.lost.extend(names),
             say=self.said.append,
         ) as found:
             yield found
@@ -61,7 +58,7 @@ class Run:
         return self
 
 
-def test_nothing_is_left_of_a_run_that_ended_well(store: FolderStore, tmp_path: Path) -> None:
+def test_nothing_is_left_of_a_run_that_ended_well(store: Store, tmp_path: Path) -> None:
     run = Run(store)
     with run.begun() as block_splats:
         assert block_splats == 100
@@ -72,7 +69,7 @@ def test_nothing_is_left_of_a_run_that_ended_well(store: FolderStore, tmp_path: 
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), MemoryError(), UnreadableError("x"), SystemExit()])
-def test_results_stay_after_an_interruption_and_are_gone_on_with(store: FolderStore, error: BaseException) -> None:
+def test_results_stay_after_an_interruption_and_are_gone_on_with(store: Store, error: BaseException) -> None:
     run = Run(store).interrupted(error)
     assert run.said == [f"what is done stays in {store}; run it again with --resume to go on"]
     run = Run(store)
@@ -84,12 +81,12 @@ def test_results_stay_after_an_interruption_and_are_gone_on_with(store: FolderSt
     assert not store.folder.exists()
 
 
-def test_results_are_removed_after_an_error_that_would_come_again(store: FolderStore) -> None:
+def test_results_are_removed_after_an_error_that_would_come_again(store: Store) -> None:
     assert Run(store).interrupted(FormatError("x")).said == []
     assert not store.folder.exists()
 
 
-def test_nothing_stays_where_nothing_was_done(store: FolderStore) -> None:
+def test_nothing_stays_where_nothing_was_done(store: Store) -> None:
     run = Run(store)
     with pytest.raises(KeyboardInterrupt), run.begun():
         raise KeyboardInterrupt
@@ -97,7 +94,7 @@ def test_nothing_stays_where_nothing_was_done(store: FolderStore) -> None:
     assert run.said == []
 
 
-def test_leftover_results_are_named_and_refused(store: FolderStore) -> None:
+def test_leftover_results_are_named_and_refused(store: Store) -> None:
     Run(store).interrupted()
     with (
         pytest.raises(ScratchError, match=r"an interrupted bake left .*scratch; .*--resume.*--overwrite"),
@@ -107,14 +104,14 @@ def test_leftover_results_are_named_and_refused(store: FolderStore) -> None:
     assert store.names() == ["first", RECIPE, "second"]
 
 
-def test_overwrite_begins_anew(store: FolderStore) -> None:
+def test_overwrite_begins_anew(store: Store) -> None:
     Run(store).interrupted()
     with Run(store).begun(overwrite=True, block_splats=50) as block_splats:
         assert block_splats == 50
         assert store.names() == [RECIPE]
 
 
-def test_resume_without_results_begins(store: FolderStore) -> None:
+def test_resume_without_results_begins(store: Store) -> None:
     with Run(store).begun(resume=True) as block_splats:
         assert block_splats == 100
 
@@ -122,20 +119,20 @@ def test_resume_without_results_begins(store: FolderStore) -> None:
 @pytest.mark.parametrize(
     ("other", "words"),
     [
-        (Recipe(("content b",), ("b.ply",), A.settings), r"b\.ply changed since"),
-        (Recipe(A.inputs, A.names, {"method": "quality", "base": 1.5}), "method was 'quick' and is 'quality'"),
-        (Recipe((*A.inputs, "more"), ("a.ply", "c.ply"), A.settings), "it had 1 input files and has 2"),
-        (Recipe(A.inputs, A.names, {"method": "quick"}), "base was 1.5 and is None"),
+        (Fingerprint(("content b",), ("b.ply",), A.settings), r"b\.ply changed since"),
+        (Fingerprint(A.inputs, A.names, {"method": "quality", "base": 1.5}), "method was 'quick' and is 'quality'"),
+        (Fingerprint((*A.inputs, "more"), ("a.ply", "c.ply"), A.settings), "it had 1 input files and has 2"),
+        (Fingerprint(A.inputs, A.names, {"method": "quick"}), "base was 1.5 and is None"),
     ],
 )
 @pytest.mark.parametrize("overwrite", [False, True])
-def test_another_recipe_is_refused_with_what_differs(
-    store: FolderStore, other: Recipe, words: str, overwrite: bool
+def test_another_fingerprint_is_refused_with_what_differs(
+    store: Store, other: Fingerprint, words: str, overwrite: bool
 ) -> None:
     Run(store).interrupted()
     with (
         pytest.raises(ScratchError, match=f"results of another bake: {words}"),
-        Run(store).begun(resume=True, overwrite=overwrite, recipe=other),
+        Run(store).begun(resume=True, overwrite=overwrite, fingerprint=other),
     ):
         pass
     assert store.names() == ["first", RECIPE, "second"]
@@ -148,25 +145,24 @@ def flip(path: Path) -> None:
 
 
 @pytest.mark.parametrize("damage", [flip, lambda path: path.write_bytes(path.read_bytes()[:-1])])
-def test_damaged_results_are_removed_and_told(store: FolderStore, damage: Callable[[Path], None]) -> None:
+def test_damaged_results_are_removed_and_told(store: Store, damage: Callable[[Path], None]) -> None:
     Run(store).interrupted()
     damage(store.folder / "second.result")
     run = Run(store)
     with run.begun(resume=True):
-        assert run.lost == ["second"]
         assert not run.store.has("second")
         assert run.store.has("first")
     assert run.said == [f"goes on with 1 result in {store}; 1 other that a failure damaged will be made again"]
 
 
-def test_a_damaged_recipe_is_refused(store: FolderStore) -> None:
+def test_a_damaged_fingerprint_is_refused(store: Store) -> None:
     Run(store).interrupted()
     flip(store.folder / f"{RECIPE}.result")
     with pytest.raises(ScratchError, match="nothing tells what the results"), Run(store).begun(resume=True):
         pass
 
 
-def test_a_folder_of_somebody_else_is_refused(store: FolderStore) -> None:
+def test_a_folder_of_somebody_else_is_refused(store: Store) -> None:
     store.folder.mkdir()
     (store.folder / "thesis.txt").write_text("mine")
     for how in ({}, {"overwrite": True}, {"resume": True}):
@@ -178,7 +174,7 @@ def test_a_folder_of_somebody_else_is_refused(store: FolderStore) -> None:
 HOLDER = """
 import sys
 from pathlib import Path
-from sparklod_cli.bake.out_of_core.lock import locked
+from sparklod_cli.bake.out_of_core.scratch_folder import locked
 with locked(Path(sys.argv[1])):
     print("at work", flush=True)
     sys.stdin.read()
@@ -186,7 +182,7 @@ with locked(Path(sys.argv[1])):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="there are no locks on Windows")
-def test_a_folder_in_use_is_refused_until_its_run_is_killed(store: FolderStore) -> None:
+def test_a_folder_in_use_is_refused_until_its_run_is_killed(store: Store) -> None:
     command = [sys.executable, "-c", HOLDER, str(store.folder)]
     with subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as holder:
         assert holder.stdout is not None
@@ -205,7 +201,7 @@ def test_a_folder_that_cannot_be_made_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with (
         pytest.raises(ScratchError, match=r"cannot write in the scratch folder .*--scratch-dir"),
-        Run(FolderStore(tmp_path / "file" / "scratch")).begun(),
+        Run(Store(tmp_path / "file" / "scratch")).begun(),
     ):
         pass
 
