@@ -59,8 +59,8 @@ if TYPE_CHECKING:  # mypy then resolves the modules first, which import this one
     from .scenes.instances_file import InstancesFileError as InstancesFileError
     from .scenes.instances_file import read_instances as read_instances
     from .scenes.loaded import Cut as Cut
-    from .simulation.streaming import Network as Network
-    from .simulation.streaming import StreamingSettings as StreamingSettings
+    from .simulation.streaming_settings import Network as Network
+    from .simulation.streaming_settings import StreamingSettings as StreamingSettings
     from .support.errors import CameraPathError as CameraPathError
     from .support.errors import FormatError as FormatError
     from .support.errors import InvalidSplatsError as InvalidSplatsError

@@ -70,11 +70,9 @@ def settled(scene: Scene | Statistics, options: WriteOptions) -> WriteOptions:
 
     Raises:
         FormatError: a coordinate does not fit the fractional bits; the text names the most that would.
-        ValueError: the version is not one that is written, or there are no such bits.
+        ValueError: there are no such bits.
     """
     version = DEFAULT_SPZ_VERSION if options.spz_version is None else options.spz_version
-    if version not in SPZ_VERSIONS:
-        raise ValueError(f"SPZ version {version} is not one of {SPZ_VERSIONS}")
     found = scene if isinstance(scene, Statistics) else Statistics.of_scene(scene, needed(options))
     assert found.reach is not None
     bits, most = options.fractional_bits, largest_fractional_bits(found.reach)

@@ -9,7 +9,6 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ...model.nodes import CHUNK_NODES
 from ...model.scene import Scene
 from ...model.sh import COEFFICIENTS
 from ...support.errors import FormatError
@@ -18,7 +17,7 @@ from ..options import RadOptions, WriteOptions
 from ..splat_encoding import LARGEST_END, SCALE_ZERO, SplatEncoding
 from ..statistics import LOWER, SMALL_QUANTILE, UPPER, Magnitudes, Statistics, fine_bits, tops
 from .property_codings import LARGEST_F16
-from .rad_layout import AUTO, OPTIONS, PROPERTIES, RANGES, Row, choices
+from .rad_layout import AUTO, OPTIONS, PROPERTIES, RANGES, Row
 
 #: What "auto" stands for, where the scene does not decide.
 AUTOMATIC = RadOptions("f32_lebytes", "r8", "r8", "ln_0r8", "oct88r8", "s8")
@@ -84,15 +83,8 @@ def settled(scene: Scene | Statistics, options: WriteOptions) -> WriteOptions:
 
     Raises:
         FormatError: there are more splats than the format can number, or centres as float16 do not reach far enough.
-        ValueError: an encoding is unknown, or the palette has no code or more than a label can name.
     """
     rad = options.rad
-    if rad.sh_codes is not None and not 1 <= rad.sh_codes <= CHUNK_NODES:
-        raise ValueError(f"sh_codes is {rad.sh_codes}, not 1 to {CHUNK_NODES:,}")
-    given = {name: getattr(rad, name) for name in OPTIONS}
-    for name, value in given.items():
-        if value not in choices(name):
-            raise ValueError(f"{name} is {value!r}, not one of {', '.join(choices(name))}")
     found = scene if isinstance(scene, Statistics) else Statistics.of_scene(scene, needed(options))
     if found.count >= 1 << 32:
         raise FormatError(f"{found.count:,} splats; RAD numbers at most {(1 << 32) - 1:,}")
@@ -102,7 +94,8 @@ def settled(scene: Scene | Statistics, options: WriteOptions) -> WriteOptions:
             " choose another encoding of centres, such as f32"
         )
     ranges = rad.ranges or fitted(found)
-    chosen = {name: getattr(AUTOMATIC, name) if value == AUTO else value for name, value in given.items()}
+    encodings = {name: getattr(rad, name) for name in OPTIONS}
+    chosen = {name: getattr(AUTOMATIC, name) if value == AUTO else value for name, value in encodings.items()}
     if rad.scales == AUTO and ranges.ln_scale_max - ranges.ln_scale_min > WIDE_LOG_RANGE:
         chosen["scales"] = "ln_f16"
     if rad.rgb == AUTO and ranges.rgb_max - ranges.rgb_min > WIDE_RGB_RANGE:

@@ -70,11 +70,8 @@ def settled(scene: Scene, options: WriteOptions) -> WriteOptions:
         FormatError: the scene has a tree or no splats, or values that SOG cannot hold: opacities above 1, more splats
             than an image has texels.
         InvalidSplatsError: a splat is invalid.
-        ValueError: the palette has no code, or more than a label can name.
     """
     codes = options.sog.sh_codes
-    if codes is not None and not 1 <= codes <= MAX_SH_CODES:
-        raise ValueError(f"sh_codes is {codes}, not 1 to {MAX_SH_CODES:,}")
     if scene.tree is not None:
         raise FormatError("SOG holds no Level-of-Detail tree")
     count = len(scene)

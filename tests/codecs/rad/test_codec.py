@@ -410,7 +410,7 @@ def test_centres_beyond_float16_are_refused(encoding: str) -> None:
 
 
 def test_an_unknown_encoding_is_named_with_those_there_are() -> None:
-    with pytest.raises(ValueError, match=r"rgb is 'r9', not one of auto, r8_delta, r8, f16, f32"):
+    with pytest.raises(ValueError, match="no rad rgb 'r9'; give one of auto, r8_delta, r8, f16, f32"):
         chosen(random_splats(1), rgb="r9")
 
 

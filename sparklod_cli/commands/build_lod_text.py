@@ -53,12 +53,12 @@ LEAST_SHARE = 0.001
 
 
 def report_baked(console: Console, source: Place, target: Place, baked: Baked) -> None:
-    """A line about the file, and one for each thing that a person should know."""
+    """Print a line about the file, and one for each thing that a person should know."""
     from ..model.selection import describe
 
     console.say(
         f"{name_of(source)}  {count_of(baked.splats, 'splat')}, SH {baked.sh_degree}  ->  {_name(target)} "
-        f" {_made(baked)}, {size_of(baked.bytes)}, {_total(baked.seconds)}"
+        f" {_contents(baked)}, {size_of(baked.bytes)}, {_total(baked.seconds)}"
     )
     if baked.detail is not None and len(baked.detail.levels) > 1:
         console.say(f"  {_levels(baked.detail)}")
@@ -81,8 +81,8 @@ def report_baked(console: Console, source: Place, target: Place, baked: Baked) -
         console.detail(f"  out of core in {count_of(baked.blocks, 'block')}; scratch: {written} written, {read} read")
 
 
-def _made(baked: Baked) -> str:
-    """What the output holds."""
+def _contents(baked: Baked) -> str:
+    """Return a phrase on the contents of the output."""
     detail = baked.detail
     if detail is None:
         chunks = f", {count_of(baked.chunks, 'chunk')}" if baked.chunks else ""
@@ -95,7 +95,7 @@ def _made(baked: Baked) -> str:
 
 
 def _refined(refined: Refined) -> str:
-    """How far cuts are from full detail before and after the fitting, on held-out cameras."""
+    """Return a phrase on the PSNR of cuts before and after the fitting, on held-out cameras."""
     gains = [
         f"{100 * share:g} % {before:.2f} -> {refined.psnr_after[share]:.2f}"
         for share, before in refined.psnr_before.items()
@@ -109,7 +109,7 @@ def _refined(refined: Refined) -> str:
 
 
 def _levels(detail: WrittenDetail) -> str:
-    """The detail levels after full detail, and how far they are from it."""
+    """Return the detail levels after full detail, and how far they are from it."""
     levels = (
         f"{level.splats:,} splats ({100 * level.share:.3g} %, error at most {level.worst_error:.2g})"
         for level in detail.levels[1:]
@@ -118,7 +118,7 @@ def _levels(detail: WrittenDetail) -> str:
 
 
 def _written(baked: Baked) -> str:
-    """The format of the output and the choices that were made for it."""
+    """Return the format of the output and the choices that were made for it."""
     if baked.detail is not None:
         return "Streamed SOG"
     if baked.arrays:
@@ -148,7 +148,7 @@ def _consequences(baked: Baked) -> str:
 
 
 def _clamped(clamp: Clamp, baked: Baked) -> str:
-    """How many nodes have values that were clamped, how far these were off, and what that means."""
+    """Return a line on clamped values: the number of nodes, the largest value, and the consequence."""
     from ..codecs.rad.property_codings import LARGEST_F16
 
     form, table = ("SPZ", CLAMPED_BY_SPZ) if baked.chunks is None else ("RAD", CLAMPED_BY_RAD)
@@ -166,7 +166,7 @@ def _clamped(clamp: Clamp, baked: Baked) -> str:
 
 
 def report_extracted(console: Console, source: Place, target: Place, extracted: Extracted) -> None:
-    """A line about the file."""
+    """Print a line about the file."""
     console.say(
         f"{name_of(source)}  {count_of(extracted.nodes, 'node')}  ->  {_name(target)} "
         f" {count_of(extracted.splats, 'splat')}, SH {extracted.sh_degree}, {size_of(extracted.bytes)},"
