@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class RadOptions:
-    """How to write RAD. Encodings are those of `rad.layout.choices`; "auto" suits the scene, see `rad.options`.
+    """How to write RAD. Encodings are those of `rad_layout.choices`; "auto" suits the scene, see `rad_options`.
 
     Attributes:
         center, alpha, rgb, scales, orientation, sh: the encoding of each property.
@@ -43,7 +43,7 @@ class SogOptions:
 
     Attributes:
         sh_codes: the most entries of the palette of spherical harmonics, which a label for each splat points into; None
-            for as many as suit the number of splats, see `sog.options`.
+            for as many as suit the number of splats, see `sog_writer`.
     """
 
     sh_codes: int | None = None
@@ -55,11 +55,11 @@ class WriteOptions:
 
     Attributes:
         spz_version: 2 (rotations in 3 bytes, off by 13.4 degrees at most) or 3 (in 4 bytes, by 0.35); None for 3.
-        fractional_bits: of SPZ positions, 0 to 24; None for as many as suit the scene, see `spz_options`.
+        fractional_bits: of SPZ positions, 0 to 24; None for as many as suit the scene, see `spz_encoder`.
         compression_level: of SPZ and RAD, 1 (fast) to 9 (small).
         rad: of RAD.
         sog: of SOG.
-        sh_bits: upper bits kept of each SH byte of SPZ, 4 to 8; None for as many as suit the scene, see `sh_bits`.
+        sh_bits: upper bits kept of each SH byte of SPZ, 4 to 8; None for as many as colours need (`statistics.enough`).
             Merged splats keep 4, and 5 of degree 1, as other writers do with all splats.
         covering: opacities make up for the rounding of scales, see `coverage`; False where splats of a tree are written
             in another format, so that they keep their opacities.

@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from ..codecs.streamed_sog.names import MANIFEST
+from ..codecs.file_names import MANIFEST
 from ..support import interrupts
 from ..support.errors import SparklodError
 from ..support.printable import MOST, shortened

@@ -6,10 +6,9 @@ from dataclasses import dataclass
 
 import click
 
-from ..codecs.formats import FORMATS, WRITABLE, ending_of
-from ..codecs.gpu.table import NPZ, RAW_SUFFIXES
-from ..codecs.rad.names import SUFFIX as RAD
-from ..codecs.streamed_sog.names import MANIFEST
+from ..codecs.file_names import MANIFEST
+from ..codecs.file_names import RAD_SUFFIX as RAD
+from ..codecs.formats import FORMATS, NPZ, RAW_SUFFIXES, WRITABLE, ending_of
 from ..support.addresses import Place
 from ..support.stdin import DASH
 from .options.baking import (

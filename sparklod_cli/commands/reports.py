@@ -149,7 +149,7 @@ def _consequences(baked: Baked) -> str:
 
 def _clamped(clamp: Clamp, baked: Baked) -> str:
     """How many nodes have values that were clamped, how far these were off, and what that means."""
-    from ..codecs.rad.encodings import LARGEST_F16
+    from ..codecs.rad.property_codings import LARGEST_F16
 
     form, table = ("SPZ", CLAMPED_BY_SPZ) if baked.chunks is None else ("RAD", CLAMPED_BY_RAD)
     name, advice = table[clamp.column, clamp.above]

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ...codecs.gpu.table import ENCODINGS, NPZ, RAW_SUFFIXES
-from ...codecs.rad.layout import OPTIONS as PROPERTIES
-from ...codecs.rad.layout import choices
-from ...codecs.streamed_sog.names import MANIFEST
+from ...codecs.file_names import MANIFEST
+from ...codecs.formats import ENCODINGS, NPZ, RAW_SUFFIXES
+from ...codecs.rad.rad_layout import OPTIONS as PROPERTIES
+from ...codecs.rad.rad_layout import choices
 from ...lod.builders import BUILDERS, METHODS
 from ...support import defaults
 from ..command import COMMON, option, with_options

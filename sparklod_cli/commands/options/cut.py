@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ...codecs.gpu import table
+from ...codecs import formats as table
 from ...lod import detail_rule
 from ...support import defaults
 from ..command import COMMON, option, with_options
