@@ -11,7 +11,7 @@ import numpy as np
 
 from ..cameras.camera import Camera
 from ..cameras.path import CameraPath
-from ..codecs.gpu.table import PRECISIONS
+from ..codecs.formats import PRECISIONS
 from ..images import metrics
 from ..lod import detail_rule
 from ..lod.budget import LARGEST, Budget, parse_budget

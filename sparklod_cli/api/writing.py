@@ -8,7 +8,7 @@ from pathlib import Path
 from types import NoneType
 from typing import TYPE_CHECKING
 
-from ..codecs.streamed_sog.names import MANIFEST
+from ..codecs.file_names import MANIFEST
 from ..io import scene_sink, write_whole
 from ..io.details import detail_sink
 from ..model.scene import Scene
@@ -90,8 +90,8 @@ def write(
     from ..bake.detail_output import DetailOutput
     from ..codecs.formats import WRITABLE, ending_of
     from ..codecs.options import RadOptions, SogOptions, WriteOptions
-    from ..codecs.sound import check_scene
     from ..codecs.splat_encoding import SplatEncoding
+    from ..codecs.validation import check_scene
     from ..lod.detail_rule import DetailSettings
 
     path, count = file_path(path), thread_count(threads)
@@ -151,8 +151,8 @@ def _write_levels(
 
 
 def _write_arrays(path: Path, scene: Scene, encoding: str, *, overwrite: bool, threads: int) -> Written:
+    from ..codecs.formats import NPZ, RAW_SUFFIXES
     from ..codecs.gpu import dump
-    from ..codecs.gpu.table import NPZ, RAW_SUFFIXES
 
     if path.suffix.lower() not in (NPZ, *RAW_SUFFIXES):
         known = ", ".join((NPZ, *RAW_SUFFIXES))

@@ -26,7 +26,7 @@ _EULER = 0.5772156649015329
 
 
 def faces(scale: FloatArray, blur: float) -> NDArray[np.float64]:
-    """(N,) sums of the products of two scales each, which the area is proportional to that a splat shows on average.
+    """Return (N,) sums of the products of two scales each, in proportion to the area that a splat shows on average.
 
     Args:
         scale: (N, 3) standard deviations, world units.
@@ -41,7 +41,7 @@ def faces(scale: FloatArray, blur: float) -> NDArray[np.float64]:
 
 
 def kept(opacity: FloatArray, scale: FloatArray, rounded: FloatArray, blur: float) -> FloatArray:
-    """(N,) linear opacities with which splats of rounded scales cover as much as before.
+    """Return (N,) linear opacities with which splats of rounded scales cover as much as before.
 
     A splat of opacity A up to 1 covers A times its area, and keeps an opacity up to 1. A merged one of A above 1 covers
     H(A) times its area, the integral of its falloff 1 - (1 - exp(-z ** 2 / 2)) ** A, where H are the harmonic numbers.

@@ -16,7 +16,7 @@ from ..support.defaults import (
     SPZ_VERSIONS,
 )
 from ..support.setting_fields import CheckedSettings, Quantity, setting, whole
-from .rad.layout import AUTO, choices
+from .rad.rad_layout import AUTO, choices
 
 if TYPE_CHECKING:
     from .splat_encoding import SplatEncoding
@@ -41,7 +41,7 @@ def _encoding(option: str, plural: str) -> Any:
 
 @dataclass(frozen=True)
 class RadOptions(CheckedSettings):
-    """How to write RAD; encodings are explained in `rad.options`.
+    """How to write RAD; encodings are explained in `rad_options`.
 
     Attributes:
         chunked: write each chunk into a file of its own.
@@ -79,7 +79,7 @@ class SogOptions:
 
     Attributes:
         sh_codes: the most entries of the palette of spherical harmonics, which a label for each splat points into; None
-            for as many as suit the number of splats, see `sog.options`.
+            for as many as suit the number of splats, see `sog_writer`.
     """
 
     sh_codes: int | None = None
@@ -96,7 +96,7 @@ class WriteOptions(CheckedSettings):
     Attributes:
         rad: of RAD.
         sog: of SOG.
-        sh_bits: upper bits kept of each SH byte of SPZ, 4 to 8; None for as many as suit the scene, see `sh_bits`.
+        sh_bits: upper bits kept of each SH byte of SPZ, 4 to 8; None for as many as colours need (`statistics.enough`).
             Merged splats keep 4, and 5 of degree 1, as other writers do with all splats.
         covering: opacities make up for the rounding of scales, see `coverage`; False where splats of a tree are written
             in another format, so that they keep their opacities.

@@ -9,11 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..codecs.formats import FORMATS, WRITABLE, ending_of
-from ..codecs.gpu.table import ENCODINGS, NPZ, RAW_SUFFIXES
+from ..codecs.file_names import MANIFEST
+from ..codecs.file_names import RAD_SUFFIX as RAD
+from ..codecs.formats import ENCODINGS, FORMATS, NPZ, RAW_SUFFIXES, WRITABLE, ending_of
 from ..codecs.options import RadOptions
-from ..codecs.rad.names import SUFFIX as RAD
-from ..codecs.streamed_sog.names import MANIFEST
 from ..lod.detail_rule import DetailSettings
 from ..support.addresses import Place
 from ..support.stdin import DASH

@@ -149,7 +149,7 @@ def _consequences(baked: Baked) -> str:
 
 def _clamped(clamp: Clamp, baked: Baked) -> str:
     """Return a line on clamped values: the number of nodes, the largest value, and the consequence."""
-    from ..codecs.rad.encodings import LARGEST_F16
+    from ..codecs.rad.property_codings import LARGEST_F16
 
     form, table = ("SPZ", CLAMPED_BY_SPZ) if baked.chunks is None else ("RAD", CLAMPED_BY_RAD)
     name, advice = table[clamp.column, clamp.above]

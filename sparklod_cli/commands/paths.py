@@ -13,8 +13,7 @@ from typing import Any
 
 import click
 
-from ..codecs.sog.names import META
-from ..codecs.streamed_sog.names import MANIFEST
+from ..codecs.file_names import MANIFEST, META
 from ..support.addresses import Address, Place, place_of
 from ..support.stdin import DASH
 from ..tables.files import FORMS

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import click
 
-from ...codecs.gpu import table
+from ...codecs import formats as table
 from ...lod import detail_rule
 from ...lod.settings import FACTOR, LodSettings
 from ...model.foveation import Cones, Foveation, Frustum

@@ -12,8 +12,8 @@ import pytest
 from sparklod_cli.codecs import spz
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import codec as rad
-from sparklod_cli.codecs.rad import layout as rad_layout
-from sparklod_cli.codecs.rad.header import read_chunk_header, read_header
+from sparklod_cli.codecs.rad import rad_layout
+from sparklod_cli.codecs.rad.rad_header import read_chunk_header, read_header
 from sparklod_cli.io import read_scene
 from sparklod_cli.lod import quick
 from sparklod_cli.model.scene import Scene
