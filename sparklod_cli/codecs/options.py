@@ -41,7 +41,7 @@ def _encoding(option: str, plural: str) -> Any:
 
 @dataclass(frozen=True)
 class RadOptions(CheckedSettings):
-    """How to write RAD. Encodings are those of `rad_layout.choices`; "auto" suits the scene, see `rad_options`.
+    """How to write RAD; encodings are explained in `rad_options`.
 
     Attributes:
         chunked: write each chunk into a file of its own.

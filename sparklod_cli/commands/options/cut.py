@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import click
 
-from ...codecs import formats as table
+from ...codecs.formats import PRECISIONS
 from ...lod import detail_rule
 from ...lod.settings import FACTOR, LodSettings
 from ...model.foveation import Cones, Foveation, Frustum
@@ -136,8 +136,8 @@ class Cut:
         "Precision of the centres and sizes that cuts are found with: the file's, its half floats, or what Spark has of"
         " the file, for the same cuts to the last node: ext with extSplats, else packed, or packed-pages of a RAD file"
         " that it streams.",
-        table.PRECISIONS,
-        table.PRECISIONS[0],
+        PRECISIONS,
+        PRECISIONS[0],
     )
 
     def one_budget(self) -> Budget:
