@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..io import RadFile
+from ..io.rad_file import RadFile
 from ..model.lod_tree import LodTree
 from ..model.nodes import CHUNK_NODES
 from ..model.scene import Scene

@@ -76,19 +76,24 @@ class Selection:
         Raises:
             InvalidSplatsError: there are no splats, some are invalid without `drop_invalid`, or none is left.
         """
-        keep, tally = np.ones(len(splats), np.bool_), Tally()
-        parts = blocks_of(len(splats), EXAMINED)
-        found = ordered_map(lambda part: self.examine(splats.take(part)), parts, threads)
-        for part, (kept, some) in zip(parts, found, strict=True):
-            keep[part], tally = kept, tally.then(some)
+        keep, tally = self.examine(splats, threads=threads)
         self.check(tally)
         return (splats if keep.all() else splats.take(keep)), tally.dropped
 
-    def examine(self, splats: Splats) -> tuple[NDArray[np.bool_], Tally]:
-        """(N,) which splats of a scene, or of a part of it, are kept, and what becomes of the others.
+    def examine(self, splats: Splats, *, threads: int = 1) -> tuple[NDArray[np.bool_], Tally]:
+        """Return which splats of a scene, or of a part of it, are kept, (N,), and what becomes of the others.
 
         Invalid ones are not kept in any case.
         """
+        keep, tally = np.ones(len(splats), np.bool_), Tally()
+        parts = blocks_of(len(splats), EXAMINED)
+        examined = ordered_map(lambda part: self._examine(splats.take(part)), parts, threads)
+        for part, (kept, more) in zip(parts, examined, strict=True):
+            keep[part], tally = kept, tally.then(more)
+        return keep, tally
+
+    def _examine(self, splats: Splats) -> tuple[NDArray[np.bool_], Tally]:
+        """`examine` for a few splats."""
         invalid = splats.invalid()
         keeps = {kind: ~mask for kind, mask in invalid.items()} | {
             "zero_opacity": splats.opacity > 0,

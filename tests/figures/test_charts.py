@@ -16,6 +16,8 @@ from sparklod_cli.tables.columns import Row
 from tests.figures.flights import count_of, marked, path_scene, pixels, plotted
 from tests.tables.rows import flight, row
 
+pytestmark = pytest.mark.slow
+
 
 def test_a_chart_of_no_frames_is_an_error() -> None:
     with pytest.raises(SparklodError, match="nothing to draw"):

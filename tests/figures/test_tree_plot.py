@@ -26,6 +26,8 @@ from sparklod_cli.support.errors import SparklodError
 from sparklod_cli.support.optional import install_hint
 from tests.scenes import random_splats
 
+pytestmark = pytest.mark.slow
+
 
 def brightness(colors: np.ndarray) -> np.ndarray:
     linear = (colors / 255) ** 2.2

@@ -18,7 +18,10 @@ from sparklod_cli.support import jit, jit_cache, jit_link, jit_numba
 from sparklod_cli.support.jit_cache import CODE
 from tests.conftest import ROOT
 
-pytestmark = pytest.mark.skipif(not jit_link.is_tested(), reason="machine code is not linked on this system")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not jit_link.is_tested(), reason="machine code is not linked on this system"),
+]
 
 #: Kernels, and what scripts call them with.
 KERNELS = """

@@ -36,9 +36,11 @@ ENTRIES = 256
 #: Terms of the harmonic sums that are added one by one; the rest is an integral. With 64 the sums are exact to 1e-7.
 TERMS = 64
 
+lod_opacity_above_1 = kernel(inline=True)(gaussian.lod_opacity_above_1)
+
 
 def harmonic(a: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """H(a) and H2(a) of real numbers a >= 1, to 1e-7: the sums of 1/k - 1/(k + a) and of 1/k^2 - 1/(k + a)^2."""
+    """Return H(a) and H2(a) of real numbers a >= 1, to 1e-7: the sums of 1/k - 1/(k + a) and of 1/k^2 - 1/(k + a)^2."""
     k = np.arange(1, TERMS + 1, dtype=np.float64)[:, None]
     start = TERMS + 0.5  # midpoint rule for the remaining terms
     first = (1 / k - 1 / (k + a)).sum(axis=0) + np.log((start + a) / start)
@@ -47,7 +49,7 @@ def harmonic(a: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.fl
 
 
 def _profiles(lod_opacity: NDArray[np.float32]) -> tuple[NDArray[np.float64], ...]:
-    """Linear opacity, spread (variance / sigma^2) and density of profiles of D at least 1."""
+    """Return linear opacity, spread (variance / sigma^2) and density of profiles of D at least 1."""
     a = linear_opacity(lod_opacity).astype(np.float64)
     first, second = harmonic(a)
     spread = (first + second / first) / 2
@@ -55,7 +57,7 @@ def _profiles(lod_opacity: NDArray[np.float32]) -> tuple[NDArray[np.float64], ..
 
 
 def _table() -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-    """Linear opacity and spread at ENTRIES densities from 1 to that of MAX_D, which is third."""
+    """Return linear opacity and spread at ENTRIES densities from 1 to that of MAX_D, which is third."""
     a, spread, density = _profiles(np.linspace(1, MAX_D, 4096, dtype=np.float32))
     even = np.linspace(1, density[-1], ENTRIES)
     return np.interp(even, density, a), np.interp(even, density, spread), float(density[-1])
@@ -64,18 +66,16 @@ def _table() -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
 OPACITIES, SPREADS, MAX_DENSITY = _table()
 NEEDLE_OPACITY, NEEDLE_SPREAD, NEEDLE_DENSITY = (float(x[0]) for x in _profiles(np.array([NEEDLE_D], np.float32)))
 
-lod_opacity_above_1 = kernel(inline=True)(gaussian.lod_opacity_above_1)
-
 
 @kernel(inline=True)
 def is_needle(a, b, c):
-    """Whether the second of three variances along the axes, in any order, is below NEEDLE squared of the largest."""
+    """Return whether the second of three variances along the axes is below NEEDLE squared of the largest."""
     return max(min(a, b), min(max(a, b), c)) < NEEDLE * NEEDLE * max(a, b, c)
 
 
 @kernel(inline=True)
 def profile_of(density, needle):
-    """Linear opacity and spread of a splat, or a needle, of a density; its variance is spread * sigma^2.
+    """Return linear opacity and spread of a splat, or a needle, of a density; its variance is spread * sigma^2.
 
     Above the density of the largest D the spread is smaller than the profile's, which makes sigma larger, so that the
     coverage is kept.
