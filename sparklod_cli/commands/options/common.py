@@ -120,7 +120,7 @@ def table_form(flag: str, output: Path | None, form: str | None = None) -> str:
 @contextlib.contextmanager
 def assert_errors() -> Iterator[None]:
     """Turn the error that an assertion cannot be understood into a usage error that names the option."""
-    from ...tables.conditions import BadAssertionError
+    from ...tables.assertions import BadAssertionError
 
     try:
         yield
