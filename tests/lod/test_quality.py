@@ -12,12 +12,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sparklod_cli.cameras.axes import Axes
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.cameras.formats.source import Parsed
+from sparklod_cli.cameras.formats.table import PathFormat
 from sparklod_cli.cameras.frame import DEFAULT_UP, Settings
 from sparklod_cli.cameras.framing import framing
 from sparklod_cli.cameras.generators import orbit
-from sparklod_cli.cameras.path import GENERATED, cameras_of
+from sparklod_cli.cameras.path import cameras_of
 from sparklod_cli.codecs.gpu import lod_tree
 from sparklod_cli.images.metrics import on_background, psnr
 from sparklod_cli.io import read_scene
@@ -197,7 +199,7 @@ def cameras_around(splats: Splats) -> tuple[Camera, ...]:
     middle, radius = framing(splats.center)
     frames = orbit(3, middle, 1.6 * radius, math.radians(15), DEFAULT_UP)
     settings = Settings(size=(240, 135), fov_y=math.radians(60))
-    return cameras_of(Parsed(frames), GENERATED["orbit"], settings).cameras
+    return cameras_of(Parsed(frames), PathFormat("", "an orbit", "", Axes.OPENGL_C2W), settings).cameras
 
 
 def picture(splats: Splats, camera: Camera) -> Image:

@@ -17,7 +17,7 @@ from sparklod_cli.model.gaussian import linear_opacity, lod_opacity
 from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.support.errors import FormatError
 from sparklod_cli.support.parallel import BLOCK_ROWS
-from tests.codecs.test_octahedral import degrees_between, random_quats
+from tests.codecs.test_spark_codings import degrees_between, random_quats
 from tests.scenes import random_splats
 
 HALF = 2.0**-11  # relative rounding error of a float16

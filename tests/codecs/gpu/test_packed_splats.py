@@ -20,7 +20,7 @@ from sparklod_cli.model.sh import COEFFICIENTS
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.support.errors import FormatError
 from sparklod_cli.support.parallel import BLOCK_ROWS
-from tests.codecs.test_octahedral import degrees_between, random_quats
+from tests.codecs.test_spark_codings import degrees_between, random_quats
 from tests.scenes import random_splats
 
 ROUNDING = 1.001  # float32's own errors, which no docstring counts
