@@ -36,8 +36,7 @@ if TYPE_CHECKING:
     from .lod.detail_rule import DetailRule
     from .lod.detail_settings import DetailSettings
     from .lod.settings import LodSettings
-    from .model.foveation import Cones, Frustum
-    from .model.instances import Instance
+    from .model.instances import Cones, Frustum, Instance
     from .model.lod_tree import LodTree
     from .model.scene import Scene, Tree
     from .model.selection import Selection

@@ -14,7 +14,7 @@ import pytest
 
 from sparklod_cli.io import companions, detail_files, detail_sink, files_of, read_levels, read_scene
 from sparklod_cli.io.names import leads_away
-from sparklod_cli.support import leftovers
+from sparklod_cli.support import atomic
 from sparklod_cli.support.addresses import Address
 from sparklod_cli.support.errors import OutputError
 from tests.conftest import FIXTURES
@@ -284,4 +284,4 @@ def test_names_that_lead_away_with_folders_too(name: str) -> None:
 
 @pytest.fixture(autouse=True)
 def first_run() -> None:
-    leftovers.sweep.cache_clear()
+    atomic.sweep.cache_clear()

@@ -22,7 +22,7 @@ from ..support.defaults import (
     MIN_GROWTH,
 )
 from ..support.errors import FormatError, InvalidSplatsError, TreeError, memory_errors_translated
-from ..support.threads import on_threads, thread_count
+from ..support.parallel import on_threads, thread_count
 from .arguments import scene_like, whole_within, within
 from .progress import Told, telling
 

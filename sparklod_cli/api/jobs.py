@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 
 from ..model.instances import instances_of
 from ..scenes.finder import CutFinder, CutSource
+from ..support.parallel import on_threads
 from ..support.progress import silent
-from ..support.threads import on_threads
 from .viewed_files import ViewedFiles
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from .. import io
 from ..model.scene import Scene, Tree
 from ..model.splats import FloatArray
 from ..support.errors import FormatError, memory_errors_translated
-from ..support.threads import on_threads
+from ..support.parallel import on_threads
 from .arguments import scene_like
 from .files import naming
 from .progress import Told, telling

@@ -10,8 +10,8 @@ from ..cameras.path import CameraPath
 from ..fitting.settings import MOST_SEED, MOST_STEPS, FitSettings
 from ..model.scene import Scene, Tree
 from ..support.errors import FormatError, memory_errors_translated
+from ..support.parallel import thread_count
 from ..support.progress import Progress
-from ..support.threads import thread_count
 from .arguments import path_like, scene_like, whole_within
 from .progress import Told, telling
 

@@ -20,7 +20,7 @@ from ..support.defaults import (
     MIN_SH_CODES,
 )
 from ..support.errors import FormatError, InvalidSplatsError, memory_errors_translated
-from ..support.threads import thread_count
+from ..support.parallel import thread_count
 from .arguments import file_path, scene_like, whole_within
 from .files import naming, pack
 from .progress import Told, telling

@@ -20,8 +20,8 @@ from ..model.scene import Scene
 from ..model.splats import Splats
 from ..support.addresses import Place
 from ..support.errors import memory_errors_translated
+from ..support.parallel import on_threads
 from ..support.progress import Progress, silent
-from ..support.threads import on_threads
 from .checks import transformed
 from .clock import Clock
 from .environment import divided, read_environment

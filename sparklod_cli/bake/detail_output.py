@@ -12,11 +12,10 @@ from ..codecs.streamed_sog.names import ENVIRONMENT, folders_of
 from ..io import SinkTogether
 from ..io.together import Files
 from ..lod.detail_settings import DetailSettings
-from ..model.detail import DetailScene
-from ..model.scene import Scene
+from ..model.scene import DetailScene, Scene
 from ..model.splats import Splats
+from ..support.parallel import on_threads
 from ..support.progress import Progress
-from ..support.threads import on_threads
 from .clock import Clock
 from .whole_output import WholeOutput
 from .written import WrittenDetail, WrittenLevel, WrittenTree

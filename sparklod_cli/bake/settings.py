@@ -13,8 +13,7 @@ from ..lod.detail_settings import DetailSettings
 from ..model.lod_tree import LodTree
 from ..model.selection import Selection
 from ..model.splats import Splats
-from ..model.transforms import Transform
-from ..model.up_axis import rotated
+from ..model.transforms import Transform, rotated
 from ..support.defaults import DEFAULT_BASE, DEFAULT_GROWTH, MAX_SH_DEGREE
 
 #: Suffix of the format that is written unless another one is chosen.
@@ -32,8 +31,8 @@ class BakeSettings:
         max_sh: the highest SH degree that is kept.
         selection: which splats are kept; its coordinates are those of the input.
         transform: turns, scales and moves the splats that are kept.
-        up: axis of the input that points up, one of `up_axis.AXES`, which `transform` may have turned to another; None
-            for the one that the input notes.
+        up: axis of the input that points up, one of `transforms.AXES`, which `transform` may have turned to another;
+            None for the one that the input notes.
         rgba: a file of colours and opacities that replace the splats' own, see `io.read_rgba`.
         suffix: of the format, one of `WRITABLE` that holds trees.
         options: how to write it.

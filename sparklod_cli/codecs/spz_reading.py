@@ -10,9 +10,8 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from ..model.coding import FileCoding, ScaleCoding
 from ..model.lod_tree import LodTree
-from ..model.scene import Scene
+from ..model.scene import FileCoding, ScaleCoding, Scene
 from ..model.sh import notes_on_degree
 from ..model.splats import COLUMNS, Splats
 from ..model.streams import SceneStream

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from ..images.text import FAINT, INK, LINE, font, write_scale, write_title
-from ..render.color_scales import Coloring
-from ..support.ticks import ticks
+from ..render.color_scales import Coloring, ticks
 from .ellipsoids import Points
 from .viewpoint import Viewpoint
 

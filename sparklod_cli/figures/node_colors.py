@@ -16,11 +16,11 @@ from ..render.color_scales import (
     log_range,
     range_of,
     smooth,
+    ticks,
     top_opacity,
     whole_numbers,
     with_ends,
 )
-from ..support.ticks import ticks
 
 #: Marks closer to an end of a scale than this share of it are left out: they would touch the mark of the end.
 APART = 0.04

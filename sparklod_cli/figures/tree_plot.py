@@ -14,10 +14,9 @@ from ..model.gaussian import spark_size
 from ..model.nodes import CHUNK_NODES
 from ..model.scene import Scene
 from ..model.splats import FloatArray, Splats
-from ..render.color_scales import VIRIDIS, ramp
+from ..render.color_scales import VIRIDIS, nice_step, ramp
 from ..support.defaults import DEFAULT_BASE, PLOT_BY
 from ..support.errors import SparklodError
-from ..support.ticks import nice_step
 from .ellipsoids import Points, box_lines, cells, evenly, level_of_step, wall_lines
 from .labels import write_png
 from .node_colors import color_by

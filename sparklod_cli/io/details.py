@@ -12,7 +12,7 @@ from ..codecs.sog.files import MAX_META, names_beside
 from ..codecs.sog.names import META
 from ..codecs.streamed_sog.manifest import MAX_MANIFEST, parse
 from ..codecs.streamed_sog.names import chunk_name, folders_of, is_folder, is_named, is_ours
-from ..support import atomic_set, folders
+from ..support import atomic, atomic_set
 from ..support.addresses import Address, Place
 from ..support.errors import FormatError, OutputError
 from .names import reason_of
@@ -76,7 +76,7 @@ def _write(path: Place, files: Files, *, overwrite: bool) -> int:
     if isinstance(target, Address):
         return send_together(target, placed(), former=[target.parent / name for name in former], overwrite=overwrite)
     try:
-        with folders.created(target.parent):
+        with atomic.created(target.parent):
             return atomic_set.write(
                 target.parent,
                 placed(),

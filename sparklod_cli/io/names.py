@@ -8,7 +8,7 @@ from pathlib import Path, PurePath
 
 from ..codecs.rad import names as rad_names
 from ..codecs.sog import names as sog_names
-from ..support.similar import near
+from ..support.printable import near
 
 #: Names in a folder that are compared with one that is missing: more take longer than a person expects of an error.
 MOST_NAMES = 10_000

@@ -11,8 +11,8 @@ from typing import Any, BinaryIO
 from ..codecs.rad.by_chunk import ByChunk, bytes_decoded
 from ..codecs.rad.codec import name_of
 from ..codecs.rad.records import RadHeader
-from ..model.coding import FileCoding
 from ..model.lod_tree import LodTree
+from ..model.scene import FileCoding
 from ..model.splats import Splats
 from ..support.machine import available_memory
 from .reading import opened

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 from ..codecs.encoder import Stored
 from ..codecs.formats import FORMATS, HEAD, Format, sniff
 from ..codecs.gpu.table import NPZ, RAW_SUFFIXES
-from ..model.detail import DetailScene
-from ..model.scene import Scene
+from ..model.scene import DetailScene, Scene
 from ..model.splats import COLUMNS
 from ..support.addresses import Place, size_of
 from ..support.errors import UnknownFormatError, UnreadableError

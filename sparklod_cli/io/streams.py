@@ -13,9 +13,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple, Protocol
 
-from ..model.merged import Placed, merged
 from ..model.splats import Splats
-from ..model.streams import SceneStream
+from ..model.streams import Placed, SceneStream, merged
 from ..model.transforms import Transform
 from ..support import atomic
 from ..support.addresses import Address, Place
@@ -94,7 +93,7 @@ def open_streams(
     threads: int = 1,
     progress: Progress = silent,
 ) -> Iterator[SceneStream]:
-    """The splats of several files, each where it stands, as those of one scene; see `model.merged`.
+    """The splats of several files, each where it stands, as those of one scene; see `streams.merged`.
 
     Nothing is kept open between reads, and the header of a file that is named twice is read once.
 

@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from ..support import atomic_set, folders
+from ..support import atomic, atomic_set
 from ..support.addresses import Address, Place
 from ..support.errors import OutputError
 from ..support.stdin import DASH
@@ -57,7 +57,7 @@ def write_together(path: Place, files: Files, *, overwrite: bool) -> int:
     target = Path(os.path.realpath(path))
     placed = ((target.name if number_of(name, target.name) is None else name, pieces) for name, pieces in files)
     try:
-        with folders.created(target.parent):
+        with atomic.created(target.parent):
             return atomic_set.write(
                 target.parent,
                 placed,

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from ..support import atomic, folders
+from ..support import atomic
 from ..support.addresses import Address, Place
 from ..support.errors import OutputError, StdoutError
 from ..support.stdin import DASH
@@ -61,7 +61,7 @@ def write_whole(path: Place, pieces: Iterable[bytes], *, overwrite: bool) -> int
             with path.open("wb") as file:
                 return sum(map(file.write, pieces))
         target = Path(os.path.realpath(path))
-        with folders.created(target.parent):
+        with atomic.created(target.parent):
             return atomic.write(target, pieces, overwrite=overwrite)
     except FileExistsError:
         raise OutputError(f"{path} exists, add --overwrite to replace it") from None

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..model.detail import DetailScene
 from ..model.lod_tree import LodTree
+from ..model.scene import DetailScene
 from ..model.splats import Splats
 from ..support.progress import Progress, silent
 from .detail_cuts import detail_cuts, shares_of

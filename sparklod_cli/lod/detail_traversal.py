@@ -9,8 +9,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ..model.detail import DetailScene
 from ..model.gaussian import spark_size
+from ..model.scene import DetailScene
 from ..model.splats import Splats
 from .detail_choice import Chains, Distant, Levels, choose
 from .detail_distance import RegionBounds

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from ..model.foveation import Foveation, Frustum
+from ..model.instances import Foveation, Frustum
 from .kernels.pixel_scale import CONE, FRUSTUM, NO_FOVEATION
 
 

@@ -3,7 +3,7 @@
 A splat of linear opacity A > 1 has the alpha p(z) = 1 - (1 - exp(-z^2 / 2)) ** A, flat on top. A plain Gaussian of
 opacity 1 and k times the scale has g(z) = exp(-z^2 / (2 k^2)). Both are isotropic on the screen, in standard deviations
 of the splat, so k depends on A alone. It is the one that covers as much: the integral of p over the plane is 2 pi H(A),
-with the harmonic number H (see `kernels/profile.py`), that of g is 2 pi k^2, so k = sqrt(H(A)).
+with the harmonic number H (see `model/falloff.py`), that of g is 2 pi k^2, so k = sqrt(H(A)).
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ import dataclasses
 
 import numpy as np
 
+from ..model.falloff import harmonic
 from ..model.splats import Splats
-from .kernels.profile import harmonic
 
 
 def with_plain_opacity(splats: Splats) -> Splats:

@@ -28,7 +28,7 @@ from .voxel_tree import VoxelTree
 def build(splats: Splats, base: float = DEFAULT_BASE, *, progress: Progress = silent) -> tuple[Splats, LodTree]:
     """Builds a Level-of-Detail tree.
 
-    The result does not depend on the number of threads (`support.threads`). Each input splat is one leaf, bit for bit.
+    The result does not depend on the number of threads. Each input splat is one leaf, bit for bit.
     The root is node 0, siblings are consecutive and come after their parent. Any prefix of the nodes is a coarser
     scene: nodes whose parents were made at a coarser level come first, and along a Morton curve within a level.
 

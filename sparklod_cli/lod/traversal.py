@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..model.foveation import Cones, Foveation
+from ..model.instances import Cones, Foveation
 from ..model.nodes import CHUNK_BITS, CHUNK_NODES, Nodes
 from .cut_search import CutSearch
 from .foveation import set_foveation

@@ -45,7 +45,7 @@ class Tally:
         return self.count - sum(self.dropped.values())
 
     def then(self, after: Tally) -> Tally:
-        """That of these splats and those that come after them."""
+        """Return the tally of these splats and of those that come after them."""
         first = self.first_invalid
         if first is None and after.first_invalid is not None:
             first = self.count + after.first_invalid
@@ -71,7 +71,7 @@ class Selection:
     within: tuple[Vector, float] | None = None
 
     def apply(self, splats: Splats, *, threads: int = 1) -> tuple[Splats, dict[str, int]]:
-        """The splats that are kept, in their order, and the number dropped for each of `REASONS` that occurred.
+        """Return the splats that are kept, in their order, and the number dropped for each of `REASONS` that occurred.
 
         Raises:
             InvalidSplatsError: there are no splats, some are invalid without `drop_invalid`, or none is left.
@@ -85,7 +85,7 @@ class Selection:
         return (splats if keep.all() else splats.take(keep)), tally.dropped
 
     def examine(self, splats: Splats) -> tuple[NDArray[np.bool_], Tally]:
-        """(N,) which splats of a scene, or of a part of it, are kept, and what becomes of the others.
+        """Return (N,) which splats of a scene, or of a part of it, are kept, and what becomes of the others.
 
         Invalid ones are not kept in any case.
         """
@@ -106,7 +106,7 @@ class Selection:
         return keep, Tally(len(splats), {reason: count for reason, count in dropped.items() if count}, first)
 
     def check(self, tally: Tally) -> None:
-        """Checks that a tree can be made of what is kept of a whole scene.
+        """Check that a tree can be made of what is kept of a whole scene.
 
         Raises:
             InvalidSplatsError: see `apply`.
@@ -134,5 +134,5 @@ class Selection:
 
 
 def describe(dropped: dict[str, int]) -> str:
-    """ "12 not finite, 3 cropped", for display."""
+    """Return a text such as "12 not finite, 3 cropped"."""
     return ", ".join(f"{count:,} {REASONS[reason]}" for reason, count in dropped.items())

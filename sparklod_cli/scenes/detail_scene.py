@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from ..io import LevelFiles
 from ..lod.detail_loading import DetailFiles
-from ..model.detail import DetailScene
-from ..model.scene import Scene
+from ..model.scene import DetailScene, Scene
 from ..model.splats import COLUMNS, Splats
 from .loaded_scene import Index, LoadedScene
 

@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..codecs.gpu import loaded_nodes, lod_tree
-from ..model.coding import FileCoding
 from ..model.lod_tree import LodTree
 from ..model.nodes import CHUNK_NODES, Nodes
-from ..model.scene import Scene
+from ..model.scene import FileCoding, Scene
 from ..model.splats import Splats
 
 Index = NDArray[np.signedinteger]

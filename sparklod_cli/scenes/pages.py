@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from ..io import RadFile
 from ..lod.kernels.pixel_scale import NODE
-from ..model.coding import FileCoding
 from ..model.lod_tree import LodTree
 from ..model.nodes import CHUNK_BITS, CHUNK_NODES, Nodes
+from ..model.scene import FileCoding
 from ..model.splats import COLUMNS, Splats
 from ..support.errors import SparklodError, TreeError
 from ..support.machine import available_memory

@@ -10,10 +10,9 @@ from pathlib import Path
 from ..codecs.gpu.table import PRECISIONS
 from ..codecs.rounding import after
 from ..io import RadFile, examine_scene, has_levels, read_level_files, read_levels, size_of_input
-from ..model.detail import DetailScene
 from ..model.instances import Instance
 from ..model.nodes import CHUNK_NODES
-from ..model.scene import Scene
+from ..model.scene import DetailScene, Scene
 from ..model.selection import Selection, describe
 from ..model.splats import COLUMNS, Splats
 from ..support.errors import FormatError, InvalidSplatsError, SparklodError, TreeError, memory_errors_translated

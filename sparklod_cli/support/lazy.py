@@ -11,7 +11,7 @@ _ROOT = __name__.partition(".")[0]
 
 
 def loader_of(package: str, names: Mapping[str, Collection[str]]) -> Callable[[str], Any]:
-    """The `__getattr__` of a package or module (PEP 562).
+    """Return the `__getattr__` of a package or module (PEP 562).
 
     Args:
         package: its `__name__`.

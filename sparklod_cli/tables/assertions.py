@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 
-from ..support.similar import near
+from ..support.printable import near
 from . import conditions
 from .columns import Column, Row
 from .conditions import SIGNS, BadAssertionError, is_number, number_text

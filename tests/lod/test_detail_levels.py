@@ -13,8 +13,8 @@ from sparklod_cli.lod import quality, quick
 from sparklod_cli.lod.detail_cuts import COARSE_ENOUGH, STEP, detail_cuts, shares_of
 from sparklod_cli.lod.detail_levels import make
 from sparklod_cli.lod.detail_settings import DetailSettings
-from sparklod_cli.model.detail import DetailScene
 from sparklod_cli.model.lod_tree import LodTree
+from sparklod_cli.model.scene import DetailScene
 from sparklod_cli.model.splats import COLUMNS, Splats
 from tests.lod.trees import children, hard_cases, sorted_rows
 from tests.scenes import random_splats

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from ...model.selection import Tally
+from ...support.parallel import on_threads
 from ...support.progress import Progress
-from ...support.threads import on_threads
 from .job import Job
 from .parts import Kept, kept_of
 from .rows import fill_rows, splats_of, width_of

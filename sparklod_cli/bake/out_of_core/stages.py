@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from ...codecs.statistics import Statistics
 from ...lod.stages.records import NO_FAMILY, Families, Pending
 from ...model.splats import Splats
+from ...support.parallel import on_threads
 from ...support.progress import Progress
-from ...support.threads import on_threads
 from .blocks import Stage
 from .job import ROOT, Job, clean_of, families_of, pending_of, stage_of
 from .rows import Rows, rows_of, splats_of, width_of

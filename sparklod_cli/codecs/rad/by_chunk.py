@@ -8,8 +8,8 @@ from typing import BinaryIO
 
 import numpy as np
 
-from ...model.coding import FileCoding
 from ...model.lod_tree import LodTree
+from ...model.scene import FileCoding
 from ...model.sh import COEFFICIENTS
 from ...model.splats import FloatArray, Splats
 from ...support.parallel import ordered_map

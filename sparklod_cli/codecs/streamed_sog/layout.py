@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ...model.detail import Bounds, Counts
+from ...model.scene import Bounds, Counts
 from .manifest import Manifest
 
 Index = NDArray[np.int64]

@@ -8,8 +8,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from ...model.detail import DetailScene
-from ...model.scene import Scene
+from ...model.scene import DetailScene, Scene
 from ...model.sh import COEFFICIENTS
 from ...model.splats import Splats
 from ...model.streams import BLOCK_SPLATS, SceneStream

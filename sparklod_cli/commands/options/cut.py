@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from ...lod.budget import Budget
     from ...lod.detail_rule import DetailRule
     from ...lod.settings import LodSettings
-    from ...model.foveation import Foveation
+    from ...model.instances import Foveation
 
 HEADING = "Cut"
 
@@ -142,7 +142,7 @@ class Cut:
         return None
 
     def _foveation(self) -> Foveation:
-        from ...model.foveation import Cones, Frustum
+        from ...model.instances import Cones, Frustum
 
         behind = self.behind_foveate
         if self.outside_foveate is not None:

@@ -1,9 +1,9 @@
 """Opacity profiles of merged splats: their coverage and variance on the screen, and the inverse.
 
-Spark draws a splat of linear opacity A > 1 with the alpha 1 - (1 - exp(-t)) ** A, t = z^2 / 2, which is that of A equal
-splats on top of each other. Its coverage, the integral over the plane, is 2 pi sigma^2 * H(A), where H(A) is the
-harmonic number 1 + 1/2 + ... + 1/A. Its variance along an axis is sigma^2 * (H(A) + H2(A) / H(A)) / 2, with H2(A) = 1 +
-1/4 + ... + 1/A^2. Both follow from integration by parts; for A up to 1 they are 2 pi sigma^2 * A and sigma^2.
+A splat of linear opacity A > 1, see `model/falloff.py`, has the coverage 2 pi sigma^2 * H(A), the integral over the
+plane, where H(A) is the harmonic number 1 + 1/2 + ... + 1/A. Its variance along an axis is sigma^2 * (H(A) + H2(A) /
+H(A)) / 2, with H2(A) = 1 + 1/4 + ... + 1/A^2. Both follow from integration by parts; for A up to 1 they are
+2 pi sigma^2 * A and sigma^2.
 
 The A of a splat of given coverage and variance therefore depends on the *density* alone, coverage / (2 pi * variance).
 The density is A itself up to 1, and H / spread above, which tends to 2, the density of a disc with a sharp edge.
@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...model import gaussian
+from ...model.falloff import harmonic
 from ...model.gaussian import MIN_OPACITY, SIZE_PER_D, linear_opacity
 from ...support.jit import kernel
 
@@ -32,18 +33,6 @@ NEEDLE, NEEDLE_D = 0.25, 1.5
 
 #: Entries of the table of profiles by density, between which it is interpolated linearly. Chosen.
 ENTRIES = 256
-
-#: Terms of the harmonic sums that are added one by one; the rest is an integral. With 64 the sums are exact to 1e-7.
-TERMS = 64
-
-
-def harmonic(a: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """H(a) and H2(a) of real numbers a >= 1, to 1e-7: the sums of 1/k - 1/(k + a) and of 1/k^2 - 1/(k + a)^2."""
-    k = np.arange(1, TERMS + 1, dtype=np.float64)[:, None]
-    start = TERMS + 0.5  # midpoint rule for the remaining terms
-    first = (1 / k - 1 / (k + a)).sum(axis=0) + np.log((start + a) / start)
-    second = (1 / k**2 - 1 / (k + a) ** 2).sum(axis=0) + 1 / start - 1 / (start + a)
-    return first, second
 
 
 def _profiles(lod_opacity: NDArray[np.float32]) -> tuple[NDArray[np.float64], ...]:

@@ -16,8 +16,7 @@ from sparklod_cli.codecs.sog import codec as sog
 from sparklod_cli.codecs.streamed_sog import codec
 from sparklod_cli.codecs.streamed_sog.manifest import parse
 from sparklod_cli.model import morton
-from sparklod_cli.model.detail import DetailScene
-from sparklod_cli.model.scene import Scene
+from sparklod_cli.model.scene import DetailScene, Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.support.errors import FormatError
 

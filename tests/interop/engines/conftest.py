@@ -21,7 +21,7 @@ from sparklod_cli.codecs.streamed_sog import codec
 from sparklod_cli.io import detail_sink, read_scene
 from sparklod_cli.lod import detail_levels, quality
 from sparklod_cli.lod.detail_settings import DetailSettings
-from sparklod_cli.model.detail import DetailScene
+from sparklod_cli.model.scene import DetailScene
 from sparklod_cli.model.splats import Splats
 from tests.conftest import FIXTURES
 from tests.interop import npm
